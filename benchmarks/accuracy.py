@@ -1,7 +1,7 @@
 """Seconds of training to reach a score, and the error and time of a prediction, of all systems.
 
-    python benchmarks/accuracy.py
-    python benchmarks/accuracy.py data=synthetic_rssi trainer.max_time=00:00:00:40 --systems gaigs mirrored
+    python benchmarks/accuracy.py python benchmarks/accuracy.py data=synthetic_rssi
+    trainer.max_time=00:00:00:40 --systems gaigs mirrored
 
 Trains every system, and the values of some axes, for the same time; look-ups stand beside them.
 Overrides are those of each run.
@@ -70,16 +70,25 @@ class Accuracy(Trainings):
         for heading, score, own in sections(self.name, rows):
             levels = self.all_levels(own, score)
             systems = [row for row in own if row["axis"] in (SYSTEMS, LOOK_UPS)]
-            parts += [heading, _table(sorted(systems, key=lambda row: score.loss(row["test"])), levels, score)]
-            for (axis, key, of, default), values in grouped(own, "axis", "key", "of", "default").items():
+            parts += [
+                heading,
+                _table(sorted(systems, key=lambda row: score.loss(row["test"])), levels, score),
+            ]
+            for (axis, key, of, default), values in grouped(
+                own, "axis", "key", "of", "default"
+            ).items():
                 if axis not in (SYSTEMS, LOOK_UPS):
-                    parts.append(f"**{axis}**: `{key}` of `{of or 'the command line'}`; the default is {default}\n")
+                    parts.append(
+                        f"**{axis}**: `{key}` of `{of or 'the command line'}`; the default is {default}\n"
+                    )
                     parts.append(_table(values, levels, score))
         return "\n".join(parts)
 
     def all_levels(self, rows: Sequence[Row], score: Score) -> dict[str, float]:
         """Levels by the column's title, the easiest first."""
-        found = {f"{level:g}": level for level in self.levels.get(monitor_names(rows[0]["task"])[0], ())}
+        found = {
+            f"{level:g}": level for level in self.levels.get(monitor_names(rows[0]["task"])[0], ())
+        }
         for row in rows:
             if row["axis"] == LOOK_UPS and row["validation"]:
                 found[f"`{row['value']}` {number(row['validation'])}"] = float(row["validation"])
@@ -87,24 +96,40 @@ class Accuracy(Trainings):
 
 
 def _table(rows: Sequence[Row], levels: Mapping[str, float], score: Score) -> str:
-    """Scores, seconds to each level, and costs; in bold the rows that no other one beats in error and time."""
+    """Scores, seconds to each level, and costs; in bold the rows that no other one beats in error
+    and time.
+    """
     ahead: list[Row] = []
     for row in sorted(rows, key=lambda row: (float(row["inference_ms"]), score.loss(row["test"]))):
         if not ahead or score.loss(row["test"]) < score.loss(ahead[-1]["test"]):
             ahead.append(row)
     compared = task_class(rows[0]["task"]).metrics()[score.first].title
-    columns = {"": "name", score.title: "test"} | ({compared: "compared"} if compared != score.title else {})
-    columns |= {"validation": "validation", "inference [ms]": "inference_ms", "rendering [ms]": "render_ms"}
+    columns = {"": "name", score.title: "test"} | (
+        {compared: "compared"} if compared != score.title else {}
+    )
+    columns |= {
+        "validation": "validation",
+        "inference [ms]": "inference_ms",
+        "rendering [ms]": "render_ms",
+    }
     columns |= {"training [s]": "train_seconds", **{f"s to {level}": level for level in levels}}
-    columns |= {"steps": "steps", "parameters": "num_parameters", "checkpoint [bytes]": "checkpoint_bytes"}
+    columns |= {
+        "steps": "steps",
+        "parameters": "num_parameters",
+        "checkpoint [bytes]": "checkpoint_bytes",
+    }
     lines, published = [], read_published()["names"]
     for row in rows:
         name = published.get(row["value"], row["value"]) if row["key"] == "model" else row["value"]
         name = f"`{row['value']}`" if row["axis"] == LOOK_UPS else name
         found = {"name": f"**{name}**" if row in ahead else name}
-        curve = [tuple(map(float, point.split(":"))) for point in row["curve"].split()]  # seconds, validation score
+        curve = [
+            tuple(map(float, point.split(":"))) for point in row["curve"].split()
+        ]  # seconds, validation score
         for title, level in levels.items():
-            found[title] = next((time for time, value in curve if score.loss(value) <= score.loss(level)), "")
+            found[title] = next(
+                (time for time, value in curve if score.loss(value) <= score.loss(level)), ""
+            )
         lines.append(row | found)
     return table(lines, columns)
 

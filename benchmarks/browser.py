@@ -21,7 +21,11 @@ FLAGS = (
 def lacking() -> str:
     """Why there is no browser; empty if there is one."""
     missing = [name for name in ("chromium", "chromedriver") if shutil.which(name) is None]
-    return f"no {' and no '.join(missing)}: apt-get install chromium chromium-driver" if missing else ""
+    return (
+        f"no {' and no '.join(missing)}: apt-get install chromium chromium-driver"
+        if missing
+        else ""
+    )
 
 
 class Browser:
@@ -35,21 +39,29 @@ class Browser:
         self.profile = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         log = Path(self.profile.name) / "driver.log"
         with open(log, "wb") as file:
-            self.driver = subprocess.Popen(["chromedriver", "--port=0"], stdout=file, stderr=subprocess.STDOUT)
+            self.driver = subprocess.Popen(
+                ["chromedriver", "--port=0"], stdout=file, stderr=subprocess.STDOUT
+            )
         mark, deadline = "on port ", time.monotonic() + 20
         while mark not in (text := log.read_text()).replace("on port 0", ""):
             if time.monotonic() > deadline:
                 raise RuntimeError(f"chromedriver does not start: {text}")
             time.sleep(0.05)
         self.url = f"http://127.0.0.1:{int(text.rsplit(mark, 1)[1].split('.')[0])}/session"
-        options = [*FLAGS, f"--window-size={width},{height}", f"--user-data-dir={self.profile.name}/profile"]
+        options = [
+            *FLAGS,
+            f"--window-size={width},{height}",
+            f"--user-data-dir={self.profile.name}/profile",
+        ]
         wanted = {"goog:chromeOptions": {"args": options}, "goog:loggingPrefs": {"browser": "ALL"}}
         self.url += "/" + self.ask("", capabilities={"alwaysMatch": wanted})["sessionId"]
 
     def __enter__(self) -> "Browser":
         return self
 
-    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         try:
             urlopen(Request(self.url, method="DELETE"), timeout=20)
         except URLError:
@@ -60,7 +72,9 @@ class Browser:
 
     def ask(self, command: str, **body: Any) -> Any:
         """The value of a command of the W3C's WebDriver."""
-        request = Request(self.url + command, json.dumps(body).encode(), {"Content-Type": "application/json"})
+        request = Request(
+            self.url + command, json.dumps(body).encode(), {"Content-Type": "application/json"}
+        )
         try:
             with urlopen(request, timeout=120) as answer:
                 return json.load(answer)["value"]
@@ -84,9 +98,17 @@ class Browser:
 
     def drag(self, *places: tuple[float, float], pause: int = 0) -> None:
         """Presses the mouse at the first place [pixels], moves it to the others, and releases it."""
-        moves = [{"type": "pointerMove", "duration": pause, "x": round(x), "y": round(y)} for x, y in places]
+        moves = [
+            {"type": "pointerMove", "duration": pause, "x": round(x), "y": round(y)}
+            for x, y in places
+        ]
         down, up = {"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}
-        self.ask("/actions", actions=[{"type": "pointer", "id": "mouse", "actions": [moves[0], down, *moves[1:], up]}])
+        self.ask(
+            "/actions",
+            actions=[
+                {"type": "pointer", "id": "mouse", "actions": [moves[0], down, *moves[1:], up]}
+            ],
+        )
 
     def picture(self, path: Path) -> None:
         path.write_bytes(base64.b64decode(self.ask_get("/screenshot")))
@@ -97,4 +119,6 @@ class Browser:
 
     def log(self) -> list[str]:
         """Messages of the console since the last call."""
-        return [f"{entry['level']}: {entry['message']}" for entry in self.ask("/se/log", type="browser")]
+        return [
+            f"{entry['level']}: {entry['message']}" for entry in self.ask("/se/log", type="browser")
+        ]

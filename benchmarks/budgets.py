@@ -3,7 +3,8 @@
     python benchmarks/budgets.py
     python benchmarks/budgets.py +experiment=rssi trainer.max_steps=300 --values paths=[0,1,2]
 
-Trains each value of each axis, and marks the smallest that suffices. Overrides are those of each run.
+Trains each value of each axis, and marks the smallest that suffices. Overrides are those of each
+run.
 """
 
 import math
@@ -40,7 +41,10 @@ class Budgets(Trainings):
         "paths": Axis(["model=mirrored", "kriging=false"], "placement.order", [0, 1, 2, 3]),
         "obstacles": Axis(["model=mirrored", "kriging=false"], "placement.obstacles"),
     }
-    tolerance: ClassVar = {"ratio": 0.005, "dB": 0.05}  # below the best validation score, by its unit
+    tolerance: ClassVar = {
+        "ratio": 0.005,
+        "dB": 0.05,
+    }  # below the best validation score, by its unit
 
     def cells(self, device: str) -> Iterator[list[Row]]:
         self.check_links()
@@ -74,12 +78,18 @@ def smallest_within(rows: Sequence[Row], tolerance: float, score: Score) -> Row:
     """The row of the smallest value whose validation score is within the tolerance of the best."""
     losses = [score.loss(row["validation"]) for row in rows]
     # Scores are stored with six digits: a score at the bound counts.
-    within = [row for row, loss in zip(rows, losses, strict=True) if loss <= min(losses) + tolerance * (1 + 1e-9)]
+    within = [
+        row
+        for row, loss in zip(rows, losses, strict=True)
+        if loss <= min(losses) + tolerance * (1 + 1e-9)
+    ]
     return min(within, key=lambda row: size(row["value"]))
 
 
 def size(value: str) -> float:
-    """The size of a value: its number, or the product of a list of numbers; a ValueError or TypeError for neither."""
+    """The size of a value: its number, or the product of a list of numbers; a ValueError or
+    TypeError for neither.
+    """
     found = yaml.safe_load(value)
     return float(math.prod(found) if isinstance(found, list) else found)
 
@@ -90,16 +100,27 @@ def _smallest(rows: Sequence[Row], tolerance: float, score: Score) -> list[str]:
     smallest = smallest_within(rows, tolerance, score)
     scores = ", ".join(f"{row['value']}: {number(row['validation'])}" for row in rows)
     default = next((row for row in rows if row["value"] == row["default"]), None)
-    pair = lambda key: ", ".join(number(row[key]) if row else "not measured" for row in (smallest, default))
+    pair = lambda key: ", ".join(
+        number(row[key]) if row else "not measured" for row in (smallest, default)
+    )
     remark = ", the largest tried" if smallest is rows[-1] else ""
-    return [scores, f"**{smallest['value']}**{remark}", rows[0]["default"], pair("inference_ms"), pair("train_seconds")]
+    return [
+        scores,
+        f"**{smallest['value']}**{remark}",
+        rows[0]["default"],
+        pair("inference_ms"),
+        pair("train_seconds"),
+    ]
 
 
 def _scatter(rows: Sequence[Row], tolerance: float, unit: str) -> str:
     """A sentence on the scores of several seeds."""
     scores = [float(row["validation"]) for row in rows]
     spread = max(scores) - min(scores)
-    seeds, texts = (", ".join(parts) for parts in ([r["value"] for r in rows], [number(r["validation"]) for r in rows]))
+    seeds, texts = (
+        ", ".join(parts)
+        for parts in ([r["value"] for r in rows], [number(r["validation"]) for r in rows])
+    )
     side = "within" if spread <= tolerance else "beyond"
     return f"Seeds {seeds} score {texts}: they scatter by {number(spread)}{unit}, {side} the tolerance."
 
@@ -107,7 +128,9 @@ def _scatter(rows: Sequence[Row], tolerance: float, unit: str) -> str:
 def main(words: Sequence[str] | None = None) -> None:
     parser = command_line(__doc__)
     text = "values of an axis without values, in multiples of its default"
-    parser.add_argument("--factors", nargs="+", type=float, default=[0.125, 0.25, 0.5, 1, 2], help=text)
+    parser.add_argument(
+        "--factors", nargs="+", type=float, default=[0.125, 0.25, 0.5, 1, 2], help=text
+    )
     Budgets(parser.parse_intermixed_args(words)).run()
 
 

@@ -1,7 +1,8 @@
 """What four benchmarks share: rows that are measured cell by cell and stored at once; their tables.
 
-``accuracy.py``, ``budgets.py``, ``rasterizer.py`` and ``step.py`` write ``<name>.csv`` and ``<name>.md`` into
-their folder. The same command with ``--folder`` measures the rows that are missing there.
+``accuracy.py``, ``budgets.py``, ``rasterizer.py`` and ``step.py`` write ``<name>.csv`` and
+``<name>.md`` into their folder. The same command with ``--folder`` measures the rows that are
+missing there.
 """
 
 import argparse

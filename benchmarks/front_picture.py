@@ -1,7 +1,8 @@
-"""The first picture of README.md: python benchmarks/front_picture.py RUN FILE.png, of a run of +experiment=mirrored.
+"""The first picture of README.md: python benchmarks/front_picture.py RUN FILE.png, of a run of
++experiment=mirrored.
 
-Left the learnt planes over the true room, and the paths of a transmitter in it. Right its measured and its predicted
-spectrum. The transmitter is the test transmitter with the median SSIM.
+Left the learnt planes over the true room, and the paths of a transmitter in it. Right its measured
+and its predicted spectrum. The transmitter is the test transmitter with the median SSIM.
 """
 
 import argparse
@@ -30,10 +31,16 @@ def draw_room(ax, links, learnt):
     edges = links.edges.numpy()
     ax.add_collection3d(Line3DCollection(edges, colors="0.55", linewidths=0.7))
     outlines = [plane.corners for plane in learnt.planes]
-    ax.add_collection3d(Poly3DCollection(outlines, facecolors=to_rgba(BLUE, 0.04), edgecolors=BLUE, linewidths=1.2))
-    colours = colormaps["plasma_r"](np.interp([path.power_db for path in learnt.paths], (-DYNAMIC, 0), (0.1, 0.95)))
+    ax.add_collection3d(
+        Poly3DCollection(outlines, facecolors=to_rgba(BLUE, 0.04), edgecolors=BLUE, linewidths=1.2)
+    )
+    colours = colormaps["plasma_r"](
+        np.interp([path.power_db for path in learnt.paths], (-DYNAMIC, 0), (0.1, 0.95))
+    )
     widths = np.interp([path.power_db for path in learnt.paths], (-DYNAMIC, 0), (0.6, 2.2))
-    ax.add_collection3d(Line3DCollection([path.points for path in learnt.paths], colors=colours, linewidths=widths))
+    ax.add_collection3d(
+        Line3DCollection([path.points for path in learnt.paths], colors=colours, linewidths=widths)
+    )
     ends = learnt.paths[0].points
     marks = {"markeredgecolor": "white", "linestyle": "none", "zorder": 10}
     ax.plot(*ends[:1].T, marker="o", color=ORANGE, label="transmitter", **marks)
@@ -51,7 +58,9 @@ def draw_room(ax, links, learnt):
 def draw_sky(ax, grid, values, title):
     """A spectrum as the sky above the array, the zenith in the middle."""
     edges = np.arange(361), np.arange(0, 91)
-    ax.pcolormesh(np.deg2rad(edges[0]), edges[1], values[::-1], cmap="magma", vmin=0, vmax=1, rasterized=True)
+    ax.pcolormesh(
+        np.deg2rad(edges[0]), edges[1], values[::-1], cmap="magma", vmin=0, vmax=1, rasterized=True
+    )
     ax.set_xticks([])
     ax.set_yticks([])
     ax.spines[:].set_visible(False)
@@ -76,15 +85,27 @@ def main():
         figure = Figure(figsize=(PAGE, 3.1))
         room = figure.add_axes((-0.06, -0.06, 0.74, 1.2), projection="3d")
         draw_room(room, chosen, model.learnt_room(chosen))
-        figure.legend(*room.get_legend_handles_labels(), loc="lower left", ncols=4, bbox_to_anchor=(0.02, -0.01))
+        figure.legend(
+            *room.get_legend_handles_labels(),
+            loc="lower left",
+            ncols=4,
+            bbox_to_anchor=(0.02, -0.01),
+        )
         for left, values, title in (
             (0.62, batch.labels[0].numpy(), "measured"),
             (0.81, prediction, f"predicted, SSIM {scores[middle]:.3f}"),
         ):
-            draw_sky(figure.add_axes((left, 0.22, 0.18, 0.56), projection="polar"), batch.directions, values, title)
+            draw_sky(
+                figure.add_axes((left, 0.22, 0.18, 0.56), projection="polar"),
+                batch.directions,
+                values,
+                title,
+            )
         picture = io.BytesIO()
         figure.savefig(picture, dpi=180)
-    Image.open(picture).convert("RGB").quantize(255).save(arguments.file, optimize=True)  # a third of the bytes
+    Image.open(picture).convert("RGB").quantize(255).save(
+        arguments.file, optimize=True
+    )  # a third of the bytes
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
-"""Fails where a rasterizer has lost more than 30 % of its speed, or its error has grown more than ten times.
+"""Fails where a rasterizer has lost more than 30 % of its speed, or its error has grown more than
+ten times.
 
     python benchmarks/guard.py
     python benchmarks/guard.py --record
 
-Speeds are ratios of processor times, each the least of some repeats: of the bare arithmetic of the kernels to
-``opencl``, of exponentials of 2^18 numbers to the forward pass of ``torch``, and of that to its backward pass.
-``baseline.json`` has both by processor, torch and OpenCL driver; ``--record`` adds this machine. Needs gaigs[opencl].
+Speeds are ratios of processor times, each the least of some repeats: of the bare arithmetic of the
+kernels to ``opencl``, of exponentials of 2^18 numbers to the forward pass of ``torch``, and of that
+to its backward pass. ``baseline.json`` has both by processor, torch and OpenCL driver; ``--record``
+adds this machine. Needs gaigs[opencl].
 """
 
 import argparse
@@ -38,10 +40,16 @@ CHECKED = {"common": (300, 23, 90), "training": (50, 23, 90)}
 def machine() -> str:
     """Processor, torch and OpenCL driver."""
     info = Path("/proc/cpuinfo").read_text()
-    family, model = (re.search(rf"^{key}\s*: (.*)", info, re.M)[1] for key in ("cpu family", "model"))
-    drivers = {f"{d.name} {d.version}" for d in importlib.metadata.distributions() if "pocl" in d.name}
+    family, model = (
+        re.search(rf"^{key}\s*: (.*)", info, re.M)[1] for key in ("cpu family", "model")
+    )
+    drivers = {
+        f"{d.name} {d.version}" for d in importlib.metadata.distributions() if "pocl" in d.name
+    }
     name = re.sub(r", \d+ threads?$", "", device_name(torch.device("cpu")))
-    return ", ".join([name, f"family {family} model {model}", f"torch {torch.__version__}", *sorted(drivers)])
+    return ", ".join(
+        [name, f"family {family} model {model}", f"torch {torch.__version__}", *sorted(drivers)]
+    )
 
 
 def ratios(repeats: int) -> dict[str, float]:
@@ -51,7 +59,11 @@ def ratios(repeats: int) -> dict[str, float]:
     for (name, scene), sizes in TIMED.items():
         built = SCENES[scene](*sizes)
         turns[name, scene] = passes(
-            registry("rasterizer").build({"name": name}), built, "cpu", torch.float32, time.process_time
+            registry("rasterizer").build({"name": name}),
+            built,
+            "cpu",
+            torch.float32,
+            time.process_time,
         )
         if name == "opencl":
             ceiling = Ceiling(built.signal.shape[-1], built.attenuations is not None)
@@ -92,13 +104,20 @@ def errors() -> dict[str, float]:
     found = {}
     truths = {scene: Truth(SCENES[scene](*sizes)) for scene, sizes in CHECKED.items()}
     for name, scene in TIMED:
-        own = truths[scene].errors(registry("rasterizer").build({"name": name}), "cpu", torch.float32)
-        found |= {f"{name}, {scene}, {way}, error": error for way, error in zip(WAYS, own.values(), strict=True)}
+        own = truths[scene].errors(
+            registry("rasterizer").build({"name": name}), "cpu", torch.float32
+        )
+        found |= {
+            f"{name}, {scene}, {way}, error": error
+            for way, error in zip(WAYS, own.values(), strict=True)
+        }
     return found
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--record", action="store_true", help="write this machine's baseline")
     parser.add_argument("--repeats", type=int, default=20)
     options = parser.parse_args()
@@ -107,15 +126,27 @@ def main() -> None:
     found = speeds | errors()
     lines = [["quantity", "found", "baseline"]]
     print(
-        markdown(lines + [[key, f"{value:.3g}", f"{known.get(key, float('nan')):.3g}"] for key, value in found.items()])
+        markdown(
+            lines
+            + [
+                [key, f"{value:.3g}", f"{known.get(key, float('nan')):.3g}"]
+                for key, value in found.items()
+            ]
+        )
     )
     if options.record:
-        write_text(BASELINE, json.dumps(baselines | {machine(): found}, indent=2, sort_keys=True) + "\n")
+        write_text(
+            BASELINE, json.dumps(baselines | {machine(): found}, indent=2, sort_keys=True) + "\n"
+        )
     elif not known:
         raise SystemExit(f"{BASELINE.name} has no baseline of {machine()}; --record adds it")
     else:
         lost = [key for key in known if key in speeds and speeds[key] < 0.7 * known[key]]
-        lost += [key for key in known if key in found.keys() - speeds.keys() and not found[key] <= 10 * known[key]]
+        lost += [
+            key
+            for key in known
+            if key in found.keys() - speeds.keys() and not found[key] <= 10 * known[key]
+        ]
         raise SystemExit("worse than the baseline: " + ", ".join(lost) if lost else 0)
 
 

@@ -3,9 +3,10 @@
     python benchmarks/learnt_room.py            trains +experiment=mirrored_csi in runs/learnt_room
     python benchmarks/learnt_room.py runs/room  a finished run of channels by mirrored Gaussians
 
-The room is exported as a scene of Mitsuba, loaded by Sionna RT, and traced at the test places, with as many reflections
-as the model's paths have and up to ``DEPTH`` crossings of furniture. Each receiver's channels have the gain that stands
-in the scene's file; nothing is fitted to the links that are compared. Prints tables in Markdown. Needs gaigs[sionna].
+The room is exported as a scene of Mitsuba, loaded by Sionna RT, and traced at the test places, with
+as many reflections as the model's paths have and up to ``DEPTH`` crossings of furniture. Each
+receiver's channels have the gain that stands in the scene's file; nothing is fitted to the links
+that are compared. Prints tables in Markdown. Needs gaigs[sionna].
 """
 
 import cmath
@@ -33,23 +34,31 @@ from gaigs.runs import links_of, load
 FOLDER = Path("runs/learnt_room")
 
 DEPTH = 6
-"""Largest number of crossings of a path. Fewer leave paths out, and with many more Sionna RT misses strong ones."""
+"""Largest number of crossings of a path. Fewer leave paths out, and with many more Sionna RT misses
+strong ones.
+"""
 
 TOGETHER = 2
-"""Transmitters traced at a time: chains of surfaces to all of them share a table, in which some displace others."""
+"""Transmitters traced at a time: chains of surfaces to all of them share a table, in which some
+displace others.
+"""
 
 
 def trace(file: Path, links: Links, query: Query, order: int) -> Complex[Tensor, "b e s"]:
     """Channels in an exported scene from the transmitters of a query."""
     carrier = float(links.scene.frequencies[0])
     scene, offsets = open_scene(carrier, file), links.task.frequencies - carrier
-    gains = re.findall(r"those traced times (\S+), turned by (\S+) degrees", file.read_text(encoding="utf-8"))
+    gains = re.findall(
+        r"those traced times (\S+), turned by (\S+) degrees", file.read_text(encoding="utf-8")
+    )
     found = torch.zeros(len(query), *links.task.shape, dtype=torch.complex128)
     for k, (receiver, (size, turn)) in enumerate(zip(links.receivers, gains, strict=True)):
         gain = cmath.rect(float(size), math.radians(float(turn)))
         rows = (query.receivers == k).nonzero()[:, 0]
         for own in rows.split(TOGETHER):
-            paths = trace_scene(scene, receiver.pose.position, query.transmitters[own], order + DEPTH, order)
+            paths = trace_scene(
+                scene, receiver.pose.position, query.transmitters[own], order + DEPTH, order
+            )
             found[own, : len(receiver.array)] = gain * respond(paths, receiver, carrier, offsets)
     return found
 
@@ -60,7 +69,11 @@ def main(folder: Path) -> None:
         gaigs.run(gaigs.compose("+experiment=mirrored_csi"), folder)
     model, links = load(folder), links_of(folder)
     own = model.trend if isinstance(model, Kriging) else model
-    placement, query, carrier = own.placement, links.query[links.split.test], float(links.scene.frequencies[0])
+    placement, query, carrier = (
+        own.placement,
+        links.query[links.split.test],
+        float(links.scene.frequencies[0]),
+    )
     bounces = int((placement.sequences[placement.kept] >= 0).sum(1).max())
     lines = [("plane", "normal", "offset [m]", "share of the power", "material", "slab")]
     chosen = materials(placement, own.traced, carrier)
@@ -69,7 +82,14 @@ def main(folder: Path) -> None:
         normal = " ".join(f"{part:.2f}" for part in plane["normal"])
         slab = f"{1e3 * thickness:.3g} mm" if thickness < 1 else "half-space"
         lines.append(
-            (f"{plane['number']}", normal, f"{plane['offset_m']:.3f}", f"{plane['share']:.3f}", material, slab)
+            (
+                f"{plane['number']}",
+                normal,
+                f"{plane['offset_m']:.3f}",
+                f"{plane['share']:.3f}",
+                material,
+                slab,
+            )
         )
     print(markdown(lines) + "\n")
     with tempfile.TemporaryDirectory() as scratch:

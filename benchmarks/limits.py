@@ -1,12 +1,14 @@
-"""Times of ``rasterizer=opencl`` beside the bare arithmetic of its kernels, on the scene ``common``.
+"""Times of ``rasterizer=opencl`` beside the bare arithmetic of its kernels, on the scene
+``common``.
 
     python benchmarks/limits.py
     python benchmarks/limits.py 1000 5000 --repeats 50
 
-The floor is the time of the kernels' arithmetic for all pairs of a splat and a pixel, and for the live ones, with every
-operand at hand: no lists, no rows that miss, no tiles to load. A pair is live if the transmittance in front of it is at
-least 1e-4, where the rasterizer of 3D Gaussian Splatting (Kerbl et al., 2023) stops. Composited is the forward pass
-without sorting and listing. Needs gaigs[opencl]. docs/speed.md has the numbers.
+The floor is the time of the kernels' arithmetic for all pairs of a splat and a pixel, and for the
+live ones, with every operand at hand: no lists, no rows that miss, no tiles to load. A pair is live
+if the transmittance in front of it is at least 1e-4, where the rasterizer of 3D Gaussian Splatting
+(Kerbl et al., 2023) stops. Composited is the forward pass without sorting and listing. Needs
+gaigs[opencl]. docs/speed.md has the numbers.
 """
 
 import argparse
@@ -34,8 +36,18 @@ class Ceiling:
 
     def __init__(self, channels: int, attenuation: bool):
         self.queue = opencl.open_queue(None)
-        macros = {"CHANNELS": channels, "ATTENUATION": int(attenuation), "TRANSMITTERS": 1, "SEPARABLE": 1}
-        bounds = {"ALPHA_MIN": ALPHA_MIN, "ALPHA_MAX": ALPHA_MAX, "OPAQUE": OPAQUE, "STEEPEST": STEEPEST}
+        macros = {
+            "CHANNELS": channels,
+            "ATTENUATION": int(attenuation),
+            "TRANSMITTERS": 1,
+            "SEPARABLE": 1,
+        }
+        bounds = {
+            "ALPHA_MIN": ALPHA_MIN,
+            "ALPHA_MAX": ALPHA_MAX,
+            "OPAQUE": OPAQUE,
+            "STEEPEST": STEEPEST,
+        }
         macros |= {bound: opencl._literal(value) for bound, value in bounds.items()}
         source = opencl._source() + Path(__file__).with_name("ceiling.cl").read_text()
         program = cl.Program(self.queue.context, source)
@@ -68,17 +80,31 @@ def count(scene: DrawnScene) -> tuple[int, int]:
     acts = product >= ALPHA_MIN
     passed = torch.where(acts, 1 - product.clamp_max(ALPHA_MAX), 1)
     before = torch.cat((torch.ones_like(passed[:, :1]), passed[:, :-1].cumprod(1)), 1)
-    share = len(coarse.plane.v) * coarse.plane.u.shape[1] / (len(scene.plane.v) * scene.plane.u.shape[1])
+    share = (
+        len(coarse.plane.v)
+        * coarse.plane.u.shape[1]
+        / (len(scene.plane.v) * scene.plane.u.shape[1])
+    )
     return tuple(round(int(pairs.sum()) / share) for pairs in (acts, acts & (before >= 1e-4)))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("gaussians", nargs="*", type=int, default=[1000, 5000, 20000])
     parser.add_argument("--repeats", type=int, default=20)
     options = parser.parse_args()
     ceiling = Ceiling(3, False)
-    head = ["splats", "pairs", "live", "floor forward, all / live [ms]", "backward", "forward [ms]", "composited"]
+    head = [
+        "splats",
+        "pairs",
+        "live",
+        "floor forward, all / live [ms]",
+        "backward",
+        "forward [ms]",
+        "composited",
+    ]
     lines = [[*head, "backward"]]
     for n in options.gaussians:
         scene = common(n, 90, 360)
@@ -93,7 +119,9 @@ def main() -> None:
             times["composited"].append(time.perf_counter() - start)
         ms = {name: 1e3 * statistics.median(values[1:]) for name, values in times.items()}
         pairs = count(scene)
-        floors = [" / ".join(f"{ms[f'floor {way}'] * number:.2f}" for number in pairs) for way in WAYS]
+        floors = [
+            " / ".join(f"{ms[f'floor {way}'] * number:.2f}" for number in pairs) for way in WAYS
+        ]
         found = [f"{ms[name]:.2f}" for name in ("forward", "composited", "backward")]
         lines.append([f"{n:,}", *(f"{number:,}" for number in pairs), *floors, *found])
     print(markdown(lines))

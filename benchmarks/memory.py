@@ -3,8 +3,8 @@
     python benchmarks/memory.py
     python benchmarks/memory.py 1000 5000 --rasterizers torch
 
-Each pass runs in a process of its own, where memory that another pass has freed cannot hide the peak. Linux only.
-docs/speed.md has the numbers.
+Each pass runs in a process of its own, where memory that another pass has freed cannot hide the
+peak. Linux only. docs/speed.md has the numbers.
 """
 
 import argparse
@@ -25,7 +25,9 @@ def status(key: str) -> int:
 
 
 def peak_mb(name: str, n: int) -> float:
-    """Memory that both passes of a rasterizer add at most [MB]; a small scene before loads and compiles."""
+    """Memory that both passes of a rasterizer add at most [MB]; a small scene before loads and
+    compiles.
+    """
     rasterizer = registry("rasterizer").build({"name": name})
     for count in (32, n):
         turn = passes(rasterizer, common(count, 90, 360), "cpu", torch.float32)
@@ -36,7 +38,9 @@ def peak_mb(name: str, n: int) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("gaussians", nargs="*", type=int, default=[1000, 5000, 20000])
     parser.add_argument("--rasterizers", nargs="+", default=["opencl", "torch"])
     options = parser.parse_args()

@@ -1,13 +1,15 @@
-"""Times predictions of mirrored Gaussians, without a map and by way of one, interleaved in one process.
+"""Times predictions of mirrored Gaussians, without a map and by way of one, interleaved in one
+process.
 
     python benchmarks/mirrored.py
     python benchmarks/mirrored.py data=synthetic_rssi --links 256
     python benchmarks/mirrored.py --checkpoint runs/a-run/best.ckpt
 
-Overrides are those of ``python -m gaigs +experiment=mirrored``. Every way gets the same Gaussians: those of a
-checkpoint, without its kriging, or untrained ones, none of them pruned. Phases count. Rendering is the
-rasterizer alone, or the sum over paths; a prediction is everything from position to label. Times are medians for one
-link; judge them by their ratios within one run, as other work on the machine slows all of them.
+Overrides are those of ``python -m gaigs +experiment=mirrored``. Every way gets the same Gaussians:
+those of a checkpoint, without its kriging, or untrained ones, none of them pruned. Phases count.
+Rendering is the rasterizer alone, or the sum over paths; a prediction is everything from position
+to label. Times are medians for one link; judge them by their ratios within one run, as other work
+on the machine slows all of them.
 """
 
 import argparse
@@ -46,7 +48,9 @@ def build(overrides: list[str], checkpoint: Path | None) -> tuple[Model, Links]:
     model = registry("model").build(config["model"], scene=links.scene)
     model.fit(links)
     if checkpoint is None:
-        model.placement.enable_phases(speed_of_light / carriers(links.scene, links.query).mean().item())
+        model.placement.enable_phases(
+            speed_of_light / carriers(links.scene, links.query).mean().item()
+        )
     else:
         trained = gaigs.load(checkpoint)
         model.placement.load_state_dict(getattr(trained, "trend", trained).placement.state_dict())
@@ -66,14 +70,20 @@ def median_times(ways: dict[str, tuple[Callable, int]], repeats: int) -> dict[st
 
 @torch.no_grad()
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
-    parser.add_argument("--checkpoint", type=Path, help="of a model trained with the same overrides")
+    parser.add_argument(
+        "--checkpoint", type=Path, help="of a model trained with the same overrides"
+    )
     parser.add_argument("--links", type=int, default=64, help="links predicted at a time")
     parser.add_argument("--repeats", type=int, default=20)
     options = parser.parse_intermixed_args()
     if min(options.links, options.repeats) < 1:
-        parser.error(f"--links and --repeats must be at least 1, got {options.links} and {options.repeats}")
+        parser.error(
+            f"--links and --repeats must be at least 1, got {options.links} and {options.repeats}"
+        )
     renderings, predictions, refusals = {}, {}, []
     task = gaigs.compose("+experiment=mirrored", *options.overrides)["task"]["name"]
     for name in ("paths", "torch", "opencl"):
@@ -95,7 +105,9 @@ def main() -> None:
         paths = int(model.placement.kept.sum())
     if not renderings:
         parser.error("; ".join(refusals))
-    rendering, prediction = (median_times(ways, options.repeats) for ways in (renderings, predictions))
+    rendering, prediction = (
+        median_times(ways, options.repeats) for ways in (renderings, predictions)
+    )
     title = f"{paths} paths, task {links.task.name}; {device_name(torch.device('cpu'))}"
     table = Table("", *map(str, rendering), title=title, box=SIMPLE_HEAD)
     for title, times in ("rendering", rendering), ("prediction", prediction):

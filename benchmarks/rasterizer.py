@@ -1,7 +1,7 @@
 """Times of both passes of each rasterizer, and its errors against a dense float64 sum.
 
-    python benchmarks/rasterizer.py
-    python benchmarks/rasterizer.py --common 1000 5000 --training --grids 90x360 --precisions float32
+    python benchmarks/rasterizer.py python benchmarks/rasterizer.py --common 1000 5000 --training
+    --grids 90x360 --precisions float32
 
 A rasterizer that cannot draw a scene is listed with the reason.
 """
@@ -13,7 +13,16 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import torch
-from common import UNAVAILABLE, Benchmark, Row, command_line, grouped, median_and_spread, positive, table
+from common import (
+    UNAVAILABLE,
+    Benchmark,
+    Row,
+    command_line,
+    grouped,
+    median_and_spread,
+    positive,
+    table,
+)
 from scenes import SCENES, Truth, passes
 
 from gaigs.registry import registry
@@ -34,7 +43,15 @@ class Rasterizers(Benchmark):
 
     name = "rasterizer"
     keys = ("device", "scene", "gaussians", "grid", "rasterizer", "precision")
-    values = ("pairs", "forward_ms", "forward_spread_ms", "backward_ms", "backward_spread_ms", "repeats", "times")
+    values = (
+        "pairs",
+        "forward_ms",
+        "forward_spread_ms",
+        "backward_ms",
+        "backward_spread_ms",
+        "repeats",
+        "times",
+    )
     values += ("error", "gradient_error")
 
     def cells(self, device: str) -> Iterator[list[Row]]:
@@ -50,13 +67,20 @@ class Rasterizers(Benchmark):
 
     def measure(self, cell: Sequence[Row], device: str) -> list[dict]:
         first = cell[0]
-        scene = SCENES[first["scene"]](int(first["gaussians"]), *map(int, first["grid"].split(" x ")))
+        scene = SCENES[first["scene"]](
+            int(first["gaussians"]), *map(int, first["grid"].split(" x "))
+        )
         truth = Truth(scene)
-        rows: dict[tuple[str, str], dict[str, Any]] = {(row["rasterizer"], row["precision"]): {**row} for row in cell}
+        rows: dict[tuple[str, str], dict[str, Any]] = {
+            (row["rasterizer"], row["precision"]): {**row} for row in cell
+        }
         turns, times = {}, defaultdict[tuple[str, str], list](list)
         for (name, precision), row in rows.items():
             try:
-                rasterizer, dtype = registry("rasterizer").build({"name": name}), getattr(torch, precision)
+                rasterizer, dtype = (
+                    registry("rasterizer").build({"name": name}),
+                    getattr(torch, precision),
+                )
                 row |= truth.errors(rasterizer, device, dtype) | {"pairs": truth.pairs}
                 turns[name, precision] = passes(rasterizer, scene, device, dtype)
             except (AttributeError, TypeError, ValueError, RuntimeError, ImportError) as error:
@@ -65,11 +89,20 @@ class Rasterizers(Benchmark):
             for kind, turn in turns.items():
                 if number_of_turn < 4 or max(times[kind][0]) < 0.5:
                     times[kind].append(turn())
-        total = {kind: sum(map(statistics.median, zip(*found[1:], strict=True))) for kind, found in times.items()}
+        total = {
+            kind: sum(map(statistics.median, zip(*found[1:], strict=True)))
+            for kind, found in times.items()
+        }
         for kind, found in times.items():
-            for way, seconds in zip(("forward", "backward"), zip(*found[1:], strict=True), strict=True):
+            for way, seconds in zip(
+                ("forward", "backward"), zip(*found[1:], strict=True), strict=True
+            ):
                 median, spread = median_and_spread(seconds)
-                rows[kind] |= {f"{way}_ms": 1e3 * median, f"{way}_spread_ms": 1e3 * spread, "repeats": len(seconds)}
+                rows[kind] |= {
+                    f"{way}_ms": 1e3 * median,
+                    f"{way}_spread_ms": 1e3 * spread,
+                    "repeats": len(seconds),
+                }
             if ("torch", kind[1]) in total:
                 rows[kind]["times"] = total["torch", kind[1]] / total[kind]
         return [*rows.values()]
@@ -78,7 +111,10 @@ class Rasterizers(Benchmark):
         size = lambda row: (int(row["gaussians"]), [int(edge) for edge in row["grid"].split(" x ")])
         groups = sorted(grouped(rows, "scene", "device").items())
         shown = {key.replace("_", " "): key for key in (*self.keys[2:], *self.values)}
-        titles = (f"## {', '.join(place)}\n\n{table(sorted(own, key=size), shown)}" for place, own in groups)
+        titles = (
+            f"## {', '.join(place)}\n\n{table(sorted(own, key=size), shown)}"
+            for place, own in groups
+        )
         return "\n".join([INTRODUCTION, *titles])
 
 
@@ -96,7 +132,13 @@ def main(words: Sequence[str] | None = None) -> None:
     add("--rasterizers", nargs="+", choices=names, default=names)
     add("--common", nargs="*", type=positive, default=[200, 1000, 5000, 20000, 100000], help=text)
     add("--training", nargs="*", type=positive, default=[200, 1000, 5000], help=text)
-    add("--grids", nargs="+", type=grid, default=[[23, 90], [90, 360]], help="rows x columns of maps")
+    add(
+        "--grids",
+        nargs="+",
+        type=grid,
+        default=[[23, 90], [90, 360]],
+        help="rows x columns of maps",
+    )
     add("--precisions", nargs="+", choices=precisions, default=precisions)
     text = "of a pass under half a second, after warm-up; a longer one has three"
     add("--repeats", type=positive, default=20, help=text)

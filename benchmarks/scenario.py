@@ -1,4 +1,5 @@
-"""Errors of mirrored channels that are written as a scenario of DeepMIMO and read back: python benchmarks/scenario.py
+"""Errors of mirrored channels that are written as a scenario of DeepMIMO and read back: python
+benchmarks/scenario.py
 
 The model has the faces of the built-in room, 40 random obstacles and no training. Seed 0.
 """
@@ -19,16 +20,24 @@ CARRIER, SUBCARRIERS, SIZE = 6.4896e9, 9, (7.0, 5.0, 3.0)
 
 
 def main() -> None:
-    print("| receiver | band [MHz] | NMSE [dB] | with amplitudes as 1 / frequency [dB] |\n|---|---|---|---|")
+    print(
+        "| receiver | band [MHz] | NMSE [dB] | with amplitudes as 1 / frequency [dB] |\n|---|---|---|---|"
+    )
     for rows, columns, bandwidth in ((1, 1, 20e6), (1, 1, 499.2e6), (4, 4, 20e6), (1, 8, 20e6)):
-        links = gaigs.links("synthetic_csi", transmitters=60, bandwidth=bandwidth, subcarriers=SUBCARRIERS, order=0)
+        links = gaigs.links(
+            "synthetic_csi", transmitters=60, bandwidth=bandwidth, subcarriers=SUBCARRIERS, order=0
+        )
         array = gaigs.Array.planar(rows, columns, speed_of_light / CARRIER / 2)
         pose = gaigs.Pose(synthetic.POSE.position, torch.tensor(deepmimo.UPRIGHT))
         task = Csi(len(array), links.task.frequencies, "known")
-        model = room(replace(links.scene, receivers=(gaigs.Receiver("array", pose, array),), task=task))
+        model = room(
+            replace(links.scene, receivers=(gaigs.Receiver("array", pose, array),), task=task)
+        )
         with tempfile.TemporaryDirectory() as folder:
             gaigs.export(model, Path(folder) / "room.deepmimo", links.query.transmitters)
-            found = deepmimo.read(Path(folder) / "room.deepmimo", [rows, columns], bandwidth, SUBCARRIERS)
+            found = deepmimo.read(
+                Path(folder) / "room.deepmimo", [rows, columns], bandwidth, SUBCARRIERS
+            )
         expected = model.predict(found.query)
         falling = found.labels * (CARRIER / task.frequencies).to(found.labels)
         errors = [nmse(labels, expected) for labels in (found.labels, falling)]

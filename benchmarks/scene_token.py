@@ -1,11 +1,11 @@
 """Probes of the scene token of GAI-GS, and trainings of several ways to use it.
 
-    python benchmarks/scene_token.py probe RUN
-    python benchmarks/scene_token.py train multiview scene_alone own_tokens trainer.max_steps=300 gaussians.count=100
+    python benchmarks/scene_token.py probe RUN python benchmarks/scene_token.py train multiview
+    scene_alone own_tokens trainer.max_steps=300 gaussians.count=100
 
-``probe`` looks into a run of ``+experiment=spectrum`` with any of the three tokenizers. ``train`` trains ways of using
-the token side by side, with overrides of ``python -m gaigs +experiment=spectrum``. Scores are of the validation links;
-the test links are not looked at.
+``probe`` looks into a run of ``+experiment=spectrum`` with any of the three tokenizers. ``train``
+trains ways of using the token side by side, with overrides of ``python -m gaigs
++experiment=spectrum``. Scores are of the validation links; the test links are not looked at.
 
 =================  =================================================================================================
 way                input of the network
@@ -79,8 +79,12 @@ class OwnTokens(GATokenizer):
     def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
         means, b = placed.means.detach(), len(query)
         n = means.shape[1]
-        tx, own = ((positions - self.middle) / self.scale for positions in (query.transmitters, means))
-        points = self.embed(torch.cat((self.cls.expand(b, 1, 3), tx[:, None], own.expand(b, n, 3)), 1))
+        tx, own = (
+            (positions - self.middle) / self.scale for positions in (query.transmitters, means)
+        )
+        points = self.embed(
+            torch.cat((self.cls.expand(b, 1, 3), tx[:, None], own.expand(b, n, 3)), 1)
+        )
         types = torch.cat((self.types[:2], self.types[2:].expand(n, 2))).expand(b, -1, -1)
         multivectors, scalars = self.first(points[..., None, :], types)
         for block in self.blocks:
@@ -109,9 +113,13 @@ class Loud(GATokenizer):
         return tokens._replace(scene=GAIN * tokens.scene)
 
 
-BASE = {way: ["deformation=two_branch", f"tokenizer={way}"] for way in ("euclidean", "ga", "multiview")}
+BASE = {
+    way: ["deformation=two_branch", f"tokenizer={way}"] for way in ("euclidean", "ga", "multiview")
+}
 BASE |= {"static": ["deformation=none"]}
-"""Overrides of ways; those of ``multiview`` are those of all others. The network is as wide as in the claims."""
+"""Overrides of ways; those of ``multiview`` are those of all others. The network is as wide as in
+the claims.
+"""
 
 NAMES = {name: name for name in ("scene_alone", "own_tokens")}
 NAMES |= {"loud": "multiview", "loud_alone": "scene_alone", "fixed_alone": "scene_alone"}
@@ -130,13 +138,23 @@ def configure(way: str, overrides: list[str]) -> dict:
     tokenizer["name"] = NAMES.get(way, tokenizer["name"])
     if way in GA:
         tokenizer["ga"]["name"] = GA[way]
-    config["trainer"] |= {"enable_progress_bar": False, "val_check_interval": config["trainer"]["max_steps"]}
+    config["trainer"] |= {
+        "enable_progress_bar": False,
+        "val_check_interval": config["trainer"]["max_steps"],
+    }
     return config
 
 
 def compare(ways: list[str], overrides: list[str]) -> Table:
     """Trains each way for the same steps."""
-    titles = ("way", "mean SSIM", "parameters", "anchors changed", "CLS moves the first layer by", "training [s]")
+    titles = (
+        "way",
+        "mean SSIM",
+        "parameters",
+        "anchors changed",
+        "CLS moves the first layer by",
+        "training [s]",
+    )
     table = Table(*titles, box=SIMPLE_HEAD)
     for way in ways:
         config = configure(way, overrides)
@@ -188,7 +206,9 @@ def mean_ssim(model: Model, links: Links) -> float:
 
 
 def probe(run: Path) -> Table:
-    """Information of the tokens of a trained model on places and labels, and their influence on the network."""
+    """Information of the tokens of a trained model on places and labels, and their influence on the
+    network.
+    """
     config = yaml.safe_load((run / "config.yaml").read_text())
     links = load(config["data"], config["split"])
     torch.manual_seed(config["seed"])
@@ -210,9 +230,14 @@ def probe(run: Path) -> Table:
         here, there = values[known], values[asked]
         labels = look_up(here, links.labels[known].flatten(1), there).unflatten(1, links.task.shape)
         texts = [str(values.shape[1]), f"{dimensions(here):.1f}"]
-        for predicted in (linear_prediction(here, places[known], there), look_up(here, places[known], there)):
+        for predicted in (
+            linear_prediction(here, places[known], there),
+            look_up(here, places[known], there),
+        ):
             texts.append(f"{r_squared(predicted, places[asked], places[known]):.3f}")
-        texts.append(f"{r_squared(linear_prediction(places[known], here, places[asked]), there, here):.3f}")
+        texts.append(
+            f"{r_squared(linear_prediction(places[known], here, places[asked]), there, here):.3f}"
+        )
         texts.append(f"{ssim(links, labels):.3f}")
         if field is not None:
             texts += [f"{moves_then[field]:.4f}", f"{moves[field]:.4f}", f"{gradients[field]:.1e}"]
@@ -270,7 +295,9 @@ def of_an_anchor(model: Model, query: Query) -> float:
 def linear_prediction(features: Tensor, values: Tensor, asked: Tensor) -> Tensor:
     """Least squares with an offset."""
     ones = lambda x: torch.cat((x, torch.ones_like(x[:, :1])), 1).double()
-    return (ones(asked) @ torch.linalg.lstsq(ones(features), values.double(), driver="gelsd").solution).float()
+    return (
+        ones(asked) @ torch.linalg.lstsq(ones(features), values.double(), driver="gelsd").solution
+    ).float()
 
 
 def look_up(features: Tensor, values: Tensor, asked: Tensor) -> Tensor:
@@ -293,12 +320,18 @@ def dimensions(features: Tensor) -> float:
 
 
 def first_layer(model: Model, tokens: Tokens) -> dict[str, float]:
-    """RMS change by each token in the attenuation branch's first layer, from transmitter to transmitter."""
+    """RMS change by each token in the attenuation branch's first layer, from transmitter to
+    transmitter.
+    """
     names = ("scene", "transmitters")
     values = [getattr(tokens, name) for name in names]
-    parts = model.deformation.attenuation_first.links.weight.split([value.shape[1] for value in values], 1)
+    parts = model.deformation.attenuation_first.links.weight.split(
+        [value.shape[1] for value in values], 1
+    )
     moves = [(value - value.mean(0)) @ part.T for value, part in zip(values, parts, strict=True)]
-    return {name: move.square().mean().sqrt().item() for name, move in zip(names, moves, strict=True)}
+    return {
+        name: move.square().mean().sqrt().item() for name, move in zip(names, moves, strict=True)
+    }
 
 
 def gradient_norms(model: Model, links: Links, loss: dict) -> dict[str, float]:
@@ -308,7 +341,11 @@ def gradient_norms(model: Model, links: Links, loss: dict) -> dict[str, float]:
     norms = {}
     for name, part in (("scene", "ga"), ("transmitters", "euclidean")):
         module = getattr(model.tokenizer, part, model.tokenizer)
-        gradients = [parameter.grad.flatten() for parameter in module.parameters() if parameter.grad is not None]
+        gradients = [
+            parameter.grad.flatten()
+            for parameter in module.parameters()
+            if parameter.grad is not None
+        ]
         norms[name] = torch.cat(gradients).square().mean().sqrt().item()
     return norms
 
@@ -318,7 +355,9 @@ def without(model: Model, links: Links, name: str) -> float:
     with torch.no_grad():
         mean = getattr(tokenize(model, links.query[links.split.train]), name).mean(0)
     hook = model.tokenizer.register_forward_hook(
-        lambda module, arguments, tokens: tokens._replace(**{name: mean.expand_as(getattr(tokens, name))})
+        lambda module, arguments, tokens: tokens._replace(
+            **{name: mean.expand_as(getattr(tokens, name))}
+        )
     )
     score = mean_ssim(model, links)
     hook.remove()
@@ -326,10 +365,14 @@ def without(model: Model, links: Links, name: str) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     commands = parser.add_subparsers(dest="command", required=True)
     commands.add_parser("probe").add_argument("run", type=Path, nargs="+", help="folder of a run")
-    commands.add_parser("train").add_argument("words", nargs="+", help=f"of {', '.join(WAYS)}, and KEY=VALUE")
+    commands.add_parser("train").add_argument(
+        "words", nargs="+", help=f"of {', '.join(WAYS)}, and KEY=VALUE"
+    )
     options = parser.parse_args()
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     console = Console(width=160)

@@ -1,16 +1,17 @@
-"""Kills, starves and robs a run, has the same command go on, and compares its end with that of an undisturbed run.
+"""Kills, starves and robs a run, has the same command go on, and compares its end with that of an
+undisturbed run.
 
-    python benchmarks/soak.py
-    python benchmarks/soak.py --faults kill --repeats 40 --seed 1
-    python benchmarks/soak.py +experiment=mirrored data.transmitters=30 trainer.max_steps=60 --faults kill
-    python benchmarks/soak.py --markdown docs/results/faults.md
-    python benchmarks/soak.py --writers --minutes 1
+    python benchmarks/soak.py python benchmarks/soak.py --faults kill --repeats 40 --seed 1 python
+    benchmarks/soak.py +experiment=mirrored data.transmitters=30 trainer.max_steps=60 --faults kill
+    python benchmarks/soak.py --markdown docs/results/faults.md python benchmarks/soak.py --writers
+    --minutes 1
 
-Overrides are those of ``python -m gaigs``; without any it is a short run of GAI-GS with kriging. Each run is the
-command line in a process of its own, forked once the packages are imported, so that random moments fall into the work.
-Moments are in processor time, so that other work on the machine does not move them. Linux only. Disks are filled in a
-small file system, which needs root. The page is written anew after each fault. With ``--writers`` no run is disturbed:
-two processes export, save and load the same files. The exit code is 1 where anything was lost.
+Overrides are those of ``python -m gaigs``; without any it is a short run of GAI-GS with kriging.
+Each run is the command line in a process of its own, forked once the packages are imported, so that
+random moments fall into the work. Moments are in processor time, so that other work on the machine
+does not move them. Linux only. Disks are filled in a small file system, which needs root. The page
+is written anew after each fault. With ``--writers`` no run is disturbed: two processes export, save
+and load the same files. The exit code is 1 where anything was lost.
 """
 
 import argparse
@@ -60,7 +61,12 @@ RUN = (
     "baselines=[{name: mean}, {name: knn, k: 3, power: 2.0}]",
 )
 
-ALWAYS = ("trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "threads=1", "save_every=0.5")
+ALWAYS = (
+    "trainer.accelerator=cpu",
+    "trainer.enable_progress_bar=false",
+    "threads=1",
+    "save_every=0.5",
+)
 
 TIMED = ("train_seconds", "inference_ms", "render_ms", "checkpoint_bytes", "seconds")
 """Keys of metrics.json that differ between two runs of the same command."""
@@ -74,7 +80,12 @@ PHASES = {
 }
 """Phase of a run by the first of these files in its folder; without any it is at the start."""
 
-NAMES = {"kill": "", "disk": "disk full", "files": "files limited in size", "folder": "run folder removed"}
+NAMES = {
+    "kill": "",
+    "disk": "disk full",
+    "files": "files limited in size",
+    "folder": "run folder removed",
+}
 NAMES |= {"memory": "memory limited", "multirun": "two jobs of `joblib`, "}
 """Faults in the words of the table."""
 
@@ -153,7 +164,9 @@ class Process:
             self.code = os.waitstatus_to_exitcode(status) if done else None
             if time.monotonic() > start + 1800:
                 os.killpg(self.id, signal.SIGKILL)
-                raise TimeoutError(f"a run must end within {1800} s, and one did not; see {self.says}")
+                raise TimeoutError(
+                    f"a run must end within {1800} s, and one did not; see {self.says}"
+                )
             time.sleep(0.002)
         return self.code is not None
 
@@ -169,16 +182,27 @@ class Process:
         if self.code < 0:
             return signal.Signals(-self.code).name
         causes = {"out of memory": "not enough memory", "not be written": "could not be written"}
-        causes |= {"was removed": "folder was removed", "stopped": "stopped", "not started": "stopped"}
+        causes |= {
+            "was removed": "folder was removed",
+            "stopped": "stopped",
+            "not started": "stopped",
+        }
         said = next(
-            (name for words, name in causes.items() if any(words in line for line in self.messages)), "no message"
+            (
+                name
+                for words, name in causes.items()
+                if any(words in line for line in self.messages)
+            ),
+            "no message",
         )
         return f"{said}, exit code {self.code}" if self.code else "ended well"
 
 
 @dataclass
 class Trial:
-    """One disturbance: at which phase it came, how the run ended, training lost [s], and the faults found."""
+    """One disturbance: at which phase it came, how the run ended, training lost [s], and the faults
+    found.
+    """
 
     fault: str
     phase: str
@@ -207,8 +231,12 @@ class Soak:
         self.seconds = time.monotonic() - start
         self.work = resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime - before
         if process.code:
-            raise SystemExit(f"the undisturbed run must end well, and says {' '.join(process.messages)}")
-        self.sizes = sorted(path.stat().st_size for path in self.reference.rglob("*") if path.is_file())
+            raise SystemExit(
+                f"the undisturbed run must end well, and says {' '.join(process.messages)}"
+            )
+        self.sizes = sorted(
+            path.stat().st_size for path in self.reference.rglob("*") if path.is_file()
+        )
 
     def start(self, folder: Path, before: Callable = lambda: None) -> Process:
         """The command, in a run folder."""
@@ -219,8 +247,12 @@ class Soak:
         self.count += 1
         return self.top / f"run{self.count}"
 
-    def disturbed(self, folder: Path, act: Callable[[Process], None], after: float = 0) -> tuple[Process, str, float]:
-        """A run to which something is done at a random moment; at which phase; how much training is not saved then."""
+    def disturbed(
+        self, folder: Path, act: Callable[[Process], None], after: float = 0
+    ) -> tuple[Process, str, float]:
+        """A run to which something is done at a random moment; at which phase; how much training is
+        not saved then.
+        """
         process, moment = self.start(folder), self.draw.uniform(0, max(0.1, self.work - after))
         self.moment = after + moment
         phase, lost = "ended", None
@@ -230,11 +262,15 @@ class Soak:
             process.wait()
         return process, phase, lost
 
-    def judge(self, process: Process, phase: str, lost: float | None = None, codes: tuple = (0, 1)) -> Trial:
+    def judge(
+        self, process: Process, phase: str, lost: float | None = None, codes: tuple = (0, 1)
+    ) -> Trial:
         """Looks at how a disturbed run has ended."""
         trial = Trial(self.fault, phase, process.end, lost)
         messages = process.messages
-        is_clear = (process.code > 0) == bool(messages) and len(messages) <= 2  # cause, and what to do
+        is_clear = (process.code > 0) == bool(messages) and len(
+            messages
+        ) <= 2  # cause, and what to do
         is_clear = is_clear and all(line.startswith("gaigs: ") for line in messages[:1])
         if process.code not in codes or not is_clear or "no message" in process.end:
             trial.wrong.append(f"exit code {process.code}, {' '.join(process.messages)}")
@@ -276,16 +312,26 @@ class Soak:
         """How a run folder differs from that of the undisturbed run, to the bit."""
         tops = (self.reference, folder)
         mine, other = (
-            {str(path.relative_to(top)) for path in top.rglob("*") if not {"log", ".hydra"} & {*path.parts}}
+            {
+                str(path.relative_to(top))
+                for path in top.rglob("*")
+                if not {"log", ".hydra"} & {*path.parts}
+            }
             for top in tops
         )
-        wrong = [f"lacks {name}" for name in mine - other] + [f"has {name}" for name in other - mine]
+        wrong = [f"lacks {name}" for name in mine - other] + [
+            f"has {name}" for name in other - mine
+        ]
         mine, other = (untimed(json.loads((top / "metrics.json").read_text())) for top in tops)
         wrong += [f"metrics.json: {key}" for key in mine if mine[key] != other.get(key)]
         predictions = [dict(np.load(top / "predictions.npz")) for top in tops]
         weights = [checkpoint.read(top / "best.ckpt")["state_dict"] for top in tops]
         logs = [curves.read_curves(sorted(top.glob("log/*/metrics.csv"))) for top in tops]
-        for part, (mine, other) in {"predictions": predictions, "weights": weights, "curves": logs}.items():
+        for part, (mine, other) in {
+            "predictions": predictions,
+            "weights": weights,
+            "curves": logs,
+        }.items():
             same = lambda name, a=mine, b=other: np.array_equal(a[name], b[name], equal_nan=True)
             if mine.keys() != other.keys() or not all(map(same, mine)):
                 wrong.append(f"other {part}")
@@ -297,7 +343,9 @@ class Soak:
         """SIGKILL and SIGTERM, or the other way round, one after the other in a folder."""
         folder, numbers, self.moment = self.new_folder(), [signal.SIGKILL, signal.SIGTERM], 0.0
         for number in numbers if self.count % 2 else reversed(numbers):
-            process, phase, lost = self.disturbed(folder, lambda p, n=number: os.kill(p.id, n), self.moment)
+            process, phase, lost = self.disturbed(
+                folder, lambda p, n=number: os.kill(p.id, n), self.moment
+            )
             saved = any("after step" in line for line in process.messages)
             self.fault = number.name
             trial = self.judge(process, phase, 0.0 if saved else lost, (0, 143, -number))
@@ -363,7 +411,13 @@ class Soak:
         """Two jobs at a time, one of them the undisturbed run's; SIGKILL goes to all processes."""
         for number in (signal.SIGKILL, signal.SIGTERM):
             top, kind = self.new_folder(), self.fault
-            words = ["-m", *self.overrides, "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "seed=0,1"]
+            words = [
+                "-m",
+                *self.overrides,
+                "hydra/launcher=joblib",
+                "hydra.launcher.n_jobs=2",
+                "seed=0,1",
+            ]
             words += [f"hydra.sweep.dir={top}", "hydra.sweep.subdir=${hydra.job.num}"]
             process = Process(words, self.top / top.name)
             process.wait(lambda top=top: any(top.glob("*/last.ckpt")))
@@ -374,7 +428,11 @@ class Soak:
             trial = self.judge(process, "training, kriging", None, (143, -number))
             again = Process(words, self.top / top.name)
             again.wait()
-            trial.wrong += [f"going on: exit code {again.code}, {' '.join(again.messages)}"] if again.code else []
+            trial.wrong += (
+                [f"going on: exit code {again.code}, {' '.join(again.messages)}"]
+                if again.code
+                else []
+            )
             self.fault = kind
             self.go_on(top / "0", trial)
 
@@ -387,11 +445,13 @@ FAULTS = {
     "memory": (Soak.limit_memory, 6),
     "multirun": (Soak.kill_multirun, 1),
 }
-"""Faults and how often each is tried, in turns; ``kill`` and ``multirun`` with each of two signals."""
+"""Faults and how often each is tried, in turns; ``kill`` and ``multirun`` with each of two signals.
+"""
 
 
 def shared_files(seconds: float, top: Path) -> int:
-    """Two processes export, save and load the same files of two models; the number of those that were mixed or failed.
+    """Two processes export, save and load the same files of two models; the number of those that
+    were mixed or failed.
 
     A file must be that of one model or of the other, to the byte.
     """
@@ -399,14 +459,18 @@ def shared_files(seconds: float, top: Path) -> int:
     options = {"max_steps": 1, "kriging": False, "order": 1, "enable_progress_bar": False}
     for number in (0, 1):
         rooms.append(gaigs.train("mirrored", links, planes=6 + number, obstacles=0, **options))
-        maps.append(gaigs.train("path_loss", gaigs.links("synthetic_rssi", transmitters=60 + number)))
+        maps.append(
+            gaigs.train("path_loss", gaigs.links("synthetic_rssi", transmitters=60 + number))
+        )
     names = ("floor.tif", "floor.geojson", "floor.nc", "places.csv")
     places = links.query.transmitters[:40]
 
     def write(number: int, folder: Path) -> None:
         folder.mkdir(exist_ok=True)
         for name in names:
-            gaigs.export(maps[number], folder / name, places if name == "places.csv" else None, pitch=1.0)
+            gaigs.export(
+                maps[number], folder / name, places if name == "places.csv" else None, pitch=1.0
+            )
         for name in ("room.glb", "room.obj", "room.xml"):
             gaigs.export(rooms[number], folder / name)
         rooms[number].save(folder / "room.ckpt")
@@ -414,12 +478,17 @@ def shared_files(seconds: float, top: Path) -> int:
 
     def digests(folder: Path) -> dict[str, bytes]:
         """A scene counts with its meshes."""
-        found = {name: (folder / name).read_bytes() for name in (*names, "room.glb", "room.obj", "room.xml")}
+        found = {
+            name: (folder / name).read_bytes()
+            for name in (*names, "room.glb", "room.obj", "room.xml")
+        }
         found["room.xml"] += b"".join(map(Path.read_bytes, scene_files(folder / "room.xml")))
         with np.load(folder / "floor.npz") as floor:
             found["floor.npz"] = floor["values_dbm"].tobytes()
         weights = gaigs.load(folder / "room.ckpt").state_dict()
-        return found | {"room.ckpt": b"".join(value.numpy().tobytes() for value in weights.values())}
+        return found | {
+            "room.ckpt": b"".join(value.numpy().tobytes() for value in weights.values())
+        }
 
     for number in (0, 1):
         write(number, top / str(number))
@@ -431,7 +500,11 @@ def shared_files(seconds: float, top: Path) -> int:
     while time.monotonic() < end:
         try:
             write(int(child == 0), shared)
-            mixed = [name for name, part in digests(shared).items() if part not in [one[name] for one in expected]]
+            mixed = [
+                name
+                for name, part in digests(shared).items()
+                if part not in [one[name] for one in expected]
+            ]
         except (OSError, ValueError) as error:
             mixed = [str(error)]
         if mixed:
@@ -452,12 +525,16 @@ def scene_files(file: Path) -> list[Path]:
 def untimed(metrics: dict) -> dict:
     """Metrics without the keys that differ between two runs of the same command."""
     values = {key: value for key, value in metrics.items() if key not in TIMED}
-    return {key: untimed(value) if isinstance(value, dict) else value for key, value in values.items()}
+    return {
+        key: untimed(value) if isinstance(value, dict) else value for key, value in values.items()
+    }
 
 
 def rows(trials: Sequence[Trial]) -> list[list[str]]:
     """Of the table: a head, and a row for each fault."""
-    table = [["fault", "times", "at", "the run", "lost nothing", "training lost, median and most [s]"]]
+    table = [
+        ["fault", "times", "at", "the run", "lost nothing", "training lost, median and most [s]"]
+    ]
     for fault in dict.fromkeys(trial.fault for trial in trials):
         own = [trial for trial in trials if trial.fault == fault]
         lost = [trial.lost for trial in own if trial.lost is not None]
@@ -466,7 +543,9 @@ def rows(trials: Sequence[Trial]) -> list[list[str]]:
             for values in ((trial.phase for trial in own), (trial.end for trial in own))
         )
         seconds = f"{np.median(lost):.2f}, {max(lost):.2f}" if lost else ""
-        table.append([fault, str(len(own)), *counted, str(sum(not trial.wrong for trial in own)), seconds])
+        table.append(
+            [fault, str(len(own)), *counted, str(sum(not trial.wrong for trial in own)), seconds]
+        )
     return table
 
 
@@ -488,14 +567,20 @@ def page(soak: Soak, seed: int) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE")
     parser.add_argument("--faults", nargs="+", choices=FAULTS, default=[*FAULTS])
     parser.add_argument("--repeats", type=int, help="of each fault")
-    parser.add_argument("--minutes", type=float, default=math.inf, help="after which nothing more is tried")
+    parser.add_argument(
+        "--minutes", type=float, default=math.inf, help="after which nothing more is tried"
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the random moments")
     parser.add_argument("--markdown", type=Path, help="page to write")
-    parser.add_argument("--writers", action="store_true", help="two processes that write the same files")
+    parser.add_argument(
+        "--writers", action="store_true", help="two processes that write the same files"
+    )
     options = parser.parse_intermixed_args()
     torch.set_num_threads(1)
     start = time.monotonic()

@@ -55,7 +55,11 @@ class Step(Benchmark):
             seconds = times[row["part"]] or [0.0]
             median, spread = (1e3 * value for value in median_and_spread(seconds))
             share = median / (1e3 * whole)
-            yield row | sizes | {"ms": median, "spread_ms": spread, "share": share, "repeats": len(seconds)}
+            yield (
+                row
+                | sizes
+                | {"ms": median, "spread_ms": spread, "share": share, "repeats": len(seconds)}
+            )
 
     def tables(self, rows: Sequence[Row]) -> str:
         parts = [INTRODUCTION]
@@ -63,15 +67,17 @@ class Step(Benchmark):
             command = f"python benchmarks/step.py {overrides}".rstrip()
             about = "{rasterizer}, {gaussians} Gaussians, {places} places a step, medians of {repeats} steps"
             columns = {"part": "part", "ms": "ms", "spread": "spread_ms", "share": "share"}
-            parts.append(f"```\n{command}\n```\n\n{device}; {about.format(**own[0])}:\n\n{table(own, columns)}")
+            parts.append(
+                f"```\n{command}\n```\n\n{device}; {about.format(**own[0])}:\n\n{table(own, columns)}"
+            )
         return "\n".join(parts)
 
 
 class Watch(Callback):
     """Times of steps [s] by part.
 
-    Autograd differentiates in the reverse order of computation: a stage's backward pass is over when the gradients of
-    its inputs are there.
+    Autograd differentiates in the reverse order of computation: a stage's backward pass is over
+    when the gradients of its inputs are there.
     """
 
     def __init__(self) -> None:
@@ -87,7 +93,9 @@ class Watch(Callback):
             self.last = time
 
     def lap_back(self, part: str, *tensors: torch.Tensor | None) -> None:
-        """Laps when the backward pass first reaches one of these tensors; ``part`` lies behind them."""
+        """Laps when the backward pass first reaches one of these tensors; ``part`` lies behind
+        them.
+        """
         tensors = [tensor for tensor in tensors if tensor is not None and tensor.requires_grad]
         if tensors:
             register_multi_grad_hook(tensors, lambda _: self.lap(part), mode="any")
@@ -140,7 +148,9 @@ class Watch(Callback):
 
 
 def train(config: dict, repeats: int, device: str) -> tuple[dict[str, list[float]], dict]:
-    """Seconds of each step by part; and the rasterizer, the number of Gaussians and that of places a step."""
+    """Seconds of each step by part; and the rasterizer, the number of Gaussians and that of places
+    a step.
+    """
     if not config["model"].get("rasterizer") or "deformation" not in config["model"]:
         raise ValueError(
             f"a step needs a model with a deformation and a rasterizer, got model={config['model']['name']}; "
@@ -151,16 +161,27 @@ def train(config: dict, repeats: int, device: str) -> tuple[dict[str, list[float
     model = registry("model").build(config["model"], scene=links.scene)
     model.fit(links)
     parts = {"model": model, "loss": registry("loss").build(config["loss"], task=links.task)}
-    module = registry("training").build(config["training"], **parts, identity={}, seed=config["seed"])
+    module = registry("training").build(
+        config["training"], **parts, identity={}, seed=config["seed"]
+    )
     watch, steps = Watch(), 6 + 2 * repeats
-    options = config["trainer"] | {"max_steps": steps, "max_time": None, "enable_progress_bar": False}
+    options = config["trainer"] | {
+        "max_steps": steps,
+        "max_time": None,
+        "enable_progress_bar": False,
+    }
     options |= {"accelerator": "gpu" if device == "cuda" else "cpu", "enable_checkpointing": False}
     trainer = make_trainer(make_budget(options)[0], callbacks=[watch], logger=False)
     rasterizer = model.rasterizer
     with warnings.catch_warnings():
-        for message in (".*LeafSpec", "You defined a `validation_step` but have no `val_dataloader`"):
+        for message in (
+            ".*LeafSpec",
+            "You defined a `validation_step` but have no `val_dataloader`",
+        ):
             warnings.filterwarnings("ignore", message)
-        trainer.fit(module, Batches(links, links.split.train, module.batch_size, config["seed"], steps))
+        trainer.fit(
+            module, Batches(links, links.split.train, module.batch_size, config["seed"], steps)
+        )
     sizes = {"gaussians": count_gaussians(model), "places": module.batch_size}
     return watch.times, sizes | {"rasterizer": rasterizer.used}
 

@@ -1,4 +1,6 @@
-"""Benchmarks whose rows are whole runs, each in a folder of its own: ``accuracy.py``, ``budgets.py``."""
+"""Benchmarks whose rows are whole runs, each in a folder of its own: ``accuracy.py``,
+``budgets.py``.
+"""
 
 import argparse
 import gc
@@ -45,7 +47,14 @@ def command_line(doc: str) -> argparse.ArgumentParser:
     parser = common.command_line(doc)
     text = "values of an axis instead of its own; [] leaves it out"
     add = parser.add_argument
-    add("--values", action="append", type=values_of_axis, default=[], metavar="AXIS=[...]", help=text)
+    add(
+        "--values",
+        action="append",
+        type=values_of_axis,
+        default=[],
+        metavar="AXIS=[...]",
+        help=text,
+    )
     return parser
 
 
@@ -90,7 +99,9 @@ class Trainings(Benchmark):
         config = self.config
         split = load(config["data"], config["split"], config["task"]["name"]).split
         if not len(split.validation):
-            raise ValueError(f"split {split.name} must have validation links; set split.validation above 0")
+            raise ValueError(
+                f"split {split.name} must have validation links; set split.validation above 0"
+            )
 
     def compose(self, device: str, overrides: Sequence[str]) -> dict:
         """The configuration of a run; look-ups are runs of their own, so it has no baselines."""
@@ -110,7 +121,9 @@ class Trainings(Benchmark):
             try:
                 config = OmegaConf.create(self.compose(device, axis.of))
             except ValueError as error:
-                raise ValueError(f"axis {name} (--values {name}=[] leaves it out): {error}") from error
+                raise ValueError(
+                    f"axis {name} (--values {name}=[] leaves it out): {error}"
+                ) from error
             default = OmegaConf.select(config, axis.key)
             if default is None:
                 log.info("%s is left out: this configuration has no %s", name, axis.key)
@@ -134,7 +147,9 @@ class Trainings(Benchmark):
         try:
             metrics = gaigs.run(self.compose(device, words), folder)
         except Exception as error:  # of whatever system; the next one goes on
-            if lacks_memory(error) or (isinstance(error, OSError) and not isinstance(error, FileNotFoundError)):
+            if lacks_memory(error) or (
+                isinstance(error, OSError) and not isinstance(error, FileNotFoundError)
+            ):
                 raise
             text = f"{type(error).__name__}: {' '.join(str(error).removeprefix('gaigs: ').split())}"
             log.error("%s: %s", " ".join(words), text)
@@ -144,7 +159,9 @@ class Trainings(Benchmark):
 
 
 class Score(NamedTuple):
-    """Names of a task's first metric and mean validation score; title, unit (or "") and direction of the latter."""
+    """Names of a task's first metric and mean validation score; title, unit (or "") and direction
+    of the latter.
+    """
 
     first: str
     mean: str
@@ -161,12 +178,16 @@ class Score(NamedTuple):
         return cls(first, mean, title, title.partition("[")[2].rstrip("]"), is_better)
 
     def loss(self, score: str | float) -> float:
-        """A validation score as a number that is lower if the score is better; infinite for an empty text."""
+        """A validation score as a number that is lower if the score is better; infinite for an
+        empty text.
+        """
         return math.inf if score == "" else (-1 if self.higher_is_better else 1) * float(score)
 
 
 def sections(name: str, rows: Sequence[Row]) -> Iterator[tuple[str, Score, list[Row]]]:
-    """Rows that can be compared with each other: a heading with their conditions and command, score, and rows."""
+    """Rows that can be compared with each other: a heading with their conditions and command,
+    score, and rows.
+    """
     groups = grouped(rows, "scene", "trainer", "device", "task", "split")
     for (scene, trainer, device, task, split), own in groups.items():
         scene = re.sub(r"=[/~.]\S*/", "=", scene)  # a page shows the last part of a path
@@ -181,11 +202,16 @@ def overrides_of(row: Row) -> list[str]:
     of = shlex.split(row["of"])
     if row["value"] == row["default"]:
         return of
-    return [*(word for word in of if word.partition("=")[0] != row["key"]), f"{row['key']}={row['value']}"]
+    return [
+        *(word for word in of if word.partition("=")[0] != row["key"]),
+        f"{row['key']}={row['value']}",
+    ]
 
 
 def results(metrics: Mapping, folder: Path) -> dict:
-    """Values of a run's row, from its ``metrics.json`` and its log; kriging is the last point of the curve."""
+    """Values of a run's row, from its ``metrics.json`` and its log; kriging is the last point of
+    the curve.
+    """
     task, own = metrics["task"], next(iter(metrics["models"]))
     score, test = Score.of(task), metrics["models"][own]
     validation = (metrics["validation"] or {}).get(own, {}).get(score.mean)
@@ -193,7 +219,9 @@ def results(metrics: Mapping, folder: Path) -> dict:
     curve = [(seconds, value) for _, seconds, value in points if math.isfinite(seconds)]
     if metrics.get("kriging") and curve and validation is not None:
         curve.append((train_seconds(metrics) or 0.0, validation))
-    found = {key: metrics[key] for key in ("task", "split", "seed", *COSTS)} | {"train_seconds": train_seconds(metrics)}
+    found = {key: metrics[key] for key in ("task", "split", "seed", *COSTS)} | {
+        "train_seconds": train_seconds(metrics)
+    }
     found |= {"validation": validation, "test": test[score.mean], "compared": test.get(score.first)}
     found["steps"] = points[-1][0] + 1 if points else None
     return found | {"curve": " ".join(f"{time:.1f}:{value:.5g}" for time, value in curve)}
@@ -204,7 +232,9 @@ def multiples(default: object, factors: Sequence[float]) -> list:
     entries = default if isinstance(default, list) else [default]
     if not all(type(entry) is int for entry in entries):
         return []
-    found = dict.fromkeys(tuple(max(1, round(entry * factor)) for entry in entries) for factor in factors)
+    found = dict.fromkeys(
+        tuple(max(1, round(entry * factor)) for entry in entries) for factor in factors
+    )
     return [[*value] if isinstance(default, list) else value[0] for value in found]
 
 

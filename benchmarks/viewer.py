@@ -1,8 +1,9 @@
-"""Time from a drag of the transmitter to its picture: python benchmarks/viewer.py RUN ... [--picture PNG].
+"""Time from a drag of the transmitter to its picture: python benchmarks/viewer.py RUN ...
+[--picture PNG].
 
-Serves each run or checkpoint, opens it in headless Chromium, which draws without a graphics card, and drags the
-transmitter through the room. A row has the median time of the model's answer alone and, from the mouse's move to the
-picture, median and 95th percentile.
+Serves each run or checkpoint, opens it in headless Chromium, which draws without a graphics card,
+and drags the transmitter through the room. A row has the median time of the model's answer alone
+and, from the mouse's move to the picture, median and 95th percentile.
 """
 
 import argparse
@@ -45,7 +46,9 @@ def drags(browser: Browser, count: int) -> list[float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("sources", nargs="+", help="run folders or checkpoints")
-    parser.add_argument("--data", help="reader of the links that checkpoints are shown with, such as synthetic")
+    parser.add_argument(
+        "--data", help="reader of the links that checkpoints are shown with, such as synthetic"
+    )
     parser.add_argument("--picture", type=Path, help="PNG of the last view")
     arguments = parser.parse_args()
     print("| run | answer [ms] | drag to picture, median [ms] | 95 % [ms] |\n|---|---|---|---|")
@@ -63,16 +66,32 @@ def main() -> None:
                     browser.run("choose(0, 0)")
                     time.sleep(1)
                 browser.picture(arguments.picture)
-                picture = Image.open(arguments.picture).convert("RGB").quantize(256, Image.Quantize.FASTOCTREE)
+                picture = (
+                    Image.open(arguments.picture)
+                    .convert("RGB")
+                    .quantize(256, Image.Quantize.FASTOCTREE)
+                )
                 picture.save(arguments.picture, optimize=True)
             serving.shutdown()
         own = []
-        for place in (contents.scene.lower + (contents.scene.upper - contents.scene.lower) * k / 20 for k in range(20)):
+        for place in (
+            contents.scene.lower + (contents.scene.upper - contents.scene.lower) * k / 20
+            for k in range(20)
+        ):
             start = time.perf_counter()
             contents.answer(place.tolist(), 0)
             own.append(1000 * (time.perf_counter() - start))
-        numbers = statistics.median(own), statistics.median(times), statistics.quantiles(times, n=20)[-1]
-        print(f"| {Path(source).name} |", " | ".join(f"{number:.0f}" for number in numbers), "|", flush=True)
+        numbers = (
+            statistics.median(own),
+            statistics.median(times),
+            statistics.quantiles(times, n=20)[-1],
+        )
+        print(
+            f"| {Path(source).name} |",
+            " | ".join(f"{number:.0f}" for number in numbers),
+            "|",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Hooks of mkdocs: the repository's layout, a page for each notebook, and the viewer's file in its page."""
+"""Hooks of mkdocs: the repository's layout, a page for each notebook, and the viewer's file in its
+page.
+"""
 
 import re
 from pathlib import Path
@@ -25,7 +27,9 @@ PAGES = [
 def on_files(files, config):
     """The files of the theme and of the pages, below the repository's root in place of ``docs``."""
     found = [file for file in files if file.src_dir != config.docs_dir]
-    for path in (path for pattern in PAGES for path in sorted(ROOT.glob(pattern)) if path.suffix != ".py"):
+    for path in (
+        path for pattern in PAGES for path in sorted(ROOT.glob(pattern)) if path.suffix != ".py"
+    ):
         name = path.relative_to(ROOT).as_posix()
         if path.suffix == ".ipynb":
             found += _notebook(config, name)

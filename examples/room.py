@@ -1,4 +1,6 @@
-"""Makes examples/room.ckpt, mirrored Gaussians of the built-in room's spectra: python examples/room.py (a minute)."""
+"""Makes examples/room.ckpt, mirrored Gaussians of the built-in room's spectra: python
+examples/room.py (a minute).
+"""
 
 from pathlib import Path
 

@@ -8,7 +8,8 @@
 >>> model.save("room.ckpt")
 >>> model = gaigs.load("room.ckpt")
 
-``python -m gaigs`` does the same from the command line: it composes a configuration and calls ``gaigs.run``.
+``python -m gaigs`` does the same from the command line: it composes a configuration and calls
+``gaigs.run``.
 """
 
 import importlib
@@ -78,7 +79,9 @@ PLACES = {
     "train": "runs.training",
     "rasterize": "splatting.rasterizer",
 }
-"""The module of each public name, which is imported when the name is first used: torch is slow to import."""
+"""The module of each public name, which is imported when the name is first used: torch is slow to
+import.
+"""
 
 __all__ = [
     "Array", "Description", "Estimate", "Fingerprints", "Frame", "Grid", "Links", "Location", "Metric", "Model", "Pose",
@@ -93,7 +96,9 @@ def __getattr__(name: str):
         raise AttributeError(f"module 'gaigs' has no attribute {name!r}")
     module = importlib.import_module(f"gaigs.{PLACES[name]}")
     value = getattr(module, name)
-    if inspect.isfunction(value) and name != "register":  # the decorator of ``register`` looks at its caller
+    if (
+        inspect.isfunction(value) and name != "register"
+    ):  # the decorator of ``register`` looks at its caller
         value = usual_modes()(value)
         setattr(module, name, value)  # where pickle looks for it
     globals()[name] = value

@@ -1,4 +1,6 @@
-"""Configurations: the files that Hydra joins, the check of the result, and the message of an error in it."""
+"""Configurations: the files that Hydra joins, the check of the result, and the message of an error
+in it.
+"""
 
 import contextlib
 import hashlib
@@ -23,7 +25,12 @@ from hydra.errors import HydraException, MissingConfigException
 from hydra.plugins.config_source import ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, MissingMandatoryValue, OmegaConfBaseException
+from omegaconf.errors import (
+    ConfigAttributeError,
+    ConfigKeyError,
+    MissingMandatoryValue,
+    OmegaConfBaseException,
+)
 
 from gaigs.registry import KINDS, check_type, listed, registry, similar, storable, suggest
 from gaigs.registry.holders import plugin_packages
@@ -56,18 +63,22 @@ READ_BY_LINKS = ("data", "split", "task")
 """Keys that ``gaigs.links`` reads."""
 
 CONSTRUCTED = tuple(kind for kind in KINDS if kind not in ("task", "training"))
-"""Kinds whose components need no configuration file: the options are read from their constructors."""
+"""Kinds whose components need no configuration file: the options are read from their constructors.
+"""
 
 
 def conf_dir() -> Path:
-    """The folder of gaigs's own configuration: in the installed package, or beside the package in a checkout."""
+    """The folder of gaigs's own configuration: in the installed package, or beside the package in a
+    checkout.
+    """
     here = Path(__file__).parent
     packaged = here / "conf"
     return packaged if packaged.is_dir() else here.parent / "conf"
 
 
 def plugin_conf_dirs() -> list[Path]:
-    """``plugins/conf``, ``plugins/<folder>/conf``, and ``<package>/conf`` of each package with an entry point of gaigs.
+    """``plugins/conf``, ``plugins/<folder>/conf``, and ``<package>/conf`` of each package with an
+    entry point of gaigs.
 
     They hold ``<kind>/<name>.yaml``; no plug-in is imported.
     """
@@ -77,7 +88,9 @@ def plugin_conf_dirs() -> list[Path]:
 
 
 class PluginConfigurations(SearchPathPlugin):
-    """Hydra's search path: gaigs's own files, then those of plug-ins, then the constructors of components."""
+    """Hydra's search path: gaigs's own files, then those of plug-ins, then the constructors of
+    components.
+    """
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in plugin_conf_dirs():
@@ -93,7 +106,11 @@ class Constructors(ConfigSource):
 
     def __init__(self, provider: str, path: str):
         super().__init__(provider, path)
-        self.found = {f"{kind}/{name}": (kind, name) for kind in CONSTRUCTED for name in registry(kind).names()}
+        self.found = {
+            f"{kind}/{name}": (kind, name)
+            for kind in CONSTRUCTED
+            for name in registry(kind).names()
+        }
 
     def __deepcopy__(self, memo: dict) -> "Constructors":
         return self  # Hydra copies its sources for each group that it lists
@@ -144,11 +161,17 @@ def differences(there: Mapping, here: Mapping, prefix: str = "") -> dict[str, tu
 
 
 def check(config: dict) -> None:
-    """Checks the keys of a configuration and their values; raises a ``TypeError`` or a ``ValueError``."""
+    """Checks the keys of a configuration and their values; raises a ``TypeError`` or a
+    ``ValueError``.
+    """
     if unknown := [key for key in config if key not in KEYS]:
-        raise ValueError(f"the configuration has no key {suggest(unknown[0], KEYS)}; it has: {listed(sorted(KEYS))}")
+        raise ValueError(
+            f"the configuration has no key {suggest(unknown[0], KEYS)}; it has: {listed(sorted(KEYS))}"
+        )
     if missing := sorted(KEYS.keys() - {*MAY_BE_NULL} - config.keys()):
-        raise ValueError(f"the configuration needs the key {missing[0]!r}; conf/config.yaml has them all")
+        raise ValueError(
+            f"the configuration needs the key {missing[0]!r}; conf/config.yaml has them all"
+        )
     for key, annotation in KEYS.items():
         check_type(key, config.get(key), annotation)
     for kind in KINDS:
@@ -166,20 +189,23 @@ def check(config: dict) -> None:
 
 
 def compose(*overrides: str, **options) -> dict:
-    """The configuration of a run, as the command line makes it: presets, then overrides, then options.
+    """The configuration of a run, as the command line makes it: presets, then overrides, then
+    options.
 
     Args:
-        overrides: Command-line words, e.g. ``"+experiment=mirrored"`` or ``"trainer.max_steps=300"``.
-        options: Values by their keys, ``**{"trainer.max_steps": 300}``, or by an option's name alone if only one part
-            has it, ``max_steps=300``. A part is chosen by its name, ``tokenizer="ga"``, by a mapping with a name and
-            options, or by an object.
+        overrides: Command-line words, e.g. ``"+experiment=mirrored"`` or
+            ``"trainer.max_steps=300"``.
+        options: Values by their keys, ``**{"trainer.max_steps": 300}``, or by an option's name
+            alone if only one part has it, ``max_steps=300``. A part is chosen by its name,
+            ``tokenizer="ga"``, by a mapping with a name and options, or by an object.
 
     Returns:
         Plain dictionaries, lists, numbers and strings: the argument of ``gaigs.run``.
 
     Raises:
         TypeError: A value has the wrong type.
-        ValueError: A word or an option is unknown, a value is out of range, or a mandatory value is missing.
+        ValueError: A word or an option is unknown, a value is out of range, or a mandatory value is
+            missing.
 
     Example:
         >>> configuration = gaigs.compose("+experiment=mirrored", "trainer.max_steps=300", planes=8)
@@ -233,7 +259,9 @@ def preset(model: str, task: str) -> list[str]:
 
 
 def resolve(config: DictConfig) -> dict:
-    """A composed configuration in plain dictionaries, unchecked; a baseline's name becomes its configuration."""
+    """A composed configuration in plain dictionaries, unchecked; a baseline's name becomes its
+    configuration.
+    """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
@@ -242,18 +270,27 @@ def resolve(config: DictConfig) -> dict:
         if key in words and config.model.name in ("kriging", "ensemble"):
             message = f"model {config.model.name!r} is made from trained models; set {words[key]}, with any model"
             raise ValueError(message) from None
-        examples = {"split.edge": "1.0, the edge of a cube [m]", "split.length": "50, the samples of a run"}
+        examples = {
+            "split.edge": "1.0, the edge of a cube [m]",
+            "split.length": "50, the samples of a run",
+        }
         examples |= {
             "split.train": "100, the training places",
             "data.root": "/path/to/folder",
             "data.file": "/path/to/file",
         }
         example = examples.get(key, "...")
-        raise ValueError(f"{key} must be given, as it has no default; add {key}={example}") from None
+        raise ValueError(
+            f"{key} must be given, as it has no default; add {key}={example}"
+        ) from None
     except OmegaConfBaseException as error:
-        raise ValueError(f"the configuration is not complete: {' '.join(str(error).split())}") from error
+        raise ValueError(
+            f"the configuration is not complete: {' '.join(str(error).split())}"
+        ) from error
     if isinstance(plain.get("baselines"), list):
-        plain["baselines"] = [{"name": base} if isinstance(base, str) else base for base in plain["baselines"]]
+        plain["baselines"] = [
+            {"name": base} if isinstance(base, str) else base for base in plain["baselines"]
+        ]
     return plain
 
 
@@ -272,12 +309,16 @@ def _choices(options: Mapping) -> tuple[list[str], dict]:
             choices += [f"{key}={value['name']}"] if "name" in value else []
             values[key] = {name: entry for name, entry in value.items() if name != "name"}
         else:
-            raise TypeError(f"{key} must be a name, a mapping with a name and options, or a component, got {value!r}")
+            raise TypeError(
+                f"{key} must be a name, a mapping with a name and options, or a component, got {value!r}"
+            )
     return choices, values
 
 
 def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
-    """The full key of an option: the name itself if it has dots or is a top-level key, else the part's key."""
+    """The full key of an option: the name itself if it has dots or is a top-level key, else the
+    part's key.
+    """
     is_new, name = name.startswith("+"), name.removeprefix("+")
     plain: Any = OmegaConf.to_container(config)
     if not sections and name in CHOSEN:
@@ -290,10 +331,19 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
         if not (is_new or last in has or is_open):
             raise ValueError(f"{place} has no key {suggest(last, has)}; it has: {listed(has)}")
         return name
-    searched = sections or plain.keys() - {*READ_BY_LINKS, "survey", "locate", "export", "view", "figures"}
+    searched = sections or plain.keys() - {
+        *READ_BY_LINKS,
+        "survey",
+        "locate",
+        "export",
+        "view",
+        "figures",
+    }
     keys = {key: key.rpartition(".")[2] for key in _options(plain, searched)}
     found = sorted(key for key, last in keys.items() if last == name)
-    if not sections and f"model.{name}" in found:  # a model's own option wins over those of its parts
+    if (
+        not sections and f"model.{name}" in found
+    ):  # a model's own option wins over those of its parts
         return f"model.{name}"
     if len(found) > 1:
         raise ValueError(f"{name} is an option of several parts; say which: {', '.join(found)}")
@@ -301,12 +351,18 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
         return found[0]
     for section in () if sections else READ_BY_LINKS:
         if name in plain[section]:
-            raise ValueError(f"{name} is an option of {section}, which gaigs.links reads; say {section}.{name}")
+            raise ValueError(
+                f"{name} is an option of {section}, which gaigs.links reads; say {section}.{name}"
+            )
     has = sorted({*keys.values()} - {"name"})
     if not sections:
-        raise ValueError(f"there is no option {suggest(name, {*has, *plain})}; python -m gaigs --help lists all")
+        raise ValueError(
+            f"there is no option {suggest(name, {*has, *plain})}; python -m gaigs --help lists all"
+        )
     parts = " and ".join(f"{section} {plain[section]['name']!r}" for section in sections)
-    raise ValueError(f"there is no option {suggest(name, has)} of {parts}; there are: {', '.join(has)}")
+    raise ValueError(
+        f"there is no option {suggest(name, has)} of {parts}; there are: {', '.join(has)}"
+    )
 
 
 def _options(config: Mapping, parts: Iterable[str], prefix: str = "") -> Iterator[str]:
@@ -320,11 +376,15 @@ def _options(config: Mapping, parts: Iterable[str], prefix: str = "") -> Iterato
 
 
 def nearest(word: str, config: Mapping) -> str:
-    """Full keys of the options with the name most similar to a word, joined by or; empty if none is similar."""
+    """Full keys of the options with the name most similar to a word, joined by or; empty if none is
+    similar.
+    """
     parts = config.keys() - {"hydra", "survey", "locate", "export", "view"}
     keys = {key: key.rpartition(".")[2] for key in (*parts, *_options(config, parts))}
     near = similar(word, {*keys.values()} - {"name"})
-    found = [key for key in near if key in config] or sorted(key for key, name in keys.items() if name in near)
+    found = [key for key in near if key in config] or sorted(
+        key for key, name in keys.items() if name in near
+    )
     return " or ".join(found)
 
 
@@ -338,9 +398,13 @@ def wrong_flag() -> str | None:
 
 
 def explain(error: Exception) -> str | None:
-    """The message of an error of a job or of a command line that Hydra cannot compose; None for any other error."""
+    """The message of an error of a job or of a command line that Hydra cannot compose; None for any
+    other error.
+    """
     is_known = isinstance(error, HydraException | OmegaConfBaseException | ValueError)
-    is_composing = any(frame.name == "load_configuration" for frame in traceback.extract_tb(error.__traceback__))
+    is_composing = any(
+        frame.name == "load_configuration" for frame in traceback.extract_tb(error.__traceback__)
+    )
     of_system = isinstance(error, MemoryError) or getattr(error, "errno", None) is not None
     if not is_known and (of_system or not is_composing):
         return None
@@ -349,15 +413,27 @@ def explain(error: Exception) -> str | None:
         case _, ConfigAttributeError(full_key=str(key)) | ConfigKeyError(full_key=str(key)):
             place, _, word = key.rpartition(".")
             has = [str(name) for name in cause.parent_node]
-            part = f"{place} {cause.parent_node['name']!r}" if "name" in has else place or "the configuration"
+            part = (
+                f"{place} {cause.parent_node['name']!r}"
+                if "name" in has
+                else place or "the configuration"
+            )
             plain: Any = OmegaConf.to_container(cause.parent_node)
             if not place and (near := nearest(word, plain)):
                 return f"{part} has no key {word!r}; did you mean {near}?"
-            hint = f"\nin a sweep write ++{key}=... for a key that only the swept {place} has" if is_multirun() else ""
+            hint = (
+                f"\nin a sweep write ++{key}=... for a key that only the swept {place} has"
+                if is_multirun()
+                else ""
+            )
             return f"{part} has no key {suggest(word, has)}; it has: {listed(sorted(has))}{hint}"
         case MissingConfigException(missing_cfg_file=str(file), options=list(names)), _:
             kind, _, name = file.rpartition("/")
-            package = OmegaConf.load(conf_dir() / "published.yaml").packages.get(name) if kind == "model" else None
+            package = (
+                OmegaConf.load(conf_dir() / "published.yaml").packages.get(name)
+                if kind == "model"
+                else None
+            )
             if package is None:
                 return f"there is no {kind} {suggest(name, names)}; there are: {listed(names)}"
             folder = package.removeprefix("gaigs-").replace("-", "_")
@@ -375,16 +451,26 @@ def explain(error: Exception) -> str | None:
         case _ if words.startswith("Config group"):  # null or a number as a file's name
             return f"a part is chosen by the name of its file ({error}); ~density leaves it out"
     about = "; its files choose each other in a circle" if isinstance(error, RecursionError) else ""
-    return _unreadable() or f"Hydra cannot join command line and configuration files ({words}){about}"
+    return (
+        _unreadable() or f"Hydra cannot join command line and configuration files ({words}){about}"
+    )
 
 
 def _unreadable() -> str | None:
     """The message for the first configuration file that cannot be parsed; None if all can."""
-    for file in (file for folder in (conf_dir(), *plugin_conf_dirs()) for file in sorted(folder.rglob("*.yaml"))):
+    for file in (
+        file
+        for folder in (conf_dir(), *plugin_conf_dirs())
+        for file in sorted(folder.rglob("*.yaml"))
+    ):
         try:
             OmegaConf.load(file)
         except Exception as error:  # any error of the YAML parser
-            cause = "not UTF-8" if isinstance(error, UnicodeDecodeError) else " ".join(str(error).split())
+            cause = (
+                "not UTF-8"
+                if isinstance(error, UnicodeDecodeError)
+                else " ".join(str(error).split())
+            )
             if getattr(error, "errno", None) is None:
                 return f"cannot parse {file}: {cause}"
     return None
@@ -413,7 +499,9 @@ def installed(*names: str) -> str:
 
 
 def known(kind: str, name: str, otherwise: str) -> str:
-    """The name if a configuration file or a component has it, else the other one: for choices by task."""
+    """The name if a configuration file or a component has it, else the other one: for choices by
+    task.
+    """
     return name if files_of(kind, name) or name in registry(kind).names() else otherwise
 
 

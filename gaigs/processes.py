@@ -1,4 +1,6 @@
-"""Resources and signals of a run: threads, memory, Ctrl-C and SIGTERM, other processes, locked folders."""
+"""Resources and signals of a run: threads, memory, Ctrl-C and SIGTERM, other processes, locked
+folders.
+"""
 
 import atexit
 import contextlib
@@ -19,18 +21,28 @@ from omegaconf.errors import OmegaConfBaseException
 from gaigs.io.files import file_message
 
 STOPPING = [signal.SIGINT, signal.SIGTERM]
-"""Signals at which a run saves and stops: Ctrl-C, that of schedulers, and that of a closed terminal."""
-if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup sets it
+"""Signals at which a run saves and stops: Ctrl-C, that of schedulers, and that of a closed
+terminal.
+"""
+if (
+    hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
+):  # as nohup sets it
     STOPPING.append(signal.SIGHUP)
 
 THREADS = ("OMP_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
-"""Environment variables that limit threads of OpenMP and of PoCL's OpenCL, up to version 3 and later."""
+"""Environment variables that limit threads of OpenMP and of PoCL's OpenCL, up to version 3 and
+later.
+"""
 
 AGAIN = 0.05
 """Delay before an ignored signal is sent again [s]."""
 
-if hasattr(os, "register_at_fork"):  # a forked process lacks the threads of torch, and would wait for them for ever
-    os.register_at_fork(after_in_child=lambda: "torch" in sys.modules and sys.modules["torch"].set_num_threads(1))
+if hasattr(
+    os, "register_at_fork"
+):  # a forked process lacks the threads of torch, and would wait for them for ever
+    os.register_at_fork(
+        after_in_child=lambda: "torch" in sys.modules and sys.modules["torch"].set_num_threads(1)
+    )
 
 received: list[int] = []
 """Signals that have stopped runs of this process: a launcher's worker starts no further run."""
@@ -47,8 +59,9 @@ class Stopped(KeyboardInterrupt):
 def keep_memory() -> None:
     """Makes this process faster and its memory larger.
 
-    Freed arrays stay with the process: with glibc each step would map their pages anew.
-    Imports make half a million objects that stay: looking for cycles among them is rarer, and left out at the end.
+    Freed arrays stay with the process: with glibc each step would map their pages anew. Imports
+    make half a million objects that stay: looking for cycles among them is rarer, and left out at
+    the end.
     """
     gc.set_threshold(50_000)
     atexit.register(gc.freeze)
@@ -63,13 +76,16 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
     """Limits the threads of torch and PoCL; PoCL keeps the limit of its first use.
 
     Args:
-        count: Number of threads; None: no limit for one job, an equal share of the processors for several.
+        count: Number of threads; None: no limit for one job, an equal share of the processors for
+            several.
         jobs: Number of jobs that run at a time on this machine; -1: one for each processor.
     """
     if count is None and jobs in (0, 1):
         yield
         return
-    processors = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    processors = (
+        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    )
     if count is None:
         count = max(1, processors // (processors if jobs < 0 else jobs))
     if count < 1:
@@ -105,7 +121,8 @@ def lacks_memory(error: BaseException | None) -> bool:
 
 
 def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
-    """The message of an error of a run in a folder that a user can mend; None for a fault of the program.
+    """The message of an error of a run in a folder that a user can mend; None for a fault of the
+    program.
 
     ``goes_on`` says how to resume the run.
     """
@@ -119,15 +136,21 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
         return f"{folder} was removed during the run; the same command begins anew"
     if isinstance(error, OSError):
         return file_message(error, folder)
-    is_known = isinstance(error, ValueError | TypeError | ImportError | RuntimeError | OmegaConfBaseException)
+    is_known = isinstance(
+        error, ValueError | TypeError | ImportError | RuntimeError | OmegaConfBaseException
+    )
     is_known |= type(error).__name__ == "MisconfigurationException"  # Lightning's
     return f"{error}{fault_of_plug_in(error)}" if is_known else None
 
 
 def fault_of_plug_in(error: Exception) -> str:
-    """File and line if code that is neither gaigs nor installed is at fault, and did not raise the error itself."""
+    """File and line if code that is neither gaigs nor installed is at fault, and did not raise the
+    error itself.
+    """
     here, stdlib = str(Path(__file__).parent) + os.sep, sysconfig.get_path("stdlib")
-    is_library = lambda name: name.startswith(("<", stdlib)) or "site-packages" in name or "dist-packages" in name
+    is_library = lambda name: (
+        name.startswith(("<", stdlib)) or "site-packages" in name or "dist-packages" in name
+    )
     trace = traceback.extract_tb(error.__traceback__)
     frames = [one for one in trace if one.filename.startswith(here) or not is_library(one.filename)]
     if not frames or frames[-1].filename.startswith(here) or "raise " in (frames[-1].line or ""):
@@ -169,7 +192,9 @@ def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
 
 
 def hang_up(number: int) -> None:
-    """At SIGHUP drops the output to the closed terminal, and ignores further ones: the shell sends one, too."""
+    """At SIGHUP drops the output to the closed terminal, and ignores further ones: the shell sends
+    one, too.
+    """
     if number != getattr(signal, "SIGHUP", None):
         return
     signal.signal(number, signal.SIG_IGN)
@@ -184,10 +209,13 @@ def hang_up(number: int) -> None:
 def stopping(waits: bool = False) -> Iterator[None]:
     """Lets the signals ``STOPPING`` stop a run as Ctrl-C does, and restores the handlers.
 
-    Python ignores errors that are raised while it destroys an object; such a signal is sent again. A process that
-    ``waits`` for another run afterwards ignores them then, as its launcher would wait for it forever.
+    Python ignores errors that are raised while it destroys an object; such a signal is sent again.
+    A process that ``waits`` for another run afterwards ignores them then, as its launcher would
+    wait for it forever.
     """
-    if threading.current_thread() is not threading.main_thread():  # other threads may not set handlers
+    if (
+        threading.current_thread() is not threading.main_thread()
+    ):  # other threads may not set handlers
         yield
         return
     handlers = {number: signal.getsignal(number) for number in STOPPING}

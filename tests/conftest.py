@@ -1,4 +1,5 @@
-"""One thread: the tests' tensors are small, and two that spin on a busy machine are several times slower.
+"""One thread: the tests' tensors are small, and two that spin on a busy machine are several times
+slower.
 
 Properties are tried on the same examples each time, and none is timed.
 """
@@ -18,18 +19,25 @@ from hypothesis import HealthCheck, Phase, settings
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of these would compile all modules
-signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell runs the tests in the background
+signal.signal(
+    signal.SIGINT, signal.default_int_handler
+)  # ignored where a shell runs the tests in the background
 settings.register_profile(
     "gaigs",
     derandomize=True,
     deadline=None,
     database=None,
     max_examples=25,
-    phases=[Phase.explicit, Phase.generate, Phase.shrink],  # the others are slow, or need a database
+    phases=[
+        Phase.explicit,
+        Phase.generate,
+        Phase.shrink,
+    ],  # the others are slow, or need a database
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("gaigs")
-gc.disable()  # modules and tests stay: a search for garbage among them takes a fifth of their collection
+# Modules and tests stay: a search for garbage among them takes a fifth of their collection
+gc.disable()
 
 
 def pytest_collection_finish():
@@ -39,7 +47,9 @@ def pytest_collection_finish():
 
 @pytest.fixture(scope="session", autouse=True)
 def quick_runs():
-    """Figures and times of a run take longer than all else; the report's tests and processes have them."""
+    """Figures and times of a run take longer than all else; the report's tests and processes have
+    them.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
         patch.setattr("gaigs.runs.evaluation.median_ms", lambda work: (work(), 1.0)[1])
@@ -48,7 +58,9 @@ def quick_runs():
 
 @pytest.fixture(scope="session", autouse=True)
 def composed_once():
-    """Copies of a configuration for the same words, while no file and no component changes; Hydra takes 0.2 s."""
+    """Copies of a configuration for the same words, while no file and no component changes; Hydra
+    takes 0.2 s.
+    """
     import hydra
     from hydra.core.global_hydra import GlobalHydra
 
@@ -57,10 +69,15 @@ def composed_once():
     compose, found = hydra.compose, {}
 
     def once(name, words):
-        folders = [element.path for element in GlobalHydra.instance().config_loader().get_search_path().get_path()]
+        folders = [
+            element.path
+            for element in GlobalHydra.instance().config_loader().get_search_path().get_path()
+        ]
         files = [(file, file.stat().st_mtime_ns) for file in Path.cwd().glob("plugins/**/*")]
         held = [(kind, *item) for kind in KINDS for item in registry(kind)._registered.items()]
-        invented = [item for item in held if not str(item[2].__module__).startswith(("gaigs", "plugins"))]
+        invented = [
+            item for item in held if not str(item[2].__module__).startswith(("gaigs", "plugins"))
+        ]
         state = (*folders, *sys.path, *files, *invented, Path.cwd() if files else None, *words)
         if state not in found:
             found[state] = compose(name, words)
@@ -73,7 +90,9 @@ def composed_once():
 
 @pytest.fixture(scope="module")
 def files_read_once():
-    """For modules that compose many different words and change no file: reading takes a third of a composition."""
+    """For modules that compose many different words and change no file: reading takes a third of a
+    composition.
+    """
     from hydra._internal.config_repository import ConfigRepository
 
     read, found = ConfigRepository.load_config, {}
@@ -91,7 +110,9 @@ def files_read_once():
 
 @pytest.fixture
 def unchecked():
-    """For runs from end to end: a third of their time is checks of annotations, which tests of the parts have."""
+    """For runs from end to end: a third of their time is checks of annotations, which tests of the
+    parts have.
+    """
     before = jaxtyping.config.jaxtyping_disable
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
@@ -109,8 +130,12 @@ def tracer(tmp_path_factory):
     except (ImportError, RuntimeError) as error:
         pytest.skip(str(error))
     with pytest.MonkeyPatch.context() as patch:
-        kernels = Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "pocl" / "kcache"
-        patch.setenv("POCL_CACHE_DIR", os.environ.get("POCL_CACHE_DIR", str(kernels)))  # OpenCL keeps its own
+        kernels = (
+            Path(os.environ.get("XDG_CACHE_HOME", "~/.cache")).expanduser() / "pocl" / "kcache"
+        )
+        patch.setenv(
+            "POCL_CACHE_DIR", os.environ.get("POCL_CACHE_DIR", str(kernels))
+        )  # OpenCL keeps its own
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         patch.setenv("DRJIT_LIBLLVM_PATH", library)
         patch.setattr(tracing, "RAYS", 5_000)

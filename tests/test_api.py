@@ -53,7 +53,9 @@ def spectra():
     return gaigs.links("synthetic", transmitters=20, order=0)
 
 
-@pytest.mark.parametrize("thing", [*PUBLIC, *OTHERS], ids=lambda thing: getattr(thing, "__qualname__", thing))
+@pytest.mark.parametrize(
+    "thing", [*PUBLIC, *OTHERS], ids=lambda thing: getattr(thing, "__qualname__", thing)
+)
 def test_the_example_runs(thing, tmp_path, monkeypatch):
     documented = getattr(gaigs, thing) if isinstance(thing, str) else thing
     text = inspect.getdoc(type(documented["task"]) if thing == "registries" else documented)
@@ -103,7 +105,9 @@ def test_a_model_is_trained_by_the_preset_of_its_experiment(experiment):
     assert there["data"]["name"] == data
     here = gaigs.compose(*configuration.preset(model, there["task"]["name"]))
     chosen_by_data = {"data", "split"}
-    assert {k: here[k] for k in here.keys() - chosen_by_data} == {k: there[k] for k in there.keys() - chosen_by_data}
+    assert {k: here[k] for k in here.keys() - chosen_by_data} == {
+        k: there[k] for k in there.keys() - chosen_by_data
+    }
 
 
 def test_scores_print_in_a_notebook_as_in_a_terminal(monkeypatch):
@@ -118,7 +122,10 @@ def test_scores_print_in_a_notebook_as_in_a_terminal(monkeypatch):
 
 @pytest.mark.parametrize(
     ("experiment", "small"),
-    [("spectrum", {"gaussians.count": 20}), ("mirrored_rssi", {"placement.planes": 6, "placement.order": 0})],
+    [
+        ("spectrum", {"gaussians.count": 20}),
+        ("mirrored_rssi", {"placement.planes": 6, "placement.order": 0}),
+    ],
 )
 def test_training_gives_the_command_lines_numbers(experiment, small, tmp_path):
     model, data = PRESETS[experiment]
@@ -128,12 +135,16 @@ def test_training_gives_the_command_lines_numbers(experiment, small, tmp_path):
     state = torch.get_rng_state()
     trained = gaigs.train(model, links, **FEW, **small, folder=tmp_path / "train")
     assert gaigs.evaluate(trained, links).models == metrics["models"]
-    assert torch.equal(torch.get_rng_state(), state), "the caller's random numbers are left as they were"
+    assert torch.equal(torch.get_rng_state(), state), (
+        "the caller's random numbers are left as they were"
+    )
     assert {path.name for path in (tmp_path / "train").iterdir()} == {
         "config.yaml", "software.json", "best.ckpt", "last.ckpt", "log"
     }  # fmt: skip
     places = links.query[links.split.test[:3]]
-    assert torch.equal(gaigs.load(tmp_path / "run/best.ckpt").predict(places), trained.predict(places))
+    assert torch.equal(
+        gaigs.load(tmp_path / "run/best.ckpt").predict(places), trained.predict(places)
+    )
     trained.save(tmp_path / "saved.ckpt")
     assert torch.equal(gaigs.load(tmp_path / "saved.ckpt").predict(places), trained.predict(places))
 
@@ -141,7 +152,10 @@ def test_training_gives_the_command_lines_numbers(experiment, small, tmp_path):
 def test_threads_hold_while_it_trains_and_no_longer(spectra, tmp_path, monkeypatch):
     seen, before = [], torch.get_num_threads()
     config = gaigs.compose("model=mean", "data.transmitters=20", "data.order=0", threads=2)
-    monkeypatch.setattr("gaigs.model.mean.Mean.fit", lambda self, links: seen.append(torch.get_num_threads()) or 1 / 0)
+    monkeypatch.setattr(
+        "gaigs.model.mean.Mean.fit",
+        lambda self, links: seen.append(torch.get_num_threads()) or 1 / 0,
+    )
     with pytest.raises(ZeroDivisionError):
         gaigs.train("mean", spectra, threads=2)
     with pytest.raises(ZeroDivisionError):
@@ -154,15 +168,30 @@ def test_threads_hold_while_it_trains_and_no_longer(spectra, tmp_path, monkeypat
     ("options", "message"),
     [
         ({"max_stepz": 3}, r"there is no option 'max_stepz' \(did you mean 'max_steps'\?\)"),
-        ({"trainer.max_stepz": 3}, r"trainer has no key 'max_stepz' \(did you mean 'max_steps'\?\)"),
-        ({"width": 3}, "width is an option of several parts; say which: deformation.width, tokenizer.euclidean.width"),
+        (
+            {"trainer.max_stepz": 3},
+            r"trainer has no key 'max_stepz' \(did you mean 'max_steps'\?\)",
+        ),
+        (
+            {"width": 3},
+            "width is an option of several parts; say which: deformation.width, tokenizer.euclidean.width",
+        ),
         ({"tokenizer": "gaa"}, r"there is no tokenizer 'gaa' \(did you mean 'ga'\?\)"),
-        ({"tokenizer": 3}, "tokenizer must be a name, a mapping with a name and options, or a component, got 3"),
-        ({"save_every": torch.nn.GELU()}, "save_every must be a number, a text, a list or a registered component"),
+        (
+            {"tokenizer": 3},
+            "tokenizer must be a name, a mapping with a name and options, or a component, got 3",
+        ),
+        (
+            {"save_every": torch.nn.GELU()},
+            "save_every must be a number, a text, a list or a registered component",
+        ),
         ({"transmitters": 3}, "transmitters is an option of data, which gaigs.links reads"),
         ({"seed": -1}, "seed must be in 0..4294967295, got -1"),
         ({"model": "nerf2_"}, "there is no model 'nerf2_'"),
-        ({"split": None}, "split must be a name, a mapping with a name and options, or a component, got None"),
+        (
+            {"split": None},
+            "split must be a name, a mapping with a name and options, or a component, got None",
+        ),
         ({"trainer.max_steps.x": 3}, r"trainer.max_steps has no key 'x'; it has: none"),
     ],
 )
@@ -172,21 +201,29 @@ def test_a_wrong_option_is_named(options, message):
 
 
 def test_options_are_found_by_name_and_parts_are_chosen():
-    config = gaigs.compose("+experiment=rssi", count=7, tokenizer={"name": "ga", "anchors": 3}, blocks=np.int64(2))
+    config = gaigs.compose(
+        "+experiment=rssi", count=7, tokenizer={"name": "ga", "anchors": 3}, blocks=np.int64(2)
+    )
     assert config["model"]["gaussians"]["count"] == config["gaussians"]["count"] == 7
     assert config["model"]["tokenizer"]["anchors"] == 3
     assert config["tokenizer"]["blocks"] == 2
     links = gaigs.links("synthetic_rssi", transmitters=20)
     tokenizer = EuclideanTokenizer(links.scene, width=16)
     assert gaigs.compose(tokenizer=tokenizer)["model"]["tokenizer"] == configuration_of(tokenizer)
-    config = gaigs.compose("model=knn", k=5, baselines=["mean", {"name": "knn", "k": 3}], **{"+trainer.min_steps": 2})
+    config = gaigs.compose(
+        "model=knn", k=5, baselines=["mean", {"name": "knn", "k": 3}], **{"+trainer.min_steps": 2}
+    )
     assert config["model"]["k"] == 5
     assert config["baselines"] == [{"name": "mean"}, {"name": "knn", "k": 3}]
     assert config["trainer"]["min_steps"] == 2
     assert gaigs.compose(gaussians=None, density=None)["model"]["gaussians"] is None
     assert gaigs.compose(**{"training.jitter": np.float64(0.5)})["training"]["jitter"] == 0.5
-    assert gaigs.links("synthetic_rssi", transmitters=20, split={"name": "random", "seed": 4}).split.name.endswith("4")
-    with pytest.raises(ValueError, match=r"seed is an option of several parts; say which: data.seed, split.seed"):
+    assert gaigs.links(
+        "synthetic_rssi", transmitters=20, split={"name": "random", "seed": 4}
+    ).split.name.endswith("4")
+    with pytest.raises(
+        ValueError, match=r"seed is an option of several parts; say which: data.seed, split.seed"
+    ):
         gaigs.links("synthetic_rssi", seed=4)
 
 
@@ -207,7 +244,11 @@ GATEWAYS = [[0.0, 0.0, 2.0], [4.0, 4.0, 2.0]]
 @pytest.mark.parametrize("reader", ["synthetic", "synthetic_rssi", "synthetic_csi"])
 def test_a_model_of_parts_is_trained_and_its_checkpoint_loads(reader, tmp_path):
     links = gaigs.links(reader, transmitters=20, order=0)
-    parts = {"tokenizer": EuclideanTokenizer(links.scene, width=8), "rasterizer": "torch", "gaussians": {"count": 10}}
+    parts = {
+        "tokenizer": EuclideanTokenizer(links.scene, width=8),
+        "rasterizer": "torch",
+        "gaussians": {"count": 10},
+    }
     model = gaigs.train(GaussianSplatting(links.scene, **parts), links, **FEW)
     model.save(tmp_path / "model.ckpt")
     again = gaigs.load(tmp_path / "model.ckpt")
@@ -238,7 +279,9 @@ def test_arguments_of_another_type_are_refused(spectra, tmp_path):
                 function(*arguments)
     with pytest.raises(TypeError):
         gaigs.run("config.yaml", tmp_path)
-    with pytest.raises(ValueError, match="baselines must be names or model configurations with a name, got 3"):
+    with pytest.raises(
+        ValueError, match="baselines must be names or model configurations with a name, got 3"
+    ):
         gaigs.evaluate(gaigs.train("mean", spectra), spectra, baselines=[3])
     model = gaigs.train("mean", spectra)
     with pytest.raises(TypeError, match=r"model must be a gaigs\.Model, got 'room'"):
@@ -258,14 +301,20 @@ def double_precision():
 
 
 def numbers(path):
-    """Predictions of a model of the built-in room, and of one of arrays, which are tensors of the caller's mode."""
+    """Predictions of a model of the built-in room, and of one of arrays, which are tensors of the
+    caller's mode.
+    """
     links = gaigs.links("synthetic_rssi", transmitters=40)
-    model = gaigs.train("gaigs", links, max_steps=2, count=20, tokenizer="ga", enable_progress_bar=False)
+    model = gaigs.train(
+        "gaigs", links, max_steps=2, count=20, tokenizer="ga", enable_progress_bar=False
+    )
     model.save(path)
     values = [gaigs.load(path).predict(PLACES), *model.predict(PLACES, interval=0.5)[:4]]
     places = torch.tensor([[float(k), k % 3, 1.0] for k in range(20)], dtype=torch.float32)
     array = gaigs.Receiver("door", gaigs.Pose.from_xyzw([0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0]))
-    links = gaigs.links(task="rssi", transmitters=places, receivers=array, labels=-40 - places[:, 0])
+    links = gaigs.links(
+        task="rssi", transmitters=places, receivers=array, labels=-40 - places[:, 0]
+    )
     model = gaigs.train("mirrored", links, max_steps=2, enable_progress_bar=False)
     return [*values, model.predict(PLACES), array.array.elements, gaigs.Grid.degrees().elevations]
 
@@ -295,7 +344,9 @@ def test_links_are_made_in_several_threads_at_once():
 
 
 def test_public_functions_go_to_other_processes_and_warn_at_the_line_that_calls_them():
-    functions = [value for value in (getattr(gaigs, name) for name in PUBLIC) if inspect.isfunction(value)]
+    functions = [
+        value for value in (getattr(gaigs, name) for name in PUBLIC) if inspect.isfunction(value)
+    ]
     assert all(pickle.loads(pickle.dumps(function)) is function for function in functions)
     model = gaigs.train("mean", gaigs.links("synthetic_rssi", transmitters=20))
     with pytest.warns(ExtrapolationWarning) as warned:
@@ -304,14 +355,21 @@ def test_public_functions_go_to_other_processes_and_warn_at_the_line_that_calls_
 
 
 def test_test_links_that_a_model_has_learnt_from_are_told(spectra, tmp_path, caplog):
-    gaigs.train("gaigs", spectra, max_steps=1, count=20, enable_progress_bar=False).save(tmp_path / "model.ckpt")
+    gaigs.train("gaigs", spectra, max_steps=1, count=20, enable_progress_bar=False).save(
+        tmp_path / "model.ckpt"
+    )
     look_up = gaigs.train("knn", spectra)
     for model in (gaigs.load(tmp_path / "model.ckpt"), look_up):
         gaigs.evaluate(model, spectra, baselines=[])
         assert "learnt" not in caplog.text
-        other = gaigs.links("synthetic", transmitters=20, order=0, **{"split.seed": 5}, split="random")
+        other = gaigs.links(
+            "synthetic", transmitters=20, order=0, **{"split.seed": 5}, split="random"
+        )
         gaigs.evaluate(model, other, baselines=[])
-        assert re.search(r"has learnt from the places of \d of 4 test links\ntake links of the split", caplog.text)
+        assert re.search(
+            r"has learnt from the places of \d of 4 test links\ntake links of the split",
+            caplog.text,
+        )
         caplog.clear()
     model = gaigs.load(tmp_path / "model.ckpt")
     gaigs.train(model, other, max_steps=1, enable_progress_bar=False)
@@ -344,14 +402,19 @@ def test_mirrored_gaussians_have_parts_that_suit_them():
 def test_models_that_cannot_be_stored_are_refused(spectra, tmp_path):
     with pytest.raises(ValueError, match="model 'knn' has no links to save; fit it first"):
         gaigs.registries["model"].build("knn", scene=spectra.scene).save(tmp_path / "knn.ckpt")
-    with pytest.raises(ValueError, match="model 'Model' has no state: keep what it learns in buffers"):
+    with pytest.raises(
+        ValueError, match="model 'Model' has no state: keep what it learns in buffers"
+    ):
         Model(spectra.scene).save(tmp_path / "stateless.ckpt")
 
     class Own(EuclideanTokenizer):
         pass
 
     model = GaussianSplatting(spectra.scene, tokenizer=Own(spectra.scene))
-    with pytest.raises(ValueError, match=r"gaigs, tokenizer must be .* a registered component to be stored, got Own"):
+    with pytest.raises(
+        ValueError,
+        match=r"gaigs, tokenizer must be .* a registered component to be stored, got Own",
+    ):
         model.save(tmp_path / "own.ckpt")
     assert not list(tmp_path.iterdir())
 
@@ -362,8 +425,14 @@ def test_the_page_on_python_runs(tmp_path, monkeypatch, capsys):
     code = "\n".join(re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S))
     code = re.sub(r"max_steps=\d+", "max_steps=1", code)
     code = code.replace("max_steps=1, seed=0", 'max_steps=1, seed=0, **{"placement.order": 0}')
-    code = re.sub(r'links\("synthetic"(, transmitters=100)?\)', 'links("synthetic", transmitters=20, order=0)', code)
-    code = code.replace('"+experiment=spectrum"', '"+experiment=spectrum", "data.transmitters=30", "data.order=0"')
+    code = re.sub(
+        r'links\("synthetic"(, transmitters=100)?\)',
+        'links("synthetic", transmitters=20, order=0)',
+        code,
+    )
+    code = code.replace(
+        '"+experiment=spectrum"', '"+experiment=spectrum", "data.transmitters=30", "data.order=0"'
+    )
     monkeypatch.chdir(tmp_path)
     names = {}
     exec(compile(code, "docs/python.md", "exec"), names)

@@ -1,7 +1,8 @@
 """Every option of every registered component with unsuitable values: each is refused by its name.
 
-Numbers at the edge may suit an option, as 0 does a penalty: then the component's result is finite. Nothing is trained.
-A registered component is swept without further entries here, in this repository or in its ``plugins``.
+Numbers at the edge may suit an option, as 0 does a penalty: then the component's result is finite.
+Nothing is trained. A registered component is swept without further entries here, in this repository
+or in its ``plugins``.
 """
 
 import ast
@@ -40,8 +41,18 @@ PLACES = {"density": "training.density", "gaussians": "model.gaussians"}
 SWEPT = ("data", "split", *PARTS, "loss", "model", "training")
 EDGES = (-1, -0.5, 0, 1e30, 10**30)
 OTHERS = (None, "", "abc", True, [], {}, math.nan, math.inf, ["abc"], {"x": 1}, *EDGES)
-SUITS = {bool: (True,), int: (), float: (), str: ("", "abc"), list: ([],), dict: ({}, {"x": 1}), type(None): OTHERS}
-"""Those of ``OTHERS`` that an option may have, by the type of its value in the file; null leaves the type open."""
+SUITS = {
+    bool: (True,),
+    int: (),
+    float: (),
+    str: ("", "abc"),
+    list: ([],),
+    dict: ({}, {"x": 1}),
+    type(None): OTHERS,
+}
+"""Those of ``OTHERS`` that an option may have, by the type of its value in the file; null leaves
+the type open.
+"""
 
 
 @contextlib.contextmanager
@@ -65,7 +76,9 @@ def found_once(files_read_once):
     find = functools.cache(registry_module.find_holders)
     with pytest.MonkeyPatch.context() as patch, repository():
         patch.setattr(registry_module, "find_holders", lambda kind, name=None: find(kind, name))
-        patch.setattr(configuration, "plugin_packages", functools.cache(configuration.plugin_packages))
+        patch.setattr(
+            configuration, "plugin_packages", functools.cache(configuration.plugin_packages)
+        )
         yield
 
 
@@ -78,7 +91,9 @@ def compositions(kind, name):
     """Configurations that may choose the component, each with its task, the plainest first."""
     for task in DATA:
         chosen = [f"{kind}={name}"] if kind == "data" else [f"data={DATA[task]}", f"{kind}={name}"]
-        for more in {"data": [()], "model": [PLAIN, ()]}.get(kind, [PLAIN, MIRRORED] if kind in PARTS else [PLAIN]):
+        for more in {"data": [()], "model": [PLAIN, ()]}.get(
+            kind, [PLAIN, MIRRORED] if kind in PARTS else [PLAIN]
+        ):
             try:
                 with initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
                     config = compose("config", [*chosen, *GIVEN.get(name, []), *more])
@@ -101,7 +116,10 @@ def build(kind, task, config):
     """Builds the components of a run up to that kind; returns their result, to be finite."""
     links = links_of(task)
     if kind == "data":  # not read: tests/data has what readers make of numbers
-        name, given = config["data"]["name"], {key: value for key, value in config["data"].items() if key != "name"}
+        name, given = (
+            config["data"]["name"],
+            {key: value for key, value in config["data"].items() if key != "name"},
+        )
         reader = functools.wraps(registry("data").get(name))(lambda **_: torch.zeros(()))
         return registry_module.call(f"data {name!r}", reader, given)
     if kind == "split":
@@ -113,7 +131,9 @@ def build(kind, task, config):
         return loss(some.labels * 0.5, some)[0]
     if kind in ("training", "density"):
         model = untrained(task, repr(config["model"]))
-        module = registry("training").build(config["training"], model=model, loss=loss, identity={}, seed=0)
+        module = registry("training").build(
+            config["training"], model=model, loss=loss, identity={}, seed=0
+        )
         module.trainer = SimpleNamespace(max_steps=1, callbacks=[])
         module.configure_optimizers()
         if module.density is not None:
@@ -181,7 +201,9 @@ def test_unsuitable_values_are_refused_by_name(kind, name):
                 if kind == "data" and value == []:  # of carriers, which tests/data has
                     continue
                 is_edge = isinstance(own, int | float) and type(value) in (int, float)
-                if not given.isfinite().all() or not (is_edge or value is None or value in SUITS[type(own)]):
+                if not given.isfinite().all() or not (
+                    is_edge or value is None or value in SUITS[type(own)]
+                ):
                     wrong.append((key, value, given))
     assert not wrong, "\n".join(map(str, wrong))
 

@@ -46,11 +46,21 @@ def test_a_model_chooses_what_suits_it_for_every_task(configure, task):
     assert model["projection"] is model["rasterizer"] is None
     assert (model["gaussians"], model["trend"]) == (None, TRENDS[task])
     steps = 2000 if task == "csi" else 900
-    assert (config["kriging"], config["threads"], config["trainer"]["max_steps"]) == (True, 1, steps)
+    assert (config["kriging"], config["threads"], config["trainer"]["max_steps"]) == (
+        True,
+        1,
+        steps,
+    )
 
 
 def test_the_command_line_wins_over_a_model_and_a_model_over_the_task(configure):
-    chosen = ("pooling=softmax_attention", "gaussians=lattice", "gaussians.count=7", "kriging=false", "threads=2")
+    chosen = (
+        "pooling=softmax_attention",
+        "gaussians=lattice",
+        "gaussians.count=7",
+        "kriging=false",
+        "threads=2",
+    )
     config = configure("model=mirrored", "data=synthetic_rssi", *chosen, "trainer.max_steps=5")
     assert config["pooling"] == configure("data=synthetic_rssi")["pooling"]
     assert config["model"]["gaussians"]["count"] == 7
@@ -70,16 +80,25 @@ def test_an_experiment_wins_over_a_model_and_a_variant_leaves_its_deformation(co
 
 @pytest.mark.parametrize(("task", "width"), [("spectrum", 128), ("rssi", 32), ("csi", 64)])
 def test_the_task_says_how_wide_the_network_is_and_the_command_line_wins(configure, task, width):
-    for words, expected in ((), width), (("deformation=two_branch",), 64), (("deformation.width=5",), 5):
+    for words, expected in (
+        ((), width),
+        (("deformation=two_branch",), 64),
+        (("deformation.width=5",), 5),
+    ):
         assert configure(f"data={DATA[task]}", *words)["model"]["deformation"]["width"] == expected
 
 
 @pytest.mark.parametrize(("task", "width"), [("spectrum", 64), ("rssi", 32), ("csi", 64)])
 def test_variants_of_the_paper_are_as_wide_as_they_were_measured(configure, task, width):
-    for words in ("+variant=no_scale", "+experiment=claims"), ("+experiment=claims", "+variant=no_scale"):
+    for words in (
+        ("+variant=no_scale", "+experiment=claims"),
+        ("+experiment=claims", "+variant=no_scale"),
+    ):
         deformation = configure(f"data={DATA[task]}", *words)["deformation"]
         assert (deformation["width"], len(deformation["heads"])) == (width, 4)
-    assert configure(f"data={DATA[task]}", "+variant=static", "+experiment=claims")["deformation"] == {"name": "none"}
+    assert configure(f"data={DATA[task]}", "+variant=static", "+experiment=claims")[
+        "deformation"
+    ] == {"name": "none"}
 
 
 # --- all systems ---
@@ -89,13 +108,19 @@ def test_variants_of_the_paper_are_as_wide_as_they_were_measured(configure, task
 @pytest.mark.parametrize("model", ["gaigs", "mirrored", "knn"])
 def test_systems_have_one_budget_with_every_model(configure, task, model):
     config = configure(f"+experiment=systems_{task}", f"model={model}")
-    assert (config["task"]["name"], config["model"]["name"], config["data"]["name"]) == (task, model, DATA[task])
+    assert (config["task"]["name"], config["model"]["name"], config["data"]["name"]) == (
+        task,
+        model,
+        DATA[task],
+    )
     budget = {"max_time": "00:00:03:00", "val_check_interval": "00:00:00:15"}
     assert config["trainer"] == configure("trainer.max_steps=-1")["trainer"] | budget
 
 
 @pytest.mark.parametrize("task", DATA)
-def test_systems_are_swept_over_as_far_as_they_are_installed(configure, task, monkeypatch, tmp_path):
+def test_systems_are_swept_over_as_far_as_they_are_installed(
+    configure, task, monkeypatch, tmp_path
+):
     monkeypatch.chdir(tmp_path)  # where no plug-in is
     settings = configure(f"+experiment=systems_{task}", with_hydra=True).hydra
     listed = OmegaConf.to_container(settings.sweeper.params)["model"]
@@ -111,7 +136,8 @@ def test_systems_are_swept_over_as_far_as_they_are_installed(configure, task, mo
 def test_the_packages_of_published_systems_are_those_of_the_plugins():
     known = OmegaConf.load(conf_dir() / "published.yaml").packages
     projects = [
-        tomllib.loads(file.read_text())["project"] for file in Path(__file__).parents[1].glob("plugins/*/*.toml")
+        tomllib.loads(file.read_text())["project"]
+        for file in Path(__file__).parents[1].glob("plugins/*/*.toml")
     ]
     held = {name: p["name"] for p in projects for name in p["entry-points"].get("gaigs.model", {})}
     assert known == held
@@ -125,12 +151,16 @@ def test_a_choice_by_task_exists_or_is_replaced():
 def test_models_that_are_not_installed_are_left_out_with_a_warning(caplog):
     with caplog.at_level(logging.WARNING):
         assert installed("knn", "yagi", "gaigs", "loop") == "knn,gaigs"
-    assert [record.getMessage() for record in caplog.records] == ["left out, as not installed: model=yagi,loop"]
+    assert [record.getMessage() for record in caplog.records] == [
+        "left out, as not installed: model=yagi,loop"
+    ]
 
 
 def test_two_jobs_run_at_a_time_if_joblib_is_installed(configure, monkeypatch):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs gaigs[parallel]")
-    settings = lambda *more: configure.__wrapped__("+experiment=systems_rssi", *more, with_hydra=True).hydra.launcher
+    settings = lambda *more: (
+        configure.__wrapped__("+experiment=systems_rssi", *more, with_hydra=True).hydra.launcher
+    )
     assert settings()["n_jobs"] == 2
     assert settings()["_target_"].endswith("JoblibLauncher")
 
@@ -146,8 +176,16 @@ def test_two_jobs_run_at_a_time_if_joblib_is_installed(configure, monkeypatch):
     ("there", "here", "expected"),
     [
         ({"a": {"b": 1, "c": 2}}, {"a": {"b": 3, "c": 2}, "d": 4}, {"a.b": (1, 3), "d": (None, 4)}),
-        ({"part": {"name": "x", "k": 1}}, {"part": {"name": "y", "l": 1}}, {"part.name": ("x", "y")}),
-        ({"threads": 1, "trainer": {"enable_progress_bar": True}}, {"threads": 2, "trainer": {}}, {}),
+        (
+            {"part": {"name": "x", "k": 1}},
+            {"part": {"name": "y", "l": 1}},
+            {"part.name": ("x", "y")},
+        ),
+        (
+            {"threads": 1, "trainer": {"enable_progress_bar": True}},
+            {"threads": 2, "trainer": {}},
+            {},
+        ),
     ],
 )
 def test_differences_name_the_part_and_leave_out_harmless_keys(there, here, expected):

@@ -36,7 +36,9 @@ from gaigs.testing import (
 
 DEVICES = [
     "cpu",
-    pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")),
+    pytest.param(
+        "cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+    ),
 ]
 SMALL = {
     "synthetic": ["data.transmitters=12", "data.order=1"],
@@ -72,7 +74,11 @@ CARRIER = 5e9
 def built_in(kind):
     """The names of a kind that do not come from plug-ins."""
     folder = Path(gaigs.__file__).parent / kind
-    return [name for name in registry(kind).names() if (folder / f"{name}.py").exists() or (folder / name).is_dir()]
+    return [
+        name
+        for name in registry(kind).names()
+        if (folder / f"{name}.py").exists() or (folder / name).is_dir()
+    ]
 
 
 every = lambda kind: pytest.mark.parametrize("name", built_in(kind))
@@ -88,7 +94,9 @@ composed = functools.cache(gaigs.compose)
 
 
 def configured(kind, name, *overrides):
-    """The configuration of a name: that of the command line, or for built-in parts the name with overrides alone."""
+    """The configuration of a name: that of the command line, or for built-in parts the name with
+    overrides alone.
+    """
     overrides = [*SMALL.get(name, []), *overrides]
     if kind in ("model", "training") or name not in built_in(kind):
         return composed(f"{kind}={name}", *overrides)[kind]
@@ -104,12 +112,19 @@ def scenes():
 
 def on_its_tasks(kind):
     """Parametrises over the names of a kind, each with the tasks that it is made for."""
-    pairs = [(name, task) for name in built_in(kind) for task in MADE_FOR[kind].get(name, SIMULATED)]
+    pairs = [
+        (name, task) for name in built_in(kind) for task in MADE_FOR[kind].get(name, SIMULATED)
+    ]
     return pytest.mark.parametrize(("name", "task"), pairs)
 
 
 def unsuitable(kind):
-    return [(name, task) for name, tasks in MADE_FOR[kind].items() for task in SIMULATED if task not in tasks]
+    return [
+        (name, task)
+        for name, tasks in MADE_FOR[kind].items()
+        for task in SIMULATED
+        if task not in tasks
+    ]
 
 
 # --- tasks, data and splits ---
@@ -147,9 +162,15 @@ def write_rssi_table(root):
 
 def write_channels(root):
     random = np.random.default_rng(0)
-    arrays = {"tx": random.random((20, 3)), "rx": np.array([[0.0, 0, 2], [5, 1, 2]]), "rx_index": np.arange(20) % 2}
+    arrays = {
+        "tx": random.random((20, 3)),
+        "rx": np.array([[0.0, 0, 2], [5, 1, 2]]),
+        "rx_index": np.arange(20) % 2,
+    }
     arrays |= {"frequencies": 2.4e9 + 1e6 * np.arange(3), "elements": 0.06 * np.eye(3)[:2]}
-    arrays["h"] = (random.standard_normal((20, 2, 3)) + 1j * random.standard_normal((20, 2, 3))).astype(np.complex64)
+    arrays["h"] = (
+        random.standard_normal((20, 2, 3)) + 1j * random.standard_normal((20, 2, 3))
+    ).astype(np.complex64)
     np.savez(root / "room.npz", **arrays)
     return [f"data.file={root / 'room.npz'}"]
 
@@ -163,7 +184,12 @@ def write_wide_table(root):
 def write_scenario(root):
     users = np.random.default_rng(0).uniform((1, -5, 0.5), (9, 5, 2), (20, 3))
     bounces = np.full((20, 1, 0, 3), np.nan)
-    deepmimo.write(root, 3.5e9, users, [(np.zeros(3), 1j / np.linalg.norm(users, axis=1, keepdims=True), bounces)])
+    deepmimo.write(
+        root,
+        3.5e9,
+        users,
+        [(np.zeros(3), 1j / np.linalg.norm(users, axis=1, keepdims=True), bounces)],
+    )
     return [f"data.root={root}"]
 
 
@@ -208,7 +234,9 @@ def test_split(name, task):
 @on_every_device
 def test_placement(name, device):
     for scene in scenes():
-        placement = registry("placement").build(configured("placement", name), scene=scene, channels=2)
+        placement = registry("placement").build(
+            configured("placement", name), scene=scene, channels=2
+        )
         check_placement(placement, scene, device)
 
 
@@ -216,7 +244,9 @@ def test_placement(name, device):
 @on_every_device
 def test_tokenizer(name, device):
     for scene in scenes():
-        check_tokenizer(registry("tokenizer").build(configured("tokenizer", name), scene=scene), scene, device)
+        check_tokenizer(
+            registry("tokenizer").build(configured("tokenizer", name), scene=scene), scene, device
+        )
 
 
 @every("deformation")
@@ -229,14 +259,20 @@ def test_deformation(name, device):
 @on_every_device
 def test_deformation_with_all_heads(device):
     heads = "[rotation,scale,signal,opacity,attenuation]"
-    config = configured("deformation", "two_branch", f"deformation.heads={heads}", "deformation.width=8")
-    check_deformation(functools.partial(registry("deformation").build, config), example_links().scene, device)
+    config = configured(
+        "deformation", "two_branch", f"deformation.heads={heads}", "deformation.width=8"
+    )
+    check_deformation(
+        functools.partial(registry("deformation").build, config), example_links().scene, device
+    )
 
 
 @every("projection")
 @on_every_device
 def test_projection(name, device):
-    check_projection(registry("projection").build(configured("projection", name), pixel=math.radians(1)), device)
+    check_projection(
+        registry("projection").build(configured("projection", name), pixel=math.radians(1)), device
+    )
 
 
 @every("rasterizer")
@@ -293,7 +329,9 @@ def test_training(device):
     options = configured("model", "gaigs", f"data={SIMULATED['spectrum']}")
     options = {key: value for key, value in options.items() if key != "name"}
     build = functools.partial(registry("training").build, configured("training", "descent"))
-    check_training(build, lambda scene: GaussianSplatting(scene, **options), example_links(), device)
+    check_training(
+        build, lambda scene: GaussianSplatting(scene, **options), example_links(), device
+    )
 
 
 @pytest.mark.parametrize(

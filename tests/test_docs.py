@@ -31,7 +31,12 @@ from gaigs.registry import find_holders, registry
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(
-    [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/results/*.md"), *ROOT.glob("plugins/*/*.md")]
+    [
+        *ROOT.glob("*.md"),
+        *ROOT.glob("docs/*.md"),
+        *ROOT.glob("docs/results/*.md"),
+        *ROOT.glob("plugins/*/*.md"),
+    ]
 )
 OURS = tuple(f"{folder}/" for folder in ("gaigs", "conf", "plugins", "tests", "docs", "benchmarks"))
 FILES = {".csv", ".json", ".png", ".ply", ".log"}
@@ -42,7 +47,11 @@ BRIEF = [
     "trainer.max_steps=2", "trainer.val_check_interval=2", "trainer.accelerator=cpu", "gaussians.count=20",
     "trainer.enable_progress_bar=false", "split.validation=0.2",
 ]  # fmt: skip
-FEW = {"+experiment=delay_spread": ["data.places=20"], "+experiment=arrival": ["data.places=20"], "data=office": []}
+FEW = {
+    "+experiment=delay_spread": ["data.places=20"],
+    "+experiment=arrival": ["data.places=20"],
+    "data=office": [],
+}
 """Little data, of an experiment that brings its own."""
 
 
@@ -59,8 +68,12 @@ def commands(page):
 
 
 def spoken(page):
-    """What stands in backticks in the running text, and in it what looks like a place, a key or a name."""
-    return re.findall(r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S))
+    """What stands in backticks in the running text, and in it what looks like a place, a key or a
+    name.
+    """
+    return re.findall(
+        r"`([^`\n]+)`", re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.M | re.S)
+    )
 
 
 def overrides(command):
@@ -72,7 +85,9 @@ def overrides(command):
 
 
 def written_files(page):
-    """The blocks that begin with a comment that is a path, by this path; before it may stand what Hydra reads."""
+    """The blocks that begin with a comment that is a path, by this path; before it may stand what
+    Hydra reads.
+    """
     texts = [block for language in ("python", "yaml", "toml") for block in blocks(page, language)]
     named = {re.match(r"(?:# @package \S+\n)?# (\S+/\S+)\n", text): text for text in texts}
     return {match[1]: text for match, text in named.items() if match}
@@ -87,15 +102,23 @@ def composable(words):
             try:
                 metadata.version(f"hydra-{name.partition('_')[0]}-launcher")
             except metadata.PackageNotFoundError:
-                return [word for word in words if not word.startswith(("hydra/launcher", "hydra.launcher."))]
+                return [
+                    word
+                    for word in words
+                    if not word.startswith(("hydra/launcher", "hydra.launcher."))
+                ]
     return words
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory):
-    """A folder that holds what docs/plugins.md tells to write, beside the plug-ins of this repository."""
+    """A folder that holds what docs/plugins.md tells to write, beside the plug-ins of this
+    repository.
+    """
     folder = tmp_path_factory.mktemp("place")
-    shutil.copytree(ROOT / "plugins", folder / "plugins", ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copytree(
+        ROOT / "plugins", folder / "plugins", ignore=shutil.ignore_patterns("__pycache__")
+    )
     files = written_files(PLUGINS)
     package = folder / "gaigs-plane-waves/gaigs_plane_waves"
     files[package / "__init__.py"] = files["plugins/plane_waves.py"]
@@ -114,7 +137,10 @@ def composed(place, files_read_once):
 
     @functools.cache
     def composed(*words):
-        with contextlib.chdir(place), initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"):
+        with (
+            contextlib.chdir(place),
+            initialize_config_dir(str(configuration.conf_dir()), version_base="1.3"),
+        ):
             return OmegaConf.to_container(compose("config", list(words), return_hydra_config=True))
 
     return composed
@@ -122,7 +148,9 @@ def composed(place, files_read_once):
 
 page_by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 of_today = pytest.mark.parametrize(
-    "page", [page for page in PAGES if page.name != "renames.md"], ids=lambda page: str(page.relative_to(ROOT))
+    "page",
+    [page for page in PAGES if page.name != "renames.md"],
+    ids=lambda page: str(page.relative_to(ROOT)),
 )
 
 
@@ -138,8 +166,12 @@ def test_files_and_links_exist(page, place):
 @page_by_page
 def test_anchors_exist(page):
     for target, anchor in re.findall(r"\]\(([^)#]*)#([^)]+)\)", page.read_text()):
-        headings = re.findall(r"^#+ (.+)$", (page.parent / target if target else page).read_text(), re.M)
-        assert anchor in [re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings]
+        headings = re.findall(
+            r"^#+ (.+)$", (page.parent / target if target else page).read_text(), re.M
+        )
+        assert anchor in [
+            re.sub(r"[^\w -]", "", heading).lower().replace(" ", "-") for heading in headings
+        ]
 
 
 @of_today
@@ -179,12 +211,18 @@ def composable_lines(page):
 def chosen(line):
     """The words that choose parts, in their order; the others set values, in whatever order."""
     values = configuration.KEYS.keys() - configuration.CHOSEN
-    return tuple(word for word in line if re.match(r"~|[+]*[\w/@]+=", word) and word.partition("=")[0] not in values)
+    return tuple(
+        word
+        for word in line
+        if re.match(r"~|[+]*[\w/@]+=", word) and word.partition("=")[0] not in values
+    )
 
 
 @functools.cache
 def together():
-    """All words of all pages that stand beside the same choices, each key once: they compose in one go."""
+    """All words of all pages that stand beside the same choices, each key once: they compose in one
+    go.
+    """
     found = {}
     for line in (line for page in PAGES for line in composable_lines(page)):
         found.setdefault(chosen(line), {}).update((word.partition("=")[0], word) for word in line)
@@ -199,12 +237,21 @@ def test_commands_compose(page, composed):
 
 @pytest.mark.parametrize("command", ["gaigs +experiment", "pytest"])
 def test_each_block_of_the_readme_installs_the_processors_torch_first(command):
-    """Each is complete alone; torch of PyPI would bring CUDA packages, unless the CPU build is there already."""
-    (block,) = [block for block in blocks(ROOT / "README.md") if "-m venv" in block and f".venv/bin/{command}" in block]
+    """Each is complete alone; torch of PyPI would bring CUDA packages, unless the CPU build is
+    there already.
+    """
+    (block,) = [
+        block
+        for block in blocks(ROOT / "README.md")
+        if "-m venv" in block and f".venv/bin/{command}" in block
+    ]
     first, torch_line, install, *_ = block.splitlines()
     assert first == "python3 -m venv .venv"
     assert "--no-deps torch --extra-index-url https://download.pytorch.org/whl/cpu" in torch_line
-    assert all(line.startswith(".venv/bin/pip install -c constraints.txt ") for line in (torch_line, install))
+    assert all(
+        line.startswith(".venv/bin/pip install -c constraints.txt ")
+        for line in (torch_line, install)
+    )
 
 
 @of_today
@@ -213,7 +260,10 @@ def test_configuration_keys_exist(page, composed, place):
         match = re.fullmatch(r"\+?(?P<top>[a-z_]+)(\.[a-z_]+)*(=\S+)?", word)
         if match is None or not set(".=") & set(word) or Path(word).suffix in FILES:
             continue
-        if match["top"] not in composed() and not (configuration.conf_dir() / match["top"]).is_dir():
+        if (
+            match["top"] not in composed()
+            and not (configuration.conf_dir() / match["top"]).is_dir()
+        ):
             continue
         key, _, value = word.removeprefix("+").partition("=")
         top, *rest = key.split(".")
@@ -222,7 +272,9 @@ def test_configuration_keys_exist(page, composed, place):
             assert value.strip('"') in options, word
         elif not _has(composed(), key):
             # A key that only some option of its group has, such as data.root, exists too.
-            names = sorted(options, key=lambda name: rest[0] not in options[name])  # likely ones first
+            names = sorted(
+                options, key=lambda name: rest[0] not in options[name]
+            )  # likely ones first
             if not any(_has(composed(f"{top}={name}"), key) for name in names):
                 assert "=" in word, word
                 composed(word)  # of a section to which any key may be added
@@ -233,9 +285,17 @@ def options_of(top, place):
     """Names of the files and components of a group, and their keys."""
     with contextlib.chdir(place):
         folders = [configuration.conf_dir(), *configuration.plugin_conf_dirs()]
-        options = {file.stem: OmegaConf.load(file) for folder in folders for file in folder.glob(f"{top}/*.yaml")}
+        options = {
+            file.stem: OmegaConf.load(file)
+            for folder in folders
+            for file in folder.glob(f"{top}/*.yaml")
+        }
         if top in configuration.CONSTRUCTED:
-            options |= {name: registry(top).options(name) for name in registry(top).names() if name not in options}
+            options |= {
+                name: registry(top).options(name)
+                for name in registry(top).names()
+                if name not in options
+            }
     return options
 
 
@@ -249,7 +309,9 @@ def _has(config, key):
 
 def choices(kind):
     """Names of our own components and presets of a kind."""
-    built_in = (holder.name for holder in find_holders(kind)[0] if holder.file and holder.root is None)
+    built_in = (
+        holder.name for holder in find_holders(kind)[0] if holder.file and holder.root is None
+    )
     return {*built_in, *(file.stem for file in configuration.conf_dir().glob(f"{kind}/*.yaml"))}
 
 
@@ -283,7 +345,9 @@ SETS = {
         "channels, NMSE": ("built-in-csi", "NMSE [dB]"),
     },
 }
-"""Columns of pages, by their heads, with the folder of docs/results that is their source, and the score."""
+"""Columns of pages, by their heads, with the folder of docs/results that is their source, and the
+score.
+"""
 
 SECTIONS = {
     "Measured spectra, 200 samples": "rfid-s23-200",
@@ -297,7 +361,9 @@ SECTIONS = {
 def tables(text):
     """Tables of a text in Markdown, each as lists of cells, without the line below the head."""
     for block in re.findall(r"(?:^\|.*\n)+", text, re.M):
-        rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()]
+        rows = [
+            [cell.strip() for cell in line.strip("|").split("|")] for line in block.splitlines()
+        ]
         yield [rows[0], *rows[2:]]
 
 
@@ -311,12 +377,19 @@ def source(folder):
 def require_score(printed, folder, system, title):
     number = printed.strip("*")
     digits = len(number.partition(".")[2])
-    assert round(float(source(folder)[system][title]), digits) == float(number), (folder, system, title)
+    assert round(float(source(folder)[system][title]), digits) == float(number), (
+        folder,
+        system,
+        title,
+    )
 
 
 @pytest.mark.parametrize("page", SETS)
 def test_pages_have_the_scores_of_their_source(page):
-    columns, names = SETS[page], {"nearest neighbours": "knn", "Gaussian process": "gaussian_process"}
+    columns, names = (
+        SETS[page],
+        {"nearest neighbours": "knn", "Gaussian process": "gaussian_process"},
+    )
     (table,) = [rows for rows in tables((ROOT / page).read_text()) if columns.keys() <= {*rows[0]}]
     count = 0
     for name, *cells in table[1:]:
@@ -332,10 +405,22 @@ def test_the_page_of_results_has_the_scores_of_their_source():
     text = (ROOT / "docs/results.md").read_text()
     first, *sections = re.split(r"^##+ ", text, flags=re.M)
     rows = {
-        "200 measured spectra, published split": ("rfid-s23-200", ["median SSIM"], ["knn", "gaussian_process"]),
+        "200 measured spectra, published split": (
+            "rfid-s23-200",
+            ["median SSIM"],
+            ["knn", "gaussian_process"],
+        ),
         "built-in room, spectra": ("built-in", ["median SSIM"], ["gaussian_process"]),
-        "flat with six Bluetooth gateways, another run as test": ("ble-flat", ["MAE [dB]"], ["gaussian_process"]),
-        "built-in room, complex channels": ("built-in-csi", ["median SNR [dB]", "NMSE [dB]"], ["friis"]),
+        "flat with six Bluetooth gateways, another run as test": (
+            "ble-flat",
+            ["MAE [dB]"],
+            ["gaussian_process"],
+        ),
+        "built-in room, complex channels": (
+            "built-in-csi",
+            ["median SNR [dB]", "NMSE [dB]"],
+            ["friis"],
+        ),
     }
     (table,) = [table for table in tables(first) if "best baseline" in table[0]]
     cells = {row[0]: row for row in table}
@@ -359,11 +444,15 @@ def test_the_page_of_results_has_the_scores_of_their_source():
 
 
 @pytest.mark.parametrize(
-    "page", [*PAGES, *sorted(ROOT.glob("docs/results/*/*.md"))], ids=lambda page: str(page.relative_to(ROOT))
+    "page",
+    [*PAGES, *sorted(ROOT.glob("docs/results/*/*.md"))],
+    ids=lambda page: str(page.relative_to(ROOT)),
 )
 def test_all_that_equal_the_best_of_a_column_are_bold(page):
     for head, *rows in tables(page.read_text()):
-        for title, *cells in zip(*(row for row in (head, *rows) if len(row) == len(head)), strict=True):
+        for title, *cells in zip(
+            *(row for row in (head, *rows) if len(row) == len(head)), strict=True
+        ):
             best = {cell.strip("*") for cell in cells if re.fullmatch(r"\*\*[-\d.,]+\*\*", cell)}
             assert not best & {*cells}, (head[0], title)
 
@@ -383,7 +472,9 @@ def test_the_reference_has_every_public_name():
 
 
 def test_the_documented_file_of_channels_is_read(tmp_path):
-    (code,) = [block for block in blocks(ROOT / "docs/data.md", "python") if 'np.savez("room.npz"' in block]
+    (code,) = [
+        block for block in blocks(ROOT / "docs/data.md", "python") if 'np.savez("room.npz"' in block
+    ]
     with contextlib.chdir(tmp_path):
         exec(code, {})
         links = load({"name": "csi_npz", "file": "room.npz"}, {"name": "random"})
@@ -407,7 +498,9 @@ for number, words in enumerate(runs):
     folders = [Path("runs/room"), *(Path(f"runs/{number}") for number in range(1, len(found)))]
     runs = []
     for words, folder in zip(found, folders, strict=True):
-        few = [FEW[word] for word in words if word in FEW] or [["data.transmitters=10", "data.order=0"]]
+        few = [FEW[word] for word in words if word in FEW] or [
+            ["data.transmitters=10", "data.order=0"]
+        ]
         runs.append([*words, *BRIEF, *few[0], f"hydra.run.dir={folder}"])
     _python(place, "-c", script, json.dumps(runs))
     return [place / folder for folder in folders]
@@ -428,7 +521,9 @@ def test_the_plug_ins_train_by_their_commands(runs):
         assert [*metrics["models"]][:3] == [model, "mean", "knn"]
         assert metrics["task"] == task
         checkpoint = torch.load(folder / "best.ckpt", weights_only=True)
-        assert checkpoint["global_step"] in (0, 2), "where a trend alone was best, the start is kept"
+        assert checkpoint["global_step"] in (0, 2), (
+            "where a trend alone was best, the start is kept"
+        )
         assert f"model.{weights}" in checkpoint["state_dict"]
     assert metrics["split"].startswith("layers 0.2 m, test 0.2, validation 0.2")
 
@@ -445,15 +540,22 @@ def test_a_plug_ins_task_has_its_own_scores_and_figures(runs):
     assert {path.stem for path in (runs[2] / "figures").glob("*.png")} >= {"room", "angle_cdf"}
 
 
-def test_the_readme_predicts_and_the_plug_ins_keep_their_contracts_as_the_page_checks_them(place, runs):
+def test_the_readme_predicts_and_the_plug_ins_keep_their_contracts_as_the_page_checks_them(
+    place, runs
+):
     (predict,) = [block for block in blocks(ROOT / "README.md", "python") if "runs/room" in block]
     (check,) = [block for block in blocks(PLUGINS, "python") if "from gaigs.testing" in block]
-    assert _python(place, "-c", f"{predict}\nprint([*spectra.shape])\n{check}").strip() == "[2, 90, 360]"
+    assert (
+        _python(place, "-c", f"{predict}\nprint([*spectra.shape])\n{check}").strip()
+        == "[2, 90, 360]"
+    )
 
 
 def test_the_packages_are_found_once_installed(place, tmp_path):
     for project in ("gaigs-plane-waves", "plugins/array_response"):
-        (wheel,) = WheelBuilder(str(place / project)).build(directory=str(tmp_path / "wheels"), versions=["standard"])
+        (wheel,) = WheelBuilder(str(place / project)).build(
+            directory=str(tmp_path / "wheels"), versions=["standard"]
+        )
         with ZipFile(wheel) as archive:
             archive.extractall(tmp_path / "site")  # what pip does with a wheel
     (tmp_path / "elsewhere").mkdir()

@@ -81,12 +81,19 @@ def test_a_run_prints_what_it_does_and_nothing_else(uninterrupted):
     assert err == ""
     lines = out.splitlines()
     assert (folder / "gaigs.log").read_text().splitlines() == [*lines[:3], *lines[4:6]]
-    assert lines[0] == "data: synthetic; split official, validation 0.1, seed 0: 22 train, 2 validation, 6 test"
-    assert re.match(r"data: training transmitters within \d\.\d\d x \d\.\d\d x \d\.\d\d m$", lines[1])
+    assert (
+        lines[0]
+        == "data: synthetic; split official, validation 0.1, seed 0: 22 train, 2 validation, 6 test"
+    )
+    assert re.match(
+        r"data: training transmitters within \d\.\d\d x \d\.\d\d x \d\.\d\d m$", lines[1]
+    )
     assert lines[2].startswith(
         "model: gaigs, placement free, tokenizer euclidean, deformation two_branch, projection mercator"
     )
-    assert re.match(r"training .* 40/40 [\d.]+ steps/s 0:00:00 loss \d\.\d{3} ssim \d\.\d{3}$", lines[3])
+    assert re.match(
+        r"training .* 40/40 [\d.]+ steps/s 0:00:00 loss \d\.\d{3} ssim \d\.\d{3}$", lines[3]
+    )
     assert re.match(r"trained 40 steps of 7 places in \d+ s: [\d.]+ steps/s$", lines[4])
     assert lines[5] == "gaigs has no intervals: 2 links calibrate them, and 9 are needed"
     assert "Test scores" in lines[6]
@@ -115,13 +122,17 @@ def test_a_killed_run_ends_as_if_it_had_not_been(uninterrupted, run, tmp_path):
     assert run(*SMALL, "+experiment=spectrum", "hydra.run.dir=run") == (0, "")
     assert int(re.search(r"going on after step (\d+)", run.out)[1]) >= 6
     folder = uninterrupted[0]
-    metrics, others = (json.loads((path / "metrics.json").read_text()) for path in (folder, tmp_path / "run"))
+    metrics, others = (
+        json.loads((path / "metrics.json").read_text()) for path in (folder, tmp_path / "run")
+    )
     assert metrics["models"] == others["models"]
     for name in ("best.ckpt", "last.ckpt"):
         a, b = (torch.load(path / name, weights_only=True) for path in (folder, tmp_path / "run"))
         assert a["global_step"] == b["global_step"]
         assert list(a["state_dict"]) == list(b["state_dict"])
-        assert all(torch.equal(a["state_dict"][key], b["state_dict"][key]) for key in a["state_dict"])
+        assert all(
+            torch.equal(a["state_dict"][key], b["state_dict"][key]) for key in a["state_dict"]
+        )
 
 
 # --- within this process, as a start takes seconds ---
@@ -193,7 +204,9 @@ def test_a_wrong_word_gives_one_message(overrides, message, run):
         pytest.skip("there is a GPU")
     small = () if "data=" in overrides else SMALL
     words = overrides.split()
-    code, err = run(*(["-m"] if "-m" in words else []), *small, *HERE, *(word for word in words if word != "-m"))
+    code, err = run(
+        *(["-m"] if "-m" in words else []), *small, *HERE, *(word for word in words if word != "-m")
+    )
     assert code == 1
     assert message in err
     assert "Traceback" not in err
@@ -207,9 +220,18 @@ def test_a_wrong_word_gives_one_message(overrides, message, run):
 @pytest.mark.parametrize(
     ("words", "near"),
     [
-        (("--epochs", "10"), "there is no flag --epochs; options have no dashes, such as trainer.max_steps=..."),
-        (("--batch-size=8",), "there is no flag --batch-size; options have no dashes, such as training.batch_size=..."),
-        (("seed=1", "--model", "knn"), "there is no flag --model; options have no dashes, such as model=..."),
+        (
+            ("--epochs", "10"),
+            "there is no flag --epochs; options have no dashes, such as trainer.max_steps=...",
+        ),
+        (
+            ("--batch-size=8",),
+            "there is no flag --batch-size; options have no dashes, such as training.batch_size=...",
+        ),
+        (
+            ("seed=1", "--model", "knn"),
+            "there is no flag --model; options have no dashes, such as model=...",
+        ),
     ],
 )
 def test_a_flag_names_the_option_that_it_means(words, near, run):
@@ -219,7 +241,10 @@ def test_a_flag_names_the_option_that_it_means(words, near, run):
 UNREADABLE = {
     "a list without its end": (b"name: [odd\n", "odd.yaml: while parsing"),
     "a key twice": (b"name: odd\nname: odd\n", "odd.yaml: while constructing"),
-    "code": (b"name: !!python/object/apply:os.system ['true']\n", "odd.yaml: could not determine a constructor"),
+    "code": (
+        b"name: !!python/object/apply:os.system ['true']\n",
+        "odd.yaml: could not determine a constructor",
+    ),
     "UTF-16": ("name: odd".encode("utf-16"), "odd.yaml: not UTF-8\n"),
     "no list of defaults": (b"defaults: x\n", "files (Invalid defaults list in"),
     "a circle": (b"defaults: [odd]\nname: odd\n", "its files choose each other in a circle"),
@@ -235,7 +260,9 @@ def test_a_configuration_file_that_hydra_cannot_read_is_named(case, run, tmp_pat
     code, err = run(*HERE, "model=odd")
     assert code == 1
     assert message in err
-    assert err.startswith(("gaigs: cannot parse ", "gaigs: Hydra cannot join command line and configuration"))
+    assert err.startswith(
+        ("gaigs: cannot parse ", "gaigs: Hydra cannot join command line and configuration")
+    )
     assert err.count("\n") == 1
 
 
@@ -251,7 +278,10 @@ def devices(monkeypatch):
     """Two OpenCL devices, neither of which is asked for; to be changed."""
     opencl = pytest.importorskip("gaigs.splatting.rasterizer.opencl", exc_type=ImportError)
     kind, platform = opencl.cl.device_type, SimpleNamespace(name="Maker", get_devices=lambda: found)
-    found = [SimpleNamespace(name=name, type=getattr(kind, name), platform=platform) for name in ("GPU", "CPU")]
+    found = [
+        SimpleNamespace(name=name, type=getattr(kind, name), platform=platform)
+        for name in ("GPU", "CPU")
+    ]
     monkeypatch.setattr(opencl.cl, "get_platforms", lambda: [platform])
     monkeypatch.delenv("GAIGS_OPENCL_DEVICE", raising=False)
     return found
@@ -273,7 +303,9 @@ def test_devices_that_are_not_there(run, devices, monkeypatch):
     monkeypatch.setenv("GAIGS_OPENCL_DEVICE", "abacus")
     code, err = run("command=devices", *HERE)
     assert code == 1
-    assert "no OpenCL device is called 'abacus'; there are: Maker: GPU (GPU); Maker: CPU (CPU)" in err
+    assert (
+        "no OpenCL device is called 'abacus'; there are: Maker: GPU (GPU); Maker: CPU (CPU)" in err
+    )
     devices.clear()
     code, err = run("command=devices", *HERE)
     assert code == 1
@@ -300,14 +332,18 @@ def test_output_that_nobody_reads_is_no_error(tmp_path):
     os.close(read)
     environment = os.environ | {"PYTHONPATH": str(Path(gaigs.__path__[0]).parent)}
     command = [sys.executable, "-m", "gaigs", "--help"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, stdout=write, stderr=subprocess.PIPE, text=True)
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment, stdout=write, stderr=subprocess.PIPE, text=True
+    )
     os.close(write)
     assert (done.returncode, done.stderr) == (141, "")
 
 
 def test_ctrl_c_while_packages_are_imported_is_one_line(tmp_path):
     (tmp_path / "hydra.py").write_text("import signal\nsignal.raise_signal(signal.SIGINT)\n")
-    environment = os.environ | {"PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(gaigs.__path__[0]).parent}"}
+    environment = os.environ | {
+        "PYTHONPATH": f"{tmp_path}{os.pathsep}{Path(gaigs.__path__[0]).parent}"
+    }
     command = [sys.executable, "-m", "gaigs"]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "gaigs: stopped\n")
@@ -325,13 +361,18 @@ def test_labels_are_compared(run, tmp_path):
     assert "Traceback" not in err
 
 
-@pytest.mark.parametrize(("stop", "code"), [(KeyboardInterrupt(), 130), (Stopped("stopped", signal.SIGTERM), 143)])
+@pytest.mark.parametrize(
+    ("stop", "code"), [(KeyboardInterrupt(), 130), (Stopped("stopped", signal.SIGTERM), 143)]
+)
 def test_a_command_that_is_stopped_says_so(stop, code, run, monkeypatch):
     def stopped(*_):
         raise stop
 
     monkeypatch.setattr(agreement, "run", stopped)
-    assert run("command=agreement", *HERE) == (code, "gaigs: stopped; the same command starts anew\n")
+    assert run("command=agreement", *HERE) == (
+        code,
+        "gaigs: stopped; the same command starts anew\n",
+    )
 
 
 def test_an_unknown_error_has_a_traceback(run, monkeypatch):
@@ -353,8 +394,14 @@ TORCH = "[enforce fail at alloc_cpu.cpp:124] DefaultCPUAllocator: can't allocate
         (RuntimeError("could not create a primitive"), "out of memory (could not"),
         (SystemError("error return without exception set"), "out of memory (error"),
         (ValueError("no model"), "out of memory (no model)"),
-        (OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), "run could not be written (No space left on device)\ncheck"),
-        (OSError(errno.ENOSPC, "run/best.ckpt could not be written"), "run/best.ckpt could not be written\n"),
+        (
+            OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)),
+            "run could not be written (No space left on device)\ncheck",
+        ),
+        (
+            OSError(errno.ENOSPC, "run/best.ckpt could not be written"),
+            "run/best.ckpt could not be written\n",
+        ),
     ],
     ids=["python", "torch", "oneDNN", "no room for the error", "cause", "disk", "named already"],
 )
@@ -388,7 +435,10 @@ def test_a_run_folder_that_hydra_cannot_make_has_a_short_message(run, tmp_path):
     code, err = run(*SMALL, "hydra.run.dir=taken/run")
     assert code == 1
     assert "Traceback" not in err
-    assert re.match(r"gaigs: .*taken/run could not be read or written \(Not a directory\)\ncheck its folder", err)
+    assert re.match(
+        r"gaigs: .*taken/run could not be read or written \(Not a directory\)\ncheck its folder",
+        err,
+    )
 
 
 def test_ctrl_c_outside_of_the_training(run, monkeypatch):
@@ -398,7 +448,10 @@ def test_ctrl_c_outside_of_the_training(run, monkeypatch):
     monkeypatch.setattr(runs, "train_and_test", press)
     stopped = "gaigs: stopped; the same command with hydra.{} goes on\n"
     assert run(*SMALL, "hydra.run.dir=run") == (130, stopped.format("run.dir=run"))
-    assert run("-m", *SMALL, "hydra.sweep.dir=sweep", "seed=0,1") == (130, stopped.format("sweep.dir=sweep"))
+    assert run("-m", *SMALL, "hydra.sweep.dir=sweep", "seed=0,1") == (
+        130,
+        stopped.format("sweep.dir=sweep"),
+    )
 
 
 def test_a_job_of_a_multirun_trains_in_one_process(run):
@@ -422,7 +475,13 @@ def test_a_multirun_goes_past_a_failure_and_reports(run, tmp_path):
 
 
 def test_systems_are_in_one_table_if_one_fails(run, tmp_path):
-    command = ("-m", "+experiment=systems_spectrum", "data.transmitters=30", "hydra/launcher=basic", *SMALL[-1:])
+    command = (
+        "-m",
+        "+experiment=systems_spectrum",
+        "data.transmitters=30",
+        "hydra/launcher=basic",
+        *SMALL[-1:],
+    )
     code, err = run(*command, "model=knn,friis,mean")
     assert code == 1
     assert "gaigs: model 'friis'" in err
@@ -441,7 +500,11 @@ def test_systems_are_in_one_table_if_one_fails(run, tmp_path):
 
 
 def test_a_training_by_time_ends_and_logs_its_seconds(run, tmp_path):
-    by_time = ("trainer.max_steps=-1", "trainer.max_time=00:00:00:01", "trainer.val_check_interval=00:00:00:01")
+    by_time = (
+        "trainer.max_steps=-1",
+        "trainer.max_time=00:00:00:01",
+        "trainer.val_check_interval=00:00:00:01",
+    )
     assert run(*SMALL, *by_time, "hydra.run.dir=run")[0] == 0
     steps = torch.load(tmp_path / "run" / "last.ckpt", weights_only=True)["global_step"]
     curves = read_curves([tmp_path / "run" / "log" / "version_0" / "metrics.csv"])

@@ -1,4 +1,6 @@
-"""The cells of quick notebooks run, one after another. The workflow runs all of them whole, as CONTRIBUTING.md says."""
+"""The cells of quick notebooks run, one after another. The workflow runs all of them whole, as
+CONTRIBUTING.md says.
+"""
 
 import json
 from pathlib import Path
@@ -30,7 +32,14 @@ def test_cells_run_and_print_as_they_are_stored(name, capsys, monkeypatch):
 @pytest.mark.parametrize("file", sorted(FOLDER.glob("*.ipynb")), ids=lambda file: file.stem)
 def test_outputs_are_stored(file):
     cells = [cell for cell in json.loads(file.read_text())["cells"] if cell["cell_type"] == "code"]
-    assert [cell["execution_count"] for cell in cells] == [*range(1, len(cells) + 1)], "run in order, from the start"
+    assert [cell["execution_count"] for cell in cells] == [*range(1, len(cells) + 1)], (
+        "run in order, from the start"
+    )
     outputs = [output for cell in cells for output in cell["outputs"]]
-    assert any("image/png" in output.get("data", ()) for output in outputs) or file.stem == "own_component"
-    assert not any(output["output_type"] == "error" or output.get("name") == "stderr" for output in outputs)
+    assert (
+        any("image/png" in output.get("data", ()) for output in outputs)
+        or file.stem == "own_component"
+    )
+    assert not any(
+        output["output_type"] == "error" or output.get("name") == "stderr" for output in outputs
+    )

@@ -15,7 +15,9 @@ ROOT = Path(__file__).parents[1]
 
 @pytest.fixture
 def place(tmp_path):
-    """An empty working directory ``run`` with site-packages beside it, and an interpreter that sees both."""
+    """An empty working directory ``run`` with site-packages beside it, and an interpreter that sees
+    both.
+    """
     return Place(tmp_path)
 
 
@@ -32,7 +34,9 @@ class Place:
     def install(self, distribution, package, entry_points, **files):
         """What pip leaves behind: the package and its dist-info."""
         info = f"site/{distribution.replace('-', '_')}-1.2.dist-info"
-        self.write(f"{info}/METADATA", f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.2\n")
+        self.write(
+            f"{info}/METADATA", f"Metadata-Version: 2.1\nName: {distribution}\nVersion: 1.2\n"
+        )
         self.write(f"{info}/entry_points.txt", entry_points)
         for name, text in files.items():
             self.write(f"site/{package}/{name}.py", text)
@@ -41,7 +45,11 @@ class Place:
         """The JSON that a script prints."""
         path = os.pathsep.join((str(self.root / "site"), str(gaigs)))
         done = subprocess.run(
-            [sys.executable, "-c", f"import json, sys\nfrom gaigs.registry import registry\n{script}"],
+            [
+                sys.executable,
+                "-c",
+                f"import json, sys\nfrom gaigs.registry import registry\n{script}",
+            ],
             cwd=self.root / "run",
             env=os.environ | {"PYTHONPATH": path},
             capture_output=True,
@@ -82,7 +90,9 @@ print(json.dumps([config, imported, gain]))
 
 
 def test_configurations_of_plugins_in_the_working_directory_are_found(place):
-    project = '[project]\nname = "loop"\n[project.entry-points."gaigs.model"]\nloop = "loop.model:Loop"\n'
+    project = (
+        '[project]\nname = "loop"\n[project.entry-points."gaigs.model"]\nloop = "loop.model:Loop"\n'
+    )
     place.write("run/plugins/loop/pyproject.toml", project)
     place.write("run/plugins/loop/src/loop/conf/model/packaged.yaml", "name: loop\n")
     place.write("run/plugins/loop/conf/model/beside.yaml", "name: loop\n")
@@ -108,12 +118,20 @@ def error(kind, name):
 def test_packages_that_are_broken_or_rivals_hurt_only_who_asks(place):
     place.install("yagi-antenna", "yagi_antenna", ENTRY, __init__="", pooling=YAGI)
     place.install(
-        "rival", "rival", "[gaigs.pooling]\nhelix = rival:Helix\n[gaigs.data]\nmuseum = rival:Gone\n", __init__=""
+        "rival",
+        "rival",
+        "[gaigs.pooling]\nhelix = rival:Helix\n[gaigs.data]\nmuseum = rival:Gone\n",
+        __init__="",
     )
     place.install(
-        "late", "late", "[gaigs.pooling]\nhelix = late:Helix\n[gaigs.data]\nattic = absent:Attic\n", __init__=""
+        "late",
+        "late",
+        "[gaigs.pooling]\nhelix = late:Helix\n[gaigs.data]\nattic = absent:Attic\n",
+        __init__="",
     )
-    place.write("run/plugins/fan.py", 'import gaigs\n@gaigs.register("pooling", "yagi")\nclass Fan: ...\n')
+    place.write(
+        "run/plugins/fan.py", 'import gaigs\n@gaigs.register("pooling", "yagi")\nclass Fan: ...\n'
+    )
     script = """
 asked = [("pooling", "helix"), ("pooling", "yagi"), ("data", "museum"), ("data", "attic")]
 print(json.dumps([error(*who) for who in asked]))
@@ -123,15 +141,17 @@ print(json.dumps([error(*who) for who in asked]))
     assert "distribution rival 1.2" in helix
     assert "distribution late 1.2" in helix
     assert "'yagi' is held by distribution yagi-antenna 1.2, and plugins/fan.py asks for it" in yagi
-    assert museum.startswith("ImportError: data 'museum' of distribution rival 1.2 cannot be loaded: AttributeError:")
-    assert attic.endswith("distribution late 1.2 cannot be loaded: ModuleNotFoundError: No module named 'absent'")
+    assert museum.startswith(
+        "ImportError: data 'museum' of distribution rival 1.2 cannot be loaded: AttributeError:"
+    )
+    assert attic.endswith(
+        "distribution late 1.2 cannot be loaded: ModuleNotFoundError: No module named 'absent'"
+    )
 
 
 def test_a_package_both_installed_and_in_plugins_is_no_rival_of_itself(place):
     place.install("yagi-antenna", "yagi_antenna", ENTRY, __init__="", pooling=YAGI)
-    project = (
-        '[project]\nname = "yagi_antenna"\n[project.entry-points."gaigs.pooling"]\nyagi = "yagi_antenna.pooling:Yagi"\n'
-    )
+    project = '[project]\nname = "yagi_antenna"\n[project.entry-points."gaigs.pooling"]\nyagi = "yagi_antenna.pooling:Yagi"\n'
     place.write("run/plugins/yagi/pyproject.toml", project)
     place.write("run/plugins/yagi/yagi_antenna/pooling.py", YAGI)
     assert place.python(ERRORS + 'print(json.dumps(error("pooling", "yagi")))') == "Yagi"
@@ -139,7 +159,13 @@ def test_a_package_both_installed_and_in_plugins_is_no_rival_of_itself(place):
 
 def test_a_component_may_carry_decorator_and_entry_point(place):
     decorated = f'from gaigs.registry import register\n\n\n@register("pooling", "yagi")\n{YAGI}'
-    place.install("yagi-antenna", "yagi_antenna", ENTRY, __init__="from .pooling import Yagi", pooling=decorated)
+    place.install(
+        "yagi-antenna",
+        "yagi_antenna",
+        ENTRY,
+        __init__="from .pooling import Yagi",
+        pooling=decorated,
+    )
     assert place.python(ERRORS + 'print(json.dumps(error("pooling", "yagi")))') == "Yagi"
 
 
@@ -155,7 +181,11 @@ def test_the_wheel_holds_the_package_and_its_configuration(place, tmp_path):
         if path.suffix in (".py", ".cl", ".yaml")
     }
     assert shipped == {
-        *(str(path.relative_to(ROOT)) for path in ROOT.glob("gaigs/**/*") if path.suffix in (".py", ".cl")),
+        *(
+            str(path.relative_to(ROOT))
+            for path in ROOT.glob("gaigs/**/*")
+            if path.suffix in (".py", ".cl")
+        ),
         *(f"gaigs/{path.relative_to(ROOT)}" for path in ROOT.glob("conf/**/*.yaml")),
     }
     script = """

@@ -1,4 +1,6 @@
-"""Several processes that train together, signals that stop a run, and the resources that runs share."""
+"""Several processes that train together, signals that stop a run, and the resources that runs
+share.
+"""
 
 import contextlib
 import json
@@ -20,7 +22,8 @@ from gaigs.training.checkpoints import KeepLast
 SMALL = (
     "+experiment=spectrum", "data.transmitters=36", "data.order=1", "training.thinning.stride=8",
     "tokenizer=euclidean", "gaussians.count=24", "deformation.width=8", "rasterizer=torch",
-    "training.batch_size=7",  # 26 places train: batches of 7, 7, 7 and 5, halves of 4 and 3 or of 3 and 2
+    # 26 places train: batches of 7, 7, 7 and 5, halves of 4 and 3 or of 3 and 2
+    "training.batch_size=7",
     "training.density={every: 4, start: 4, stop: 12, gradient: 1e-4, split_angle: 0.3, opacity: 0.005, max_count: 40}",
     "trainer.accelerator=cpu", "trainer.precision=64-true", "trainer.max_steps=40", "trainer.val_check_interval=12",
     "trainer.log_every_n_steps=1", "trainer.enable_progress_bar=false", "baselines=[mean]",
@@ -29,8 +32,15 @@ SMALL = (
 
 def start(folder, *overrides):
     """``python -m gaigs`` beside a folder."""
-    environment = os.environ | {"PYTHONPATH": str(Path(gaigs.__path__[0]).parent), "OMP_NUM_THREADS": "1"}
-    words = [*(["-m"] if "-m" in overrides else []), *SMALL, *(word for word in overrides if word != "-m")]
+    environment = os.environ | {
+        "PYTHONPATH": str(Path(gaigs.__path__[0]).parent),
+        "OMP_NUM_THREADS": "1",
+    }
+    words = [
+        *(["-m"] if "-m" in overrides else []),
+        *SMALL,
+        *(word for word in overrides if word != "-m"),
+    ]
     return subprocess.Popen(
         [sys.executable, "-m", "gaigs", *words],
         cwd=folder.parent, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
@@ -51,13 +61,19 @@ def test_two_processes_train_as_one_though_they_are_stopped(tmp_path):
     command = (folder, "trainer.devices=2", "trainer.strategy=ddp", f"hydra.run.dir={folder}")
     process = start(*command, "save_every=0")
     wait_for(process, (folder / "last.ckpt").is_file)
-    with pytest.raises(ValueError, match=r"another run is at work in .*two"), processes.only_run(folder):
+    with (
+        pytest.raises(ValueError, match=r"another run is at work in .*two"),
+        processes.only_run(folder),
+    ):
         pass
     process.send_signal(signal.SIGTERM)
     _, err = process.communicate(timeout=120)
     assert process.returncode == 143
     step = torch.load(folder / "last.ckpt", weights_only=True)["global_step"]
-    assert err == f"gaigs: stopped after step {step}; the same command with hydra.run.dir={folder} goes on\n"
+    assert (
+        err
+        == f"gaigs: stopped after step {step}; the same command with hydra.run.dir={folder} goes on\n"
+    )
     process = start(*command)
     out, err = process.communicate(timeout=300)
     assert process.returncode == 0, err
@@ -69,27 +85,42 @@ def test_two_processes_train_as_one_though_they_are_stopped(tmp_path):
     )
     assert metrics["num_gaussians"] == others["num_gaussians"] != metrics["num_gaussians_start"]
     assert metrics["models"]["gaigs"] == pytest.approx(others["models"]["gaigs"], rel=1e-5)
-    one, two = (torch.load(tmp_path / name / "last.ckpt", weights_only=True)["state_dict"] for name in ("one", "two"))
+    one, two = (
+        torch.load(tmp_path / name / "last.ckpt", weights_only=True)["state_dict"]
+        for name in ("one", "two")
+    )
     assert one.keys() == two.keys()
     for key in one:
         torch.testing.assert_close(one[key], two[key], rtol=1e-9, atol=1e-9)
-    curves, resumed = (read_curves(sorted((tmp_path / name).glob("log/*/metrics.csv"))) for name in ("one", "two"))
+    curves, resumed = (
+        read_curves(sorted((tmp_path / name).glob("log/*/metrics.csv"))) for name in ("one", "two")
+    )
     assert curves.keys() == resumed.keys()
     for name, (steps, values) in curves.items():
         assert steps.tolist() == resumed[name][0].tolist()
-        assert values == pytest.approx(resumed[name][1], rel=1e-6), name  # float32 in the validation's mean
+        assert values == pytest.approx(resumed[name][1], rel=1e-6), (
+            name
+        )  # float32 in the validation's mean
 
 
 def test_sigterm_stops_all_jobs_of_a_launcher(tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs gaigs[parallel]")
-    jobs = ("-m", "seed=0,1,2", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2", f"hydra.sweep.dir={tmp_path / 's'}")
+    jobs = (
+        "-m",
+        "seed=0,1,2",
+        "hydra/launcher=joblib",
+        "hydra.launcher.n_jobs=2",
+        f"hydra.sweep.dir={tmp_path / 's'}",
+    )
     process = start(tmp_path / "s", *jobs, "save_every=0.2", "trainer.max_steps=100000")
     saved = lambda: sorted((tmp_path / "s").glob("*/last.ckpt"))
     wait_for(process, lambda: len(saved()) == 2)
     process.send_signal(signal.SIGTERM)
     process.communicate(timeout=120)
     assert process.returncode == 143
-    assert [path.parent.name.partition("seed=")[2][0] for path in saved()] == ["0", "1"], "the third is not started"
+    assert [path.parent.name.partition("seed=")[2][0] for path in saved()] == ["0", "1"], (
+        "the third is not started"
+    )
     assert all(torch.load(path, weights_only=True)["global_step"] > 0 for path in saved())
 
 
@@ -135,7 +166,9 @@ def test_a_signal_that_python_ignores_stops_a_run_all_the_same(number):
 
 @pytest.mark.parametrize("trains", [False, True])
 def test_the_second_signal_of_a_closed_terminal_is_ignored(trains, tmp_path):
-    """The system and the shell each send one; at a second signal of another kind a training does not save."""
+    """The system and the shell each send one; at a second signal of another kind a training does
+    not save.
+    """
     before = signal.getsignal(signal.SIGHUP)
     keep = KeepLast(tmp_path / "last.ckpt", every=0)
     try:
@@ -158,8 +191,12 @@ def test_nohup_is_heeded():
     environment = os.environ | {"PYTHONPATH": str(Path(gaigs.__path__[0]).parent)}
     for words, expected in ((["nohup"], "False"), ([], "True")):
         command = [*words, sys.executable, "-c", code]
-        usual = lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL)  # the tests may run by nohup themselves
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, preexec_fn=usual)
+        usual = lambda: signal.signal(
+            signal.SIGHUP, signal.SIG_DFL
+        )  # the tests may run by nohup themselves
+        done = subprocess.run(
+            command, env=environment, capture_output=True, text=True, preexec_fn=usual
+        )
         assert done.stdout.strip() == expected
 
 
@@ -198,7 +235,13 @@ def test_jobs_of_a_launcher_share_the_processors(monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
     for name in processes.THREADS:
         monkeypatch.setenv(name, "")
-    for count, jobs, expected in ((None, 4, 2), (None, -1, 1), (None, 16, 1), (3, 4, 3), (None, 1, threads)):
+    for count, jobs, expected in (
+        (None, 4, 2),
+        (None, -1, 1),
+        (None, 16, 1),
+        (3, 4, 3),
+        (None, 1, threads),
+    ):
         with processes.limited_threads(count, jobs):
             assert torch.get_num_threads() == expected
             if expected != threads:
@@ -212,7 +255,9 @@ def test_jobs_of_a_launcher_share_the_processors(monkeypatch):
 
 def test_a_fault_of_a_plug_in_has_its_file_and_line(tmp_path):
     file = tmp_path / "plug_in.py"
-    file.write_text("def fault():\n    return len(3)\n\n\ndef refusal():\n    raise ValueError('width is too small')\n")
+    file.write_text(
+        "def fault():\n    return len(3)\n\n\ndef refusal():\n    raise ValueError('width is too small')\n"
+    )
     functions: dict = {}
     exec(compile(file.read_text(), str(file), "exec"), functions)
     messages = {}

@@ -38,7 +38,9 @@ def plugins(tmp_path, monkeypatch):
     """Writes files below ./plugins of an empty working directory; imports from there are undone."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
-    for module in [name for name in sys.modules if name.split(".")[0] == "plugins"]:  # of other tests
+    for module in [
+        name for name in sys.modules if name.split(".")[0] == "plugins"
+    ]:  # of other tests
         monkeypatch.delitem(sys.modules, module)
 
     def write(path, text):
@@ -65,7 +67,10 @@ def component(kind, name, body="value = 1"):
 
 
 def test_registry_of_an_unknown_kind_suggests_the_nearest():
-    with pytest.raises(ValueError, match=r"'tokeniser' \(did you mean 'tokenizer'\?\); there are: task, data, split, "):
+    with pytest.raises(
+        ValueError,
+        match=r"'tokeniser' \(did you mean 'tokenizer'\?\); there are: task, data, split, ",
+    ):
         registry("tokeniser")
     with pytest.raises(ValueError, match="unknown kind"):
         register("antenna", "horn")
@@ -75,27 +80,35 @@ def test_registry_of_an_unknown_kind_suggests_the_nearest():
 
 
 def test_a_taken_name_tells_who_holds_it_and_who_asks(models):
-    with pytest.raises(ValueError, match=r"model 'horn' is held by \w+.horn, and \w+.Waveguide asks for it"):
+    with pytest.raises(
+        ValueError, match=r"model 'horn' is held by \w+.horn, and \w+.Waveguide asks for it"
+    ):
         models.register("horn")(Waveguide)
     assert models.get("horn") is horn
 
 
 def test_a_built_in_name_is_taken_before_its_file_is_imported():
     with pytest.raises(
-        ValueError, match=r"'mercator' is held by gaigs.splatting.projection.mercator\.py, and \w+.Waveguide asks"
+        ValueError,
+        match=r"'mercator' is held by gaigs.splatting.projection.mercator\.py, and \w+.Waveguide asks",
     ):
         Registry("projection").register("mercator")(Waveguide)
 
 
 def test_a_module_loaded_anew_may_register_again(models):
-    reloaded = type("Waveguide", (), {"__module__": Waveguide.__module__, "__qualname__": Waveguide.__qualname__})
+    reloaded = type(
+        "Waveguide",
+        (),
+        {"__module__": Waveguide.__module__, "__qualname__": Waveguide.__qualname__},
+    )
     models.register("waveguide")(reloaded)
     assert models.get("waveguide") is reloaded
 
 
 def test_an_unknown_name_suggests_the_nearest_and_lists_all(models):
     with pytest.raises(
-        ValueError, match=r"unknown model 'wavegiude' \(did you mean 'waveguide'\?\); there are:.* horn\b"
+        ValueError,
+        match=r"unknown model 'wavegiude' \(did you mean 'waveguide'\?\); there are:.* horn\b",
     ):
         models.get("wavegiude")
 
@@ -107,15 +120,27 @@ def test_build_passes_options_and_the_context_that_is_asked_for(models):
     config = {"name": "waveguide", "width": 0.33, "modes": 2}
     built = models.build(config, scene="room", frequency=9e8)
     assert (built.scene, built.width, built.modes) == ("room", 0.33, 2)
-    assert config.keys() == {"name", "width", "modes"}, "the caller's configuration is left as it was"
-    assert configuration_of(built) == {"name": "waveguide", "width": 0.33, "modes": 2}, "without the context"
+    assert config.keys() == {"name", "width", "modes"}, (
+        "the caller's configuration is left as it was"
+    )
+    assert configuration_of(built) == {"name": "waveguide", "width": 0.33, "modes": 2}, (
+        "without the context"
+    )
 
 
 @pytest.mark.parametrize(
     ("config", "error", "message"),
     [
-        ({"width": 1}, ValueError, r"needs the key 'name', got {'width': 1}; there are:.* horn,.* waveguide"),
-        ({"name": "waveguide"}, ValueError, r"model 'waveguide' needs option width; it has: width, modes"),
+        (
+            {"width": 1},
+            ValueError,
+            r"needs the key 'name', got {'width': 1}; there are:.* horn,.* waveguide",
+        ),
+        (
+            {"name": "waveguide"},
+            ValueError,
+            r"model 'waveguide' needs option width; it has: width, modes",
+        ),
         (
             {"name": "waveguide", "widht": 1, "width": 1},
             ValueError,
@@ -126,7 +151,11 @@ def test_build_passes_options_and_the_context_that_is_asked_for(models):
             ValueError,
             "'waveguide' has no option 'scene'; it has: ",
         ),
-        ({"name": "horn", "scene": 2}, ValueError, r"'horn' has no option 'scene'; it has: gain_db"),
+        (
+            {"name": "horn", "scene": 2},
+            ValueError,
+            r"'horn' has no option 'scene'; it has: gain_db",
+        ),
         ({"name": 3}, TypeError, r"^model\.name must be a string, got 3$"),
         (["horn"], TypeError, "must be a mapping with the key 'name', got"),
         (None, TypeError, "must be a mapping with the key 'name', got None"),
@@ -152,7 +181,9 @@ def test_a_subclass_without_a_name_cannot_be_stored(models):
     class Wider(models.get("waveguide")):
         pass
 
-    with pytest.raises(ValueError, match=r"^Wider must have a name to be stored; put @gaigs\.register"):
+    with pytest.raises(
+        ValueError, match=r"^Wider must have a name to be stored; put @gaigs\.register"
+    ):
         configuration_of(Wider("room", 0.3))
 
 
@@ -216,7 +247,9 @@ NO = {
 @pytest.mark.parametrize("option", NO)
 def test_an_option_of_another_type_is_refused(option):
     for message, value in NO[option].items():
-        with pytest.raises(TypeError, match=f"^horn option '{option}' must be {re.escape(message)}$"):
+        with pytest.raises(
+            TypeError, match=f"^horn option '{option}' must be {re.escape(message)}$"
+        ):
             call("horn", tuned, {option: value})
 
 
@@ -224,9 +257,17 @@ def test_an_option_of_another_type_is_refused(option):
     ("option", "value", "message"),
     [
         ("octaves", [0.5, 2], "horn option 'octaves', entry 0, must be a whole number, got 0.5"),
-        ("weights", {"opacity": "high"}, "horn option 'weights', entry 'opacity', must be a number, got 'high'"),
+        (
+            "weights",
+            {"opacity": "high"},
+            "horn option 'weights', entry 'opacity', must be a number, got 'high'",
+        ),
         ("weights", {3: 1.0}, "a key of horn option 'weights' must be a string, got 3"),
-        ("sizes", [8, 16.0], "horn option 'sizes', entry 1, must be a whole number, got 16.0; write 16"),
+        (
+            "sizes",
+            [8, 16.0],
+            "horn option 'sizes', entry 1, must be a whole number, got 16.0; write 16",
+        ),
         ("devices", [0, None], "horn option 'devices', entry 1, must be a whole number, got None"),
     ],
 )
@@ -247,7 +288,10 @@ def test_an_entry_of_another_type_is_refused(option, value, message):
 )
 def test_an_error_that_names_no_option_is_given_with_all_options(function, options, cause):
     keys = ", ".join(options) or "none"
-    with pytest.raises(ValueError, match=rf"^horn cannot be made \({re.escape(cause)}.*\)\ncheck its options: {keys}$"):
+    with pytest.raises(
+        ValueError,
+        match=rf"^horn cannot be made \({re.escape(cause)}.*\)\ncheck its options: {keys}$",
+    ):
         call("horn", function, options)
 
 
@@ -262,7 +306,9 @@ def test_an_option_that_suits_or_cannot_be_checked_passes():
     for option, values in suitable.items():
         for value in values:
             assert call("horn", tuned, {option: value})[option] is value
-    assert call("horn", tuned, {}, count=0.5)["count"] == 0.5, "the caller's own arguments are not checked"
+    assert call("horn", tuned, {}, count=0.5)["count"] == 0.5, (
+        "the caller's own arguments are not checked"
+    )
 
 
 def test_annotations_in_quotes_are_checked_where_they_can_be_read():
@@ -277,10 +323,20 @@ def test_annotations_in_quotes_are_checked_where_they_can_be_read():
 
 
 def test_options_of_the_trainer_are_checked_as_lightning_annotates_them(tmp_path):
-    options = {"logger": False, "enable_checkpointing": False, "accelerator": "cpu", "enable_model_summary": False}
+    options = {
+        "logger": False,
+        "enable_checkpointing": False,
+        "accelerator": "cpu",
+        "enable_model_summary": False,
+    }
     with pytest.raises(TypeError, match=r"'max_steps' must be a whole number, got 10\.0; write 10"):
         call("trainer", Trainer, options | {"max_steps": 10.0})
-    trainer = call("trainer", Trainer, options | {"max_steps": 10, "limit_val_batches": 0.5}, default_root_dir=tmp_path)
+    trainer = call(
+        "trainer",
+        Trainer,
+        options | {"max_steps": 10, "limit_val_batches": 0.5},
+        default_root_dir=tmp_path,
+    )
     assert trainer.max_steps == 10
 
 
@@ -340,13 +396,17 @@ def test_a_plugin_that_fails_hurts_only_who_asks_for_it(plugins, body, cause):
     plugins("broken.py", component("model", "broken", body))
     plugins("sound.py", component("model", "sound"))
     assert registry("model").build({"name": "sound"}).value == 1
-    with pytest.raises(ImportError, match=rf"model 'broken' of plugins.broken\.py cannot be loaded: {cause}"):
+    with pytest.raises(
+        ImportError, match=rf"model 'broken' of plugins.broken\.py cannot be loaded: {cause}"
+    ):
         registry("model").get("broken")
 
 
 def test_ctrl_c_within_a_plugin_stays_one_and_says_where(plugins):
     plugins("slow.py", component("model", "slow", "raise KeyboardInterrupt"))
-    with pytest.raises(KeyboardInterrupt, match=r"^stopped while model 'slow' of plugins.slow\.py was loaded$"):
+    with pytest.raises(
+        KeyboardInterrupt, match=r"^stopped while model 'slow' of plugins.slow\.py was loaded$"
+    ):
         registry("model").get("slow")
 
 
@@ -356,7 +416,11 @@ def test_ctrl_c_within_a_plugin_stays_one_and_says_where(plugins):
         ("cavity/pyproject.toml", "[project\n", "line 1"),
         ("odd/pyproject.toml", "project = 3", "has no attribute"),
         ("odd.py", "value = = 1", r"invalid syntax \(odd.py, line 1\)"),
-        ("odd.py", f"x = {100_000 * '-'}1\n", r"odd\.py: (MemoryError|Parser stack)"),  # Python's, if too deep
+        (
+            "odd.py",
+            f"x = {100_000 * '-'}1\n",
+            r"odd\.py: (MemoryError|Parser stack)",
+        ),  # Python's, if too deep
     ],
 )
 def test_an_unreadable_file_is_named_where_a_name_is_missing(file, content, cause, plugins):
@@ -369,35 +433,57 @@ def test_an_unreadable_file_is_named_where_a_name_is_missing(file, content, caus
 
 def test_a_plugin_may_not_take_a_name(plugins, models):
     plugins("flare.py", component("model", "horn"))
-    with pytest.raises(ValueError, match=r"'horn' is held by \w+\.horn, and plugins.flare\.py asks for it"):
+    with pytest.raises(
+        ValueError, match=r"'horn' is held by \w+\.horn, and plugins.flare\.py asks for it"
+    ):
         models.get("horn")
     plugins("map.py", component("projection", "mercator"))
-    with pytest.raises(ValueError, match=r"'mercator' is held by gaigs.*mercator\.py, and plugins.map\.py asks for it"):
+    with pytest.raises(
+        ValueError,
+        match=r"'mercator' is held by gaigs.*mercator\.py, and plugins.map\.py asks for it",
+    ):
         registry("projection").get("mercator")
     registry("projection").get("equirectangular")
 
 
-def test_a_module_of_the_same_name_from_elsewhere_is_not_taken_for_the_plugin(plugins, tmp_path, monkeypatch):
+def test_a_module_of_the_same_name_from_elsewhere_is_not_taken_for_the_plugin(
+    plugins, tmp_path, monkeypatch
+):
     plugins("slot.py", component("model", "slot"))
     registry("model").get("slot")
     other = tmp_path / "elsewhere"
     plugins("../elsewhere/plugins/slot.py", component("model", "notch"))
     monkeypatch.chdir(other)
     with pytest.raises(
-        ImportError, match=r"model 'notch' of plugins.slot\.py .* is imported as 'plugins.slot' already"
+        ImportError,
+        match=r"model 'notch' of plugins.slot\.py .* is imported as 'plugins.slot' already",
     ):
         registry("model").get("notch")
 
 
-@pytest.mark.parametrize(("target", "file"), [("cavity.box:Box.open", "box.py"), ("cavity.horn", "horn.py")])
+@pytest.mark.parametrize(
+    ("target", "file"), [("cavity.box:Box.open", "box.py"), ("cavity.horn", "horn.py")]
+)
 def test_an_entry_point_names_an_attribute_or_a_module_that_registers(plugins, target, file):
-    plugins("cavity/pyproject.toml", f'[project]\n[project.entry-points."gaigs.model"]\nopened = "{target}"\n')
-    plugins("cavity/cavity/box.py", "class Box:\n    @staticmethod\n    def open(value=1):\n        return Box()\n")
+    plugins(
+        "cavity/pyproject.toml",
+        f'[project]\n[project.entry-points."gaigs.model"]\nopened = "{target}"\n',
+    )
+    plugins(
+        "cavity/cavity/box.py",
+        "class Box:\n    @staticmethod\n    def open(value=1):\n        return Box()\n",
+    )
     plugins("cavity/cavity/horn.py", component("model", "opened"))
-    assert type(registry("model").build({"name": "opened"})).__module__ == f"cavity.{file.removesuffix('.py')}"
+    assert (
+        type(registry("model").build({"name": "opened"})).__module__
+        == f"cavity.{file.removesuffix('.py')}"
+    )
 
 
 def test_a_plugin_that_cannot_be_imported_is_named_when_it_is_composed(plugins):
     plugins("broken.py", "import nothing\n@register('model', 'broken')\nclass Broken: ...\n")
-    with pytest.raises(ValueError, match=r"model 'broken' of plugins.broken\.py cannot be loaded: ModuleNotFoundError"):
+    with pytest.raises(
+        ValueError,
+        match=r"model 'broken' of plugins.broken\.py cannot be loaded: ModuleNotFoundError",
+    ):
         compose(model="broken")

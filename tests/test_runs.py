@@ -63,7 +63,9 @@ CASES = {
             "max_count: 50}",
         ),
     ),
-    "early stop": (  # the first step drives all opacities to 0 or 1, so the second validation is as good as the first
+    # The first step drives all opacities to 0 or 1, so the second validation is as good as the
+    # first
+    "early stop": (
         3,
         (
             "trainer.val_check_interval=3",
@@ -127,7 +129,9 @@ def assert_same_run(metrics, folder, others, other):
         a, b = (torch.load(path / name, weights_only=True) for path in (folder, other))
         for part in ("state_dict", "optimizer_states", "lr_schedulers", "global_step", "gaigs"):
             assert_same(a[part], b[part], f"{name}: {part}")
-    curves, resumed = (read_curves(sorted(path.glob("log/*/metrics.csv"))) for path in (folder, other))
+    curves, resumed = (
+        read_curves(sorted(path.glob("log/*/metrics.csv"))) for path in (folder, other)
+    )
     assert curves.keys() == resumed.keys()
     for name in curves:
         np.testing.assert_array_equal(curves[name], resumed[name], name)
@@ -147,7 +151,9 @@ def test_an_interrupted_run_ends_as_if_it_had_not_been(case, tmp_path, monkeypat
 
 
 @pytest.mark.parametrize("case", ["density control"], indirect=True)
-def test_a_run_is_resumed_after_several_interruptions_with_a_save_every_step(case, tmp_path, monkeypatch):
+def test_a_run_is_resumed_after_several_interruptions_with_a_save_every_step(
+    case, tmp_path, monkeypatch
+):
     _, config, folder, metrics = case
     config = config | {"save_every": 0}
     for at in (1, 2, 6):
@@ -158,7 +164,9 @@ def test_a_run_is_resumed_after_several_interruptions_with_a_save_every_step(cas
     others = runs.run(config, tmp_path)
     assert metrics["models"] == others["models"]
     for name in ("best.ckpt", "last.ckpt"):
-        a, b = (torch.load(path / name, weights_only=True)["state_dict"] for path in (folder, tmp_path))
+        a, b = (
+            torch.load(path / name, weights_only=True)["state_dict"] for path in (folder, tmp_path)
+        )
         assert_same(a, b, name)
 
 
@@ -170,8 +178,12 @@ def test_a_run_is_resumed_after_several_interruptions_with_a_save_every_step(cas
         ("on_train_end", signal.SIGTERM, "stopped after step 2", True),
     ],
 )
-def test_a_signal_around_the_steps_stops_a_run_too(hook, message, left, number, tmp_path, monkeypatch):
-    """Lightning exits with 1 and no message before the first step, and ignores a signal after the last."""
+def test_a_signal_around_the_steps_stops_a_run_too(
+    hook, message, left, number, tmp_path, monkeypatch
+):
+    """Lightning exits with 1 and no message before the first step, and ignores a signal after the
+    last.
+    """
     monkeypatch.setattr(Descent, hook, lambda *_: signal.raise_signal(number), raising=False)
     with stopping(), pytest.raises(Stopped, match=f"{message}$") as stop:
         runs.run(configure("trainer.max_steps=2"), tmp_path)
@@ -210,15 +222,31 @@ def test_metrics(finished):
     assert (metrics["seed"], metrics["rasterizer"]) == (0, "torch")
     assert metrics["num_gaussians"] == metrics["num_gaussians_start"] == 30
     assert metrics["checkpoint_bytes"] == (folder / "best.ckpt").stat().st_size
-    assert metrics["num_parameters"] == sum(p.numel() for p in gaigs.load(folder / "best.ckpt").parameters())
+    assert metrics["num_parameters"] == sum(
+        p.numel() for p in gaigs.load(folder / "best.ckpt").parameters()
+    )
     assert min(metrics[time] for time in ("train_seconds", "inference_ms", "render_ms")) > 0
     assert list(metrics["models"]) == ["gaigs", "mean", "knn"] == list(metrics["validation"])
     best = torch.load(folder / "best.ckpt", weights_only=True)["callbacks"]
     (kept,) = (state["best"] for name, state in best.items() if name.startswith("KeepBest"))
-    assert metrics["validation_score"] == metrics["validation"]["gaigs"]["ssim_mean"] == pytest.approx(kept, abs=1e-6)
+    assert (
+        metrics["validation_score"]
+        == metrics["validation"]["gaigs"]["ssim_mean"]
+        == pytest.approx(kept, abs=1e-6)
+    )
     numbers = ["ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae"]
-    intervals = ["coverage_50", "coverage_50_error", "coverage_90", "coverage_90_error", "width_90", "crps", "nll"]
-    for name, scores in metrics["models"].items():  # two validation links are too few for intervals of 90 %
+    intervals = [
+        "coverage_50",
+        "coverage_50_error",
+        "coverage_90",
+        "coverage_90_error",
+        "width_90",
+        "crps",
+        "nll",
+    ]
+    for name, scores in metrics[
+        "models"
+    ].items():  # two validation links are too few for intervals of 90 %
         assert list(scores) == numbers + [*intervals, "calibration_links"] * (name != "gaigs")
         assert list(metrics["validation"][name]) == numbers
 
@@ -229,9 +257,13 @@ def test_predictions_belong_to_the_test_links(finished):
     with np.load(folder / "predictions.npz") as file:
         stored = dict(file)
     assert stored["link"].tolist() == links.split.test.tolist()
-    np.testing.assert_array_equal(stored["transmitters"], links.query.transmitters[links.split.test])
+    np.testing.assert_array_equal(
+        stored["transmitters"], links.query.transmitters[links.split.test]
+    )
     np.testing.assert_allclose(stored["labels"], links.labels[links.split.test], atol=5e-4)
-    assert np.median(stored["ssim_gaigs"]) == pytest.approx(metrics["models"]["gaigs"]["ssim_median"])
+    assert np.median(stored["ssim_gaigs"]) == pytest.approx(
+        metrics["models"]["gaigs"]["ssim_median"]
+    )
 
 
 def test_a_finished_run_started_again_ends_at_once(finished, monkeypatch):
@@ -249,12 +281,16 @@ def test_a_damaged_checkpoint_to_resume_from_destroys_nothing(finished, tmp_path
     (copy / "metrics.json").unlink()
     (copy / name).write_bytes((copy / name).read_bytes()[:-999])
     before = digest(copy)
-    with pytest.raises(ValueError, match=rf"cannot resume the training: .*{name} is damaged.*\nmove .*last\.ckpt"):
+    with pytest.raises(
+        ValueError, match=rf"cannot resume the training: .*{name} is damaged.*\nmove .*last\.ckpt"
+    ):
         runs.run(config, copy)
     assert digest(copy) == before
 
 
-def test_a_folder_that_was_removed_and_made_anew_gets_its_configuration_again(finished, tmp_path, monkeypatch):
+def test_a_folder_that_was_removed_and_made_anew_gets_its_configuration_again(
+    finished, tmp_path, monkeypatch
+):
     """Loggers make it anew where it is removed before the first save."""
     config, _, metrics = finished
     own = tmp_path / "run"
@@ -270,7 +306,8 @@ def test_a_folder_that_was_removed_and_made_anew_gets_its_configuration_again(fi
 
 
 @pytest.mark.parametrize(
-    "text", ["model: 3\ndata: ${x.y\n", "model: &a {x: *a}\ndata: {}\n", "model: {null: 2}\ndata: {}\n"]
+    "text",
+    ["model: 3\ndata: ${x.y\n", "model: &a {x: *a}\ndata: {}\n", "model: {null: 2}\ndata: {}\n"],
 )
 def test_a_damaged_configuration_in_the_folder_is_named(text, finished, tmp_path):
     config, folder, _ = finished
@@ -319,7 +356,10 @@ def test_another_configuration_in_the_same_folder_is_refused(left, finished, tmp
 def test_options_that_change_no_result_may_change(finished, tmp_path):
     config, run, metrics = finished
     folder = shutil.copytree(run, tmp_path / "run")
-    other = config | {"save_every": 99.0, "trainer": config["trainer"] | {"enable_progress_bar": True}}
+    other = config | {
+        "save_every": 99.0,
+        "trainer": config["trainer"] | {"enable_progress_bar": True},
+    }
     assert other != config
     assert runs.run(other, folder) == metrics
 
@@ -339,7 +379,9 @@ def test_the_name_of_a_folder_is_no_markup(name, tmp_path, capsys):
 def test_the_name_of_a_split_is_no_markup():
     task = gaigs.links("synthetic_rssi", transmitters=10, order=0).task
     scores = {"mean": task.scores(torch.zeros(3), torch.ones(3))}
-    assert "on split folder[/red]." in str(evaluation.Evaluation(task, "folder[/red]", scores, "cpu"))
+    assert "on split folder[/red]." in str(
+        evaluation.Evaluation(task, "folder[/red]", scores, "cpu")
+    )
 
 
 def test_files_that_a_killed_writer_left_are_removed(tmp_path):
@@ -369,7 +411,11 @@ def test_look_ups_run_without_training(model, others, finished, tmp_path, monkey
     assert list(metrics) == METRICS
     assert list(metrics["models"]) == [model, *others]
     assert metrics["models"][model] == finished[2]["models"][model], "as beside any other model"
-    assert (metrics["num_gaussians"], metrics["num_gaussians_start"], metrics["num_parameters"]) == (0, 0, 0)
+    assert (
+        metrics["num_gaussians"],
+        metrics["num_gaussians_start"],
+        metrics["num_parameters"],
+    ) == (0, 0, 0)
     for key in ("rasterizer", "train_seconds", "render_ms"):
         assert metrics[key] is None
     names = {path.name for path in tmp_path.iterdir()}
@@ -377,9 +423,13 @@ def test_look_ups_run_without_training(model, others, finished, tmp_path, monkey
     monkeypatch.setattr("gaigs.data.load", None)  # the data are not read again
     with np.load(tmp_path / "predictions.npz") as file:
         found = gaigs.load(tmp_path).predict(file["transmitters"], 0)
-        np.testing.assert_allclose(found, file["prediction"], rtol=1e-3, atol=1e-3)  # stored in half precision
+        np.testing.assert_allclose(
+            found, file["prediction"], rtol=1e-3, atol=1e-3
+        )  # stored in half precision
     (tmp_path / "best.ckpt").unlink()
-    with pytest.raises(FileNotFoundError, match=r"has no best\.ckpt: the run is not finished, or one of a look-up"):
+    with pytest.raises(
+        FileNotFoundError, match=r"has no best\.ckpt: the run is not finished, or one of a look-up"
+    ):
         gaigs.load(tmp_path)
 
 
@@ -393,19 +443,37 @@ def test_look_ups_run_without_training(model, others, finished, tmp_path, monkey
             {"+model.gaussians.conut": 3},
             r"gaussians has no option 'conut' \(did you mean 'count'\?\); it has: count, near",
         ),
-        ({"+training.thinning.strid": 2}, r"training.thinning has no option 'strid' \(did you mean 'stride'\?\)"),
+        (
+            {"+training.thinning.strid": 2},
+            r"training.thinning has no option 'strid' \(did you mean 'stride'\?\)",
+        ),
         (
             {"+training.learning_rates.netwrk": 1},
             r"training.learning_rates has no key 'netwrk' \(did you mean 'network'\?\)",
         ),
-        ({"baselines": ["mean", {"name": "mean"}]}, r"baselines must have different names, got 'mean' twice"),
+        (
+            {"baselines": ["mean", {"name": "mean"}]},
+            r"baselines must have different names, got 'mean' twice",
+        ),
         ({"baselines": ["gaigs2"]}, r"unknown model 'gaigs2'"),
-        ({"baselines": [{"k": 3}]}, r"baselines must be names or model configurations with a name, got {'k': 3}"),
-        ({"baselines": [{"name": "mirrored", "pooling": "path_spectrum"}]}, r"baseline 'mirrored' has to be trained"),
+        (
+            {"baselines": [{"k": 3}]},
+            r"baselines must be names or model configurations with a name, got {'k': 3}",
+        ),
+        (
+            {"baselines": [{"name": "mirrored", "pooling": "path_spectrum"}]},
+            r"baseline 'mirrored' has to be trained",
+        ),
         ({"task.name": "rssi"}, r"the labels of data 'synthetic' are of task 'spectrum', and"),
         ({"+trainer.callbacks": []}, r"trainer has no option 'callbacks'"),
-        ({"+trainer.accumulate_grad_batches": 2}, r"trainer.accumulate_grad_batches must be left out"),
-        ({"trainer.devices": 2, "trainer.strategy": "ddp_spawn"}, r"trainer.strategy must be auto for one"),
+        (
+            {"+trainer.accumulate_grad_batches": 2},
+            r"trainer.accumulate_grad_batches must be left out",
+        ),
+        (
+            {"trainer.devices": 2, "trainer.strategy": "ddp_spawn"},
+            r"trainer.strategy must be auto for one",
+        ),
         ({"+trainer.limit_val_batches": 2}, r"trainer.limit_val_batches must be left out"),
         ({"+trainer.limit_train_batches": 1}, r"trainer.limit_train_batches must be left out"),
         ({"+trainer.overfit_batches": 0.5}, r"trainer.overfit_batches must be left out"),
@@ -453,16 +521,26 @@ def test_damaged_data_are_refused_and_left_alone(rfid, tmp_path):
     lines[3] = "0.5,nan,1.0"
     (data / "tx_pos.csv").write_text("\n".join(lines))
     before = digest(data)
-    with pytest.raises(ValueError, match=r"tx_pos\.csv, line 4: expected a finite number, got 'nan' in column y"):
+    with pytest.raises(
+        ValueError, match=r"tx_pos\.csv, line 4: expected a finite number, got 'nan' in column y"
+    ):
         runs.run(measured(data), tmp_path / "run")
     assert digest(data) == before
 
 
 def test_another_split_in_the_same_folder_is_refused():
-    links = {"split": {"train": torch.tensor([0, 1]), "validation": torch.tensor([2]), "test": torch.tensor([3])}}
+    links = {
+        "split": {
+            "train": torch.tensor([0, 1]),
+            "validation": torch.tensor([2]),
+            "test": torch.tensor([3]),
+        }
+    }
     links["links"] = "digest"
     runs.folder.check_same_links(links, links, Path("last.ckpt"))
-    exchanged = links | {"split": links["split"] | {"train": torch.tensor([0, 3]), "test": torch.tensor([1])}}
+    exchanged = links | {
+        "split": links["split"] | {"train": torch.tensor([0, 3]), "test": torch.tensor([1])}
+    }
     for others in (exchanged, links | {"links": "another"}):
         with pytest.raises(ValueError, match=r"the data have changed since last\.ckpt was written"):
             runs.folder.check_same_links(links, others, Path("last.ckpt"))
@@ -476,18 +554,40 @@ def test_a_fingerprint_sees_every_change_of_the_links():
         "receivers": (turned, *links.receivers[1:]),
         "labels": links.labels * 0.999,
     }
-    queries = {"receivers": links.query.receivers.flip(0), "frequencies": torch.full((len(links),), 1e9)}
-    others = {runs.folder.fingerprint(replace(links, **{name: value})) for name, value in changes.items()}
+    queries = {
+        "receivers": links.query.receivers.flip(0),
+        "frequencies": torch.full((len(links),), 1e9),
+    }
+    others = {
+        runs.folder.fingerprint(replace(links, **{name: value})) for name, value in changes.items()
+    }
     for name, value in queries.items():
-        others.add(runs.folder.fingerprint(replace(links, query=replace(links.query, **{name: value}))))
+        others.add(
+            runs.folder.fingerprint(replace(links, query=replace(links.query, **{name: value})))
+        )
     assert len(others | {runs.folder.fingerprint(links)}) == 6
     assert runs.folder.fingerprint(example_links()) == runs.folder.fingerprint(links)
 
 
 RSSI = (
-    *("+experiment=rssi", "data.transmitters=40", "data.order=0", "tokenizer=euclidean", "rasterizer=torch"),
-    *("gaussians.count=12", "deformation.width=8", "trainer.max_steps=6", "trainer.val_check_interval=3"),
-    *("trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "trainer.log_every_n_steps=1"),
+    *(
+        "+experiment=rssi",
+        "data.transmitters=40",
+        "data.order=0",
+        "tokenizer=euclidean",
+        "rasterizer=torch",
+    ),
+    *(
+        "gaussians.count=12",
+        "deformation.width=8",
+        "trainer.max_steps=6",
+        "trainer.val_check_interval=3",
+    ),
+    *(
+        "trainer.accelerator=cpu",
+        "trainer.enable_progress_bar=false",
+        "trainer.log_every_n_steps=1",
+    ),
 )
 
 
@@ -507,8 +607,12 @@ def test_rssi_from_end_to_end(tmp_path):
             assert scores["mae_db"] == pytest.approx(errors.mean(), abs=1e-4)
             assert scores["median_ae_db"] == pytest.approx(np.median(errors), abs=1e-4)
             west = errors[stored["receiver"] == 0]
-            assert metrics["receivers"]["west"][name]["mae_db"] == pytest.approx(west.mean(), abs=1e-4)
-        np.testing.assert_allclose(stored["prediction"] - stored["labels"], stored["error_gaigs"], atol=1e-4)
+            assert metrics["receivers"]["west"][name]["mae_db"] == pytest.approx(
+                west.mean(), abs=1e-4
+            )
+        np.testing.assert_allclose(
+            stored["prediction"] - stored["labels"], stored["error_gaigs"], atol=1e-4
+        )
     model = gaigs.load(tmp_path / "best.ckpt")
     floor = RadioMap.load(tmp_path / "radio_map.npz")
     point = torch.tensor([floor.x[3], floor.y[2], floor.height])
@@ -516,7 +620,9 @@ def test_rssi_from_end_to_end(tmp_path):
 
 
 @pytest.mark.parametrize(("part", "word"), [("validation", "training"), ("test", "known")])
-def test_a_receiver_without_links_to_learn_from_is_refused_before_the_training(part, word, tmp_path, monkeypatch):
+def test_a_receiver_without_links_to_learn_from_is_refused_before_the_training(
+    part, word, tmp_path, monkeypatch
+):
     links = load({"name": "synthetic_rssi", "transmitters": 20, "order": 0}, {"name": "random"})
     own = getattr(links.split, part)
     links.query.receivers[links.query.receivers == 3] = 2
@@ -528,7 +634,9 @@ def test_a_receiver_without_links_to_learn_from_is_refused_before_the_training(p
 
 
 def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path, monkeypatch):
-    """Whatever the steps do: here they drive all apart. The start is looked at before the first revision."""
+    """Whatever the steps do: here they drive all apart. The start is looked at before the first
+    revision.
+    """
     options = (
         "+experiment=mirrored_csi", "data.transmitters=30", "data.order=1", "split.validation=0.5", "kriging=false",
         "baselines=[{name: friis}]", "trainer.max_steps=6", "trainer.val_check_interval=3", *SMALL[9:11],
@@ -552,7 +660,9 @@ def test_a_folder_of_an_earlier_version_is_refused(finished, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(folder, copy)
     (copy / "software.json").unlink()
-    with pytest.raises(ValueError, match=r"copy was begun by gaigs 0.1 or earlier, and this is .*\nchoose another"):
+    with pytest.raises(
+        ValueError, match=r"copy was begun by gaigs 0.1 or earlier, and this is .*\nchoose another"
+    ):
         runs.run(config, copy)
     (copy / "software.json").write_text('{"gaigs": "0.1.3"}')
     with pytest.raises(ValueError, match=r"copy was begun by gaigs 0.1.3, and this is"):
@@ -604,7 +714,9 @@ def test_a_changed_plug_in_is_no_finished_run(tmp_path, monkeypatch, caplog):
     for file in (other, own):
         text = file.read_text()
         file.write_text(text + "\n")
-        with pytest.raises(ValueError, match=r"the source of model own_mean has changed since .*run was begun"):
+        with pytest.raises(
+            ValueError, match=r"the source of model own_mean has changed since .*run was begun"
+        ):
             runs.folder.claim(folder, config)
         runs.folder.warn_of_changes(folder, {"name": "own_mean"})
         assert f"the source of model own_mean has changed since {folder} was trained" in caplog.text
@@ -627,10 +739,15 @@ def test_a_reader_of_a_run_is_imported_if_it_is_the_recorded_one_or_trusted(tmp_
     monkeypatch.setattr(sys, "path", sys.path[:])
     runs.run(gaigs.compose("model=knn", "data=own_data", baselines=[]), tmp_path / "run")
     source.write_text(source.read_text() + "\n")
-    forget = [(sys.modules, "plugins.own_data"), (registry("data")._registered, "own_data")]  # as a new process
+    forget = [
+        (sys.modules, "plugins.own_data"),
+        (registry("data")._registered, "own_data"),
+    ]  # as a new process
     for names, name in forget:
         del names[name]
-    with pytest.raises(ValueError, match=r"plugins/own_data.py is not the source of data 'own_data'"):
+    with pytest.raises(
+        ValueError, match=r"plugins/own_data.py is not the source of data 'own_data'"
+    ):
         runs.links_of(tmp_path / "run", trust=False)
     assert len(runs.links_of(tmp_path / "run", trust=True)) == 30
     for names, name in forget:
@@ -638,15 +755,24 @@ def test_a_reader_of_a_run_is_imported_if_it_is_the_recorded_one_or_trusted(tmp_
 
 
 @pytest.mark.parametrize("name", ["own_mean", "own_level"])
-def test_a_plug_in_is_imported_if_it_is_the_recorded_one_or_trusted(name, tmp_path, monkeypatch, caplog):
-    """A look-up by the digests of its folder; a trained model by those of its checkpoint, or of an old one's folder."""
+def test_a_plug_in_is_imported_if_it_is_the_recorded_one_or_trusted(
+    name, tmp_path, monkeypatch, caplog
+):
+    """A look-up by the digests of its folder; a trained model by those of its checkpoint, or of an
+    old one's folder.
+    """
     (tmp_path / "plugins").mkdir()
     (tmp_path / "plugins/other.py").write_text("LEVEL = 1")
     (tmp_path / f"plugins/{name}.py").write_text(PLUGIN if name == "own_mean" else LEVEL)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
     monkeypatch.setattr(registry("model"), "_registered", registry("model")._registered.copy())
-    words = "data=synthetic_rssi", "data.transmitters=30", "trainer.max_steps=1", "trainer.enable_progress_bar=false"
+    words = (
+        "data=synthetic_rssi",
+        "data.transmitters=30",
+        "trainer.max_steps=1",
+        "trainer.enable_progress_bar=false",
+    )
     config = gaigs.compose(f"model={name}", *words, baselines=[])
     runs.run(config, tmp_path / "run")
     loaded = [tmp_path / "run"]
@@ -663,11 +789,15 @@ def test_a_plug_in_is_imported_if_it_is_the_recorded_one_or_trusted(name, tmp_pa
         gaigs.load(path)
     (tmp_path / "plugins/other.py").write_text("LEVEL = 2")
     for path in loaded:
-        with pytest.raises(ValueError, match=rf"plugins/{name}.py is not the source .*\n.*trust=True in gaigs.load"):
+        with pytest.raises(
+            ValueError, match=rf"plugins/{name}.py is not the source .*\n.*trust=True in gaigs.load"
+        ):
             gaigs.load(path)
         gaigs.load(path, trust=True).predict([[1.0, 2.0, 1.5]])
     with pytest.raises(ValueError, match="is not the source"):
-        gaigs.run(gaigs.compose("command=survey", folder=str(tmp_path / "run")), tmp_path / "survey")
+        gaigs.run(
+            gaigs.compose("command=survey", folder=str(tmp_path / "run")), tmp_path / "survey"
+        )
     for module in [module for module in sys.modules if module.partition(".")[0] == "plugins"]:
         del sys.modules[module]
 
@@ -687,7 +817,9 @@ def test_a_changed_component_of_a_notebook_is_no_finished_run(body, monkeypatch)
     digests = []
     for number, value in enumerate((2, 3, 2)):
         cell = f"# {number}\n@gaigs.register('split', 'cell')\n{body.format(value)}\nother = {number}\n"
-        monkeypatch.setitem(linecache.cache, f"cell {number}", (len(cell), None, cell.splitlines(True), ""))
+        monkeypatch.setitem(
+            linecache.cache, f"cell {number}", (len(cell), None, cell.splitlines(True), "")
+        )
         exec(compile(cell, f"cell {number}", "exec"), {"__name__": "__main__", "gaigs": gaigs})
         digests.append(runs.folder.software({"split": {"name": "cell"}})["split cell"])
     assert digests[0] == digests[2] != digests[1]
@@ -700,7 +832,9 @@ def test_a_run_killed_behind_its_training_only_tests_anew(finished, tmp_path, mo
         with pytest.raises(ZeroDivisionError):
             runs.run(config, tmp_path)
     monkeypatch.setattr(Descent, "training_step", lambda *_: 1 / 0)
-    trained = torch.load(tmp_path / "last.ckpt", weights_only=True)["callbacks"]["Budget"]["seconds"]
+    trained = torch.load(tmp_path / "last.ckpt", weights_only=True)["callbacks"]["Budget"][
+        "seconds"
+    ]
     others = runs.run(config, tmp_path)
     assert_same_run(metrics, folder, others, tmp_path)
     assert others["train_seconds"] == trained

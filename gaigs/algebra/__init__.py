@@ -12,11 +12,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Algebra:
-    """The Clifford algebra G(p, q, r): of n = p + q + r basis vectors p square to +1, q to -1 and r to 0.
+    """The Clifford algebra G(p, q, r): of n = p + q + r basis vectors p square to +1, q to -1 and r
+    to 0.
 
-    A multivector is the last axis of a tensor: ``k = 2**n`` components, one for each basis blade. The order of basis
-    vectors is null, positive, negative; blades are sorted by grade, then by their vectors. Vectors count from e0 if
-    there is a null vector, else from e1:
+    A multivector is the last axis of a tensor: ``k = 2**n`` components, one for each basis blade.
+    The order of basis vectors is null, positive, negative; blades are sorted by grade, then by
+    their vectors. Vectors count from e0 if there is a null vector, else from e1:
 
     - G(3,0,1), ``PROJECTIVE``: e0² = 0, e1² = e2² = e3² = 1, components
       ``1, e0, e1, e2, e3, e01, e02, e03, e12, e13, e23, e012, e013, e023, e123, e0123``;
@@ -44,7 +45,9 @@ class Algebra:
 
     def __post_init__(self):
         if min(self.p, self.q, self.r) < 0 or self.dimension == 0:
-            raise ValueError(f"a signature (p, q, r) must have a basis vector and no negative count, got {self}")
+            raise ValueError(
+                f"a signature (p, q, r) must have a basis vector and no negative count, got {self}"
+            )
 
     @property
     def dimension(self) -> int:
@@ -58,7 +61,13 @@ class Algebra:
     def blades(self) -> tuple[str, ...]:
         """Names of the components: "1", "e0", ..., "e0123"."""
         first = 0 if self.r else 1
-        return ("1", *("e" + "".join(str(v + first) for v in blade) for blade in _vectors(self.dimension)[1:]))
+        return (
+            "1",
+            *(
+                "e" + "".join(str(v + first) for v in blade)
+                for blade in _vectors(self.dimension)[1:]
+            ),
+        )
 
     @property
     def grades(self) -> tuple[int, ...]:
@@ -67,21 +76,33 @@ class Algebra:
 
     @property
     def homogeneous(self) -> int:
-        """Index of the blade of all vectors that are not null: e123, a projective point's homogeneous coordinate."""
+        """Index of the blade of all vectors that are not null: e123, a projective point's
+        homogeneous coordinate.
+        """
         return _vectors(self.dimension).index(tuple(range(self.r, self.dimension)))
 
-    def product(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
+    def product(
+        self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
+    ) -> Float[Tensor, "*batch k"]:
         """Geometric product x y; of vectors, x y = x · y + x ∧ y."""
         return self._multiply("product", x, y)
 
-    def wedge(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
-        """Outer product x ∧ y; in the projective algebra the intersection, such as the line of two planes."""
+    def wedge(
+        self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
+    ) -> Float[Tensor, "*batch k"]:
+        """Outer product x ∧ y; in the projective algebra the intersection, such as the line of two
+        planes.
+        """
         return self._multiply("wedge", x, y)
 
-    def join(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
-        """Regressive product x ∨ y, the dual of the duals' wedge; of projective points, the line through them.
+    def join(
+        self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
+    ) -> Float[Tensor, "*batch k"]:
+        """Regressive product x ∨ y, the dual of the duals' wedge; of projective points, the line
+        through them.
 
-        A mirror changes its sign besides mirroring it: join(ux, uy) = -u join(x, y) for an odd versor u.
+        A mirror changes its sign besides mirroring it: join(ux, uy) = -u join(x, y) for an odd
+        versor u.
         """
         return self._multiply("join", x, y)
 
@@ -92,8 +113,12 @@ class Algebra:
         product, join = self._multiply("product_and_join", x, y).chunk(2, -1)
         return product, join
 
-    def inner(self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch"]:
-        """Invariant inner product, the scalar part of reverse(x) y; blades with a null vector have weight 0."""
+    def inner(
+        self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
+    ) -> Float[Tensor, "*batch"]:
+        """Invariant inner product, the scalar part of reverse(x) y; blades with a null vector have
+        weight 0.
+        """
         return (x * y * self.table("metric", x)).sum(-1)
 
     def reverse(self, x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
@@ -108,16 +133,21 @@ class Algebra:
         """Projection to one grade."""
         return x * self.table("grades", x)[grade]
 
-    def sandwich(self, versor: Float[Tensor, "*#batch k"], x: Float[Tensor, "*#batch k"]) -> Float[Tensor, "*batch k"]:
+    def sandwich(
+        self, versor: Float[Tensor, "*#batch k"], x: Float[Tensor, "*#batch k"]
+    ) -> Float[Tensor, "*batch k"]:
         """Motion of x by a versor u: u x u⁻¹ for an even u, u involute(x) u⁻¹ for an odd one.
 
-        A vector u mirrors at the hyperplane orthogonal to it; products of vectors rotate and translate.
+        A vector u mirrors at the hyperplane orthogonal to it; products of vectors rotate and
+        translate.
 
         A versor u reverse(u) = 0 has no inverse and raises a ``ValueError``.
         """
         square = self.inner(versor, versor)[..., None]
         if not (square != 0).all():
-            raise ValueError("a versor must be a product of vectors that are not null, got one whose square is zero")
+            raise ValueError(
+                "a versor must be a product of vectors that are not null, got one whose square is zero"
+            )
         # Even and odd parts of x are moved separately: involute(u) has the sign of an odd versor.
         odd = (x - self.involute(x)) / 2
         moved = self.product(versor, x - odd) + self.product(self.involute(versor), odd)
@@ -126,35 +156,45 @@ class Algebra:
     def table(self, name: str, like: Tensor) -> Tensor:
         """A constant of the algebra on the device and in the dtype of ``like``.
 
-        ``product``, ``wedge``, ``join`` (k*k, k): row i*k + j holds blade i times blade j. ``metric``, ``reverse``,
-        ``involute`` (k,): a factor a blade. ``grades`` (n+1, k): 1 where a blade has the grade.
-        ``ideal`` (k,): for blades of points at infinity (r = 1) the metric of their non-null vectors, else 0.
-        ``null_wedges`` (2**r, k, k): matrix of the wedge with each blade of null vectors (the first is 1).
-        ``linear_maps`` (2**r, k): number of the equivariant linear map (``layers.EquivariantLinear``) that leads from
-        each of these wedges to a component.
+        ``product``, ``wedge``, ``join`` (k*k, k): row i*k + j holds blade i times blade j.
+        ``metric``, ``reverse``, ``involute`` (k,): a factor a blade. ``grades`` (n+1, k): 1 where a
+        blade has the grade. ``ideal`` (k,): for blades of points at infinity (r = 1) the metric of
+        their non-null vectors, else 0. ``null_wedges`` (2**r, k, k): matrix of the wedge with each
+        blade of null vectors (the first is 1). ``linear_maps`` (2**r, k): number of the equivariant
+        linear map (``layers.EquivariantLinear``) that leads from each of these wedges to a
+        component.
         """
         return _table(self, name, like.dtype, like.device)
 
     def _multiply(self, name: str, x: Tensor, y: Tensor) -> Tensor:
-        # One matrix multiplication, components first in memory, is a third faster than gathering non-zero terms.
+        # One matrix multiplication, components first in memory, is a third faster than gathering
+        # non-zero terms.
         x, y = torch.broadcast_tensors(x, y)
         batch = x.shape[:-1]
-        rows, columns = (factor.movedim(-1, 0).reshape(self.size, batch.numel()) for factor in (x, y))
+        rows, columns = (
+            factor.movedim(-1, 0).reshape(self.size, batch.numel()) for factor in (x, y)
+        )
         result = self.table(name, x).mT @ (rows[:, None] * columns).flatten(0, 1)
         return result.reshape(len(result), *batch).movedim(0, -1)
 
 
 PROJECTIVE = Algebra(3, 0, 1)
-"""Projective geometric algebra of space, GATr's: planes are vectors, lines bivectors, points trivectors."""
+"""Projective geometric algebra of space, GATr's: planes are vectors, lines bivectors, points
+trivectors.
+"""
 
 SPACETIME = Algebra(3, 1, 0)
-"""Space-time algebra with the metric (+, +, +, -): events are vectors e1, e2, e3 (space) and e4 (time)."""
+"""Space-time algebra with the metric (+, +, +, -): events are vectors e1, e2, e3 (space) and e4
+(time).
+"""
 
 
 @functools.cache
 def _vectors(dimension: int) -> tuple[tuple[int, ...], ...]:
     """Basis vectors of every blade."""
-    return tuple(b for grade in range(dimension + 1) for b in itertools.combinations(range(dimension), grade))
+    return tuple(
+        b for grade in range(dimension + 1) for b in itertools.combinations(range(dimension), grade)
+    )
 
 
 @functools.cache
@@ -180,13 +220,21 @@ def _tables(algebra: Algebra) -> dict[str, Tensor]:
     count = torch.tensor(algebra.grades)
     grades = (count == torch.arange(algebra.dimension + 1)[:, None]).double()
     metric = [square(blade) for blade in blades]
-    # Points at infinity: the blades of a point's grade that hold the one null vector, with the metric of the others.
-    infinite = [algebra.r == 1 and len(blade) == algebra.dimension - 1 and 0 in blade for blade in blades]
-    ideal = [square(blade[1:]) if at_infinity else 0.0 for blade, at_infinity in zip(blades, infinite, strict=True)]
+    # Points at infinity: the blades of a point's grade that hold the one null vector, with the
+    # metric of the others.
+    infinite = [
+        algebra.r == 1 and len(blade) == algebra.dimension - 1 and 0 in blade for blade in blades
+    ]
+    ideal = [
+        square(blade[1:]) if at_infinity else 0.0
+        for blade, at_infinity in zip(blades, infinite, strict=True)
+    ]
     reverse = (-1.0) ** (count * (count - 1) // 2).double()
-    # Motions leave null vectors unchanged, so the wedge of a grade with one of their blades, 1 included, is
-    # equivariant. Maps are numbered by blade, then by grade.
-    null_blades = [i for i, blade in enumerate(blades) if all(vector < algebra.r for vector in blade)]
+    # Motions leave null vectors unchanged, so the wedge of a grade with one of their blades, 1
+    # included, is equivariant. Maps are numbered by blade, then by grade.
+    null_blades = [
+        i for i, blade in enumerate(blades) if all(vector < algebra.r for vector in blade)
+    ]
     first, maps = 0, []
     for i in null_blades:
         highest = algebra.dimension - algebra.grades[i]
@@ -209,6 +257,7 @@ def _tables(algebra: Algebra) -> dict[str, Tensor]:
 
 @functools.cache
 def _table(algebra: Algebra, name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
-    # A tensor first made in inference mode (Lightning's validation) could not be saved for a later backward pass.
+    # A tensor first made in inference mode (Lightning's validation) could not be saved for a later
+    # backward pass.
     with torch.inference_mode(False):
         return _tables(algebra)[name].to(device, dtype)

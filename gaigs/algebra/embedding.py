@@ -1,7 +1,8 @@
 """Points and planes of the projective algebra G(3,0,1), and events of space-time, as multivectors.
 
-``PROJECTIVE.sandwich`` moves points and planes by any product of planes. Multiples of a multivector are the same point
-or plane; a mirrored point has a factor of -1, which ``extract_point`` divides away.
+``PROJECTIVE.sandwich`` moves points and planes by any product of planes. Multiples of a multivector
+are the same point or plane; a mirrored point has a factor of -1, which ``extract_point`` divides
+away.
 
 Source: Brehmer et al., Geometric Algebra Transformer, 2023, table 1.
 """
@@ -20,25 +21,35 @@ def _embed(**components: Tensor) -> Tensor:
 
 
 def embed_point(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
-    """Points [m] as trivectors e123 - x e023 + y e013 - z e012, where the planes of their coordinates meet."""
+    """Points [m] as trivectors e123 - x e023 + y e013 - z e012, where the planes of their
+    coordinates meet.
+    """
     x, y, z = points.unbind(-1)
     return _embed(e123=torch.ones_like(x), e023=-x, e013=y, e012=-z)
 
 
 def extract_point(multivectors: Float[Tensor, "*batch 16"]) -> Float[Tensor, "*batch 3"]:
     """Points [m] of trivectors; not finite for directions, whose e123 is zero."""
-    x, y, z, w = (multivectors[..., PROJECTIVE.blades.index(blade)] for blade in ("e023", "e013", "e012", "e123"))
+    x, y, z, w = (
+        multivectors[..., PROJECTIVE.blades.index(blade)]
+        for blade in ("e023", "e013", "e012", "e123")
+    )
     return torch.stack((-x, y, -z), -1) / w[..., None]
 
 
-def embed_plane(normals: Float[Tensor, "*batch 3"], offsets: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 16"]:
-    """Oriented planes {x: normal · x = offset} as vectors; the offset is in [m] where the normal is of unit length."""
+def embed_plane(
+    normals: Float[Tensor, "*batch 3"], offsets: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 16"]:
+    """Oriented planes {x: normal · x = offset} as vectors; the offset is in [m] where the normal is
+    of unit length.
+    """
     x, y, z = normals.unbind(-1)
     return _embed(e1=x, e2=y, e3=z, e0=-offsets)
 
 
 def embed_event(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
-    """Points [m] as events at time zero, vectors x e1 + y e2 + z e3 of the space-time algebra G(3,1,0).
+    """Points [m] as events at time zero, vectors x e1 + y e2 + z e3 of the space-time algebra
+    G(3,1,0).
 
     Its motions are rotations, boosts and mirrors about the origin, without translations.
     """

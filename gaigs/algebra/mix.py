@@ -22,7 +22,16 @@ class Mix(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx, multivectors, scalars, weight, from_weight, from_bias, to_weight, to_bias, maps, null_wedges
+        ctx,
+        multivectors,
+        scalars,
+        weight,
+        from_weight,
+        from_bias,
+        to_weight,
+        to_bias,
+        maps,
+        null_wedges,
     ) -> tuple[Tensor, Tensor]:
         ctx.shapes = multivectors.shape, scalars.shape
         x, flat = _components_first(multivectors), scalars.flatten(0, -2)
@@ -34,14 +43,18 @@ class Mix(torch.autograd.Function):
         result[0].addmm_(flat, from_weight.mT).add_(from_bias)
         seen = torch.cat((x[0], flat), -1)
         mixed = torch.addmm(to_bias, seen, to_weight.mT)
-        ctx.save_for_backward(seen, matrices, weight, from_weight, to_weight, maps, null_wedges, *wedges)
+        ctx.save_for_backward(
+            seen, matrices, weight, from_weight, to_weight, maps, null_wedges, *wedges
+        )
         tokens = multivectors.shape[:-2]
         return result.unflatten(1, tokens).movedim(0, -1), mixed.unflatten(0, tokens)
 
     @staticmethod
     @once_differentiable
     def backward(ctx, to_multivectors, to_scalars):
-        seen, matrices, weight, from_weight, to_weight, maps, null_wedges, *wedges = ctx.saved_tensors
+        seen, matrices, weight, from_weight, to_weight, maps, null_wedges, *wedges = (
+            ctx.saved_tensors
+        )
         shape, scalars_shape = ctx.shapes
         g, flat = _components_first(to_multivectors), to_scalars.flatten(0, -2)
         x = torch.bmm(g, matrices[0].mT)

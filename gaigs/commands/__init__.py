@@ -23,21 +23,24 @@ SCRIPTS = {
 
 @usual_modes()
 def run(configuration: Mapping, folder: str | Path) -> dict | None:
-    """Executes the command of a configuration, as ``python -m gaigs`` does; resumes a run that was stopped.
+    """Executes the command of a configuration, as ``python -m gaigs`` does; resumes a run that was
+    stopped.
 
     Args:
         configuration: The result of ``gaigs.compose``.
         folder: Gets the results; with ``command=train`` the run folder of docs/start.md.
 
     Returns:
-        With ``command=train`` the contents of ``metrics.json``, or None in all but the first of several processes.
-        None with the other commands.
+        With ``command=train`` the contents of ``metrics.json``, or None in all but the first of
+        several processes. None with the other commands.
 
     Raises:
-        TypeError, ValueError: The configuration does not fit the data, or the folder holds another run.
+        TypeError, ValueError: The configuration does not fit the data, or the folder holds another
+            run.
         ImportError: A component needs a package that is not installed.
         OSError: A file cannot be read or written; no partial file is left.
-        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it, SIGTERM and SIGHUP within a training.
+        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it, SIGTERM and SIGHUP within a
+            training.
 
     Example:
         >>> configuration = gaigs.compose("model=knn", "data.transmitters=40", "data.order=0", baselines=["mean"])
@@ -49,14 +52,20 @@ def run(configuration: Mapping, folder: str | Path) -> dict | None:
         ['knn', 'mean']
     """
     if not isinstance(configuration, Mapping):
-        raise TypeError(f"configuration must be the result of gaigs.compose, got {configuration!r:.80}")
+        raise TypeError(
+            f"configuration must be the result of gaigs.compose, got {configuration!r:.80}"
+        )
     config, folder = dict(configuration), Path(folder)
     if config.get("command") == "devices":  # works with any other keys
         from gaigs.splatting.rasterizer.devices import default_device, devices
 
         names, default = devices(), default_device()
         for number, name in enumerate(names):
-            print(f"{name}  <- rasterizer=opencl takes this one" if number == names.index(default) else name)
+            print(
+                f"{name}  <- rasterizer=opencl takes this one"
+                if number == names.index(default)
+                else name
+            )
         return None
     check(config)
     with call("figures", figure_formats, config["figures"]):
@@ -74,7 +83,9 @@ def _execute(config: dict, folder: Path) -> dict | None:
         if command in SCRIPTS:
             raise ValueError(f"there is no command {command!r}; {SCRIPTS[command]}")
         known = ("train", *COMMANDS, "devices")
-        raise ValueError(f"command must be one of {', '.join(known)}, got {suggest(command, known)}")
+        raise ValueError(
+            f"command must be one of {', '.join(known)}, got {suggest(command, known)}"
+        )
     module = importlib.import_module(f"gaigs.commands.{command}")
     with processes.limited_threads(config["threads"]):
         if command == "view":

@@ -24,8 +24,9 @@ log = logging.getLogger("gaigs")
 def run(config: DictConfig) -> float | None:
     """One job: ``gaigs.run`` in Hydra's run folder; returns the validation score for sweepers.
 
-    An error that a user can mend becomes one message; ``hydra.verbose=true`` prints the traceback first. A signal ends
-    the process with 128 and the signal's number, as in shells. Without a result there is no folder.
+    An error that a user can mend becomes one message; ``hydra.verbose=true`` prints the traceback
+    first. A signal ends the process with 128 and the signal's number, as in shells. Without a
+    result there is no folder.
     """
     settings = HydraConfig.get()
     is_sweep, launcher = (
@@ -54,10 +55,13 @@ def run(config: DictConfig) -> float | None:
         message = f"gaigs: {str(stop) or 'stopped'}; {goes_on}"
         number = getattr(stop, "number", signal.SIGINT)
         if is_sweep and launcher != "BasicLauncher":
-            # Only this job ends: a launcher that sees a process exit kills its other jobs before they have saved.
+            # Only this job ends: a launcher that sees a process exit kills its other jobs before
+            # they have saved.
             processes.received.append(number)
             raise CompactHydraException(message) from None
-        if not processes.is_first():  # exits with 0: at a failure Lightning would kill the first process
+        if (
+            not processes.is_first()
+        ):  # exits with 0: at a failure Lightning would kill the first process
             raise SystemExit(0) from None
         print(message, file=sys.stderr)
         raise SystemExit(128 + number) from None
@@ -102,7 +106,9 @@ def note_task(words: list[str], config: dict) -> None:
 
 
 def remove_without_result(folder: Path) -> None:
-    """Removes a run folder with nothing but what Hydra and the start of a run write, unless a run is at work there."""
+    """Removes a run folder with nothing but what Hydra and the start of a run write, unless a run
+    is at work there.
+    """
     begun = {".hydra", "gaigs.log", "config.yaml", "software.json"}
     with contextlib.suppress(OSError, ValueError), processes.only_run(folder):
         names = {path.name for path in folder.iterdir()}
@@ -112,20 +118,28 @@ def remove_without_result(folder: Path) -> None:
 
 
 def compose_and_run() -> None:
-    """Lets Hydra read the command line and run its jobs; exits with 1 after the message of an error."""
+    """Lets Hydra read the command line and run its jobs; exits with 1 after the message of an
+    error.
+    """
     if message := configuration.wrong_flag():
         print(f"gaigs: {message}", file=sys.stderr)
         raise SystemExit(2)
     full_error = os.environ.get("HYDRA_FULL_ERROR", "")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     try:
-        hydra.main(version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config")(run)()
+        hydra.main(
+            version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config"
+        )(run)()
     except Exception as error:
         if full_error == "1":
             raise
-        if isinstance(error, BrokenPipeError) and not configuration.is_multirun():  # launchers have other pipes
+        if (
+            isinstance(error, BrokenPipeError) and not configuration.is_multirun()
+        ):  # launchers have other pipes
             raise SystemExit(141) from None
-        message = configuration.explain(error) or processes.advice(error, Path.cwd(), "the same command goes on")
+        message = configuration.explain(error) or processes.advice(
+            error, Path.cwd(), "the same command goes on"
+        )
         if message is None:
             traceback.print_exc()
         else:
@@ -137,8 +151,12 @@ def compose_and_run() -> None:
 
 def main() -> None:
     """The console script ``gaigs``."""
-    logging.getLogger("matplotlib").setLevel(logging.WARNING)  # it reports the making of its font cache
-    logging.raiseExceptions = False  # on a full disk the log stays silent; the run's own files report it
+    logging.getLogger("matplotlib").setLevel(
+        logging.WARNING
+    )  # it reports the making of its font cache
+    logging.raiseExceptions = (
+        False  # on a full disk the log stays silent; the run's own files report it
+    )
     signals = []
 
     def stop(number: int, _) -> None:

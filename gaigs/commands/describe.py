@@ -22,7 +22,9 @@ from gaigs.registry import check_instance
 from gaigs.report import style
 
 LINKS, RECEIVERS = 2000, 12
-"""Most links whose spectra or channels are read, evenly spread, and most receivers that the text lists."""
+"""Most links whose spectra or channels are read, evenly spread, and most receivers that the text
+lists.
+"""
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,8 @@ class Description:
 
 @torch.no_grad()
 def describe(links: Links) -> Description:
-    """A first look at links of any task: extent, levels and receivers, and what is suspicious in them.
+    """A first look at links of any task: extent, levels and receivers, and what is suspicious in
+    them.
 
     Args:
         links: With or without a split.
@@ -71,7 +74,9 @@ def describe(links: Links) -> Description:
     sites, values = places.unique(dim=0), levels(links, index)
     axes = zip("xyz", sites.amin(0).tolist(), sites.amax(0).tolist(), strict=True)
     quantity, unit = quantity_of(links)
-    low, middle, high = np.quantile(values.numpy(), (0.0, 0.5, 1.0)).tolist()  # torch takes no more than 2**24
+    low, middle, high = np.quantile(
+        values.numpy(), (0.0, 0.5, 1.0)
+    ).tolist()  # torch takes no more than 2**24
     count = len(links.receivers)
     read = [
         f"{links.task.name}: {len(links)} links of {len(sites)} places at {count} receiver{'s' * (count != 1)}",
@@ -80,7 +85,10 @@ def describe(links: Links) -> Description:
         + f" of {len(index)} links" * (len(index) < len(links)),
     ]
     if links.split is not None:
-        read.append(f"split {links.split.name}: " + ", ".join(f"{len(p)} {n}" for n, p in links.split.parts().items()))
+        read.append(
+            f"split {links.split.name}: "
+            + ", ".join(f"{len(p)} {n}" for n, p in links.split.parts().items())
+        )
     if repeated := len(links) - len(links.query.unique(with_receivers=True)[0]):
         read.append(f"{repeated} links repeat place and receiver of another")
     findings = tuple(check(links))
@@ -132,7 +140,9 @@ def levels(links: Links, index: Tensor) -> Float[Tensor, " k"]:
 
 
 def run(config: dict, folder: Path) -> None:
-    """Describes the data of a configuration; prints the text, and writes ``describe.txt`` and ``describe.png``."""
+    """Describes the data of a configuration; prints the text, and writes ``describe.txt`` and
+    ``describe.png``.
+    """
     links = load(config["data"], config["split"])
     text = str(describe(links))
     folder.mkdir(parents=True, exist_ok=True)
@@ -144,16 +154,23 @@ def run(config: dict, folder: Path) -> None:
 def figure(links: Links) -> Figure:
     """Places and receivers from above, and a histogram of levels.
 
-    Colours are the number of receivers that hear a place, or the level at the first one if all numbers are equal.
+    Colours are the number of receivers that hear a place, or the level at the first one if all
+    numbers are equal.
     """
     index = _read(links)
     values, (quantity, unit) = levels(links, index), quantity_of(links)
-    heard = torch.cat((links.query.transmitters, links.query.receivers[:, None].float()), 1).unique(dim=0)
+    heard = torch.cat((links.query.transmitters, links.query.receivers[:, None].float()), 1).unique(
+        dim=0
+    )
     places, counts = heard[:, :3].unique(dim=0, return_counts=True)
     colours, label = counts, "receivers that hear the place"
     if counts.min() == counts.max():
         first = links.query.receivers[index] == 0
-        places, colours, label = links.query.transmitters[index[first]], values[first], with_unit(quantity, unit)
+        places, colours, label = (
+            links.query.transmitters[index[first]],
+            values[first],
+            with_unit(quantity, unit),
+        )
         label += f" at {links.receivers[0].name}" if len(links.receivers) > 1 else ""
     with rc_context(style.STYLE):
         drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
@@ -161,8 +178,19 @@ def figure(links: Links) -> Figure:
         dots = left.scatter(*places[:, :2].T.numpy(), 8, colours.numpy(), cmap="viridis", zorder=2)
         drawn.colorbar(dots, ax=left, label=label)
         stands = torch.stack([receiver.pose.position for receiver in links.receivers])
-        words = "receivers" if links.uncertainties is None or not links.uncertainties.any() else "receivers, estimated"
-        left.plot(*stands[:, :2].T.numpy(), "^", color=style.ORANGE, markeredgecolor="white", markersize=6, label=words)
+        words = (
+            "receivers"
+            if links.uncertainties is None or not links.uncertainties.any()
+            else "receivers, estimated"
+        )
+        left.plot(
+            *stands[:, :2].T.numpy(),
+            "^",
+            color=style.ORANGE,
+            markeredgecolor="white",
+            markersize=6,
+            label=words,
+        )
         left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         drawn.legend(loc="outside lower left")
         low, high = math.floor(values.min().item()), values.max().item()

@@ -37,7 +37,9 @@ TOLERATED = 1.05
 """Largest rise of the mean error for which known places count as superfluous together."""
 
 LENGTH, NUGGET = 0.25, 0.6
-"""Correlation length over the diagonal of all points and nugget of the process that stands in for a model."""
+"""Correlation length over the diagonal of all points and nugget of the process that stands in for a
+model.
+"""
 
 
 @dataclass(frozen=True, repr=False)
@@ -46,14 +48,16 @@ class SurveyPlan:
 
     Attributes:
         places: To measure, the most useful first (n, 3) [m].
-        errors: Expected mean absolute error of a label over the region and all receivers, before and after each place,
-            in the label's unit (n + 1,); None without a model.
+        errors: Expected mean absolute error of a label over the region and all receivers, before
+            and after each place, in the label's unit (n + 1,); None without a model.
         known: Places that were measured (k, 3) [m].
         losses: Rise of ``known_error`` if one of them had been left out (k,).
-        superfluous: Known places that together raise ``known_error`` by at most 5 % if left out (k,).
+        superfluous: Known places that together raise ``known_error`` by at most 5 % if left out
+            (k,).
         unit: Of the errors.
         frame: Place of x and y on a map; None if unknown.
-        known_error: Expected mean error over the region, or else the box of the training transmitters, now.
+        known_error: Expected mean error over the region, or else the box of the training
+            transmitters, now.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -78,26 +82,39 @@ class SurveyPlan:
             return f"{len(self.places)} places to measure first; without a trained model their error is unknown"
         first, last = (f"{error:.3g}" for error in (self.errors[0], self.errors[-1]))
         few = int(self.superfluous.sum())
-        words = (
-            f"{len(self.places)} more places bring the expected mean error from {first} to {last} {self.unit}".rstrip()
-        )
+        words = f"{len(self.places)} more places bring the expected mean error from {first} to {last} {self.unit}".rstrip()
         return f"{words}; {few} of {len(self.known)} measured places could have been left out for 5 % more"
 
     def save(self, path: str | Path) -> None:
-        """Writes a CSV table: places to measure, each with the error after it, then measured ones to leave out.
+        """Writes a CSV table: places to measure, each with the error after it, then measured ones
+        to leave out.
 
         With a ``frame`` it has easting and northing too. Without a model errors are empty.
         """
         frame = self.frame
-        rows = [["use", "x", "y", "z", *([] if frame is None else ["easting", "northing"]), "mean_error"]]
+        rows = [
+            [
+                "use",
+                "x",
+                "y",
+                "z",
+                *([] if frame is None else ["easting", "northing"]),
+                "mean_error",
+            ]
+        ]
         on_map = lambda x, y, z: () if frame is None else (frame.x + x, frame.y + y)
-        row = lambda use, place, word: rows.append([use, *(f"{x:.3f}" for x in (*place, *on_map(*place))), word])
+        row = lambda use, place, word: rows.append(
+            [use, *(f"{x:.3f}" for x in (*place, *on_map(*place))), word]
+        )
         words = [""] * len(self.places)
         if self.errors is not None:
             words = [f"{error:.6g}" for error in self.errors[1:].tolist()]
         for place, word in zip(self.places.tolist(), words, strict=True):
             row("measure", place, word)
-        known, losses = self.known[self.superfluous].tolist(), self.losses[self.superfluous].tolist()
+        known, losses = (
+            self.known[self.superfluous].tolist(),
+            self.losses[self.superfluous].tolist(),
+        )
         for place, loss in zip(known, losses, strict=True):
             row("leave out", place, f"{self.known_error + loss:.6g}")
         write_csv(Path(path), rows)
@@ -111,25 +128,28 @@ def survey(
     candidates: object = None,
     frequency: float | None = None,
 ) -> SurveyPlan:
-    """The next places to measure: each lowers the mean variance over a region most, at all receivers together.
+    """The next places to measure: each lowers the mean variance over a region most, at all
+    receivers together.
 
-    A receiver counts at a place as much as it is likely to hear it, by the measured places around. Labels do not enter
-    beyond the fitted process, so a plan is made before anything is measured. The largest variance would be a poor
-    guide: it is in the corners. The first places of a longer plan are those of a shorter one.
+    A receiver counts at a place as much as it is likely to hear it, by the measured places around.
+    Labels do not enter beyond the fitted process, so a plan is made before anything is measured.
+    The largest variance would be a poor guide: it is in the corners. The first places of a longer
+    plan are those of a shorter one.
 
     Args:
-        model: ``gaussian_process``, or a trained model with kriging; None: nothing is measured yet, and a default
-            process takes its place.
-        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the error is stated; None: the
-            candidates or, without these, the box of the training transmitters, of several floors these.
+        model: ``gaussian_process``, or a trained model with kriging; None: nothing is measured yet,
+            and a default process takes its place.
+        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the error is stated;
+            None: the candidates or, without these, the box of the training transmitters, of several
+            floors these.
         count: Number of places; at most as many as there are candidates.
         candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
-        frequency: Carrier [Hz]; None: that of the training links, of several the middle one. Without a model it has no
-            effect.
+        frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
+            Without a model it has no effect.
 
     Raises:
-        ValueError: The model has no process over places, the count is less than 1, a place is impossible, or there is
-            neither model nor region nor candidates.
+        ValueError: The model has no process over places, the count is less than 1, a place is
+            impossible, or there is neither model nor region nor candidates.
 
     Example:
         >>> first = gaigs.survey(region=[[0, 0, 1], [6, 4, 1]], count=15)  # nothing is measured yet
@@ -141,8 +161,9 @@ def survey(
         (torch.Size([5, 3]), True)
         >>> plan.save("survey.csv")
 
-    Source: Krause, Singh and Guestrin, Near-optimal sensor placements in Gaussian processes, 2008; the criterion is the
-    A-optimal one of Cohn, Neural network exploration using optimal experiment design, 1996.
+    Source: Krause, Singh and Guestrin, Near-optimal sensor placements in Gaussian processes, 2008;
+    the criterion is the A-optimal one of Cohn, Neural network exploration using optimal experiment
+    design, 1996.
     """
     if not isinstance(model, Model | None):
         raise TypeError(
@@ -164,7 +185,9 @@ def survey(
         box = as_positions("region", region).reshape(-1, 3)
         if len(box) != 2:
             advice = "\ngive places that can be measured as candidates" if len(box) > 2 else ""
-            raise ValueError(f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points{advice}")
+            raise ValueError(
+                f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points{advice}"
+            )
         even = even_places(box[0], box[1], POINTS, model.scene.floors if is_whole else ())
     places = even if candidates is None else as_positions("candidates", candidates).reshape(-1, 3)
     beside = even[:0] if candidates is None else even
@@ -189,12 +212,17 @@ def survey(
 
         asked = at(points)
         centres = scene.positions(asked) if scene.task.is_scalar else [None] * len(processes)
-        processes = [with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)]
+        processes = [
+            with_trend(process, centre) for process, centre in zip(processes, centres, strict=True)
+        ]
         factor, calibration = MEAN, model.calibration
         if calibration is not None:
             rms = calibration.sizes.square().mean().sqrt().item()
             factor = MEAN * rms if scene.task.is_scalar else calibration.mean_error
-    posteriors, hears = [posterior(process, asked) for process in processes], heard(processes, asked)
+    posteriors, hears = (
+        [posterior(process, asked) for process in processes],
+        heard(processes, asked),
+    )
     noises = [process.noise for process in processes]
 
     def error(parts: list[Tensor]) -> float:
@@ -218,20 +246,32 @@ def survey(
             part -= own[best] * torch.outer(part[best], part[best]) / (part[best, best] + noise)
         errors.append(error(posteriors))
     if model is None:
-        return SurveyPlan(places[chosen], None, places[:0], places[:0, 0], torch.zeros(0, dtype=torch.bool))
-    box = asked[stated] if region is not None else at(even_places(scene.lower, scene.upper, POINTS, scene.floors))
+        return SurveyPlan(
+            places[chosen], None, places[:0], places[:0, 0], torch.zeros(0, dtype=torch.bool)
+        )
+    box = (
+        asked[stated]
+        if region is not None
+        else at(even_places(scene.lower, scene.upper, POINTS, scene.floors))
+    )
     known, own, losses, superfluous = without(processes, box, factor)
     unit = getattr(model.scene.task, "error_unit", model.scene.task.unit)
     frame = model.scene.frame
-    return SurveyPlan(places[chosen], torch.tensor(errors), known, losses, superfluous, unit, frame, own)
+    return SurveyPlan(
+        places[chosen], torch.tensor(errors), known, losses, superfluous, unit, frame, own
+    )
 
 
 def run(config: dict, folder: Path) -> None:
-    """Plans a survey, by the model of a finished run if given; writes ``survey.csv`` and ``survey.png``."""
+    """Plans a survey, by the model of a finished run if given; writes ``survey.csv`` and
+    ``survey.png``.
+    """
     model = None if config["folder"] is None else load(config["folder"], config["trust"])
     options = dict(config["survey"])
     if isinstance(options["candidates"], str):
-        options["candidates"] = read_points(Path(options["candidates"]), "xyz", "x,y,z [m] of one candidate a line")
+        options["candidates"] = read_points(
+            Path(options["candidates"]), "xyz", "x,y,z [m] of one candidate a line"
+        )
     plan = call("survey", survey, options, model=model)
     folder.mkdir(parents=True, exist_ok=True)
     plan.save(folder / "survey.csv")
@@ -249,7 +289,11 @@ def figure(plan: SurveyPlan) -> Figure:
         (left, *right) = drawn.subplots(1, 1 if plan.errors is None else 2, squeeze=False)[0]
         for rows, look, words in (
             (~plan.superfluous, {"color": style.GREY}, "measured"),
-            (plan.superfluous, {"markeredgecolor": style.GREY, "color": "none"}, "measured, could be left out"),
+            (
+                plan.superfluous,
+                {"markeredgecolor": style.GREY, "color": "none"},
+                "measured, could be left out",
+            ),
         ):
             if len(plan.known):
                 left.plot(*plan.known[rows, :2].T.numpy(), "o", markersize=3, label=words, **look)
@@ -265,7 +309,14 @@ def figure(plan: SurveyPlan) -> Figure:
         for number, place in enumerate(plan.places.tolist(), 1):
             numbers.setdefault(tuple(place[:2]), []).append(str(number))
         for place, words in numbers.items():  # one above the other, for places at several heights
-            left.annotate("\n".join(words), place, ha="center", va="center", color="white", size=5 / len(words) ** 0.5)
+            left.annotate(
+                "\n".join(words),
+                place,
+                ha="center",
+                va="center",
+                color="white",
+                size=5 / len(words) ** 0.5,
+            )
         left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
         drawn.legend(loc="outside lower left", ncols=3)
         label = f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
@@ -280,7 +331,10 @@ def figure(plan: SurveyPlan) -> Figure:
 
 def processes_of(model: Model) -> list[Process]:
     """The processes of a model's receivers; raises a ``ValueError`` for a model without."""
-    found = [call_optional(model, "process_at", receiver) for receiver in range(len(model.scene.receivers))]
+    found = [
+        call_optional(model, "process_at", receiver)
+        for receiver in range(len(model.scene.receivers))
+    ]
     processes = [process for process in found if process is not None]
     if not processes:
         raise ValueError(
@@ -290,7 +344,9 @@ def processes_of(model: Model) -> list[Process]:
 
 
 def default_process(points: Float[Tensor, "g 3"]) -> Process:
-    """A process without readings and with an unknown constant: its places spread evenly over the points' box."""
+    """A process without readings and with an unknown constant: its places spread evenly over the
+    points' box.
+    """
     length = LENGTH * (points.amax(0) - points.amin(0)).norm().item() or 1.0
     return Process(lambda a, b: 100 + kernel(a, b, length), points[:0], points[:0, 0], NUGGET)
 
@@ -298,10 +354,15 @@ def default_process(points: Float[Tensor, "g 3"]) -> Process:
 def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process:
     """The process with the coefficients of its trend, which readings have to determine too.
 
-    They are a constant and, for labels of one number, a slope over the logarithm of the distance to the receiver, with
-    a standard deviation of twice that of the readings: as much as receivers of one survey may differ.
+    They are a constant and, for labels of one number, a slope over the logarithm of the distance to
+    the receiver, with a standard deviation of twice that of the readings: as much as receivers of
+    one survey may differ.
     """
-    scale = 2 * float(process.covariances(process.places[:1], process.places[:1])[0, 0] + process.noise) ** 0.5
+    scale = (
+        2
+        * float(process.covariances(process.places[:1], process.places[:1])[0, 0] + process.noise)
+        ** 0.5
+    )
     decades = lambda places: (places[:, :3] - receiver).norm(dim=1).clamp_min(0.1).log10()
     middle = decades(process.places).mean() if receiver is not None else 0.0
 
@@ -322,13 +383,17 @@ def posterior(process: Process, asked: Float[Tensor, "g d"]) -> Float[Tensor, "g
 
 
 def heard(processes: list[Process], asked: Float[Tensor, "g d"]) -> Float[Tensor, "r g"]:
-    """Shares of the measured places around others that each receiver hears at the asked carrier, or the nearest one."""
+    """Shares of the measured places around others that each receiver hears at the asked carrier, or
+    the nearest one.
+    """
     places = torch.cat([process.places for process in processes])
     if not len(places):
         return asked.new_ones(len(processes), len(asked))
     apart = (places[:, 3:] - asked[:1, 3:]).abs().sum(1)  # of carriers
     at_carrier = apart <= apart.min() + 1e-6
-    own = torch.repeat_interleave(torch.tensor([len(process.places) for process in processes])).to(places.device)
+    own = torch.repeat_interleave(torch.tensor([len(process.places) for process in processes])).to(
+        places.device
+    )
     known, rows = places[at_carrier, :3].unique(dim=0, return_inverse=True)
     hears = known.new_zeros(len(known), len(processes))
     hears[rows, own[at_carrier]] = 1
@@ -346,12 +411,19 @@ def mean_of_heard(values: Float[Tensor, "r g"], hears: Float[Tensor, "r g"]) -> 
 def without(
     processes: list[Process], asked: Float[Tensor, "g d"], factor: float
 ) -> tuple[Float[Tensor, "k 3"], float, Float[Tensor, " k"], Bool[Tensor, " k"]]:
-    """Known places, the mean error, its rise without each of them, and those that together raise it by little."""
-    rows = [evenly(torch.arange(len(process.places)), COMPARED).to(asked.device) for process in processes]
+    """Known places, the mean error, its rise without each of them, and those that together raise it
+    by little.
+    """
+    rows = [
+        evenly(torch.arange(len(process.places)), COMPARED).to(asked.device)
+        for process in processes
+    ]
     measured = [process.places[own, :3] for process, own in zip(processes, rows, strict=True)]
     known = torch.cat(measured).unique(dim=0)
     which = [distances(places, known).argmin(1) for places in measured]
-    variances = lambda process: torch.cat([process.covariances(x, x).diagonal() for x in asked.split(16)])
+    variances = lambda process: torch.cat(
+        [process.covariances(x, x).diagonal() for x in asked.split(16)]
+    )
     prior, hears = [variances(process) for process in processes], heard(processes, asked)
 
     def error(kept: Bool[Tensor, " k"]) -> float:
@@ -363,7 +435,9 @@ def without(
 
     losses = known.new_zeros(len(known))
     parts = zip(processes, rows, which, prior, hears, strict=True)
-    for process, own, place, variance, likely in track(parts, "places to leave out", len(processes)):
+    for process, own, place, variance, likely in track(
+        parts, "places to leave out", len(processes)
+    ):
         left, root = process.whitened(asked, own)
         deviations = ((variance - left.square().sum(0)).clamp_min(0) + process.noise).sqrt()
         weights = torch.linalg.solve_triangular(root.mT, left, upper=True)
@@ -371,10 +445,14 @@ def without(
         for number in place.unique().tolist():  # all readings of a place go together
             there = (place == number).nonzero()[:, 0]
             gone = weights[there]
-            # Variances rise by w' (inverse of these rows)^-1 w; roots by half of it over themselves.
+            # Variances rise by w' (inverse of these rows)^-1 w; roots by half of it over
+            # themselves.
             rises = (gone * torch.linalg.solve(inverse[there[:, None], there], gone)).sum(0)
             losses[number] += likely @ (rises / (2 * deviations)) / hears.sum()
-    order, before = losses.argsort(), error(torch.ones(len(known), dtype=torch.bool, device=known.device))
+    order, before = (
+        losses.argsort(),
+        error(torch.ones(len(known), dtype=torch.bool, device=known.device)),
+    )
     fewest, most = 0, len(known) - 1  # places that may, and may not be left out together
     superfluous = torch.zeros(len(known), dtype=torch.bool)
     while most - fewest > max(1, len(known) // 32):

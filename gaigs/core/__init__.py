@@ -1,1 +1,3 @@
-"""Geometry, antennas, queries, tasks and the laws of propagation: what data, models and figures share."""
+"""Geometry, antennas, queries, tasks and the laws of propagation: what data, models and figures
+share.
+"""

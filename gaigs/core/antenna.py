@@ -12,11 +12,15 @@ from torch import Tensor
 from gaigs.core.geometry import Pose
 
 PATTERNS = ("isotropic", "cosine")
-"""Field patterns of an element; as of a patch, the cosine of the angle to the array's normal, and 0 behind it."""
+"""Field patterns of an element; as of a patch, the cosine of the angle to the array's normal, and 0
+behind it.
+"""
 
 
 def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"]]:
-    """The distinct vectors between places, rounded to nine decimals, and the index of each pair's vector."""
+    """The distinct vectors between places, rounded to nine decimals, and the index of each pair's
+    vector.
+    """
     apart = (places[:, None] - places).flatten(0, 1).round(decimals=9)
     return torch.unique(apart, dim=0, return_inverse=True)
 
@@ -39,9 +43,13 @@ class Array:
 
     def __post_init__(self) -> None:
         if self.pattern not in PATTERNS:
-            raise ValueError(f"an array's pattern must be one of {', '.join(PATTERNS)}, got {self.pattern!r}")
+            raise ValueError(
+                f"an array's pattern must be one of {', '.join(PATTERNS)}, got {self.pattern!r}"
+            )
         if self.elements.ndim != 2 or self.elements.shape[1] != 3 or not len(self.elements):
-            raise ValueError(f"an array's elements must be (e, 3) positions [m], got {tuple(self.elements.shape)}")
+            raise ValueError(
+                f"an array's elements must be (e, 3) positions [m], got {tuple(self.elements.shape)}"
+            )
 
     @classmethod
     def single(cls) -> "Array":
@@ -74,7 +82,8 @@ class Array:
 
     @functools.cached_property
     def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"], Float[Tensor, " l"]]:
-        """The distinct vectors between elements [m], the index of each pair's vector, and the pairs of each; float64.
+        """The distinct vectors between elements [m], the index of each pair's vector, and the pairs
+        of each; float64.
 
         The covariance of a field depends on them only: 49 for a 4 x 4 array.
         """
@@ -86,7 +95,9 @@ class Array:
     def by_lag(self, covariances: Complex[Tensor, "b e e"]) -> Complex[Tensor, "b l"]:
         """Mean covariance of the pairs of elements at each of ``lags``."""
         pairs, counts = (part.to(covariances.device) for part in self.lags[1:])
-        summed = covariances.new_zeros(len(covariances), len(counts)).index_add(1, pairs, covariances.flatten(1))
+        summed = covariances.new_zeros(len(covariances), len(counts)).index_add(
+            1, pairs, covariances.flatten(1)
+        )
         return summed / counts.to(covariances.real)
 
     def gain(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -113,12 +124,21 @@ class Receiver:
     def __post_init__(self) -> None:
         axes = self.pose.rotation.double()
         # NaN is no rotation either, nor a mirror, whose determinant is -1.
-        if not ((axes.mT @ axes - torch.eye(3).to(axes)).abs().max() <= 1e-3 and torch.linalg.det(axes) > 0):
+        if not (
+            (axes.mT @ axes - torch.eye(3).to(axes)).abs().max() <= 1e-3
+            and torch.linalg.det(axes) > 0
+        ):
             wanted = "a rotation, whose orthonormal columns are the array's axes"
-            raise ValueError(f"the pose of receiver {self.name!r} must have {wanted}, got {axes.tolist()}")
+            raise ValueError(
+                f"the pose of receiver {self.name!r} must have {wanted}, got {axes.tolist()}"
+            )
 
 
-def lacking(receivers: Sequence[Receiver], index: Int[Tensor, " b"], count: int) -> Bool[Tensor, "b e"]:
-    """True for each of ``count`` elements that the array of a link's receiver lacks; ``index`` numbers receivers."""
+def lacking(
+    receivers: Sequence[Receiver], index: Int[Tensor, " b"], count: int
+) -> Bool[Tensor, "b e"]:
+    """True for each of ``count`` elements that the array of a link's receiver lacks; ``index``
+    numbers receivers.
+    """
     sizes = torch.tensor([len(receiver.array) for receiver in receivers], device=index.device)
     return torch.arange(count, device=index.device) >= sizes[index.long()][:, None]

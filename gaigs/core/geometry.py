@@ -1,4 +1,6 @@
-"""Poses, quaternions, coordinates, harmonics, and grids of directions; conventions: docs/conventions.md."""
+"""Poses, quaternions, coordinates, harmonics, and grids of directions; conventions:
+docs/conventions.md.
+"""
 
 import math
 from collections.abc import Sequence
@@ -22,11 +24,12 @@ class ExtrapolationWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Frame:
-    """The place of the world frame on a map: its origin (x, y) in the projected system of an EPSG code [m].
+    """The place of the world frame on a map: its origin (x, y) in the projected system of an EPSG
+    code [m].
 
     Raises:
-        ValueError: There is no such system, it has other units than metres, or the origin is not within it. Without
-            pyproj systems other than UTM are not checked.
+        ValueError: There is no such system, it has other units than metres, or the origin is not
+            within it. Without pyproj systems other than UTM are not checked.
 
     Example:
         >>> places, levels = [[10.0, 20.0, 1.5], [30.0, 5.0, 1.5], [0.0, 9.0, 1.5]], [-50.0, -60.0, -55.0]
@@ -42,9 +45,15 @@ class Frame:
 
     def __post_init__(self) -> None:
         remedy = "gaigs.data.maps.to_utm converts degrees and feet into metres of UTM, and gives its code"
-        is_number = isinstance(self.epsg, Integral) and isinstance(self.x, Real) and isinstance(self.y, Real)
+        is_number = (
+            isinstance(self.epsg, Integral)
+            and isinstance(self.x, Real)
+            and isinstance(self.y, Real)
+        )
         if not is_number or not math.isfinite(self.x + self.y) or self._is_elsewhere():
-            raise ValueError(f"a frame must be an EPSG code with an easting and a northing [m], got {self}\n{remedy}")
+            raise ValueError(
+                f"a frame must be an EPSG code with an easting and a northing [m], got {self}\n{remedy}"
+            )
         if is_utm(self.epsg) or find_spec("pyproj") is None:
             return
         import pyproj
@@ -59,7 +68,9 @@ class Frame:
             raise ValueError(f"a frame must be a projected system in metres, got {found}\n{remedy}")
 
     def _is_elsewhere(self) -> bool:
-        """True if the origin is in degrees, or beyond all of UTM: Norway has eastings of -80 to 1120 km in zone 33."""
+        """True if the origin is in degrees, or beyond all of UTM: Norway has eastings of -80 to
+        1120 km in zone 33.
+        """
         is_small = abs(self.x) <= 180 and abs(self.y) <= 90
         if is_utm(self.epsg):
             return is_small or not (-2e5 <= self.x <= 1.3e6 and -1e5 <= self.y <= 1.01e7)
@@ -90,8 +101,12 @@ class Pose:
 
     @classmethod
     def from_xyzw(cls, position, quaternion) -> "Pose":
-        """A pose from a scalar-last quaternion of unit length (to 1e-3), as in scipy and the NeRF² files."""
-        plain = lambda values: values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, float))
+        """A pose from a scalar-last quaternion of unit length (to 1e-3), as in scipy and the NeRF²
+        files.
+        """
+        plain = lambda values: (
+            values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, float))
+        )
         position, quaternion = plain(position).double(), plain(quaternion).double()
         if position.shape != (3,) or quaternion.shape != (4,) or not position.isfinite().all():
             raise ValueError(
@@ -100,7 +115,9 @@ class Pose:
             )
         norm = float(quaternion.norm())
         if not abs(norm - 1) <= 1e-3:
-            raise ValueError(f"a rotation quaternion must have length 1, got {norm:.6g}; normalise it")
+            raise ValueError(
+                f"a rotation quaternion must have length 1, got {norm:.6g}; normalise it"
+            )
         rotation = quaternions_to_rotations(quaternion.roll(1))
         return cls(position.float(), rotation.float())
 
@@ -143,38 +160,54 @@ def _of_moderate_length(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*bat
     return quats / torch.where(largest == 0, 1, largest)
 
 
-def semi_axes(quats: Float[Tensor, "*#batch 4"], scales: Float[Tensor, "*#batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """Semi-axes R diag(scales) of Gaussians as columns, from quaternions (w, x, y, z) and standard deviations [m]."""
+def semi_axes(
+    quats: Float[Tensor, "*#batch 4"], scales: Float[Tensor, "*#batch 3"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """Semi-axes R diag(scales) of Gaussians as columns, from quaternions (w, x, y, z) and standard
+    deviations [m].
+    """
     return quaternions_to_rotations(quats) * scales[..., None, :]
 
 
 def to_spherical(points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Azimuth in [-pi, pi] [rad], elevation in [-pi/2, pi/2] [rad] and distance [m] of points in the array's frame.
+    """Azimuth in [-pi, pi] [rad], elevation in [-pi/2, pi/2] [rad] and distance [m] of points in
+    the array's frame.
 
-    At the zenith, where azimuth is undefined, it is 0. Gradients are finite everywhere but at the origin.
+    At the zenith, where azimuth is undefined, it is 0. Gradients are finite everywhere but at the
+    origin.
     """
     x, y, z = points.unbind(-1)
     distances = points.norm(dim=-1)
-    # Within rounding of the axis no azimuth is resolved: such a point counts as one just beside it, at azimuth 0.
+    # Within rounding of the axis no azimuth is resolved: such a point counts as one just beside it,
+    # at azimuth 0.
     least = torch.finfo(points.dtype).eps * distances.detach()
     axial = torch.hypot(x, y) <= least
     x, y = torch.where(axial, least, x), torch.where(axial, 0.0, y)
     return torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y)), distances
 
 
-def from_spherical(azimuths: Float[Tensor, "*batch"], elevations: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
+def from_spherical(
+    azimuths: Float[Tensor, "*batch"], elevations: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 3"]:
     """Unit vectors towards azimuths and elevations [rad]."""
     horizontal = torch.cos(elevations)
-    return torch.stack((horizontal * torch.cos(azimuths), horizontal * torch.sin(azimuths), torch.sin(elevations)), -1)
+    return torch.stack(
+        (horizontal * torch.cos(azimuths), horizontal * torch.sin(azimuths), torch.sin(elevations)),
+        -1,
+    )
 
 
-def polar(amplitudes: Float[Tensor, "*batch"], phases: Float[Tensor, "*batch"]) -> Complex[Tensor, "*batch"]:
+def polar(
+    amplitudes: Float[Tensor, "*batch"], phases: Float[Tensor, "*batch"]
+) -> Complex[Tensor, "*batch"]:
     """``torch.polar`` with value and gradient 0 below ``FAINTEST``, where its own gradient is NaN."""
     return torch.polar(amplitudes.masked_fill(amplitudes < FAINTEST, 0), phases)
 
 
 def magnitudes(waves: Complex[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Magnitudes of complex waves; value and gradient are 0 where both parts are below ``FAINTEST``."""
+    """Magnitudes of complex waves; value and gradient are 0 where both parts are below
+    ``FAINTEST``.
+    """
     largest = torch.maximum(waves.real.detach().abs(), waves.imag.detach().abs())
     return waves.masked_fill(largest < FAINTEST, 0).abs()
 
@@ -200,17 +233,24 @@ def sinc(values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     return _Sinc.apply(values)
 
 
-def spherical_harmonics(vectors: Float[Tensor, "*batch 3"], degree: int) -> Float[Tensor, "*batch k"]:
-    """The k = (degree + 1)² real spherical harmonics of degree n up to ``degree`` in given directions.
+def spherical_harmonics(
+    vectors: Float[Tensor, "*batch 3"], degree: int
+) -> Float[Tensor, "*batch k"]:
+    """The k = (degree + 1)² real spherical harmonics of degree n up to ``degree`` in given
+    directions.
 
-    Number n² + n + m is sqrt(2) N P_n^|m|(z) times cos(m az) for m > 0, sin(|m| az) for m < 0, and N P_n(z) for m = 0.
-    P has the factor (-1)^m, and N makes the mean square over the sphere 1 / 4 pi, as in .ply viewers. The recurrence
-    over n runs on N P_n^m / sin^m, a polynomial in z, so values and gradients are finite at the poles.
+    Number n² + n + m is sqrt(2) N P_n^|m|(z) times cos(m az) for m > 0, sin(|m| az) for m < 0, and
+    N P_n(z) for m = 0. P has the factor (-1)^m, and N makes the mean square over the sphere 1 / 4
+    pi, as in .ply viewers. The recurrence over n runs on N P_n^m / sin^m, a polynomial in z, so
+    values and gradients are finite at the poles.
 
     Source: Holmes and Featherstone, A unified approach to the Clenshaw summation, 2002, section 3.
     """
     x, y, z = vectors.unbind(-1)
-    cosines, sines = torch.ones_like(z), torch.zeros_like(z)  # of m az, times sin^m of the polar angle
+    cosines, sines = (
+        torch.ones_like(z),
+        torch.zeros_like(z),
+    )  # of m az, times sin^m of the polar angle
     harmonics = [z] * (degree + 1) ** 2
     first = 0.5 / math.sqrt(math.pi)
     for m in range(degree + 1):
@@ -264,7 +304,8 @@ class Rays:
 
 @dataclass
 class Grid:
-    """Directions of a spectrum's pixel centres in the array's frame, an elevation a row and an azimuth a column [rad].
+    """Directions of a spectrum's pixel centres in the array's frame, an elevation a row and an
+    azimuth a column [rad].
 
     Example:
         >>> gaigs.Grid.degrees().shape, gaigs.Grid.degrees(elevations=range(-30, 31, 10), azimuths=range(8)).shape
@@ -277,14 +318,20 @@ class Grid:
     @classmethod
     def degrees(cls, elevations=range(1, 91), azimuths=range(360)) -> "Grid":
         """A grid of whole degrees; the default is that of the NeRF² spectra, 90 x 360."""
-        as_radians = lambda values: torch.tensor([float(v) for v in values], dtype=torch.float32).deg2rad()
+        as_radians = lambda values: torch.tensor(
+            [float(v) for v in values], dtype=torch.float32
+        ).deg2rad()
         return cls(as_radians(elevations), as_radians(azimuths))
 
     @classmethod
     def sphere(cls, rows: int, columns: int) -> "Grid":
-        """The full sphere in at least 2 x 3 pixels of equal solid angle: the rows' sines are evenly spaced."""
+        """The full sphere in at least 2 x 3 pixels of equal solid angle: the rows' sines are evenly
+        spaced.
+        """
         if rows < 2 or columns < 3:
-            raise ValueError(f"a grid over the sphere takes at least 2 rows and 3 columns, got {rows} x {columns}")
+            raise ValueError(
+                f"a grid over the sphere takes at least 2 rows and 3 columns, got {rows} x {columns}"
+            )
         sines = (2 * torch.arange(rows, dtype=torch.float64) + 1 - rows) / rows
         azimuths = 2 * math.pi / columns * (torch.arange(columns, dtype=torch.float64) + 0.5)
         return cls(sines.asin().float(), azimuths.float())
@@ -296,13 +343,21 @@ class Grid:
     @property
     def pitch(self) -> float:
         """Mean distance between neighbouring rows [rad]."""
-        return ((self.elevations[-1] - self.elevations[0]) / max(len(self.elevations) - 1, 1)).abs().item()
+        return (
+            ((self.elevations[-1] - self.elevations[0]) / max(len(self.elevations) - 1, 1))
+            .abs()
+            .item()
+        )
 
     @property
     def solid_angles(self) -> Float[Tensor, "rows columns"]:
-        """Shares of the pixels in the grid's; rows meet where the sine of the elevation is halfway between theirs."""
+        """Shares of the pixels in the grid's; rows meet where the sine of the elevation is halfway
+        between theirs.
+        """
         if len(self.elevations) < 2:
-            raise ValueError(f"solid angles take at least 2 rows, got {len(self.elevations)}; use a finer grid")
+            raise ValueError(
+                f"solid angles take at least 2 rows, got {len(self.elevations)}; use a finer grid"
+            )
         sines = self.elevations.double().sin()
         first, last = (3 * sines[:1] - sines[1:2]) / 2, (3 * sines[-1:] - sines[-2:-1]) / 2
         bounds = torch.cat((first, (sines[1:] + sines[:-1]) / 2, last)).clamp(-1, 1)
@@ -336,14 +391,19 @@ Directions = Grid | Rays
 
 
 def even_places(
-    lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], count: int, floors: Sequence[float] | Tensor = ()
+    lower: Float[Tensor, "3"],
+    upper: Float[Tensor, "3"],
+    count: int,
+    floors: Sequence[float] | Tensor = (),
 ) -> Float[Tensor, "g 3"]:
-    """About so many evenly spaced places in a box; an edge shorter than their distance has one. With the heights of
-    ``floors`` they are on these."""
+    """About so many evenly spaced places in a box; an edge shorter than their distance has one.
+    With the heights of ``floors`` they are on these."""
     if len(floors):
         at = lambda end, floor: torch.cat((end[:2], end.new_tensor([floor])))
         each = max(1, count // len(floors))
-        return torch.cat([even_places(at(lower, floor), at(upper, floor), each) for floor in floors])
+        return torch.cat(
+            [even_places(at(lower, floor), at(upper, floor), each) for floor in floors]
+        )
     lower, edges = torch.minimum(lower, upper), (upper - lower).abs()
     longest, pitch = edges.double().sort(descending=True).values, 0.0
     for dimensions in (3, 2, 1):  # an edge below the pitch has no part in it
@@ -351,5 +411,8 @@ def even_places(
         if 0 < pitch <= longest[dimensions - 1]:
             break
     counts = [max(1, round(edge / (pitch or 1.0))) for edge in edges.tolist()]
-    axes = [low + edge * (torch.arange(n) + 0.5) / n for low, edge, n in zip(lower, edges, counts, strict=True)]
+    axes = [
+        low + edge * (torch.arange(n) + 0.5) / n
+        for low, edge, n in zip(lower, edges, counts, strict=True)
+    ]
     return torch.cartesian_prod(*axes)

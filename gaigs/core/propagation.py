@@ -18,37 +18,50 @@ NEAREST = 1e-2
 def free_space(
     distances: Float[Tensor, "*#batch"], frequencies: Float[Tensor, "*#batch"], sign: int = -1
 ) -> Complex[Tensor, "*batch"]:
-    """lambda / (4 pi d) exp(sign j 2 pi f d / c): unit power between isotropic antennas, computed in float64.
+    """lambda / (4 pi d) exp(sign j 2 pi f d / c): unit power between isotropic antennas, computed
+    in float64.
 
     Args:
         distances, frequencies: [m] and [Hz], broadcast against each other.
-        sign: -1 for the time dependence exp(+j omega t), +1 for exp(-j omega t), 0 for the amplitude alone.
+        sign: -1 for the time dependence exp(+j omega t), +1 for exp(-j omega t), 0 for the
+            amplitude alone.
 
     Source: Friis, A note on a simple transmission formula, 1946.
     """
-    phases = distances.double().clamp(min=NEAREST) * (2 * math.pi / speed_of_light) * frequencies.double()
+    phases = (
+        distances.double().clamp(min=NEAREST)
+        * (2 * math.pi / speed_of_light)
+        * frequencies.double()
+    )
     return torch.polar(0.5 / phases, sign * phases)
 
 
 def bartlett(
-    responses: Complex[Tensor, "*batch elements f"], grid: Directions, array: Array, frequency: float
+    responses: Complex[Tensor, "*batch elements f"],
+    grid: Directions,
+    array: Array,
+    frequency: float,
 ) -> Float[Tensor, "..."]:
-    """Amplitudes of the conventional (Bartlett) beamformer of element signals, root mean square over the frequencies.
+    """Amplitudes of the conventional (Bartlett) beamformer of element signals, root mean square
+    over the frequencies.
 
-    At one frequency it is |sum_n y_n exp(-j 2 pi / lambda (r_n . u))| for element n at r_n and the direction u. Its
-    square depends on the y_n through sums over pairs of elements a lag apart: a 4 x 4 array has 49 lags, 256 pairs.
+    At one frequency it is |sum_n y_n exp(-j 2 pi / lambda (r_n . u))| for element n at r_n and the
+    direction u. Its square depends on the y_n through sums over pairs of elements a lag apart: a 4
+    x 4 array has 49 lags, 256 pairs.
 
     Args:
-        responses: Linear amplitudes of the array's elements at each frequency (..., e, f), for the time dependence
-            exp(+j omega t).
+        responses: Linear amplitudes of the array's elements at each frequency (..., e, f), for the
+            time dependence exp(+j omega t).
         grid: Directions in the array's frame [rad].
         array: Positions of the elements [m].
         frequency: Carrier of the weights [Hz].
 
     Returns:
-        (..., rows, columns), or (..., k) of rays; differentiable, with a gradient of 0 where the amplitude is 0.
+        (..., rows, columns), or (..., k) of rays; differentiable, with a gradient of 0 where the
+        amplitude is 0.
 
-    Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
+    Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the
+    spectra of NeRF².
 
     Example:
         >>> from gaigs.core.propagation import bartlett
@@ -64,12 +77,17 @@ def bartlett(
             f"responses must be complex (..., elements, frequencies) of {len(array)} elements, got {responses.dtype} "
             f"{tuple(responses.shape)}"
         )
-    batch, responses = responses.shape[:-2], responses.flatten(0, -3) if responses.ndim > 2 else responses[None]
+    batch, responses = (
+        responses.shape[:-2],
+        responses.flatten(0, -3) if responses.ndim > 2 else responses[None],
+    )
     covariances = responses @ responses.mH / responses.shape[-1]
     places = array.elements.double() * (2 * frequency / speed_of_light)  # in half wavelengths
     steps, pair = differences(places)
     pair = pair.to(responses.device)
-    lags = covariances.new_zeros(len(responses), len(steps)).index_add(1, pair, covariances.flatten(1))
+    lags = covariances.new_zeros(len(responses), len(steps)).index_add(
+        1, pair, covariances.flatten(1)
+    )
     directions = grid.to(torch.float64).flatten().vectors().to(steps)
     phases = math.pi * steps @ directions.T
     cosines, sines = (part.to(lags.real) for part in (torch.cos(phases), torch.sin(phases)))
@@ -88,7 +106,8 @@ def min_max(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b rows c
 def fresnel(
     permittivity: complex | Complex[Tensor, "*#batch"], cosines: Float[Tensor, "*#batch"]
 ) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
-    """Fresnel reflection coefficients of a half-space, electric field across (TE) and in (TM) the plane of incidence.
+    """Fresnel reflection coefficients of a half-space, electric field across (TE) and in (TM) the
+    plane of incidence.
 
     Args:
         permittivity: Complex relative permittivity, for the time dependence exp(+j omega t).
@@ -107,7 +126,8 @@ def slab(
     cosines: Float[Tensor, "*#batch"],
     thickness: float | Float[Tensor, "*#batch"],
 ) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
-    """Reflection coefficients TE and TM of a slab in air, as ``fresnel``; a thick slab with losses is a half-space.
+    """Reflection coefficients TE and TM of a slab in air, as ``fresnel``; a thick slab with losses
+    is a half-space.
 
     ``thickness`` is in wavelengths of air.
 
@@ -115,14 +135,19 @@ def slab(
     """
     turns = torch.exp(-4j * math.pi * thickness * torch.sqrt(permittivity - (1 - cosines.square())))
     te, tm = fresnel(permittivity, cosines)
-    return te * (1 - turns) / (1 - te.square() * turns), tm * (1 - turns) / (1 - tm.square() * turns)
+    return te * (1 - turns) / (1 - te.square() * turns), tm * (1 - turns) / (
+        1 - tm.square() * turns
+    )
 
 
-def fit_gain(channels: Complex[Tensor, " k *shape"], waves: Complex[Tensor, " k *shape"]) -> Complex[Tensor, ""]:
+def fit_gain(
+    channels: Complex[Tensor, " k *shape"], waves: Complex[Tensor, " k *shape"]
+) -> Complex[Tensor, ""]:
     """The complex gain of measured channels h over waves w predicted at a gain of 1; complex128.
 
-    Its magnitude is the median over the links of |h| / |w|, its phase that of the sum of w* h / (|w| |h|). So each link
-    counts once, weak or strong. Links with h = 0 or w = 0 do not count; without any other the gain is 0.
+    Its magnitude is the median over the links of |h| / |w|, its phase that of the sum of w* h /
+    (|w| |h|). So each link counts once, weak or strong. Links with h = 0 or w = 0 do not count;
+    without any other the gain is 0.
     """
     h, w = (part.to(torch.complex128).flatten(1) for part in (channels, waves))
     sizes, strengths = h.norm(dim=1), w.norm(dim=1)
@@ -134,12 +159,18 @@ def fit_gain(channels: Complex[Tensor, " k *shape"], waves: Complex[Tensor, " k 
 
 
 def strength(
-    channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, " k"]
+    channels: Complex[Tensor, "k e s"],
+    waves: Complex[Tensor, "k e s"],
+    receivers: Int[Tensor, " k"],
 ) -> float:
-    """Amplitude of channels over waves: the median over a receiver's links, the geometric mean over receivers.
+    """Amplitude of channels over waves: the median over a receiver's links, the geometric mean over
+    receivers.
 
     It is 1 where all channels are 0.
     """
-    gains = [fit_gain(channels[own], waves[own]).abs() for own in (receivers == k for k in receivers.unique())]
+    gains = [
+        fit_gain(channels[own], waves[own]).abs()
+        for own in (receivers == k for k in receivers.unique())
+    ]
     heard = [gain.log() for gain in gains if gain > 0]
     return torch.stack(heard).mean().exp().item() if heard else 1.0

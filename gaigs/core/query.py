@@ -18,14 +18,20 @@ CARRIERS = 1e4, 3e11
 """Lowest and highest carrier [Hz]; another number is in another unit."""
 
 ROUNDING = 1e-6
-"""Relative difference below which two carriers are equal: float32 and seven printed digits round by less."""
+"""Relative difference below which two carriers are equal: float32 and seven printed digits round by
+less.
+"""
 
 
 def unit_hint(number: float) -> str:
-    """The end of an error, such as ``; in MHz?``, if a number would be a carrier in that unit; else empty."""
+    """The end of an error, such as ``; in MHz?``, if a number would be a carrier in that unit; else
+    empty.
+    """
     units = {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}
     low, high = CARRIERS
-    return next((f"; in {unit}?" for unit, size in units.items() if low / size <= number <= high / size), "")
+    return next(
+        (f"; in {unit}?" for unit, size in units.items() if low / size <= number <= high / size), ""
+    )
 
 
 def check_carrier(name: str, frequencies: float | Tensor) -> None:
@@ -45,10 +51,14 @@ def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
 
 
 def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped[Tensor, "k m"]:
-    """At most so many numbers of each label, evenly spread over its rows and columns: arrays resolve fewer."""
+    """At most so many numbers of each label, evenly spread over its rows and columns: arrays
+    resolve fewer.
+    """
     numbers, columns = labels[..., None].flatten(1), labels.shape[-1] if labels.ndim > 1 else 1
     index = evenly(torch.arange(numbers.shape[1]), most)
-    while len((index % columns).unique()) < min(columns, most) / 8:  # a step that divides the columns meets few
+    while (
+        len((index % columns).unique()) < min(columns, most) / 8
+    ):  # a step that divides the columns meets few
         most -= 1
         index = evenly(torch.arange(numbers.shape[1]), most)
     return numbers[:, index]
@@ -59,7 +69,9 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
     if isinstance(values, Tensor):
         if values.is_meta or values.layout is not torch.strided:
             kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
-            raise ValueError(f"{name} must be {expected}, got a {kind} tensor; give a dense tensor with values")
+            raise ValueError(
+                f"{name} must be {expected}, got a {kind} tensor; give a dense tensor with values"
+            )
         return values.clone() if values.is_inference() else values  # which a training could not use
     if isinstance(values, list | tuple) and any(isinstance(value, Tensor) for value in values):
         parts = [as_tensor(name, value, expected) for value in values]
@@ -69,12 +81,18 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
         if np.ma.is_masked(values):
             raise TypeError("masked")
         array: Any = np.array(values)  # a copy, since torch warns of arrays that are read-only
-        if array.dtype == object and array.ndim:  # of numbers, such as a column of pandas; None and NA are NaN
-            is_missing = np.frompyfunc(lambda value: value is None or type(value).__name__ == "NAType", 1, 1)
+        if (
+            array.dtype == object and array.ndim
+        ):  # of numbers, such as a column of pandas; None and NA are NaN
+            is_missing = np.frompyfunc(
+                lambda value: value is None or type(value).__name__ == "NAType", 1, 1
+            )
             array[is_missing(array).astype(bool)] = np.nan
             array = np.array(array.tolist())
         # Torch takes no negative strides and no other byte order.
-        return torch.from_numpy(np.ascontiguousarray(array, array.dtype.newbyteorder("=")).reshape(array.shape))
+        return torch.from_numpy(
+            np.ascontiguousarray(array, array.dtype.newbyteorder("=")).reshape(array.shape)
+        )
     except (TypeError, ValueError, RuntimeError, OverflowError):  # of words and ragged lists
         raise ValueError(f"{name} must be {expected}, got {reprlib.repr(values)}") from None
 
@@ -89,12 +107,16 @@ def as_numbers(name: str, values: object, expected: str) -> Tensor:
 
 
 def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
-    """Positions of any kind as a float32 tensor [m]; raises a ``ValueError`` unless all are finite and in range."""
+    """Positions of any kind as a float32 tensor [m]; raises a ``ValueError`` unless all are finite
+    and in range.
+    """
     positions = as_numbers(name, values, "(..., 3) positions [m]")
     if positions.shape == (0,):  # an empty list
         positions = positions.reshape(0, 3)
     if not positions.ndim or positions.shape[-1] != 3:
-        raise ValueError(f"{name} must be (..., 3) positions [m], got shape {tuple(positions.shape)}")
+        raise ValueError(
+            f"{name} must be (..., 3) positions [m], got shape {tuple(positions.shape)}"
+        )
     points = positions.reshape(-1, 3)
     for holds, expected in ((points.isfinite(), "finite"), (points.abs() < FAR, WITHIN)):
         if not holds.all():
@@ -104,7 +126,9 @@ def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
 
 
 def as_receivers(values: Any, names: Sequence[str]) -> Int[Tensor, "*points"]:
-    """Indices of receivers, given by names or indices; raises a ``ValueError`` for an unknown receiver."""
+    """Indices of receivers, given by names or indices; raises a ``ValueError`` for an unknown
+    receiver.
+    """
     expected = f"one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
     if isinstance(values, KeysView | ValuesView) or hasattr(values, "to_numpy"):
         values = [*values]
@@ -134,32 +158,48 @@ def _is_text(values: object) -> bool:
 
 
 def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, "*points"] | None:
-    """Carriers that a user asks for [Hz]; for None the only known one, or None if no carrier is known.
+    """Carriers that a user asks for [Hz]; for None the only known one, or None if no carrier is
+    known.
 
     Raises:
-        ValueError: A carrier is out of range, differs from the only known one, or is missing beside several.
+        ValueError: A carrier is out of range, differs from the only known one, or is missing beside
+            several.
     """
     if values is None:
         if len(known) > 1:
             span = f"{known[0]:.7g} to {known[-1]:.7g} Hz"
-            raise ValueError(f"the training links have {len(known)} carriers, {span}; choose one with frequency=...")
+            raise ValueError(
+                f"the training links have {len(known)} carriers, {span}; choose one with frequency=..."
+            )
         return known[0] if len(known) else None
     frequencies = as_numbers("a frequency", values, "a carrier in Hz")
     check_carrier("a frequency", frequencies)
-    if len(known) < 2 and not (len(known) and torch.isclose(frequencies, known[0], rtol=ROUNDING).all()):
+    if len(known) < 2 and not (
+        len(known) and torch.isclose(frequencies, known[0], rtol=ROUNDING).all()
+    ):
         carrier = f"one carrier, {known[0]:.7g} Hz" if len(known) else "no known carrier"
-        raise ValueError(f"the training links have {carrier}, so no other can be predicted; leave frequency out")
+        raise ValueError(
+            f"the training links have {carrier}, so no other can be predicted; leave frequency out"
+        )
     return frequencies
 
 
 def as_subcarriers(values: object) -> Float[Tensor, " s"]:
-    """Subcarriers that a user asks for [Hz], one or several, in float64; raises a ``ValueError`` for anything else."""
+    """Subcarriers that a user asks for [Hz], one or several, in float64; raises a ``ValueError``
+    for anything else.
+    """
     expected = "different subcarriers (s,) in Hz"
     as_numbers("frequencies", values, expected)
     exact = as_tensor("frequencies", values, expected).detach().cpu()
     subcarriers = exact.double().reshape(-1) if exact.ndim < 2 else exact
-    if subcarriers.ndim != 1 or not len(subcarriers) or len(subcarriers.unique()) < len(subcarriers):
-        raise ValueError(f"frequencies must be {expected}, got shape {tuple(exact.shape)}: {reprlib.repr(values)}")
+    if (
+        subcarriers.ndim != 1
+        or not len(subcarriers)
+        or len(subcarriers.unique()) < len(subcarriers)
+    ):
+        raise ValueError(
+            f"frequencies must be {expected}, got shape {tuple(exact.shape)}: {reprlib.repr(values)}"
+        )
     check_carrier("frequencies", subcarriers)
     return subcarriers
 
@@ -168,27 +208,32 @@ def as_directions(directions: Directions | None, own: Grid | None, task: str) ->
     """Directions that a user asks for, in float32, or for None the label's own of a task.
 
     Raises:
-        ValueError: The label has no directions; an angle is not a number, or too large for radians; or rays have
-            different numbers of elevations and azimuths.
+        ValueError: The label has no directions; an angle is not a number, or too large for radians;
+            or rays have different numbers of elevations and azimuths.
     """
     if directions is None:
         return own
     if own is None:
         raise ValueError(f"labels of task {task!r} have no directions; leave directions out")
     angles = {}
-    # Azimuths are periodic: a few turns are accepted, a circle in degrees is more. 1e-4 allows for rounded angles.
+    # Azimuths are periodic: a few turns are accepted, a circle in degrees is more. 1e-4 allows for
+    # rounded angles.
     for name, most in (("elevations", math.pi / 2), ("azimuths", 20 * math.pi)):
         expected = f"a list of angles from {-most:.4f} to {most:.4f} rad"
         angles[name] = values = as_numbers(name, getattr(directions, name, None), expected)
         if values.ndim != 1:
             raise ValueError(f"{name} must be {expected}, got shape {tuple(values.shape)}")
         if len(wrong := values[~(values.abs() <= most + 1e-4)]):
-            raise ValueError(f"{name} must be {expected}, got {wrong[0]:g}; Grid.degrees takes degrees")
+            raise ValueError(
+                f"{name} must be {expected}, got {wrong[0]:g}; Grid.degrees takes degrees"
+            )
     if isinstance(directions, Grid):
         return Grid(**angles)
     rows, columns = map(len, angles.values())
     if rows != columns:
-        raise ValueError(f"rays must have as many elevations as azimuths, got {rows} and {columns}; Grid has rows")
+        raise ValueError(
+            f"rays must have as many elevations as azimuths, got {rows} and {columns}; Grid has rows"
+        )
     return Rays(**angles)
 
 
@@ -213,25 +258,39 @@ class Query:
 
     @classmethod
     def from_positions(
-        cls, positions: object, receiver: object, frequency: object, names: Sequence[str], known: Float[Tensor, " f"]
+        cls,
+        positions: object,
+        receiver: object,
+        frequency: object,
+        names: Sequence[str],
+        known: Float[Tensor, " f"],
     ) -> tuple["Query", tuple[int, ...]]:
-        """Links from transmitters at the positions that a user gives; every number is checked here, and only here.
+        """Links from transmitters at the positions that a user gives; every number is checked here,
+        and only here.
 
         Args:
-            positions: Positions (..., 3) [m], anything that becomes a float tensor; or a whole query.
-            receiver: Name or index of the receiver, or of that of each position; None: all receivers.
+            positions: Positions (..., 3) [m], anything that becomes a float tensor; or a whole
+                query.
+            receiver: Name or index of the receiver, or of that of each position; None: all
+                receivers.
             frequency: Carrier, one for all or one for each position [Hz]; None is the known one.
             names: Names of the scene's receivers.
             known: Different carriers of the training links, ascending [Hz]; empty if unknown.
 
         Returns:
-            The links in the order of ``positions.reshape(-1, 3)``, and their axes: the leading ones of the positions,
-            and a last one of all receivers if none is given.
+            The links in the order of ``positions.reshape(-1, 3)``, and their axes: the leading ones
+            of the positions, and a last one of all receivers if none is given.
         """
         if isinstance(positions, Query):
             if frequency is not None or receiver is not None:
-                raise ValueError("a query has its own receivers and frequencies; leave receiver and frequency out")
-            receiver, frequency, positions = positions.receivers, positions.frequencies, positions.transmitters
+                raise ValueError(
+                    "a query has its own receivers and frequencies; leave receiver and frequency out"
+                )
+            receiver, frequency, positions = (
+                positions.receivers,
+                positions.frequencies,
+                positions.transmitters,
+            )
         points = as_positions("transmitters", positions)
         shape = points.shape[:-1]
 
@@ -242,9 +301,13 @@ class Query:
             return values.expand(shape).reshape(-1)
 
         points = points.reshape(-1, 3)
-        receivers = spread("receivers", as_receivers(0 if receiver is None else receiver, names)).to(points.device)
+        receivers = spread(
+            "receivers", as_receivers(0 if receiver is None else receiver, names)
+        ).to(points.device)
         frequencies = as_frequencies(frequency, known.cpu().float())
-        query = cls(points, receivers, None if frequencies is None else spread("frequencies", frequencies))
+        query = cls(
+            points, receivers, None if frequencies is None else spread("frequencies", frequencies)
+        )
         if receiver is not None:
             return query, shape
         query = query[torch.arange(len(points)).repeat_interleave(len(names))]
@@ -269,30 +332,47 @@ class Query:
     @property
     def place_keys(self) -> Int[Tensor, " b"]:
         """A number for each transmitter's position, the same for the same one."""
-        x, y, z = (self.transmitters.detach().cpu().float() + 0.0).contiguous().view(torch.int32).long().unbind(1)
-        return (x * 1_000_003 + y) * 1_000_003 + z  # past 64 bits it wraps; + 0.0 makes -0 the same as 0
+        x, y, z = (
+            (self.transmitters.detach().cpu().float() + 0.0)
+            .contiguous()
+            .view(torch.int32)
+            .long()
+            .unbind(1)
+        )
+        return (
+            x * 1_000_003 + y
+        ) * 1_000_003 + z  # past 64 bits it wraps; + 0.0 makes -0 the same as 0
 
     @property
     def votes(self) -> Float[Tensor, " b"]:
-        """1 over the number of links of the same place, receiver and carrier: repeated readings have one vote."""
+        """1 over the number of links of the same place, receiver and carrier: repeated readings
+        have one vote.
+        """
         _, which = self.unique(with_receivers=True)
         return which.bincount().double().reciprocal()[which]
 
     def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, " b"]]:
-        """The different links, sorted by position, frequency and receiver; and the index of each link among them.
+        """The different links, sorted by position, frequency and receiver; and the index of each
+        link among them.
 
-        Without receivers links to two of them are equal, and each place has any one of its receivers.
+        Without receivers links to two of them are equal, and each place has any one of its
+        receivers.
         """
         others = [self.frequencies] if self.frequencies is not None else []
         others += [self.receivers] if with_receivers else []
-        # Double holds float32, float64 and indices exactly. Of a thousand links this takes a tenth of torch's unique.
-        columns = [part.detach().double().cpu().numpy() for part in (*self.transmitters.unbind(1), *others)]
+        # Double holds float32, float64 and indices exactly. Of a thousand links this takes a tenth
+        # of torch's unique.
+        columns = [
+            part.detach().double().cpu().numpy() for part in (*self.transmitters.unbind(1), *others)
+        ]
         order = np.lexsort(columns[::-1])
         is_new = np.ones(len(order), dtype=bool)
         is_new[1:] = np.any([column[order[1:]] != column[order[:-1]] for column in columns], axis=0)
         numbers = np.empty_like(order)
         numbers[order] = is_new.cumsum() - 1
-        first, which = (torch.from_numpy(part).to(self.transmitters.device) for part in (order[is_new], numbers))
+        first, which = (
+            torch.from_numpy(part).to(self.transmitters.device) for part in (order[is_new], numbers)
+        )
         return self[first], which
 
 
@@ -303,8 +383,8 @@ class Batch:
     Attributes:
         directions: Directions to predict, the same for all links; None for a label without.
         labels: Measured values (b, ...), of the task's shape; None when predicting.
-        shares: Weights of the mean over these links, and of the mean over their places, in the mean over all processes
-            that train together; 1 for a single process.
+        shares: Weights of the mean over these links, and of the mean over their places, in the mean
+            over all processes that train together; 1 for a single process.
     """
 
     query: Query

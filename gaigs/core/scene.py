@@ -1,4 +1,6 @@
-"""The scene of a model: receivers with their arrays, the box of the training transmitters, the task."""
+"""The scene of a model: receivers with their arrays, the box of the training transmitters, the
+task.
+"""
 
 import functools
 import logging
@@ -22,10 +24,11 @@ log = logging.getLogger(__name__)
 
 
 class FlatAxis(NamedTuple):
-    """A world axis, 0 to 2, along which all transmitters have one coordinate [m], and all receivers' elements one.
+    """A world axis, 0 to 2, along which all transmitters have one coordinate [m], and all
+    receivers' elements one.
 
-    A plane across it and its mirror image half-way between the two reflect paths of the same length. ``is_common`` is
-    true if both stand at the same coordinate.
+    A plane across it and its mirror image half-way between the two reflect paths of the same
+    length. ``is_common`` is true if both stand at the same coordinate.
     """
 
     axis: int
@@ -53,10 +56,11 @@ class Scene:
         lower, upper: Corners of the box of the training transmitters, world frame (3,) [m].
         spacing: Median distance of a training transmitter to the nearest other one [m].
         frequencies: Distinct carriers of the training links, ascending (f,) [Hz]; empty if unknown.
-        bandwidth: Band around each carrier over which a label's power is averaged, 0 for a carrier alone [Hz]; None if
-            unknown.
+        bandwidth: Band around each carrier over which a label's power is averaged, 0 for a carrier
+            alone [Hz]; None if unknown.
         frame: Place of the world frame on a map; None if unknown.
-        floors: Heights of separate floors of training transmitters, that with most places first (k,) [m]; empty of one.
+        floors: Heights of separate floors of training transmitters, that with most places first
+            (k,) [m]; empty of one.
 
     Example:
         >>> scene = gaigs.links("synthetic_rssi", transmitters=50).scene
@@ -69,7 +73,9 @@ class Scene:
     upper: Float[Tensor, "3"]
     spacing: float
     task: Task
-    frequencies: Float[Tensor, " f"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
+    frequencies: Float[Tensor, " f"] = field(
+        default_factory=lambda: torch.zeros(0, dtype=torch.float32)
+    )
     bandwidth: float | None = None
     frame: Frame | None = None
     floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
@@ -80,7 +86,9 @@ class Scene:
 
     @property
     def box(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Lower and upper corner of the box that holds the training transmitters and all receivers [m]."""
+        """Lower and upper corner of the box that holds the training transmitters and all receivers
+        [m].
+        """
         ends = torch.cat((torch.stack((self.lower, self.upper)), self.positions(self.lower)))
         return ends.amin(0), ends.amax(0)
 
@@ -92,10 +100,14 @@ class Scene:
 
     @functools.cached_property
     def flat_axes(self) -> list[FlatAxis]:
-        """World axes along which all training transmitters, and all elements, stand within a centimetre."""
+        """World axes along which all training transmitters, and all elements, stand within a
+        centimetre.
+        """
         elements = []
         for receiver in self.receivers:
-            elements.append(receiver.pose.to(self.lower).world(receiver.array.elements.to(self.lower)))
+            elements.append(
+                receiver.pose.to(self.lower).world(receiver.array.elements.to(self.lower))
+            )
         least = 0.01  # [m]; tripods are set up no better
         transmitters, receivers = torch.stack((self.lower, self.upper)), torch.cat(elements)
         found = []
@@ -108,13 +120,21 @@ class Scene:
 
     @property
     def height(self) -> float:
-        """Height of the floor with most training places; of one floor half-way between lowest and highest [m]."""
-        return float(self.floors[0] if len(self.floors) else (self.lower[2].double() + self.upper[2].double()) / 2)
+        """Height of the floor with most training places; of one floor half-way between lowest and
+        highest [m].
+        """
+        return float(
+            self.floors[0]
+            if len(self.floors)
+            else (self.lower[2].double() + self.upper[2].double()) / 2
+        )
 
     @property
     def middle_frequency(self) -> float | None:
         """The middle one of the training links' carriers [Hz]; None if they have none."""
-        return float(self.frequencies[len(self.frequencies) // 2]) if len(self.frequencies) else None
+        return (
+            float(self.frequencies[len(self.frequencies) // 2]) if len(self.frequencies) else None
+        )
 
     @property
     def has_band(self) -> bool:
@@ -122,11 +142,17 @@ class Scene:
         return len(self.frequencies) > 1
 
     def band_positions(self, query: Query) -> Float[Tensor, " b"]:
-        """Positions of carriers in the training links' band, by the logarithm: -1 at the lowest, 1 at the highest."""
+        """Positions of carriers in the training links' band, by the logarithm: -1 at the lowest, 1
+        at the highest.
+        """
         if query.frequencies is None:
-            raise ValueError(f"a frequency must be given, as the data have {len(self.frequencies)} carriers")
+            raise ValueError(
+                f"a frequency must be given, as the data have {len(self.frequencies)} carriers"
+            )
         low, high = self.frequencies.double().log()[[0, -1]].tolist()
-        return ((2 * query.frequencies.double().log() - low - high) / (high - low)).to(query.transmitters.dtype)
+        return ((2 * query.frequencies.double().log() - low - high) / (high - low)).to(
+            query.transmitters.dtype
+        )
 
     def state(self) -> dict:
         """The scene in plain tensors, lists and strings, for a checkpoint."""
@@ -146,14 +172,17 @@ class Scene:
                 name: getattr(self, name)
                 for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors")
             },
-            "frame": self.frame and (int(self.frame.epsg), float(self.frame.x), float(self.frame.y)),
+            "frame": self.frame
+            and (int(self.frame.epsg), float(self.frame.x), float(self.frame.y)),
         }
 
     @classmethod
     def from_state(cls, state: dict) -> "Scene":
         """The inverse of ``state``."""
         receivers = tuple(
-            Receiver(r["name"], Pose(r["position"], r["rotation"]), Array(r["elements"], r["pattern"]))
+            Receiver(
+                r["name"], Pose(r["position"], r["rotation"]), Array(r["elements"], r["pattern"])
+            )
             for r in state["receivers"]
         )
         task, frame = registry("task").build(state["task"]), None
@@ -165,7 +194,8 @@ class Scene:
 
 
 def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
-    """The frequency of each link [Hz]: the query's, else the data's only one; for channels the middle of their band.
+    """The frequency of each link [Hz]: the query's, else the data's only one; for channels the
+    middle of their band.
 
     Raises:
         ValueError: The query has no frequency, and the data do not have exactly one.
@@ -175,50 +205,71 @@ def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
     if query.frequencies is not None:
         return query.frequencies
     if len(scene.frequencies) != 1:
-        raise ValueError(f"each link must have a frequency [Hz], as the data have {len(scene.frequencies)} carriers")
+        raise ValueError(
+            f"each link must have a frequency [Hz], as the data have {len(scene.frequencies)} carriers"
+        )
     return scene.frequencies.to(query.transmitters).expand(len(query))
 
 
 def check_elements(owner: str, scene: Scene, pads: bool = False) -> Csi:
-    """The task of channels with as many elements as each receiver's array; ``owner`` names a component in errors.
+    """The task of channels with as many elements as each receiver's array; ``owner`` names a
+    component in errors.
 
-    A component that ``pads`` takes smaller arrays too: it predicts 0 at the elements that they lack.
+    A component that ``pads`` takes smaller arrays too: it predicts 0 at the elements that they
+    lack.
 
     Raises:
         ValueError: Labels are not channels, or an array has another number of elements.
     """
     task = scene.task
     if not isinstance(task, Csi):
-        raise ValueError(f"{owner} gives complex channels, not labels of task {task.name!r}; take another")
+        raise ValueError(
+            f"{owner} gives complex channels, not labels of task {task.name!r}; take another"
+        )
     largest = max(scene.receivers, key=lambda receiver: len(receiver.array))
     for receiver in [largest] if pads else scene.receivers:
         if len(receiver.array) != task.elements:
             own = f"the array of {receiver.name} {len(receiver.array)}"
-            raise ValueError(f"the labels have {task.elements} elements, and {own}; give the data's elements")
+            raise ValueError(
+                f"the labels have {task.elements} elements, and {own}; give the data's elements"
+            )
     return task
 
 
 def direct_waves(
-    scene: Scene, query: Query, frequencies: Float[Tensor, " s"], sign: int = -1, at_elements: bool = True
+    scene: Scene,
+    query: Query,
+    frequencies: Float[Tensor, " s"],
+    sign: int = -1,
+    at_elements: bool = True,
 ) -> Complex[Tensor, "b e s"]:
-    """Free space from each transmitter to the elements of its receiver, or to its middle alone (e = 1).
+    """Free space from each transmitter to the elements of its receiver, or to its middle alone (e =
+    1).
 
-    It is 0 at elements that other receivers' arrays have alone. The sign is that of the phases, as for ``free_space``.
+    It is 0 at elements that other receivers' arrays have alone. The sign is that of the phases, as
+    for ``free_space``.
     """
-    # In float64: some metres from the origin float32 would round an element's place by 1e-6 m, at 6 GHz 1e-4 rad.
+    # In float64: some metres from the origin float32 would round an element's place by 1e-6 m, at 6
+    # GHz 1e-4 rad.
     own = []
     for receiver in scene.receivers:
-        pose, elements = receiver.pose.to(torch.zeros((), dtype=torch.float64)), receiver.array.elements.double().cpu()
+        pose, elements = (
+            receiver.pose.to(torch.zeros((), dtype=torch.float64)),
+            receiver.array.elements.double().cpu(),
+        )
         own.append(pose.world(elements) if at_elements else pose.position[None])
     counts = torch.tensor([*map(len, own)], device=query.transmitters.device)[query.receivers]
     places = pad_sequence(own, batch_first=True).to(counts.device)[query.receivers]
     distances = (query.transmitters.double()[:, None] - places).norm(dim=-1)
     waves = free_space(distances[..., None], frequencies.to(distances.device), sign)
-    return waves * (torch.arange(places.shape[1], device=counts.device) < counts[:, None])[..., None]
+    return (
+        waves * (torch.arange(places.shape[1], device=counts.device) < counts[:, None])[..., None]
+    )
 
 
 def direct_gains(scene: Scene, query: Query) -> Float[Tensor, " b"]:
-    """Field gain of each receiver's elements towards the transmitter, from the middle of the array; float64.
+    """Field gain of each receiver's elements towards the transmitter, from the middle of the array;
+    float64.
 
     A transmitter in the middle itself gets the gain along the array's normal.
     """
@@ -227,5 +278,7 @@ def direct_gains(scene: Scene, query: Query) -> Float[Tensor, " b"]:
         own, antenna = query.receivers == receiver, scene.receivers[receiver]
         points = antenna.pose.to(gains).local(query.transmitters[own].double())
         lengths = points.norm(dim=-1, keepdim=True)
-        gains[own] = antenna.array.gain(torch.where(lengths > 0, points / lengths, points.new_tensor([0.0, 0.0, 1.0])))
+        gains[own] = antenna.array.gain(
+            torch.where(lengths > 0, points / lengths, points.new_tensor([0.0, 0.0, 1.0]))
+        )
     return gains

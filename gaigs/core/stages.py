@@ -16,7 +16,9 @@ log = logging.getLogger(__name__)
 
 
 class Timekeeper:
-    """The clock of a run with a ``limit`` [s], its open stages, their bars if ``shown``, and what it has left out."""
+    """The clock of a run with a ``limit`` [s], its open stages, their bars if ``shown``, and what
+    it has left out.
+    """
 
     def __init__(self, limit: float = math.inf, shown: bool = True):
         self.limit, self.shown, self.began = limit, shown, time.monotonic()
@@ -34,7 +36,13 @@ class Stage:
     """A part of a run; arguments are those of ``stage``."""
 
     def __init__(self, keeper: Timekeeper, name: str, total: int, until: float, is_fixed: bool):
-        self.keeper, self.name, self.total, self.until, self.is_fixed = keeper, name, total, until, is_fixed
+        self.keeper, self.name, self.total, self.until, self.is_fixed = (
+            keeper,
+            name,
+            total,
+            until,
+            is_fixed,
+        )
         self.done, self.began = 0, time.monotonic()
         self.row: TaskID | None = None
         self.owns_bars = False
@@ -43,7 +51,9 @@ class Stage:
         """Ends a step."""
         self.done += 1
         if self.row is not None and self.keeper.bars is not None:
-            self.keeper.bars.update(self.row, completed=self.done, count=f"{self.done}/{self.total}")
+            self.keeper.bars.update(
+                self.row, completed=self.done, count=f"{self.done}/{self.total}"
+            )
         more = (time.monotonic() - self.began) * (self.total - 1)
         if self.is_fixed and self.done == 1 and more > max(2.0, self.keeper.left()):
             words = "%s: %.0f s more, which cannot be shortened; max_time leaves %.0f s"
@@ -58,7 +68,9 @@ class Stage:
                 self.keeper.bars, self.owns_bars = make_bars(transient=True), True
                 self.keeper.bars.start()
             fields: dict[str, Any] = {"count": f"{self.done}/{self.total}", "scores": ""}
-            self.row = self.keeper.bars.add_task(self.name, total=self.total, completed=self.done, **fields)
+            self.row = self.keeper.bars.add_task(
+                self.name, total=self.total, completed=self.done, **fields
+            )
 
     def close(self) -> None:
         """Takes the bar away."""
@@ -95,14 +107,18 @@ def watched(limit: float = math.inf, shown: bool = True) -> Iterator[Timekeeper]
 
 
 @contextlib.contextmanager
-def stage(name: str = "", total: int = 1, until: float = 1.0, is_fixed: bool = False) -> Iterator[Stage]:
+def stage(
+    name: str = "", total: int = 1, until: float = 1.0, is_fixed: bool = False
+) -> Iterator[Stage]:
     """A stage of the current run.
 
     Args:
-        name: Stands before the bar, which a terminal shows after a second; without a name there is none.
+        name: Stands before the bar, which a terminal shows after a second; without a name there is
+            none.
         total: Number of its steps.
         until: Share of the run's limit at which it has to end.
-        is_fixed: True if it cannot end early, which is logged after its first step where the time does not suffice.
+        is_fixed: True if it cannot end early, which is logged after its first step where the time
+            does not suffice.
     """
     own = Stage(current(), name, total, until, is_fixed)
     timer = threading.Timer(1.0, own.show)
@@ -118,7 +134,9 @@ def stage(name: str = "", total: int = 1, until: float = 1.0, is_fixed: bool = F
         own.close()
 
 
-def track(items: Iterable, name: str = "", total: int | None = None, is_fixed: bool = False) -> Iterator[Any]:
+def track(
+    items: Iterable, name: str = "", total: int | None = None, is_fixed: bool = False
+) -> Iterator[Any]:
     """Goes through items, each a step of a stage; ``total`` is their number if they have no length."""
     if total is None:
         total = len(items) if isinstance(items, Sized) else 1

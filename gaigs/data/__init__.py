@@ -1,4 +1,6 @@
-"""Measured and simulated links, each from one transmitter position to one receiver, with their labels."""
+"""Measured and simulated links, each from one transmitter position to one receiver, with their
+labels.
+"""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -35,7 +37,8 @@ Parts = tuple[Int[Tensor, " train"], Int[Tensor, " test"]]
 class Split:
     """Links to train, validate and test on; ``name`` is the protocol with its numbers.
 
-    ``groups`` has the group of each link of the data, a row, a run or a cube: each is held out whole. None: places are.
+    ``groups`` has the group of each link of the data, a row, a run or a cube: each is held out
+    whole. None: places are.
     """
 
     name: str
@@ -73,20 +76,25 @@ class Links:
     Attributes:
         query: Transmitter positions (float32), receivers and frequencies.
         receivers: Receivers that the query points to.
-        labels: Tensor, or object that reads labels from files; an index (k,) gives labels (k, *task.shape).
+        labels: Tensor, or object that reads labels from files; an index (k,) gives labels (k,
+            *task.shape).
         task: Task of the labels.
-        rows: Row of each link in the order of measurement, from 0 (n,). Links of one transmission to several
-            receivers, or at several frequencies, share a row. None: each link has its own.
-        official: Reads the training and test links that came with the data, for the official split only; or None.
+        rows: Row of each link in the order of measurement, from 0 (n,). Links of one transmission
+            to several receivers, or at several frequencies, share a row. None: each link has its
+            own.
+        official: Reads the training and test links that came with the data, for the official split
+            only; or None.
         split: Train, validation and test links; None until a split is chosen, see ``load``.
-        bandwidth: Band around each carrier that a label's power is averaged over, 0 for a carrier alone [Hz]; None if
-            unknown.
-        held_out: The same links at subcarriers that are held out, with the labels of the test; None if there are none.
+        bandwidth: Band around each carrier that a label's power is averaged over, 0 for a carrier
+            alone [Hz]; None if unknown.
+        held_out: The same links at subcarriers that are held out, with the labels of the test; None
+            if there are none.
         frame: Place of the world frame on a map; None if unknown.
-        uncertainties: Standard deviation of each receiver's place (r,) [m]: 0 if given, infinite until ``divide``
-            estimates it from the training links. None: all are given, and receivers without training links stay.
-        noises: Standard deviation of each label by the scatter of repeated readings, less the more of them it is the
-            mean of (n,), in the label's unit; None without repetitions.
+        uncertainties: Standard deviation of each receiver's place (r,) [m]: 0 if given, infinite
+            until ``divide`` estimates it from the training links. None: all are given, and
+            receivers without training links stay.
+        noises: Standard deviation of each label by the scatter of repeated readings, less the more
+            of them it is the mean of (n,), in the label's unit; None without repetitions.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
         remarks: Counts of links read and left out, with the reason.
         origin: Configurations of ``data`` and ``split``; empty for arrays in memory.
@@ -112,7 +120,9 @@ class Links:
     frame: Frame | None = None
     uncertainties: Float[Tensor, " r"] | None = None
     noises: Float[Tensor, " n"] | None = None
-    edges: Float[Tensor, "k 2 3"] = field(default_factory=lambda: torch.zeros(0, 2, 3, dtype=torch.float32))
+    edges: Float[Tensor, "k 2 3"] = field(
+        default_factory=lambda: torch.zeros(0, 2, 3, dtype=torch.float32)
+    )
     remarks: str = ""
     origin: Mapping = field(default_factory=dict)
 
@@ -130,7 +140,11 @@ class Links:
     def batch(self, index: Int[Tensor, " b"]) -> Batch:
         """Links as a batch with labels, in all directions of the task."""
         # Rows of a tensor are copied five times as fast by index_select as by brackets.
-        labels = self.labels.index_select(0, index) if isinstance(self.labels, Tensor) else self.labels[index]
+        labels = (
+            self.labels.index_select(0, index)
+            if isinstance(self.labels, Tensor)
+            else self.labels[index]
+        )
         return Batch(self.query[index], self.task.directions, labels)
 
     def known(self, receiver: int) -> Int[Tensor, " k"]:
@@ -140,14 +154,28 @@ class Links:
 
     @property
     def scene(self) -> Scene:
-        """The scene that a model is built from; a ``ValueError`` if all training transmitters stand at one point."""
+        """The scene that a model is built from; a ``ValueError`` if all training transmitters stand
+        at one point.
+        """
         training = self.query[self.split.train]
         train = training.transmitters.unique(dim=0)
         if len(train) < 2:
-            raise ValueError(f"training takes transmitters at two points or more, got {len(train)}; check the split")
-        frequencies = torch.zeros(0) if training.frequencies is None else training.frequencies.unique()
+            raise ValueError(
+                f"training takes transmitters at two points or more, got {len(train)}; check the split"
+            )
+        frequencies = (
+            torch.zeros(0) if training.frequencies is None else training.frequencies.unique()
+        )
         box = train.amin(0), train.amax(0), median_spacing(train)
-        return Scene(self.receivers, *box, self.task, frequencies, self.bandwidth, self.frame, floors_of(train))
+        return Scene(
+            self.receivers,
+            *box,
+            self.task,
+            frequencies,
+            self.bandwidth,
+            self.frame,
+            floors_of(train),
+        )
 
 
 def median_spacing(places: Float[Tensor, "n 3"]) -> float:
@@ -159,7 +187,8 @@ def median_spacing(places: Float[Tensor, "n 3"]) -> float:
 def floors_of(places: Float[Tensor, "n 3"]) -> Float[Tensor, " k"]:
     """Heights of separate floors [m], that with most places first; empty of one floor.
 
-    A floor has 5 places or more. None lies in the 2 m between two floors, nor in twice the range of a floor's heights.
+    A floor has 5 places or more. None lies in the 2 m between two floors, nor in twice the range of
+    a floor's heights.
     """
     heights = places[:, 2].sort().values
     gaps = heights.diff()
@@ -175,7 +204,8 @@ def floors_of(places: Float[Tensor, "n 3"]) -> Float[Tensor, " k"]:
 
 
 def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
-    """A data set with its split, by the configurations of both; ``task`` names the expected task, None for any.
+    """A data set with its split, by the configurations of both; ``task`` names the expected task,
+    None for any.
 
     Raises:
         FileNotFoundError: The data are missing.
@@ -184,19 +214,23 @@ def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
     links = registry("data").build(data)
     if task not in (None, links.task.name):
         found = f"the labels of data {data['name']!r} are of task {links.task.name!r}"
-        raise ValueError(f"{found}, and the configuration is for {task!r}; add task={links.task.name}")
+        raise ValueError(
+            f"{found}, and the configuration is for {task!r}; add task={links.task.name}"
+        )
     origin = {"data": dict(data), "split": dict(split)}
     return replace(divide(links, split), origin=origin)
 
 
 def divide(links: Links, split: Mapping) -> Links:
-    """Links with their split, by its configuration; remarks say what is doubtful, such as the phase of channels.
+    """Links with their split, by its configuration; remarks say what is doubtful, such as the phase
+    of channels.
 
-    Of links with ``uncertainties``, receivers without a training link are left out, and those without a place get an
-    estimate of it from the training links.
+    Of links with ``uncertainties``, receivers without a training link are left out, and those
+    without a place get an estimate of it from the training links.
 
     Raises:
-        ValueError: An option of the split has a defect, two of its parts share a link, or all spectra are constant.
+        ValueError: An option of the split has a defect, two of its parts share a link, or all
+            spectra are constant.
     """
     if isinstance(links.task, Csi) and isinstance(links.labels, Tensor):
         check_elements(links)
@@ -204,8 +238,14 @@ def divide(links: Links, split: Mapping) -> Links:
     parts = registry("split").build(split, links=links)
     given = [*parts.parts().values()]
     numbers, is_whole = torch.cat(given), all(part.dtype == torch.long for part in given)
-    if not is_whole or not ((numbers >= 0) & (numbers < len(links))).all() or len(numbers.unique()) < len(numbers):
-        raise ValueError(f"split {parts.name!r} must give int64 numbers of links, no masks, and none in two parts")
+    if (
+        not is_whole
+        or not ((numbers >= 0) & (numbers < len(links))).all()
+        or len(numbers.unique()) < len(numbers)
+    ):
+        raise ValueError(
+            f"split {parts.name!r} must give int64 numbers of links, no masks, and none in two parts"
+        )
     if links.held_out is not None:
         tasks: Any = links.task, links.held_out.task
         bands = [task.frequencies / 1e9 for task in tasks]
@@ -228,7 +268,9 @@ def divide(links: Links, split: Mapping) -> Links:
 
 
 def check_elements(links: Links) -> None:
-    """A ``ValueError`` unless channels have the elements of their receivers' arrays, and are 0 at all others."""
+    """A ``ValueError`` unless channels have the elements of their receivers' arrays, and are 0 at
+    all others.
+    """
     count, sizes = links.task.shape[0], [len(receiver.array) for receiver in links.receivers]
     if max(sizes) != count:
         raise ValueError(
@@ -237,7 +279,9 @@ def check_elements(links: Links) -> None:
         )
     for part in torch.arange(len(links) if min(sizes) < count else 0).split(1024):
         own = links.query.receivers[part]
-        if (beyond := (links.labels[part] != 0).any(2) & lacking(links.receivers, own, count)).any():
+        if (
+            beyond := (links.labels[part] != 0).any(2) & lacking(links.receivers, own, count)
+        ).any():
             link, element = beyond.nonzero()[0].tolist()
             raise ValueError(
                 f"labels must be 0 at elements that an array lacks; that of link {int(part[link])} is not at element "
@@ -246,9 +290,11 @@ def check_elements(links: Links) -> None:
 
 
 def without_constant(links: Links) -> Links:
-    """Channels without the subcarriers, and then the links, that have no channel; remarks and a warning count them.
+    """Channels without the subcarriers, and then the links, that have no channel; remarks and a
+    warning count them.
 
-    The same holds for the subcarriers that are held out. If all subcarriers of the links are so, they stay.
+    The same holds for the subcarriers that are held out. If all subcarriers of the links are so,
+    they stay.
 
     Raises:
         ValueError: All subcarriers that are held out are so.
@@ -257,7 +303,9 @@ def without_constant(links: Links) -> Links:
     for part in filter(None, (links, links.held_out)):
         constant = constant_subcarriers(part)
         if constant.all() and part is not links:
-            raise ValueError("all subcarriers to test on have one value in every link; choose another data.band_test")
+            raise ValueError(
+                "all subcarriers to test on have one value in every link; choose another data.band_test"
+            )
         if constant.any() and not constant.all():
             task: Any = part.task
             remarks.append(constant_sentence(constant, task.frequencies).format("and are left out"))
@@ -271,14 +319,20 @@ def without_constant(links: Links) -> Links:
     if silent := int((~heard).sum()):
         remarks.append(f"{silent} links with no other subcarrier are left out")
         both = [kept_links(part, heard) for part in both]
-    return replace(both[0], held_out=both[1] if len(both) > 1 else None, remarks="; ".join(filter(None, remarks)))
+    return replace(
+        both[0],
+        held_out=both[1] if len(both) > 1 else None,
+        remarks="; ".join(filter(None, remarks)),
+    )
 
 
 def kept_links(links: Links, kept: Bool[Tensor, " n"]) -> Links:
     """Some of the links, before a split; receivers stay."""
     number = kept.cumsum(0) - 1
     given = links.official
-    official = None if given is None else lambda: tuple(number[part[kept[part]]] for part in given())
+    official = (
+        None if given is None else lambda: tuple(number[part[kept[part]]] for part in given())
+    )
     return replace(
         links,
         query=links.query[kept],
@@ -290,21 +344,29 @@ def kept_links(links: Links, kept: Bool[Tensor, " n"]) -> Links:
 
 
 def only_trained(links: Links) -> Links:
-    """Links to receivers that have training links: nothing is known of others. A remark names these."""
+    """Links to receivers that have training links: nothing is known of others. A remark names
+    these.
+    """
     trained = links.query.receivers[links.split.train].unique()
     if len(trained) == len(links.receivers):
         return links
-    number = torch.full((len(links.receivers),), -1).index_copy(0, trained, torch.arange(len(trained)))
+    number = torch.full((len(links.receivers),), -1).index_copy(
+        0, trained, torch.arange(len(trained))
+    )
     kept = (number[links.query.receivers] >= 0).nonzero()[:, 0]
     some = lambda values: None if values is None else values[kept]
-    parts = {name: torch.isin(kept, part).nonzero()[:, 0] for name, part in links.split.parts().items()}
+    parts = {
+        name: torch.isin(kept, part).nonzero()[:, 0] for name, part in links.split.parts().items()
+    }
     if len(links.split.test) and not len(parts["test"]) and len(links) < 1.5 * len(links.receivers):
         each = f"{len(links.receivers)} receivers have {len(links)} links"
         raise ValueError(
             f"{each}, and those with test links none to train on: models are learnt for each receiver\n"
             "give a fixed receiver one place for all its links, and the moving end as transmitters"
         )
-    names = [receiver.name for receiver, new in zip(links.receivers, number, strict=True) if new < 0]
+    names = [
+        receiver.name for receiver, new in zip(links.receivers, number, strict=True) if new < 0
+    ]
     remark = f"receivers without a training link are left out, with {len(links) - len(kept)} links: {shortened(names)}"
     return replace(
         links,
@@ -321,7 +383,9 @@ def only_trained(links: Links) -> Links:
 
 
 def with_places(links: Links) -> Links:
-    """Links whose receivers without a place have an estimate from the training links; remarks say how certain it is."""
+    """Links whose receivers without a place have an estimate from the training links; remarks say
+    how certain it is.
+    """
     if links.uncertainties.isfinite().all():
         return links
     receivers, deviations, named = [*links.receivers], links.uncertainties.clone(), []

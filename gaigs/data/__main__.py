@@ -1,4 +1,6 @@
-"""Writes a simulated room in a layout that gaigs reads: python -m gaigs.data FOLDER DATA [OPTION=VALUE ...]"""
+"""Writes a simulated room in a layout that gaigs reads: python -m gaigs.data FOLDER DATA
+[OPTION=VALUE ...]
+"""
 
 import argparse
 from pathlib import Path
@@ -20,15 +22,24 @@ from gaigs.processes import only_run
 def main() -> None:
     """Reads the command line, simulates and writes."""
     parser = argparse.ArgumentParser(
-        prog="python -m gaigs.data", description="Simulate a room and write its labels in a layout that gaigs reads."
+        prog="python -m gaigs.data",
+        description="Simulate a room and write its labels in a layout that gaigs reads.",
     )
-    rooms = [f"{room}{labels}" for room in ("synthetic", "sionna") for labels in ("", "_rssi", "_csi")]
+    rooms = [
+        f"{room}{labels}" for room in ("synthetic", "sionna") for labels in ("", "_rssi", "_csi")
+    ]
     parser.add_argument("folder", type=Path, help="folder to write; must be empty or missing")
-    parser.add_argument("data", choices=rooms, help="data set: spectra, readings (rssi) or channels (csi) of a room")
     parser.add_argument(
-        "--deepmimo", action="store_true", help="write the paths of the built-in room, as a scenario of DeepMIMO v4"
+        "data", choices=rooms, help="data set: spectra, readings (rssi) or channels (csi) of a room"
     )
-    parser.add_argument("options", nargs="*", metavar="option=value", help="its options, as in docs/data.md")
+    parser.add_argument(
+        "--deepmimo",
+        action="store_true",
+        help="write the paths of the built-in room, as a scenario of DeepMIMO v4",
+    )
+    parser.add_argument(
+        "options", nargs="*", metavar="option=value", help="its options, as in docs/data.md"
+    )
     arguments = parser.parse_intermixed_args()
     folder = arguments.folder
     try:
@@ -37,7 +48,9 @@ def main() -> None:
         links = load({"name": arguments.data, **options}, {"name": "official", "validation": 0})
         is_built_in = arguments.data.startswith("synthetic")
         if arguments.deepmimo and not is_built_in:
-            raise ValueError("--deepmimo writes the built-in room; DeepMIMO has a converter of its own for Sionna RT")
+            raise ValueError(
+                "--deepmimo writes the built-in room; DeepMIMO has a converter of its own for Sionna RT"
+            )
         if is_built_in:
             geometry = synthetic.wavefront_obj(synthetic.ROOM)
         elif options.get("scene") is None:
@@ -54,13 +67,22 @@ def main() -> None:
                 writers[links.task.name](folder, links)
             if geometry is not None:
                 write_text(folder / "geometry.obj", geometry)
-    except (ValueError, TypeError, OSError, ImportError, RuntimeError, OmegaConfBaseException) as error:
+    except (
+        ValueError,
+        TypeError,
+        OSError,
+        ImportError,
+        RuntimeError,
+        OmegaConfBaseException,
+    ) as error:
         parser.error(str(error))
     print(f"{folder}: {len(links.split.train)} training and {len(links.split.test)} test labels")
 
 
 def write_paths(folder: Path, links: Links, order: int) -> None:
-    """Writes the paths of the built-in room to the receivers of links of one carrier, as a scenario of DeepMIMO v4."""
+    """Writes the paths of the built-in room to the receivers of links of one carrier, as a scenario
+    of DeepMIMO v4.
+    """
     frequencies = links.query.frequencies.unique().tolist()
     if len(frequencies) > 1:
         raise ValueError(f"a scenario of DeepMIMO has one carrier, got frequency={frequencies}")

@@ -31,7 +31,9 @@ ARRAYS = {
     "h": ("complex", ("n", "e", "s")),
     "elements": ("real", ("e", 3)),
 }
-"""Numbers and shape of each array: n links, k receivers, s subcarriers, e elements. ``elements`` may be missing."""
+"""Numbers and shape of each array: n links, k receivers, s subcarriers, e elements. ``elements``
+may be missing.
+"""
 
 RESPONSES = {
     "tx": ("real", ("n", 3)),
@@ -62,24 +64,27 @@ def read(
 ) -> Links:
     """A data set from an ``.npz``, ``.mat`` or HDF5 file: one link for each channel.
 
-    Receivers are named ``rx0``, ``rx1`` ... by their rows in ``rx``, and look along the world's axes. The links of one
-    transmitter position share a row. Channels of zeros and receivers without links are left out; the remarks count
-    them. The middle of the subcarriers' band counts as the carrier. There is no official split.
+    Receivers are named ``rx0``, ``rx1`` ... by their rows in ``rx``, and look along the world's
+    axes. The links of one transmitter position share a row. Channels of zeros and receivers without
+    links are left out; the remarks count them. The middle of the subcarriers' band counts as the
+    carrier. There is no official split.
 
     Args:
-        file: Arrays ``tx`` (n, 3), positions of the transmitters [m]; ``rx`` (k, 3), positions of the receivers [m];
-            ``rx_index`` (n,), receiver of each link, from 0, not needed with one receiver; ``frequencies`` (s,),
-            subcarriers [Hz]; ``h`` (n, e, s), complex channels, linear amplitude; optionally ``elements`` (e, 3),
-            offsets of an array's elements from its receiver's position along the world's axes [m], by default 0. With
-            (k, e, 3) each receiver has its own, and NaN for those that it lacks, where ``h`` is 0. The remarks name
-            other arrays. In place of ``h`` and ``rx_index`` the file may have impulse responses, see
-            ``gaigs.data.impulse_responses.from_sionna``.
-        arrays: Names of these arrays in the file where they differ, such as ``{"h": "CSI"}``; two names are those of
-            real and imaginary part.
+        file: Arrays ``tx`` (n, 3), positions of the transmitters [m]; ``rx`` (k, 3), positions of
+            the receivers [m]; ``rx_index`` (n,), receiver of each link, from 0, not needed with one
+            receiver; ``frequencies`` (s,), subcarriers [Hz]; ``h`` (n, e, s), complex channels,
+            linear amplitude; optionally ``elements`` (e, 3), offsets of an array's elements from
+            its receiver's position along the world's axes [m], by default 0. With (k, e, 3) each
+            receiver has its own, and NaN for those that it lacks, where ``h`` is 0. The remarks
+            name other arrays. In place of ``h`` and ``rx_index`` the file may have impulse
+            responses, see ``gaigs.data.impulse_responses.from_sionna``.
+        arrays: Names of these arrays in the file where they differ, such as ``{"h": "CSI"}``; two
+            names are those of real and imaginary part.
         phase: Of ``gaigs.core.task.csi.Csi``.
-        band_train, band_test: Subcarriers to train and to test on, as for ``gaigs.data.bands.hold_out_band`` [Hz].
-        parts: Axis of 2, ``first`` or ``last``, along which a real ``h`` has real and imaginary part. None: ``h`` is
-            complex, or two arrays.
+        band_train, band_test: Subcarriers to train and to test on, as for
+            ``gaigs.data.bands.hold_out_band`` [Hz].
+        parts: Axis of 2, ``first`` or ``last``, along which a real ``h`` has real and imaginary
+            part. None: ``h`` is complex, or two arrays.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -118,14 +123,21 @@ def read(
     elements = numbers.get("elements", torch.zeros(count, 3)).float().expand(len(positions), -1, -1)
     antennas = [Array(own[own.isfinite().all(1)]) for own in elements]
     poses = [Pose(position, torch.eye(3)) for position in positions]
-    everyone = [Receiver(f"rx{k}", *parts) for k, parts in enumerate(zip(poses, antennas, strict=True))]
-    remarks = [f"{len(rows)} channels from {len(places)} places at {len(present)} receivers", *added]
+    everyone = [
+        Receiver(f"rx{k}", *parts) for k, parts in enumerate(zip(poses, antennas, strict=True))
+    ]
+    remarks = [
+        f"{len(rows)} channels from {len(places)} places at {len(present)} receivers",
+        *added,
+    ]
     if silent := int((~heard).sum()):
         remarks.append(f"{silent} that are zero throughout are left out")
     if absent := [receiver.name for k, receiver in enumerate(everyone) if k not in present]:
         remarks.append(f"receivers without links are left out: {', '.join(absent)}")
     if count > 1 and "elements" not in loaded:
-        remarks.append(f"positions of the {count} elements are unknown: all count as standing at their receiver's")
+        remarks.append(
+            f"positions of the {count} elements are unknown: all count as standing at their receiver's"
+        )
     if ignored:
         remarks.append(f"arrays ignored: {', '.join(ignored)}")
     links = Links(
@@ -155,8 +167,12 @@ def write(folder: str | Path, links: Links) -> None:
         )
 
 
-def _load(file: Path, given: Mapping[str, str | list], axis: str | None) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The arrays by name, and the names of ignored arrays; ``given`` has other names of arrays in the file."""
+def _load(
+    file: Path, given: Mapping[str, str | list], axis: str | None
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """The arrays by name, and the names of ignored arrays; ``given`` has other names of arrays in
+    the file.
+    """
     arrays: dict[str, np.ndarray] = {}
     place, used = "", list[str]()
     with file.open("rb") as stream:
@@ -169,7 +185,9 @@ def _load(file: Path, given: Mapping[str, str | list], axis: str | None) -> tupl
     try:
         with opened(file) as (members, get):
             has = {*members, *given}
-            for name, (kind, sizes) in (RESPONSES if {"a", "tau"} <= has and "h" not in has else ARRAYS).items():
+            for name, (kind, sizes) in (
+                RESPONSES if {"a", "tau"} <= has and "h" not in has else ARRAYS
+            ).items():
                 place, names = f"{name}: ", given.get(name, name)
                 names = [names] if isinstance(names, str) else [*names]
                 if name not in given and name not in members:
@@ -195,7 +213,9 @@ def _load(file: Path, given: Mapping[str, str | list], axis: str | None) -> tupl
                 arrays[name] = array
     except ImportError:
         raise
-    except Exception as error:  # damaged files make numpy, scipy and h5py raise exceptions of many types
+    except (
+        Exception
+    ) as error:  # damaged files make numpy, scipy and h5py raise exceptions of many types
         raise ValueError(f"cannot parse {file}: {place}{error}; expected {expected}") from error
     return arrays, [name for name in members if name not in used]
 
@@ -215,7 +235,9 @@ Opened = Iterator[tuple[list[str], Callable[[str], np.ndarray]]]
 
 @contextlib.contextmanager
 def _npz(file: Path) -> Opened:
-    """Names of the arrays, and a function that reads one to the end, where zipfile compares checksums."""
+    """Names of the arrays, and a function that reads one to the end, where zipfile compares
+    checksums.
+    """
     # Opened here, since numpy leaves a damaged file open; it warns of headers written by Python 2.
     with file.open("rb") as stream, warnings.catch_warnings(action="ignore"):
         content = np.load(stream, allow_pickle=False)
@@ -250,7 +272,9 @@ def _hdf5(file: Path) -> Opened:
         raise ImportError(f"{file} needs h5py: pip install 'gaigs[hdf5]'") from error
     with h5py.File(file, "r") as content:
         members: list[str] = []
-        content.visititems(lambda name, item: members.append(name) if isinstance(item, h5py.Dataset) else None)
+        content.visititems(
+            lambda name, item: members.append(name) if isinstance(item, h5py.Dataset) else None
+        )
 
         def get(name: str) -> np.ndarray:
             array = content[name][()]
@@ -263,7 +287,9 @@ def _hdf5(file: Path) -> Opened:
 
 
 def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises a ``ValueError`` for other kinds and shapes of arrays; the first array with a size fixes it."""
+    """Raises a ``ValueError`` for other kinds and shapes of arrays; the first array with a size
+    fixes it.
+    """
     known: dict[object, int] = {}
     kinds = {"real": "iuf", "whole": "iu", "complex": "c"}  # of numpy's data types
     for name, array in arrays.items():
@@ -275,19 +301,28 @@ def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
             got = f"{array.dtype}{hint}" if kind == "complex" else array.dtype
             raise ValueError(f"{file}: {name}: expected {kind} numbers, got {got}")
         sizes = tuple(known.get(letter, letter) for letter in letters)
-        fits = [isinstance(size, str) or size == got for size, got in zip(sizes, array.shape, strict=False)]
+        fits = [
+            isinstance(size, str) or size == got
+            for size, got in zip(sizes, array.shape, strict=False)
+        ]
         if array.ndim != len(sizes) or not all(fits) or not array.size:
-            is_flat = name == "h" and (array.ndim == 2 or array.shape[-1] == 1)  # MATLAB's arrays get a last axis of 1
+            is_flat = name == "h" and (
+                array.ndim == 2 or array.shape[-1] == 1
+            )  # MATLAB's arrays get a last axis of 1
             hint = "; for one antenna add an axis, h[:, None, :]" if is_flat else ""
             expected = str(sizes).replace("'", "")
-            raise ValueError(f"{file}: {name}: expected the shape {expected}, got {array.shape}{hint}")
+            raise ValueError(
+                f"{file}: {name}: expected the shape {expected}, got {array.shape}{hint}"
+            )
         known |= dict(zip(letters, array.shape, strict=True))
 
 
 def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
     """Converts arrays to the types of the computation; a ``ValueError`` for a number out of range."""
     for name, array in arrays.items():
-        with np.errstate(all="ignore"):  # numbers too large for a type become infinite, which fails below
+        with np.errstate(
+            all="ignore"
+        ):  # numbers too large for a type become infinite, which fails below
             dtype = {"h": np.complex64, "rx_index": np.int64}.get(name, np.float64)
             arrays[name] = array = array.astype(dtype, copy=False)
             match name:
@@ -298,23 +333,41 @@ def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
                     expected = f"magnitudes below {high:g}, the largest of a link {low:g} or more unless all are 0"
                 case "rx_index":
                     count = len(arrays["rx"])
-                    holds, expected = (array >= 0) & (array < count), f"a row of rx, counted from 0, 0..{count - 1}"
+                    holds, expected = (
+                        (array >= 0) & (array < count),
+                        f"a row of rx, counted from 0, 0..{count - 1}",
+                    )
                 case "frequencies":
                     low, high = CARRIERS
-                    holds, expected = (low <= array) & (array <= high), f"a frequency from {low:g} to {high:g} Hz"
+                    holds, expected = (
+                        (low <= array) & (array <= high),
+                        f"a frequency from {low:g} to {high:g} Hz",
+                    )
                 case _:
                     # An element that a receiver lacks has no position.
-                    array = np.where(np.isnan(array).all(-1, keepdims=True), 0, array) if array.ndim == 3 else array
+                    array = (
+                        np.where(np.isnan(array).all(-1, keepdims=True), 0, array)
+                        if array.ndim == 3
+                        else array
+                    )
                     holds, expected = np.abs(array) < FAR, WITHIN
         for rule, good in (("a number", ~np.isnan(array)), (expected, holds)):
             wrong = np.argwhere(~good)
             if len(wrong):
                 value, rows = array[tuple(wrong[0])], len(np.unique(wrong[:, 0]))
-                got = "NaN" if np.isnan(value) else f"{value}{unit_hint(value) if name == 'frequencies' else ''}"
+                got = (
+                    "NaN"
+                    if np.isnan(value)
+                    else f"{value}{unit_hint(value) if name == 'frequencies' else ''}"
+                )
                 count = f"in {rows} of {len(array)} rows"
-                raise ValueError(f"{file}: {name}{wrong[0].tolist()}: expected {rule}, got {got} ({count})")
+                raise ValueError(
+                    f"{file}: {name}{wrong[0].tolist()}: expected {rule}, got {got} ({count})"
+                )
     if len(np.unique(arrays["frequencies"])) < len(arrays["frequencies"]):
-        raise ValueError(f"{file}: frequencies: expected different ones, got one twice; leave one subcarrier out")
+        raise ValueError(
+            f"{file}: frequencies: expected different ones, got one twice; leave one subcarrier out"
+        )
     if not arrays["h"].any():
         raise ValueError(f"{file}: h: expected a channel that is not zero throughout, got none")
 
@@ -325,10 +378,14 @@ def _move_missing_elements_last(file: Path, arrays: dict[str, np.ndarray]) -> No
         return
     missing = np.isnan(arrays["elements"]).all(-1)
     if len(bare := np.flatnonzero(missing.all(1))):
-        raise ValueError(f"{file}: elements[{bare[0]}]: expected an element of each receiver, got NaN alone")
+        raise ValueError(
+            f"{file}: elements[{bare[0]}]: expected an element of each receiver, got NaN alone"
+        )
     wrong = np.argwhere(arrays["h"].any(2) & missing[arrays["rx_index"]])
     if len(wrong):
-        raise ValueError(f"{file}: h{wrong[0].tolist()}: expected 0 at an element without a position")
+        raise ValueError(
+            f"{file}: h{wrong[0].tolist()}: expected 0 at an element without a position"
+        )
     order = missing.argsort(1, kind="stable")
     arrays["elements"] = np.take_along_axis(arrays["elements"], order[..., None], 1)
     arrays["h"] = np.take_along_axis(arrays["h"], order[arrays["rx_index"]][..., None], 1)

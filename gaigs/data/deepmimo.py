@@ -1,4 +1,6 @@
-"""Scenarios of DeepMIMO v4, folders of ray-traced paths from base stations to users; docs/data.md describes them."""
+"""Scenarios of DeepMIMO v4, folders of ray-traced paths from base stations to users; docs/data.md
+describes them.
+"""
 
 import json
 import math
@@ -29,7 +31,9 @@ from gaigs.io.tables import find_folder, has_file, number_places, quote
 from gaigs.registry import register
 
 UPRIGHT = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-"""Rotation of the stations' arrays: rows run upwards, columns along y, and the normal along x, as DeepMIMO's panels."""
+"""Rotation of the stations' arrays: rows run upwards, columns along y, and the normal along x, as
+DeepMIMO's panels.
+"""
 
 RANGES = {
     "rx_pos": (-FAR, FAR, WITHIN),
@@ -38,10 +42,15 @@ RANGES = {
     "phase": (-1e6, 1e6, "an angle in degrees"),
     "delay": (0.0, 1e-3, "a delay of 0 to 1 ms in seconds"),
     "aod_az": (-720.0, 720.0, "an angle in degrees"),
-    "aod_el": (0.0, 180.0, "an angle from the z axis, 0 to 180 degrees; data.elements=[1, 1] needs none"),
+    "aod_el": (
+        0.0,
+        180.0,
+        "an angle from the z axis, 0 to 180 degrees; data.elements=[1, 1] needs none",
+    ),
     "inter": (-1.0, math.inf, "a code of interactions, 0 for line of sight"),
 }
-"""Lowest and highest value of each matrix that is read, and its description; for paths that exist."""
+"""Lowest and highest value of each matrix that is read, and its description; for paths that exist.
+"""
 
 
 @dataclass(frozen=True)
@@ -79,29 +88,36 @@ def read(
 ) -> Links:
     """Channels from users to the base stations of a scenario; by reciprocity the users transmit.
 
-    Channels are those of DeepMIMO's generator without its factor of 1 / sqrt(subcarriers): isotropic antennas, plane
-    waves over the array, time dependence exp(+j omega t). The links of one user share a row. Users without a path and
-    paths between base stations are left out. There is no official split.
+    Channels are those of DeepMIMO's generator without its factor of 1 / sqrt(subcarriers):
+    isotropic antennas, plane waves over the array, time dependence exp(+j omega t). The links of
+    one user share a row. Users without a path and paths between base stations are left out. There
+    is no official split.
 
     Args:
-        root: Folder with ``params.json`` and a file of each matrix for each base station and set of users, such as
-            ``power_t001_tx000_r000.npz`` (or .mat, .npy). Of a dynamic scenario it is the folder of one scene.
+        root: Folder with ``params.json`` and a file of each matrix for each base station and set of
+            users, such as ``power_t001_tx000_r000.npz`` (or .mat, .npy). Of a dynamic scenario it
+            is the folder of one scene.
         elements: Rows and columns of the stations' arrays, half a wavelength of the carrier apart.
         bandwidth: From the lowest subcarrier to the highest, about the scenario's carrier [Hz].
         subcarriers: Evenly over the band; a single one is the carrier.
         transmitters: Number of random users to take; None for all.
         seed: Seed of the choice of users.
         phase: Of ``gaigs.core.task.csi.Csi``.
-        band_train, band_test: Subcarriers to train and to test on, as for ``gaigs.data.bands.hold_out_band`` [Hz].
+        band_train, band_test: Subcarriers to train and to test on, as for
+            ``gaigs.data.bands.hold_out_band`` [Hz].
 
     Raises:
         FileNotFoundError: There is no such folder.
-        ValueError: An option is out of range, or a file is missing or has a defect; the message names it.
+        ValueError: An option is out of range, or a file is missing or has a defect; the message
+            names it.
 
-    Source: the format as the package deepmimo 4.0.5 reads it; Alkhateeb, DeepMIMO, 2019, arXiv:1902.06435.
+    Source: the format as the package deepmimo 4.0.5 reads it; Alkhateeb, DeepMIMO, 2019,
+    arXiv:1902.06435.
     """
     if len(elements) != 2 or not all(isinstance(count, int) and count > 0 for count in elements):
-        raise ValueError(f"elements must be the array's rows and columns, such as [1, 8], got {[*elements]}")
+        raise ValueError(
+            f"elements must be the array's rows and columns, such as [1, 8], got {[*elements]}"
+        )
     if not 0 < bandwidth < math.inf:
         raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")
     if subcarriers < 1:
@@ -111,7 +127,9 @@ def read(
     edge = bandwidth / 2 if subcarriers > 1 else 0.0
     offsets = np.linspace(-edge, edge, subcarriers)
     task = Csi(len(array), torch.from_numpy(frequency + offsets), phase)
-    wavelengths = array.elements.double().numpy() @ np.array(UPRIGHT).T * (frequency / speed_of_light)
+    wavelengths = (
+        array.elements.double().numpy() @ np.array(UPRIGHT).T * (frequency / speed_of_light)
+    )
 
     def channels(station: StationPaths, users: np.ndarray) -> Tensor:
         gains = station.fields[users, None]
@@ -134,30 +152,47 @@ def gather(
     seed: int,
     remarks: Sequence[str],
 ) -> Links:
-    """Links from users to the stations that have a path to them; ``measure`` gives the labels of some of its users."""
+    """Links from users to the stations that have a path to them; ``measure`` gives the labels of
+    some of its users.
+    """
     heard = [np.flatnonzero(station.fields.any(1)) for station in stations]
-    users = np.concatenate([station.users[own] for station, own in zip(stations, heard, strict=True)])
+    users = np.concatenate(
+        [station.users[own] for station, own in zip(stations, heard, strict=True)]
+    )
     places, rows = number_places(users.tolist())
     if transmitters is not None:
         if not 2 <= transmitters <= len(places):
-            raise ValueError(f"transmitters must be 2 to {len(places)}, the users with a path, got {transmitters}")
-        chosen = torch.randperm(len(places), generator=torch.Generator().manual_seed(seed))[:transmitters]
+            raise ValueError(
+                f"transmitters must be 2 to {len(places)}, the users with a path, got {transmitters}"
+            )
+        chosen = torch.randperm(len(places), generator=torch.Generator().manual_seed(seed))[
+            :transmitters
+        ]
         kept = torch.isin(rows, chosen)
-        heard = [own[part.numpy()] for own, part in zip(heard, kept.split([*map(len, heard)]), strict=True)]
+        heard = [
+            own[part.numpy()]
+            for own, part in zip(heard, kept.split([*map(len, heard)]), strict=True)
+        ]
         users, rows = users[kept.numpy()], rows[kept].unique(return_inverse=True)[1]
     counts = torch.tensor([*map(len, heard)])
     names = [station.name for station in stations]
     present = sorted({name for name, own in zip(names, heard, strict=True) if len(own)})
     number = torch.tensor([present.index(name) if name in present else -1 for name in names])
-    poses = {s.name: Pose(torch.from_numpy(s.position).float(), torch.tensor(UPRIGHT)) for s in stations}
+    poses = {
+        s.name: Pose(torch.from_numpy(s.position).float(), torch.tensor(UPRIGHT)) for s in stations
+    }
     every = len(np.unique(np.concatenate([station.users for station in stations]), axis=0))
     absent = sorted({*names} - {*present})
     return Links(
         query=Query(
-            torch.from_numpy(users).float(), number.repeat_interleave(counts), torch.full((len(users),), frequency)
+            torch.from_numpy(users).float(),
+            number.repeat_interleave(counts),
+            torch.full((len(users),), frequency),
         ),
         receivers=tuple(Receiver(name, poses[name], array) for name in present),
-        labels=torch.cat([measure(station, own) for station, own in zip(stations, heard, strict=True)]),
+        labels=torch.cat(
+            [measure(station, own) for station, own in zip(stations, heard, strict=True)]
+        ),
         task=task,
         rows=rows,
         remarks="; ".join(
@@ -171,22 +206,37 @@ def gather(
     )
 
 
-def read_stations(root: str | Path, with_angles: bool) -> tuple[float, list[StationPaths], list[str]]:
-    """The carrier of a scenario [Hz], its paths of each base station and set of users, and remarks on them."""
+def read_stations(
+    root: str | Path, with_angles: bool
+) -> tuple[float, list[StationPaths], list[str]]:
+    """The carrier of a scenario [Hz], its paths of each base station and set of users, and remarks
+    on them.
+    """
     root = find_folder(root)
-    names = sorted(path.name for path in (*root.iterdir(), *root.glob("*/*.mat")))  # scenes have a folder each
-    old = [name for name in names if re.fullmatch(r"BS\d+_(BS|UE_\d+-\d+)\.mat|.*\.\d+\.(CIR|DoA|DoD)\.mat", name)]
+    names = sorted(
+        path.name for path in (*root.iterdir(), *root.glob("*/*.mat"))
+    )  # scenes have a folder each
+    old = [
+        name
+        for name in names
+        if re.fullmatch(r"BS\d+_(BS|UE_\d+-\d+)\.mat|.*\.\d+\.(CIR|DoA|DoD)\.mat", name)
+    ]
     if old:
         raise ValueError(
             f"{root}: a scenario of DeepMIMO v3 or before, as {old[0]} shows; get that of v4\n"
             f"by the package deepmimo: deepmimo.download({root.name!r}), or deepmimo.convert of the ray tracer's files"
         )
     file = root / "params.json"
-    if not has_file(file) and has_file(root.parent / file.name):  # of a dynamic scenario, one folder a scene
+    if not has_file(file) and has_file(
+        root.parent / file.name
+    ):  # of a dynamic scenario, one folder a scene
         file = root.parent / file.name
     try:
         params = json.loads(file.read_text(encoding="utf-8"))
-        frequency, tracer = float(params["rt_params"]["frequency"]), str(params["rt_params"].get("raytracer_name"))
+        frequency, tracer = (
+            float(params["rt_params"]["frequency"]),
+            str(params["rt_params"].get("raytracer_name")),
+        )
         both = {int(own["id"]) for own in params["txrx_sets"].values() if own["is_tx"]}
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         cause = " ".join(f"{type(error).__name__}: {error}".split())
@@ -194,7 +244,13 @@ def read_stations(root: str | Path, with_angles: bool) -> tuple[float, list[Stat
         raise ValueError(f"cannot parse {file}: {cause}; expected {expected}") from error
     check_carrier(f"{file}: rt_params.frequency", frequency)
     pattern = re.compile(r"power_((t\d+_tx\d+)_r(\d+))\.(?:npz|mat|npy)")
-    found = sorted({m.groups() for name in sorted(p.name for p in root.iterdir()) if (m := pattern.fullmatch(name))})
+    found = sorted(
+        {
+            m.groups()
+            for name in sorted(p.name for p in root.iterdir())
+            if (m := pattern.fullmatch(name))
+        }
+    )
     pairs = [(code, name) for code, name, users in found if int(users) not in both]
     if not pairs:
         folders = quote([path.name for path in root.iterdir() if path.is_dir()])
@@ -215,11 +271,15 @@ def read_stations(root: str | Path, with_angles: bool) -> tuple[float, list[Stat
     if lacks_carrier(fields, delays, frequency, otherwise=tracer.startswith("Sionna")):
         turn = lambda station: np.exp(-2j * np.pi * frequency * station.delays)
         stations = [replace(station, fields=station.fields * turn(station)) for station in stations]
-        remarks.append("phases lack the carrier's over the delay, as those of Sionna RT; it is added")
+        remarks.append(
+            "phases lack the carrier's over the delay, as those of Sionna RT; it is added"
+        )
     return frequency, stations, remarks
 
 
-def _read_station(root: Path, code: str, name: str, with_angles: bool) -> tuple[StationPaths, np.ndarray]:
+def _read_station(
+    root: Path, code: str, name: str, with_angles: bool
+) -> tuple[StationPaths, np.ndarray]:
     """The paths of one base station and set of users, and True for those in line of sight (n, p)."""
     angles = ("aod_az", "aod_el") if with_angles else ()
     names = ("power", "rx_pos", "tx_pos", "phase", "delay", *angles, "inter")
@@ -243,7 +303,9 @@ def _read_station(root: Path, code: str, name: str, with_angles: bool) -> tuple[
             raise ValueError(f"{at}: expected {expected}, got {got} ({len(wrong)} of {array.size})")
         arrays[key] = array if is_position else np.where(exists, array, 0)
     powers = arrays["power"][exists]
-    if len(powers) and 0 <= powers.min() and powers.max() <= 1:  # no passive path has a gain of 0 dB or more
+    if (
+        len(powers) and 0 <= powers.min() and powers.max() <= 1
+    ):  # no passive path has a gain of 0 dB or more
         span = f"{powers.min():.3g} to {powers.max():.3g}"
         raise ValueError(
             f"{files['power']}: expected gains in dB, got {span} for all paths, as if linear\n"
@@ -253,9 +315,13 @@ def _read_station(root: Path, code: str, name: str, with_angles: bool) -> tuple[
     if with_angles:
         azimuths, zeniths = np.deg2rad(arrays["aod_az"]), np.deg2rad(arrays["aod_el"])
         level = np.sin(zeniths)
-        departures = np.stack((level * np.cos(azimuths), level * np.sin(azimuths), np.cos(zeniths)), -1)
+        departures = np.stack(
+            (level * np.cos(azimuths), level * np.sin(azimuths), np.cos(zeniths)), -1
+        )
     fields = exists * 10 ** (arrays["power"] / 20) * np.exp(1j * np.deg2rad(arrays["phase"]))
-    station = StationPaths(name, arrays["tx_pos"][0], arrays["rx_pos"], fields, arrays["delay"], departures)
+    station = StationPaths(
+        name, arrays["tx_pos"][0], arrays["rx_pos"], fields, arrays["delay"], departures
+    )
     return station, exists & (arrays["inter"] == 0)
 
 
@@ -279,30 +345,36 @@ def _load(file: Path, name: str) -> np.ndarray:
                 array = content if file.suffix == ".npy" else content[name]
             if array.dtype.kind not in "iuf":
                 raise ValueError(f"{array.dtype} for real numbers")
-            return array.astype(float).reshape((1, 3) if name == "tx_pos" and array.size == 3 else array.shape)
+            return array.astype(float).reshape(
+                (1, 3) if name == "tx_pos" and array.size == 3 else array.shape
+            )
     except Exception as error:  # damaged files make numpy and scipy raise exceptions of many types
         cause = " ".join(f"{type(error).__name__}: {error}".split())
-        raise ValueError(f"cannot parse {file}: {cause}; expected an array {name!r} of real numbers") from error
+        raise ValueError(
+            f"cannot parse {file}: {cause}; expected an array {name!r} of real numbers"
+        ) from error
 
 
 def write(
     folder: str | Path,
     frequency: float,
     users: Float[np.ndarray, "n 3"],
-    stations: Sequence[tuple[Float[np.ndarray, "3"], Complex[np.ndarray, "n p"], Float[np.ndarray, "n p k 3"]]],
+    stations: Sequence[
+        tuple[Float[np.ndarray, "3"], Complex[np.ndarray, "n p"], Float[np.ndarray, "n p k 3"]]
+    ],
 ) -> None:
     """Writes traced paths as a scenario of DeepMIMO v4.
 
-    DeepMIMO loads it by name from ``deepmimo_scenarios`` in the working folder, if the name has no capitals; of its
-    own accord it loads the strongest 25 paths of a user.
+    DeepMIMO loads it by name from ``deepmimo_scenarios`` in the working folder, if the name has no
+    capitals; of its own accord it loads the strongest 25 paths of a user.
 
     Args:
         folder: An existing folder.
         frequency: Carrier [Hz].
         users: Positions [m].
-        stations: Of each base station its position [m], the gain of each path at the carrier with the phase of its
-            length, 0 for no path, and the points of its reflections from the station on [m], NaN in place of missing
-            ones.
+        stations: Of each base station its position [m], the gain of each path at the carrier with
+            the phase of its length, 0 for no path, and the points of its reflections from the
+            station on [m], NaN in place of missing ones.
 
     Example:
         >>> from gaigs.data import deepmimo
@@ -322,7 +394,10 @@ def write(
         np.savez_compressed(part, vertices=np.zeros((0, 3)))
     write_text(folder / "objects.json", "[]\n")
     heard = np.any([fields.any(1) for _, fields, _ in stations], 0)
-    sets = (("base stations", len(stations), len(stations)), ("users", len(users), int(heard.sum())))
+    sets = (
+        ("base stations", len(stations), len(stations)),
+        ("users", len(users), int(heard.sum())),
+    )
     params = {
         "version": "4.0.5",
         "rt_params": {
@@ -336,9 +411,19 @@ def write(
             **dict.fromkeys(("diffuse_final_interaction_only", "diffuse_random_phases"), False),
             **{f"terrain_{kind}": False for kind in ("reflection", "diffraction", "scattering")},
             **{"num_rays": 0, "ray_casting_method": "image", "synthetic_array": True},
-            **{"ray_casting_range_az": 360.0, "ray_casting_range_el": 180.0, "gps_bbox": [0, 0, 0, 0]},
+            **{
+                "ray_casting_range_az": 360.0,
+                "ray_casting_range_el": 180.0,
+                "gps_bbox": [0, 0, 0, 0],
+            },
         },
-        "scene": {"num_scenes": 1, "n_objects": 0, "n_vertices": 0, "n_faces": 0, "n_triangular_faces": 0},
+        "scene": {
+            "num_scenes": 1,
+            "n_objects": 0,
+            "n_vertices": 0,
+            "n_faces": 0,
+            "n_triangular_faces": 0,
+        },
         "materials": {},
         "txrx_sets": {
             f"txrx_set_{k}": {
@@ -368,7 +453,10 @@ def _matrices(
 ) -> dict[str, np.ndarray]:
     """All matrices of one base station, strongest paths first, NaN where there is no path."""
     order = np.argsort(-np.abs(fields), axis=1, kind="stable")
-    fields, bounces = np.take_along_axis(fields, order, 1), np.take_along_axis(bounces, order[..., None, None], 1)
+    fields, bounces = (
+        np.take_along_axis(fields, order, 1),
+        np.take_along_axis(bounces, order[..., None, None], 1),
+    )
     met = np.isfinite(bounces).all(-1)
     bounces = np.take_along_axis(bounces, np.argsort(~met, axis=2, kind="stable")[..., None], 2)
     count, exists = met.sum(2), fields != 0
@@ -382,9 +470,13 @@ def _matrices(
         "power": 20 * np.log10(np.abs(np.where(exists, fields, 1))),
         "phase": np.angle(fields, deg=True),
         "delay": np.linalg.norm(legs, axis=-1).sum(2) / speed_of_light,
-        **{f"{end}_az": np.rad2deg(np.arctan2(ray[..., 1], ray[..., 0])) for end, ray in angles.items()},
         **{
-            f"{end}_el": np.rad2deg(np.arctan2(np.hypot(*ray[..., :2].T).T, ray[..., 2])) for end, ray in angles.items()
+            f"{end}_az": np.rad2deg(np.arctan2(ray[..., 1], ray[..., 0]))
+            for end, ray in angles.items()
+        },
+        **{
+            f"{end}_el": np.rad2deg(np.arctan2(np.hypot(*ray[..., :2].T).T, ray[..., 2]))
+            for end, ray in angles.items()
         },
         "inter": (10.0**count - 1) / 9,  # a digit of 1 for each reflection
     }

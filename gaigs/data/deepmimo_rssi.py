@@ -18,8 +18,11 @@ from gaigs.registry import register
 
 
 @register("data", "deepmimo_rssi")
-def read(root: str | Path, bandwidth: float = 10e6, transmitters: int | None = None, seed: int = 0) -> Links:
-    """Signal strength of users of 0 dBm at the base stations of a scenario, between isotropic antennas.
+def read(
+    root: str | Path, bandwidth: float = 10e6, transmitters: int | None = None, seed: int = 0
+) -> Links:
+    """Signal strength of users of 0 dBm at the base stations of a scenario, between isotropic
+    antennas.
 
     Files, errors and other options are those of ``deepmimo``.
 
@@ -27,11 +30,15 @@ def read(root: str | Path, bandwidth: float = 10e6, transmitters: int | None = N
         bandwidth: Width of the band about the scenario's carrier over which power is averaged [Hz].
     """
     frequency, stations, remarks = read_stations(root, with_angles=False)
-    offsets = sample_band(bandwidth, speed_of_light * max(station.delays.max() for station in stations)).numpy()
+    offsets = sample_band(
+        bandwidth, speed_of_light * max(station.delays.max() for station in stations)
+    ).numpy()
 
     def strengths(station: StationPaths, users: np.ndarray) -> Tensor:
         channels = to_channels(station.fields[users, None], station.delays[users, None], offsets)
         return rss_dbm(torch.from_numpy(channels))
 
-    links = gather(stations, strengths, Rssi(), Array.single(), frequency, transmitters, seed, remarks)
+    links = gather(
+        stations, strengths, Rssi(), Array.single(), frequency, transmitters, seed, remarks
+    )
     return replace(links, bandwidth=bandwidth)

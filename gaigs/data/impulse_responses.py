@@ -14,9 +14,12 @@ PART = 256
 
 
 def to_channels(
-    gains: Complex[np.ndarray, "n e p"], delays: Float[np.ndarray, "n d p"], offsets: Float[np.ndarray, " s"]
+    gains: Complex[np.ndarray, "n e p"],
+    delays: Float[np.ndarray, "n d p"],
+    offsets: Float[np.ndarray, " s"],
 ) -> Complex[np.ndarray, "n e s"]:
-    """Channels sum_p g_p exp(-j 2 pi f t_p), complex64, from gains at the carrier that include its phase.
+    """Channels sum_p g_p exp(-j 2 pi f t_p), complex64, from gains at the carrier that include its
+    phase.
 
     Args:
         gains: Baseband-equivalent gain of each path at each element; 0 for no path.
@@ -38,29 +41,40 @@ def to_channels(
 
 
 def lacks_carrier(
-    fields: Complex[np.ndarray, " k"], delays: Float[np.ndarray, " k"], frequency: float, otherwise: bool = False
+    fields: Complex[np.ndarray, " k"],
+    delays: Float[np.ndarray, " k"],
+    frequency: float,
+    otherwise: bool = False,
 ) -> bool:
-    """True if gains of lines of sight are without the phase of their delay at the carrier: all phases are alike.
+    """True if gains of lines of sight are without the phase of their delay at the carrier: all
+    phases are alike.
 
     Ray tracers may give gains so. Fewer than ten lines of sight leave it to ``otherwise``.
     """
     if len(fields) < 10:
         return otherwise
     units = fields / np.abs(fields)
-    alike, included = abs(units.mean()), abs((units * np.exp(2j * np.pi * frequency * delays)).mean())
+    alike, included = (
+        abs(units.mean()),
+        abs((units * np.exp(2j * np.pi * frequency * delays)).mean()),
+    )
     return bool(alike > max(0.9, included))
 
 
-def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Arrays of ``gaigs.data.csi_npz`` from impulse responses as ``sionna.rt.Paths.cir`` gives them, and remarks.
+def from_sionna(
+    arrays: Mapping[str, np.ndarray], needs_delays: bool
+) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Arrays of ``gaigs.data.csi_npz`` from impulse responses as ``sionna.rt.Paths.cir`` gives
+    them, and remarks.
 
-    Gains without the phase of the delay at the carrier, as of ``sionna.rt.Paths.a``, get it. Lines of sight show it:
-    first paths whose delay is the distance over the speed of light. The end with fewer places, the receivers in a tie,
-    becomes the fixed one; a channel is the same both ways.
+    Gains without the phase of the delay at the carrier, as of ``sionna.rt.Paths.a``, get it. Lines
+    of sight show it: first paths whose delay is the distance over the speed of light. The end with
+    fewer places, the receivers in a tie, becomes the fixed one; a channel is the same both ways.
 
     Args:
-        arrays: ``a`` (k, e, n, m, p, 1) and ``tau`` (k, n, p) or (k, e, n, m, p), of k receivers ``rx`` with e antennas
-            and n transmitters ``tx`` with m; ``carrier`` [Hz]; ``frequencies``, absolute or relative to it [Hz].
+        arrays: ``a`` (k, e, n, m, p, 1) and ``tau`` (k, n, p) or (k, e, n, m, p), of k receivers
+            ``rx`` with e antennas and n transmitters ``tx`` with m; ``carrier`` [Hz];
+            ``frequencies``, absolute or relative to it [Hz].
         needs_delays: True if delays must count from the transmission.
 
     Raises:
@@ -70,7 +84,9 @@ def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> tuple[d
         if name != "a" and array.dtype.kind not in "iuf":
             raise ValueError(f"{name}: expected real numbers, got {array.dtype}")
     if arrays["carrier"].size != 1:
-        raise ValueError(f"carrier: expected one number [Hz], got an array of {arrays['carrier'].shape}")
+        raise ValueError(
+            f"carrier: expected one number [Hz], got an array of {arrays['carrier'].shape}"
+        )
     a, tau, tx, rx, subcarriers = (arrays[name] for name in ("a", "tau", "tx", "rx", "frequencies"))
     carrier = float(arrays["carrier"].item())
     check_carrier("carrier", carrier)
@@ -85,14 +101,26 @@ def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> tuple[d
     check_parts("a", a[a != 0])
     tau = tau[:, None, :, None] if tau.ndim == 3 else tau
     shared = (a.shape[0], 1, a.shape[2], 1, a.shape[4])  # the delays of a synthetic array
-    if tx.shape != (a.shape[2], 3) or rx.shape != (a.shape[0], 3) or tau.shape not in (a.shape, shared):
-        expected = f"tx {(a.shape[2], 3)}, rx {(a.shape[0], 3)} and tau {a.shape} or without antennas"
-        raise ValueError(f"a of {a.shape}: expected {expected}, got {tx.shape}, {rx.shape} and {arrays['tau'].shape}")
+    if (
+        tx.shape != (a.shape[2], 3)
+        or rx.shape != (a.shape[0], 3)
+        or tau.shape not in (a.shape, shared)
+    ):
+        expected = (
+            f"tx {(a.shape[2], 3)}, rx {(a.shape[0], 3)} and tau {a.shape} or without antennas"
+        )
+        raise ValueError(
+            f"a of {a.shape}: expected {expected}, got {tx.shape}, {rx.shape} and {arrays['tau'].shape}"
+        )
     exists = a != 0
     delays = np.where(exists, tau, 0)
     if not ((delays >= 0) & (delays < 1e-3)).all():
         raise ValueError("tau: expected a delay of 0 to 1 ms in seconds where a is not 0")
-    if needs_delays and exists.any() and not np.where(exists, tau, np.inf).min(-1)[exists.any(-1)].any():
+    if (
+        needs_delays
+        and exists.any()
+        and not np.where(exists, tau, np.inf).min(-1)[exists.any(-1)].any()
+    ):
         raise ValueError(
             "tau: expected delays from the transmission on, got 0 for the first path of every link; save those of "
             "paths.cir(normalize_delays=False), or set data.phase=per_link_and_delay"
@@ -100,10 +128,13 @@ def from_sionna(arrays: Mapping[str, np.ndarray], needs_delays: bool) -> tuple[d
     if len(tx) < len(rx):
         a, delays, tx, rx = a.transpose(2, 3, 0, 1, 4), delays.transpose(2, 3, 0, 1, 4), rx, tx
     if a.shape[3] != 1:
-        raise ValueError(f"a: expected one antenna at each place of the moving end, got {a.shape[3]}")
+        raise ValueError(
+            f"a: expected one antenna at each place of the moving end, got {a.shape[3]}"
+        )
     # Links run over the transmitters, and over the receivers of each.
     gains, delays = (
-        part[:, :, :, 0].transpose(2, 0, 1, 3).reshape(-1, *part[0, :, 0, 0].shape) for part in (a, delays)
+        part[:, :, :, 0].transpose(2, 0, 1, 3).reshape(-1, *part[0, :, 0, 0].shape)
+        for part in (a, delays)
     )
     is_relative = (np.abs(subcarriers) < carrier / 2).all()
     frequencies = subcarriers + (carrier if is_relative else 0.0)

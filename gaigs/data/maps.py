@@ -36,15 +36,17 @@ def metres_of(epsg: int) -> float | None:
     try:
         system = pyproj.CRS.from_epsg(epsg)
     except pyproj.exceptions.ProjError as error:
-        raise ValueError(f"data.epsg={epsg} is no coordinate system: {' '.join(str(error).split())}") from None
+        raise ValueError(
+            f"data.epsg={epsg} is no coordinate system: {' '.join(str(error).split())}"
+        ) from None
     return None if system.is_geographic else system.axis_info[0].unit_conversion_factor
 
 
 def are_degrees(points: Float[ndarray, "n d"]) -> bool:
     """True if x and y [m] are probably longitude and latitude, in either order.
 
-    They then span less than 0.3 and less than a hundredth of their distance from the origin, and have five decimals or
-    more. A grid in metres has no such decimals.
+    They then span less than 0.3 and less than a hundredth of their distance from the origin, and
+    have five decimals or more. A grid in metres has no such decimals.
     """
     if len(points) < 2:
         return False
@@ -52,7 +54,9 @@ def are_degrees(points: Float[ndarray, "n d"]) -> bool:
     span = np.ptp(points[:, :2], axis=0).max()
     rests = np.abs(points[:, :2] - points[:, :2].round(4))
     is_on_earth = max(x, y) <= 180 and min(x, y) <= 90
-    return bool(is_on_earth and 0 < span < min(0.3, max(x, y) / 100) and (rests > 1e-5).mean() > 0.3)
+    return bool(
+        is_on_earth and 0 < span < min(0.3, max(x, y) / 100) and (rests > 1e-5).mean() > 0.3
+    )
 
 
 def check_metres(
@@ -60,10 +64,14 @@ def check_metres(
     points: Float[ndarray, "n d"],
     mend: str = "convert them, as gaigs.data.maps.to_utm(points, 4326) does, longitude first",
 ) -> None:
-    """Raises a ``ValueError`` if coordinates are longitudes and latitudes; ``mend`` says how to read them."""
+    """Raises a ``ValueError`` if coordinates are longitudes and latitudes; ``mend`` says how to
+    read them.
+    """
     if are_degrees(points):
         x, y = points[0, :2].tolist()
-        raise ValueError(f"{where}: expected metres, got such as ({x:.7g}, {y:.7g}), which look like degrees\n{mend}")
+        raise ValueError(
+            f"{where}: expected metres, got such as ({x:.7g}, {y:.7g}), which look like degrees\n{mend}"
+        )
 
 
 def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 2"], int]:
@@ -85,10 +93,14 @@ def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 
     pyproj = find_pyproj()
     try:
         x, y = points[0].tolist()
-        lon, lat = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True).transform(x, y, errcheck=True)
+        lon, lat = pyproj.Transformer.from_crs(epsg, 4326, always_xy=True).transform(
+            x, y, errcheck=True
+        )
         utm = (32700 if lat < 0 else 32600) + int((lon + 180) % 360 // 6) + 1
         east, north = points.T
-        moved = pyproj.Transformer.from_crs(epsg, utm, always_xy=True).transform(east, north, errcheck=True)
+        moved = pyproj.Transformer.from_crs(epsg, utm, always_xy=True).transform(
+            east, north, errcheck=True
+        )
     except pyproj.exceptions.ProjError as error:
         cause = " ".join(str(error).split())
         raise ValueError(f"data.epsg={epsg} does not suit the coordinates: {cause}") from None

@@ -10,7 +10,9 @@ from gaigs.data import Links
 
 
 def check_fit(links: Links, scene: Scene | None = None) -> None:
-    """Raises a ``ValueError`` unless links have a split and, with a model's scene, its receivers and labels."""
+    """Raises a ``ValueError`` unless links have a split and, with a model's scene, its receivers
+    and labels.
+    """
     if links.split is None:
         raise ValueError("links must have a split; gaigs.links(..., split='random') gives one")
     if scene is None:
@@ -18,9 +20,14 @@ def check_fit(links: Links, scene: Scene | None = None) -> None:
     axes = [task.state() | {"normalisation": ""} for task in (scene.task, links.task)]
     if not are_alike(*axes):
         expected, got = (f"{task.name!r} {tuple(task.shape)}" for task in (scene.task, links.task))
-        raise ValueError(f"links must have the model's labels, {expected} with the same axes, got {got}")
+        raise ValueError(
+            f"links must have the model's labels, {expected} with the same axes, got {got}"
+        )
     both = scene.receivers, links.receivers
-    antennas = [[(r.pose.position, r.pose.rotation, r.array.elements, r.array.pattern) for r in each] for each in both]
+    antennas = [
+        [(r.pose.position, r.pose.rotation, r.array.elements, r.array.pattern) for r in each]
+        for each in both
+    ]
     if not are_alike(*antennas):
         expected, got = (", ".join(receiver.name for receiver in each) for each in both)
         raise ValueError(

@@ -26,12 +26,14 @@ NOT_HEARD = -100.0
 def read(root: str | Path, frequency: float | None = None) -> Links:
     """A data set from its folder: one link for each reading that a gateway heard.
 
-    Readings of -100 dBm were not heard. They, and gateways that heard nothing, are left out and counted in the remarks.
-    Gateways look along the world's axes. The readings of one measurement share a row.
+    Readings of -100 dBm were not heard. They, and gateways that heard nothing, are left out and
+    counted in the remarks. Gateways look along the world's axes. The readings of one measurement
+    share a row.
 
     Args:
-        root: Folder with ``tx_pos.csv``, ``gateway_rssi.csv``, ``gateway_position.yml``, for the official split
-            ``train_index.txt`` and ``test_index.txt``, and optionally ``layout.csv``.
+        root: Folder with ``tx_pos.csv``, ``gateway_rssi.csv``, ``gateway_position.yml``, for the
+            official split ``train_index.txt`` and ``test_index.txt``, and optionally
+            ``layout.csv``.
         frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
 
     Raises:
@@ -41,7 +43,9 @@ def read(root: str | Path, frequency: float | None = None) -> Links:
     Source: NeRF², https://github.com/XPengZhao/NeRF2.
     """
     root = tables.find_folder(root)
-    positions = tables.read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one measurement a line")
+    positions = tables.read_points(
+        root / "tx_pos.csv", "xyz", "x,y,z [m] of one measurement a line"
+    )
     file = root / "gateway_position.yml"
     gateways = {
         name: to_position(f"{file}: {name}", value)
@@ -49,7 +53,9 @@ def read(root: str | Path, frequency: float | None = None) -> Links:
     }
     names, readings = _read_readings(root / "gateway_rssi.csv", [*gateways])
     if len(positions) != len(readings):
-        raise ValueError(f"{root}: tx_pos.csv has {len(positions)} positions, gateway_rssi.csv {len(readings)} rows")
+        raise ValueError(
+            f"{root}: tx_pos.csv has {len(positions)} positions, gateway_rssi.csv {len(readings)} rows"
+        )
     layout = root / "layout.csv"
     walls = tables.read_walls(layout) if tables.has_file(layout) else torch.zeros(0, 2, 3)
 
@@ -82,27 +88,37 @@ def _read_readings(file: Path, gateways: Sequence[str]) -> tuple[list[str], list
     lines = tables.read_lines(file, "an RSSI [dBm] of each gateway, one measurement a line")
     delimiter = tables.find_delimiter(lines)
     first = tables.split_cells(lines[0], delimiter)
-    header = any(cell in gateways for cell in first) or all(math.isnan(tables.to_number(cell)) for cell in first)
+    header = any(cell in gateways for cell in first) or all(
+        math.isnan(tables.to_number(cell)) for cell in first
+    )
     matched = match_names(first, gateways) if header else {}
     names = [matched.get(cell, cell) for cell in first] if header else [*gateways]
     for name in names:
         if name not in gateways:
             near = suggested(name, [other for other in gateways if other not in names])
-            raise ValueError(f"{file}, line 1: column {near} has no position in gateway_position.yml")
+            raise ValueError(
+                f"{file}, line 1: column {near} has no position in gateway_position.yml"
+            )
     for name in gateways:
         if names.count(name) != 1:
-            raise ValueError(f"{file}, line 1: expected one column {tables.quote(name)}, got {names.count(name)}")
+            raise ValueError(
+                f"{file}, line 1: expected one column {tables.quote(name)}, got {names.count(name)}"
+            )
     rows = tables.split_rows(file, lines, names, int(header), delimiter)
     readings = to_dbm(file, rows, names, NOT_HEARD, [NOT_HEARD], f"write {NOT_HEARD:g}")
     if all(value == NOT_HEARD for row in readings for value in row):
-        raise ValueError(f"{file}: expected readings above {NOT_HEARD:g} dBm, got none; no gateway heard anything")
+        raise ValueError(
+            f"{file}: expected readings above {NOT_HEARD:g} dBm, got none; no gateway heard anything"
+        )
     return names, readings
 
 
 def _read_official(root: Path, heard: Bool[Tensor, "rows gateways"], names: Sequence[str]) -> Parts:
     """Training and test links of the index files, which list rows, or pairs of row and gateway."""
     # A gateway has its column's number as a second name, unless names are numbers.
-    columns = {} if any(name.isdecimal() for name in names) else {str(k): k for k in range(len(names))}
+    columns = (
+        {} if any(name.isdecimal() for name in names) else {str(k): k for k in range(len(names))}
+    )
     columns |= {name: k for k, name in enumerate(names)}
 
     def parse(line: str) -> tuple[int | None, ...] | None:
@@ -112,7 +128,9 @@ def _read_official(root: Path, heard: Bool[Tensor, "rows gateways"], names: Sequ
 
     parts = tables.read_parts(root, parse, f"a row in 0..{len(heard) - 1}, or a row and a gateway")
     if len({len(entry) for part in parts for entry in part}) > 1:
-        raise ValueError(f"{root}: index files must list rows, or pairs of row and gateway, got both")
+        raise ValueError(
+            f"{root}: index files must list rows, or pairs of row and gateway, got both"
+        )
     found = []
     for name, part in zip(("train", "test"), parts, strict=True):
         listed = torch.zeros_like(heard)
@@ -120,5 +138,7 @@ def _read_official(root: Path, heard: Bool[Tensor, "rows gateways"], names: Sequ
             listed[entry] = True
         found.append(listed[heard].nonzero()[:, 0])  # links are heard readings, row by row
         if not len(found[-1]):
-            raise ValueError(f"{root}/{name}_index.txt: expected a reading that was heard, got none")
+            raise ValueError(
+                f"{root}/{name}_index.txt: expected a reading that was heard, got none"
+            )
     return found[0], found[1]

@@ -36,33 +36,43 @@ def read(
     frequency: float | None = 920e6,
     bandwidth: float | None = None,
 ) -> Links:
-    """A data set from its folder. Everything but the pixels is checked here; images are decoded when requested.
+    """A data set from its folder. Everything but the pixels is checked here; images are decoded
+    when requested.
 
     With a carrier for each link, the links of one position share a row.
 
     Args:
-        root: Folder with ``tx_pos.csv``, ``gateway_info.yml``, ``spectrum/``, for the official split
-            ``train_index.txt`` and ``test_index.txt``, and optionally ``freq.txt``, the carrier of each link.
-        elements: Rows and columns of the receiver's planar array, half a wavelength of the highest carrier apart; None
-            if unknown.
-        frequency: Carrier of all links without ``freq.txt`` [Hz]; None if unknown. An array of unknown elements or
-            carrier counts as a single antenna.
-        bandwidth: Width of the band around each carrier that powers were averaged over, 0 for a carrier alone [Hz];
-            None if unknown.
+        root: Folder with ``tx_pos.csv``, ``gateway_info.yml``, ``spectrum/``, for the official
+            split ``train_index.txt`` and ``test_index.txt``, and optionally ``freq.txt``, the
+            carrier of each link.
+        elements: Rows and columns of the receiver's planar array, half a wavelength of the highest
+            carrier apart; None if unknown.
+        frequency: Carrier of all links without ``freq.txt`` [Hz]; None if unknown. An array of
+            unknown elements or carrier counts as a single antenna.
+        bandwidth: Width of the band around each carrier that powers were averaged over, 0 for a
+            carrier alone [Hz]; None if unknown.
 
     Raises:
         FileNotFoundError: The folder does not exist.
-        ValueError: An option is out of range, or a file has a defect; the message names file, line and value.
+        ValueError: An option is out of range, or a file has a defect; the message names file, line
+            and value.
 
-    Source: NeRF², https://github.com/XPengZhao/NeRF2; its spectra s23 are of a 4 x 4 array at about 920 MHz.
+    Source: NeRF², https://github.com/XPengZhao/NeRF2; its spectra s23 are of a 4 x 4 array at about
+    920 MHz.
     """
     if bandwidth is not None and not 0 <= bandwidth < math.inf:
-        raise ValueError(f"bandwidth must be that of a band, 0 or more [Hz], or null, got {bandwidth}")
+        raise ValueError(
+            f"bandwidth must be that of a band, 0 or more [Hz], or null, got {bandwidth}"
+        )
     if frequency is not None:
         check_carrier("frequency", frequency)
     is_pair = isinstance(elements, Sequence) and len(elements) == 2
-    if elements is not None and not (is_pair and all(isinstance(count, int) and count > 0 for count in elements)):
-        raise ValueError(f"elements must be the array's rows and columns, such as [4, 4], or null, got {elements!r}")
+    if elements is not None and not (
+        is_pair and all(isinstance(count, int) and count > 0 for count in elements)
+    ):
+        raise ValueError(
+            f"elements must be the array's rows and columns, such as [4, 4], or null, got {elements!r}"
+        )
     root = tables.find_folder(root)
     positions = tables.read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one spectrum a line")
     receiver = _read_receiver(root / "gateway_info.yml")
@@ -74,15 +84,23 @@ def read(
     if has_own:
         frequencies = _read_frequencies(carriers, len(files))
         low, high = frequencies.min().item() / 1e6, frequencies.max().item() / 1e6
-        remarks.append(f"{len(frequencies.unique())} carriers of {carriers.name}, {low:.6g} to {high:.6g} MHz")
+        remarks.append(
+            f"{len(frequencies.unique())} carriers of {carriers.name}, {low:.6g} to {high:.6g} MHz"
+        )
     array = Array.single()
     if elements is not None and frequencies is not None:
-        array = Array.planar(elements[0], elements[1], speed_of_light / frequencies.double().max().item() / 2)
+        array = Array.planar(
+            elements[0], elements[1], speed_of_light / frequencies.double().max().item() / 2
+        )
     elif elements is not None:
-        remarks.append("the array counts as a single antenna, since without a frequency its extent is unknown")
+        remarks.append(
+            "the array counts as a single antenna, since without a frequency its extent is unknown"
+        )
     grid = Grid.degrees()
     return Links(
-        query=Query(torch.tensor(positions), torch.zeros(len(files), dtype=torch.long), frequencies),
+        query=Query(
+            torch.tensor(positions), torch.zeros(len(files), dtype=torch.long), frequencies
+        ),
         receivers=(replace(receiver, array=array),),
         labels=GreyImages(files, SHAPE),
         task=Spectrum(grid.elevations, grid.azimuths),
@@ -96,8 +114,8 @@ def read(
 def write(folder: str | Path, links: Links) -> None:
     """Writes a data set of spectra in the layout that ``read`` reads; labels are rounded to 8 bits.
 
-    The index files hold the split's training and validation links together, and its test links. ``freq.txt`` holds
-    known carriers; the layout has no place for the array.
+    The index files hold the split's training and validation links together, and its test links.
+    ``freq.txt`` holds known carriers; the layout has no place for the array.
 
     Raises:
         OSError: The folder is not empty, or a file cannot be written.
@@ -105,37 +123,55 @@ def write(folder: str | Path, links: Links) -> None:
     """
     folder = Path(folder)
     tables.check_empty(folder)
-    if len(links.receivers) != 1 or not isinstance(links.task, Spectrum) or links.task.shape != SHAPE:
+    if (
+        len(links.receivers) != 1
+        or not isinstance(links.task, Spectrum)
+        or links.task.shape != SHAPE
+    ):
         raise ValueError(
             f"the layout holds spectra of {SHAPE[0]} x {SHAPE[1]} directions at one receiver, got labels of "
             f"{links.task.name} {links.task.shape} at {len(links.receivers)}"
         )
     split, query = links.split, links.query
     if split is None:
-        raise ValueError("the layout's index files hold a split, got links without one; make them by gaigs.data.load")
+        raise ValueError(
+            "the layout's index files hold a split, got links without one; make them by gaigs.data.load"
+        )
     (folder / "spectrum").mkdir(parents=True)
     for k in range(len(links)):
         pixels = (links.labels[torch.tensor([k])][0] * 255).round().byte()
         with atomic_write(folder / "spectrum" / f"{k + 1:05d}.png") as part:
             Image.fromarray(pixels.numpy()).save(part)
     # Nine digits give the same float32.
-    rows = ["x,y,z", *(",".join(f"{value:.9g}" for value in row) for row in query.transmitters.tolist())]
+    rows = [
+        "x,y,z",
+        *(",".join(f"{value:.9g}" for value in row) for row in query.transmitters.tolist()),
+    ]
     write_text(folder / "tx_pos.csv", "\n".join(rows) + "\n")
     if query.frequencies is not None:
-        write_text(folder / "freq.txt", "".join(f"{value / 1e9:.9g}\n" for value in query.frequencies.tolist()))
+        write_text(
+            folder / "freq.txt",
+            "".join(f"{value / 1e9:.9g}\n" for value in query.frequencies.tolist()),
+        )
     receiver = links.receivers[0]
     quaternion = Rotation.from_matrix(receiver.pose.rotation.double().numpy()).as_quat()
     pose = {"position": receiver.pose.position.tolist(), "orientation": quaternion.tolist()}
-    write_text(folder / "gateway_info.yml", yaml.safe_dump({receiver.name: pose}, default_flow_style=None))
+    write_text(
+        folder / "gateway_info.yml", yaml.safe_dump({receiver.name: pose}, default_flow_style=None)
+    )
     for name, index in (("train", split.known), ("test", split.test)):
         write_text(folder / f"{name}_index.txt", "".join(f"{k + 1:05d}\n" for k in index.tolist()))
 
 
 def _read_receiver(file: Path) -> Receiver:
     expected = "one gateway with position [m] and orientation (quaternion x, y, z, w)"
-    gateways = {name: pose for name, pose in read_mapping(file, expected).items() if isinstance(pose, dict)}
+    gateways = {
+        name: pose for name, pose in read_mapping(file, expected).items() if isinstance(pose, dict)
+    }
     if len(gateways) != 1:
-        raise ValueError(f"{file}: expected {expected}, got {tables.quote(', '.join(gateways) or 'none')}")
+        raise ValueError(
+            f"{file}: expected {expected}, got {tables.quote(', '.join(gateways) or 'none')}"
+        )
     ((name, pose),) = gateways.items()
     position = to_position(f"{file}: {name}: position", pose.get("position"))
     orientation = to_vector(f"{file}: {name}: orientation", pose.get("orientation"), "xyzw")
@@ -149,7 +185,9 @@ def _read_frequencies(file: Path, count: int) -> Float[Tensor, " n"]:
     """The carrier of each link [Hz]."""
     lines = tables.read_lines(file, "the carrier [GHz] of one spectrum a line")
     if len(lines) != count:
-        raise ValueError(f"{file}: expected {count} lines, one for each row of tx_pos.csv, got {len(lines)}")
+        raise ValueError(
+            f"{file}: expected {count} lines, one for each row of tx_pos.csv, got {len(lines)}"
+        )
     gigahertz = [tables.to_number(line) for line in lines]
     low, high = (bound / 1e9 for bound in CARRIERS)
     wrong = {

@@ -18,7 +18,9 @@ from gaigs.io.tables import Rows, to_number, to_numbers
 from gaigs.registry import suggest
 
 QUIETEST, LOUDEST = -150.0, 30.0
-"""Bounds of readings [dBm]: others are another unit, a lost sign or a mark of "not heard" such as 100."""
+"""Bounds of readings [dBm]: others are another unit, a lost sign or a mark of "not heard" such as
+100.
+"""
 
 MARKS, ROUND = (100.0, 127.0, -200.0, -999.0), (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)
 """Usual marks of "not heard", out of these bounds and within."""
@@ -30,9 +32,15 @@ def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiv
 
 
 def to_dbm(
-    file: Path, rows: Rows, names: Sequence[str], lowest: float, not_heard: Sequence[float], mend: str
+    file: Path,
+    rows: Rows,
+    names: Sequence[str],
+    lowest: float,
+    not_heard: Sequence[float],
+    mend: str,
 ) -> list[list[float]]:
-    """Cells of a table as readings [dBm]; a ``ValueError`` where one is neither ``not_heard`` nor in range.
+    """Cells of a table as readings [dBm]; a ``ValueError`` where one is neither ``not_heard`` nor
+    in range.
 
     ``mend`` says in the error what to do with other marks of "not heard".
     """
@@ -55,7 +63,9 @@ def marks_given(not_heard: float | Sequence[float]) -> list[float]:
 
 
 def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
-    """The known name of each name: the same, or the only one that differs in case, blanks, ``_``, ``-`` and ``:``."""
+    """The known name of each name: the same, or the only one that differs in case, blanks, ``_``,
+    ``-`` and ``:``.
+    """
     plain = lambda name: re.sub(r"[\s_:-]", "", name.casefold())
     spelt, alike = Counter(map(plain, names)), Counter(map(plain, known))
     same, last = {*known}, {plain(name): name for name in known}
@@ -70,7 +80,9 @@ def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
 
 def suggested(name: str, others: Iterable[str]) -> str:
     """A name, with the most similar one of others that have the same digits."""
-    return suggest(name, [other for other in others if re.findall(r"\d+", other) == re.findall(r"\d+", name)])
+    return suggest(
+        name, [other for other in others if re.findall(r"\d+", other) == re.findall(r"\d+", name)]
+    )
 
 
 def and_list(numbers: Iterable[float]) -> str:
@@ -85,10 +97,13 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     Out of bounds they are repeated or usual values. Within bounds they are
 
     - 0 and repeated values from -1 up, three at most, more than 10 dB above all others;
-    - of columns with two values or more, a usual value from -105 down, 5 dB below all others, or 10 dB if it is not
-      repeated; -100, if it is repeated and more than 10 dB below them; and the lowest or a usual value with 5 % of the
-      readings, five times those of each value within 5 dB, in two columns or the only one;
-    - the lowest values, three at most, more than 10 dB below all others, each of them three times and in two columns
+    - of columns with two values or more, a usual value from -105 down, 5 dB below all others, or 10
+    dB if it is not
+      repeated; -100, if it is repeated and more than 10 dB below them; and the lowest or a usual
+      value with 5 % of the readings, five times those of each value within 5 dB, in two columns or
+      the only one;
+    - the lowest values, three at most, more than 10 dB below all others, each of them three times
+    and in two columns
       that have higher levels.
     """
     values, counts = np.unique(levels[np.isfinite(levels)], return_counts=True)
@@ -103,16 +118,23 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     own = own[:, [len(np.unique(column[~np.isnan(column)])) > 1 for column in own.T]]
     values, counts = np.unique(own[~np.isnan(own)], return_counts=True)
     for value in values[np.isin(values, [*ROUND, lowest])].tolist():
-        count, near = counts[values == value][0], counts[(values != value) & (np.abs(values - value) < 5)]
+        count, near = (
+            counts[values == value][0],
+            counts[(values != value) & (np.abs(values - value) < 5)],
+        )
         is_often = count >= max(3, 0.05 * counts.sum()) and count > 5 * near.max(initial=0)
         is_alone = (np.abs(values - value) <= 10).sum() == 1
-        is_apart = value in ROUND[1:] and value == lowest and not len(near) and (count > 1 or is_alone)
+        is_apart = (
+            value in ROUND[1:] and value == lowest and not len(near) and (count > 1 or is_alone)
+        )
         is_apart |= value == ROUND[0] == lowest and count > 1 and is_alone
         if is_apart or (is_often and (own == value).any(0).sum() >= min(2, own.shape[1])):
             marks.append(value)
     ends = np.flatnonzero(np.diff(values[:4]) > 10)
     for value in values[: ends[-1] + 1 if len(ends) else 0].tolist():
-        mixed = (own == value).any(0) & (own > values[ends[-1]]).any(0)  # a weak receiver has its floor alone
+        mixed = (own == value).any(0) & (own > values[ends[-1]]).any(
+            0
+        )  # a weak receiver has its floor alone
         if value not in marks and (own == value).sum() >= 3 and mixed.sum() >= 2:
             marks.append(value)
     return marks

@@ -30,31 +30,41 @@ def read(
     not_heard: float | list[float] = -100.0,
     frequency: float | None = None,
 ) -> Links:
-    """A data set from a table with a heading, one reading a line: one link for each reading that was heard.
+    """A data set from a table with a heading, one reading a line: one link for each reading that
+    was heard.
 
-    The places of the fixed end become the receivers, ``rx1`` ... or ``tx1`` ... in the order of their first appearance,
-    and look along the world's axes. The places of the moving end become the transmitters: by reciprocity a channel
-    attenuates alike either way. The readings of one such place share a row. Readings of ``not_heard``, and fixed places
-    without others, are left out and counted in the remarks. There is no official split.
+    The places of the fixed end become the receivers, ``rx1`` ... or ``tx1`` ... in the order of
+    their first appearance, and look along the world's axes. The places of the moving end become the
+    transmitters: by reciprocity a channel attenuates alike either way. The readings of one such
+    place share a row. Readings of ``not_heard``, and fixed places without others, are left out and
+    counted in the remarks. There is no official split.
 
     Args:
-        file: Table with the columns ``tx_x``, ``tx_y``, ``tx_z``, ``rx_x``, ``rx_y``, ``rx_z`` [m] and ``rss_dbm`` in
-            any order and in any case; the remarks name other columns.
-        layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; None for no walls.
-        fixed: End that stands still, ``tx`` or ``rx``; None for the end with fewer places, the receiver in a tie.
-        not_heard: Value, or values, of readings that were not heard [dBm]; all others lie in [-200, 30].
+        file: Table with the columns ``tx_x``, ``tx_y``, ``tx_z``, ``rx_x``, ``rx_y``, ``rx_z`` [m]
+            and ``rss_dbm`` in any order and in any case; the remarks name other columns.
+        layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; None for no
+            walls.
+        fixed: End that stands still, ``tx`` or ``rx``; None for the end with fewer places, the
+            receiver in a tie.
+        not_heard: Value, or values, of readings that were not heard [dBm]; all others lie in [-200,
+            30].
         frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
 
     Raises:
         FileNotFoundError: The file does not exist.
-        ValueError: An option is out of range, or a file has a defect; the message names file, line and value.
+        ValueError: An option is out of range, or a file has a defect; the message names file, line
+            and value.
     """
     if fixed not in (None, *ENDS):
-        raise ValueError(f"fixed must be tx or rx, or null for the end with fewer places, got {fixed!r}")
+        raise ValueError(
+            f"fixed must be tx or rx, or null for the end with fewer places, got {fixed!r}"
+        )
     file = tables.find_file(file, "a table of readings")
     marks = marks_given(not_heard)
     if not marks or not all(map(math.isfinite, marks)):
-        raise ValueError(f"not_heard must be finite numbers [dBm], got {not_heard!r}; write such numbers in the file")
+        raise ValueError(
+            f"not_heard must be finite numbers [dBm], got {not_heard!r}; write such numbers in the file"
+        )
     points, dbm, ignored = _read_table(file, marks)
     walls = torch.zeros(0, 2, 3) if layout is None else tables.read_walls(Path(layout).expanduser())
 
@@ -92,8 +102,12 @@ def write(folder: str | Path, links: Links) -> None:
     """Writes readings as ``room.csv`` in a folder, for ``read``."""
     receivers = np.array([receiver.pose.position.numpy() for receiver in links.receivers])
     index = links.query.receivers.numpy()
-    table = np.column_stack((links.query.transmitters.numpy(), receivers[index], links.labels.numpy()))
-    rows = [",".join(f"{value:.9g}" for value in row) for row in table]  # nine digits give the same float32
+    table = np.column_stack(
+        (links.query.transmitters.numpy(), receivers[index], links.labels.numpy())
+    )
+    rows = [
+        ",".join(f"{value:.9g}" for value in row) for row in table
+    ]  # nine digits give the same float32
     write_text(Path(folder) / "room.csv", "\n".join((",".join(COLUMNS), *rows)) + "\n")
 
 
@@ -110,14 +124,25 @@ def _read_table(file: Path, marks: list[float]) -> tuple[dict[str, list], list[f
         )
     for name in COLUMNS:
         if (count := names.count(name)) != 1:
-            raise ValueError(f"{file}, line 1: expected one column {name}, got {count} in {tables.quote(lines[0])}")
+            raise ValueError(
+                f"{file}, line 1: expected one column {name}, got {count} in {tables.quote(lines[0])}"
+            )
     at = [names.index(name) for name in COLUMNS]
     everything = tables.split_rows(file, lines, names, 1, delimiter)
     rows = {number: [cells[k] for k in at] for number, cells in everything.items()}
-    positions = tables.to_coordinates(file, {number: cells[:6] for number, cells in rows.items()}, COLUMNS)
+    positions = tables.to_coordinates(
+        file, {number: cells[:6] for number, cells in rows.items()}, COLUMNS
+    )
     levels = {number: cells[6:] for number, cells in rows.items()}
-    dbm = [value for (value,) in to_dbm(file, levels, COLUMNS[6:], QUIETEST, marks, "list them in data.not_heard")]
+    dbm = [
+        value
+        for (value,) in to_dbm(
+            file, levels, COLUMNS[6:], QUIETEST, marks, "list them in data.not_heard"
+        )
+    ]
     if all(value in marks for value in dbm):
-        raise ValueError(f"{file}: expected a reading that was heard, got none but {and_list(marks)} dBm")
+        raise ValueError(
+            f"{file}: expected a reading that was heard, got none but {and_list(marks)} dBm"
+        )
     points = {"tx": [row[:3] for row in positions], "rx": [row[3:] for row in positions]}
     return points, dbm, [name for name in written if name.lower() not in COLUMNS]

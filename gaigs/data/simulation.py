@@ -23,7 +23,9 @@ from gaigs.data import Links, Parts
 from gaigs.registry import check_type
 
 PART = 64
-"""Transmitters simulated at a time, since the waves of all paths take a hundred times the memory of the labels."""
+"""Transmitters simulated at a time, since the waves of all paths take a hundred times the memory of
+the labels.
+"""
 
 
 @dataclass(frozen=True)
@@ -35,9 +37,10 @@ class SimulatedRoom:
         gateways: Receivers with a single antenna.
         edges: Line segments to draw in figures (k, 2, 3) [m].
         place: From a count and a seed, random places of transmitters (count, 3) [m].
-        frequency_offsets: From a bandwidth, frequencies that sample the band, relative to its middle [Hz].
-        respond: From places (n, 3), a receiver, a frequency and offsets (f,), the response of each element to
-            unit-power transmitters, ``PART`` of them at a time (part, elements, f).
+        frequency_offsets: From a bandwidth, frequencies that sample the band, relative to its
+            middle [Hz].
+        respond: From places (n, 3), a receiver, a frequency and offsets (f,), the response of each
+            element to unit-power transmitters, ``PART`` of them at a time (part, elements, f).
     """
 
     pose: Pose
@@ -56,21 +59,32 @@ def simulate_spectra(
     bandwidth: float,
     seed: int,
 ) -> Links:
-    """Spectra of transmitters at random places; ``gaigs.data.synthetic.furnished_room`` describes the options."""
+    """Spectra of transmitters at random places; ``gaigs.data.synthetic.furnished_room`` describes
+    the options.
+    """
     carriers: list[Any] = list(frequency) if isinstance(frequency, list | tuple) else [frequency]
     for carrier in carriers:
         check_type("frequency", carrier, float)
         check_carrier("frequency", carrier)
     if not carriers or len(set(carriers)) < len(carriers):
-        raise ValueError(f"frequency must be a carrier or several different ones [Hz], got {frequency}")
+        raise ValueError(
+            f"frequency must be a carrier or several different ones [Hz], got {frequency}"
+        )
     offsets = spectrum_offsets(spectrum, room.frequency_offsets, bandwidth)
     places = room.place(transmitters, seed)
     receiver = patch_array(room.pose, max(carriers))
     grid = Grid.degrees()
-    labels = [to_spectra(room.respond(places, receiver, f, offsets), grid, receiver.array, f) for f in carriers]
+    labels = [
+        to_spectra(room.respond(places, receiver, f, offsets), grid, receiver.array, f)
+        for f in carriers
+    ]
     rows = torch.arange(transmitters).repeat_interleave(len(carriers))
     links = Links(
-        query=Query(places[rows], torch.zeros_like(rows), torch.tensor(carriers).float().repeat(transmitters)),
+        query=Query(
+            places[rows],
+            torch.zeros_like(rows),
+            torch.tensor(carriers).float().repeat(transmitters),
+        ),
         receivers=(receiver,),
         labels=torch.stack(labels, 1).flatten(0, 1),
         task=Spectrum(grid.elevations, grid.azimuths),
@@ -91,11 +105,13 @@ def simulate_channels(
     seed: int,
     phase: str = "known",
 ) -> Links:
-    """Channels of transmitters at random places; ``gaigs.data.synthetic_csi`` describes the options.
+    """Channels of transmitters at random places; ``gaigs.data.synthetic_csi`` describes the
+    options.
 
-    A channel's squared magnitude is the power that an element receives of unit power sent, between antennas of unit
-    gain. Its time dependence is exp(+j omega t). There is no noise. Unless ``phase`` is known, each link has a random
-    phase; with ``per_link_and_delay`` also a delay of at most two over the bandwidth, and a gain of -6 to 6 dB.
+    A channel's squared magnitude is the power that an element receives of unit power sent, between
+    antennas of unit gain. Its time dependence is exp(+j omega t). There is no noise. Unless
+    ``phase`` is known, each link has a random phase; with ``per_link_and_delay`` also a delay of at
+    most two over the bandwidth, and a gain of -6 to 6 dB.
     """
     if not 0 < bandwidth < math.inf:
         raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")
@@ -111,10 +127,15 @@ def simulate_channels(
         sequence = np.random.SeedSequence((seed % 2**64, 2))  # the places use ``seed`` itself
         (state,) = sequence.generate_state(1, np.uint64)
         generator = torch.Generator().manual_seed(int(state) % 2**63)
-        angles, delays, gains = 2 * torch.rand(3, transmitters, 1, 1, generator=generator, dtype=torch.float64) - 1
+        angles, delays, gains = (
+            2 * torch.rand(3, transmitters, 1, 1, generator=generator, dtype=torch.float64) - 1
+        )
         angles = math.pi * angles
         if phase == "per_link_and_delay":
-            angles, labels = angles + 4 * math.pi / bandwidth * delays * offsets, 10 ** (0.3 * gains) * labels
+            angles, labels = (
+                angles + 4 * math.pi / bandwidth * delays * offsets,
+                10 ** (0.3 * gains) * labels,
+            )
         labels = labels * torch.polar(torch.ones_like(angles), angles)
     links = Links(
         query=Query(places, torch.zeros_like(rows), torch.full((transmitters,), float(frequency))),
@@ -129,12 +150,16 @@ def simulate_channels(
 
 
 def without_silent(links: Links, transmitters: int, heard: Bool[Tensor, " n"]) -> Links:
-    """Links from places that a path leads to; the remarks count the others. A ``ValueError`` if there are too few."""
+    """Links from places that a path leads to; the remarks count the others. A ``ValueError`` if
+    there are too few.
+    """
     if heard.all():
         return links
     rows = links.rows[heard]
     if len(rows.unique()) < 2:
-        raise ValueError(f"paths must lead to two of {transmitters} transmitters or more; move the receiver or heights")
+        raise ValueError(
+            f"paths must lead to two of {transmitters} transmitters or more; move the receiver or heights"
+        )
     return replace(
         links,
         query=links.query[heard],
@@ -145,10 +170,14 @@ def without_silent(links: Links, transmitters: int, heard: Bool[Tensor, " n"]) -
     )
 
 
-def simulate_readings(room: SimulatedRoom, transmitters: int, noise: float, sensitivity: float, seed: int) -> Links:
-    """Signal strength of transmitters of 0 dBm at random places; ``gaigs.data.synthetic_rssi`` describes the options.
+def simulate_readings(
+    room: SimulatedRoom, transmitters: int, noise: float, sensitivity: float, seed: int
+) -> Links:
+    """Signal strength of transmitters of 0 dBm at random places; ``gaigs.data.synthetic_rssi``
+    describes the options.
 
-    Power is averaged over the band of Bluetooth's advertising channels. The links of one place share a row.
+    Power is averaged over the band of Bluetooth's advertising channels. The links of one place
+    share a row.
     """
     if not 0 <= noise < math.inf:
         raise ValueError(f"noise must be a standard deviation, 0 or more [dB], got {noise}")
@@ -156,12 +185,24 @@ def simulate_readings(room: SimulatedRoom, transmitters: int, noise: float, sens
     frequency, bandwidth = 2.441e9, 78e6  # Bluetooth's advertising channels span 2.402 to 2.480 GHz
     offsets = room.frequency_offsets(bandwidth)
     strengths = torch.stack(
-        [torch.cat([*map(rss_dbm, room.respond(places, each, frequency, offsets))]) for each in room.gateways], 1
+        [
+            torch.cat([*map(rss_dbm, room.respond(places, each, frequency, offsets))])
+            for each in room.gateways
+        ],
+        1,
     )
-    generator = torch.Generator().manual_seed(hash((seed, 1)) % 2**63)  # the places use ``seed`` itself
-    readings = strengths + noise * torch.randn(strengths.shape, dtype=strengths.dtype, generator=generator)
+    generator = torch.Generator().manual_seed(
+        hash((seed, 1)) % 2**63
+    )  # the places use ``seed`` itself
+    readings = strengths + noise * torch.randn(
+        strengths.shape, dtype=strengths.dtype, generator=generator
+    )
     heard = readings >= sensitivity
-    if deaf := [each.name for each, any_heard in zip(room.gateways, heard.any(0), strict=True) if not any_heard]:
+    if deaf := [
+        each.name
+        for each, any_heard in zip(room.gateways, heard.any(0), strict=True)
+        if not any_heard
+    ]:
         none = f"{deaf[0]!r} hears none of {len(places)} at {sensitivity:g} dBm"
         raise ValueError(f"sensitivity must let each gateway hear a reading, but {none}; lower it")
     rows, columns = heard.nonzero(as_tuple=True)
@@ -181,7 +222,9 @@ def simulate_readings(room: SimulatedRoom, transmitters: int, noise: float, sens
     )
 
 
-def spectrum_offsets(spectrum: str, sample: Callable[[float], Tensor], bandwidth: float) -> Float[Tensor, " f"]:
+def spectrum_offsets(
+    spectrum: str, sample: Callable[[float], Tensor], bandwidth: float
+) -> Float[Tensor, " f"]:
     """Frequencies of a spectrum, ``band`` or ``carrier``, relative to the carrier [Hz]."""
     if spectrum not in ("band", "carrier"):
         raise ValueError(f"spectrum must be 'band' or 'carrier', got {spectrum!r}")
@@ -189,7 +232,9 @@ def spectrum_offsets(spectrum: str, sample: Callable[[float], Tensor], bandwidth
 
 
 def patch_array(pose: Pose, frequency: float) -> Receiver:
-    """A receiver with 4 x 4 patches, as in the NeRF² spectra, half a wavelength of the frequency [Hz] apart."""
+    """A receiver with 4 x 4 patches, as in the NeRF² spectra, half a wavelength of the frequency
+    [Hz] apart.
+    """
     check_carrier("frequency", frequency)
     return Receiver("gateway1", pose, Array.planar(4, 4, speed_of_light / frequency / 2, "cosine"))
 
@@ -209,32 +254,47 @@ def draw_places(
 ) -> Float[Tensor, "count 3"]:
     """Two or more random places [m], uniform over the free part of a box."""
     if count < 2:
-        raise ValueError(f"transmitters must be at least 2, one to train and one to test on, got {count}")
+        raise ValueError(
+            f"transmitters must be at least 2, one to train and one to test on, got {count}"
+        )
     generator = torch.Generator().manual_seed(seed)
     places, rounds = torch.zeros(0, 3), 0
     while len(places) < count:
         tries = lower + (upper - lower) * torch.rand(count, 3, generator=generator)
         places, rounds = torch.cat((places, tries[is_free(tries)])), rounds + 1
         if rounds == 1000 and not len(places):
-            raise ValueError(f"transmitters must have free space to stand in, got none at {1000 * count} places tried")
+            raise ValueError(
+                f"transmitters must have free space to stand in, got none at {1000 * count} places tried"
+            )
     return places[:count]
 
 
 def sample_band(bandwidth: float, longest: float) -> Float[Tensor, " f"]:
-    """Frequencies that sample a band, relative to its middle [Hz]: no beat of paths up to a length [m] is aliased."""
+    """Frequencies that sample a band, relative to its middle [Hz]: no beat of paths up to a length
+    [m] is aliased.
+    """
     if not 0 < bandwidth < math.inf:
-        raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}; one frequency is the spectrum 'carrier'")
+        raise ValueError(
+            f"bandwidth must be positive [Hz], got {bandwidth}; one frequency is the spectrum 'carrier'"
+        )
     count = math.ceil(bandwidth * longest / speed_of_light) + 1
     return torch.linspace(-bandwidth / 2, bandwidth / 2, count, dtype=torch.float64)
 
 
 def to_spectra(
-    responses: Iterable[Complex[Tensor, "part elements f"]], grid: Grid, array: Array, frequency: float
+    responses: Iterable[Complex[Tensor, "part elements f"]],
+    grid: Grid,
+    array: Array,
+    frequency: float,
 ) -> Float[Tensor, "n rows columns"]:
     """Spectra of an array's responses at a carrier [Hz], float32 in [0, 1]."""
-    return torch.cat([min_max(bartlett(part, grid, array, frequency)).float() for part in responses])
+    return torch.cat(
+        [min_max(bartlett(part, grid, array, frequency)).float() for part in responses]
+    )
 
 
 def rss_dbm(responses: Complex[Tensor, "b elements f"]) -> Float[Tensor, " b"]:
-    """Received signal strength of a transmitter of 0 dBm [dBm]: power averaged over elements and frequencies."""
+    """Received signal strength of a transmitter of 0 dBm [dBm]: power averaged over elements and
+    frequencies.
+    """
     return 10 * torch.log10(responses.abs().square().mean((1, 2)))

@@ -1,4 +1,6 @@
-"""Complex channels of the ray tracer's rooms, as a wideband receiver with an antenna array estimates them."""
+"""Complex channels of the ray tracer's rooms, as a wideband receiver with an antenna array
+estimates them.
+"""
 
 from collections.abc import Sequence
 
@@ -28,10 +30,12 @@ def traced_room_csi(
 ) -> Links:
     """Channels of transmitters at random places in a room, at each element of its 4 x 4 array.
 
-    Rooms, scenes, places, array, diffraction and errors are those of ``sionna``, channels and other options those of
-    ``synthetic_csi``.
+    Rooms, scenes, places, array, diffraction and errors are those of ``sionna``, channels and other
+    options those of ``synthetic_csi``.
     """
     receivers = None if receiver is None else [receiver]
     simulated = find_room(room, scene, "receiver", receivers, facing, heights, diffraction)
-    links = simulate_channels(simulated, transmitters, frequency, bandwidth, subcarriers, seed, phase)
+    links = simulate_channels(
+        simulated, transmitters, frequency, bandwidth, subcarriers, seed, phase
+    )
     return hold_out_band(links, band_train, band_test)

@@ -1,4 +1,6 @@
-"""Received signal strength in the ray tracer's rooms, as Bluetooth gateways on their walls report it."""
+"""Received signal strength in the ray tracer's rooms, as Bluetooth gateways on their walls report
+it.
+"""
 
 from collections.abc import Sequence
 
@@ -22,8 +24,8 @@ def traced_room_rssi(
 ) -> Links:
     """Signal strength of transmitters of 0 dBm at random places in a room, at four gateways.
 
-    Rooms, scenes, places, diffraction and errors are those of ``sionna``, readings and other options those of
-    ``synthetic_rssi``.
+    Rooms, scenes, places, diffraction and errors are those of ``sionna``, readings and other
+    options those of ``synthetic_rssi``.
 
     Args:
         receivers: Positions of the gateways in the scene [m].

@@ -1,4 +1,6 @@
-"""Complex channels of the built-in room, as a wideband receiver with an antenna array estimates them."""
+"""Complex channels of the built-in room, as a wideband receiver with an antenna array estimates
+them.
+"""
 
 from collections.abc import Sequence
 
@@ -21,19 +23,24 @@ def furnished_room_csi(
     band_train: Sequence[float] | None = None,
     band_test: Sequence[float] | None = None,
 ) -> Links:
-    """Channels of transmitters at random places in the default room, at each element of its 4 x 4 array.
+    """Channels of transmitters at random places in the default room, at each element of its 4 x 4
+    array.
 
-    Places, array and other options are those of ``synthetic``; unit and time dependence are those of
-    ``gaigs.data.simulation.simulate_channels``. The official split tests on the last fifth of the places.
+    Places, array and other options are those of ``synthetic``; unit and time dependence are those
+    of ``gaigs.data.simulation.simulate_channels``. The official split tests on the last fifth of
+    the places.
 
     Args:
         bandwidth: From the lowest subcarrier to the highest, about the carrier [Hz].
         subcarriers: Evenly over the band; a single one is the carrier.
         phase: Of ``gaigs.core.task.csi.Csi``; other than ``known``, links get random phases.
-        band_train, band_test: Subcarriers to train and to test on, as for ``gaigs.data.bands.hold_out_band`` [Hz].
+        band_train, band_test: Subcarriers to train and to test on, as for
+            ``gaigs.data.bands.hold_out_band`` [Hz].
 
     Raises:
         ValueError: An option is out of range.
     """
-    links = simulate_channels(default_room(order), transmitters, frequency, bandwidth, subcarriers, seed, phase)
+    links = simulate_channels(
+        default_room(order), transmitters, frequency, bandwidth, subcarriers, seed, phase
+    )
     return hold_out_band(links, band_train, band_test)

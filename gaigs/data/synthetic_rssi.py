@@ -8,11 +8,17 @@ from gaigs.registry import register
 
 @register("data", "synthetic_rssi")
 def furnished_room_rssi(
-    transmitters: int = 600, noise: float = 2.0, sensitivity: float = -95.0, order: int = 2, seed: int = 0
+    transmitters: int = 600,
+    noise: float = 2.0,
+    sensitivity: float = -95.0,
+    order: int = 2,
+    seed: int = 0,
 ) -> Links:
-    """Signal strength of transmitters of 0 dBm at random places in the default room, at four gateways.
+    """Signal strength of transmitters of 0 dBm at random places in the default room, at four
+    gateways.
 
-    Antennas are isotropic. Links of one place share a row. The official split tests on the last fifth of the places.
+    Antennas are isotropic. Links of one place share a row. The official split tests on the last
+    fifth of the places.
 
     Args:
         noise: Standard deviation of the Gaussian error of each reading [dB].

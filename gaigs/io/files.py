@@ -10,10 +10,11 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary path with the same ending, which replaces the file once it is written and on the disk.
+    """Yields a temporary path with the same ending, which replaces the file once it is written and
+    on the disk.
 
-    Each writer has a path of its own: of several the last replaces the file. If writing fails or is interrupted, the
-    temporary file is removed and the old file stays.
+    Each writer has a path of its own: of several the last replaces the file. If writing fails or is
+    interrupted, the temporary file is removed and the old file stays.
 
     Raises:
         OSError: The file cannot be written; with the ``errno`` of the cause.
@@ -37,7 +38,9 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         if not isinstance(error, OSError):
             raise
         message = _unwritten(path, error)
-        raise (OSError(message) if error.errno is None else OSError(error.errno, message)) from error
+        raise (
+            OSError(message) if error.errno is None else OSError(error.errno, message)
+        ) from error
 
 
 def remove_parts(folder: Path) -> None:
@@ -53,11 +56,18 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def file_message(error: OSError, folder: Path) -> str:
-    """The message of a file's error: its own, or for a plain system error the file or folder, cause and remedy."""
+    """The message of a file's error: its own, or for a plain system error the file or folder, cause
+    and remedy.
+    """
     if error.errno is None or error.strerror != os.strerror(error.errno):
         return str(error.strerror or error)
     path = error.filename or f"a file in {folder}"
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS):  # only writing raises them
+    if error.errno in (
+        errno.ENOSPC,
+        errno.EDQUOT,
+        errno.EFBIG,
+        errno.EROFS,
+    ):  # only writing raises them
         return _unwritten(path, error)
     return f"{path} could not be read or written ({error.strerror})\ncheck its folder and permissions, and try again"
 

@@ -16,12 +16,15 @@ MODES = {"1", "L", "LA", "P", "RGB", "RGBA", "I", "I;16", "I;16B"}
 
 
 class GreyImages:
-    """PNGs of grey values (rows, columns), decoded when first requested and then kept at one or two bytes a pixel.
+    """PNGs of grey values (rows, columns), decoded when first requested and then kept at one or two
+    bytes a pixel.
 
-    8-bit values count in 255, 16-bit ones in 65535. Colour images have equal channels, and no pixel is transparent.
+    8-bit values count in 255, 16-bit ones in 65535. Colour images have equal channels, and no pixel
+    is transparent.
 
     Raises:
-        ValueError: A file has no PNG header, or another shape; when requested: its pixels are damaged or coloured.
+        ValueError: A file has no PNG header, or another shape; when requested: its pixels are
+            damaged or coloured.
     """
 
     def __init__(self, files: Sequence[Path], shape: tuple[int, int]):
@@ -31,10 +34,14 @@ class GreyImages:
                 mode, (width, height) = image.mode, image.size
             if mode not in MODES or (height, width) != shape:
                 expected = f"grey values of {shape[0]} x {shape[1]} pixels"
-                raise ValueError(f"{file}: expected {expected}, got mode {mode} of {height} x {width}")
+                raise ValueError(
+                    f"{file}: expected {expected}, got mode {mode} of {height} x {width}"
+                )
             modes.add(mode)
         self.files = files
-        self._pixels = np.empty((len(files), *shape), np.uint16 if any("I" in mode for mode in modes) else np.uint8)
+        self._pixels = np.empty(
+            (len(files), *shape), np.uint16 if any("I" in mode for mode in modes) else np.uint8
+        )
         self._decoded = torch.zeros(len(files), dtype=torch.bool)
 
     def __len__(self) -> int:
@@ -48,7 +55,9 @@ class GreyImages:
             with _opened(self.files[k]) as image:
                 image.load()
             grey = _grey(self.files[k], image)
-            wide = 257 if self._pixels.dtype == np.uint16 and grey.dtype == np.uint8 else 1  # 255 becomes 65535
+            wide = (
+                257 if self._pixels.dtype == np.uint16 and grey.dtype == np.uint8 else 1
+            )  # 255 becomes 65535
             self._pixels[k] = grey.astype(self._pixels.dtype) * self._pixels.dtype.type(wide)
             self._decoded[k] = True
         most = np.iinfo(self._pixels.dtype).max
@@ -69,7 +78,9 @@ def _grey(file: Path, image: Image.Image) -> UInt[np.ndarray, "rows columns"]:
             got += "; as of a colour map: store the grey amplitudes"
         raise ValueError(f"{file}: expected grey values, got {got}")
     for row, column in np.argwhere(channels[..., 3] < 255)[:1]:
-        raise ValueError(f"{file}: expected no transparent pixel, got one in row {row}, column {column}")
+        raise ValueError(
+            f"{file}: expected no transparent pixel, got one in row {row}, column {column}"
+        )
     return channels[..., 0]
 
 
@@ -80,4 +91,6 @@ def _opened(file: Path) -> Iterator[Image.Image]:
         with warnings.catch_warnings(action="error"), Image.open(file, formats=["PNG"]) as image:
             yield image
     except Exception as error:  # a damaged file makes Pillow raise exceptions of many types
-        raise ValueError(f"cannot parse {file}: no whole PNG image ({error}); copy it again") from error
+        raise ValueError(
+            f"cannot parse {file}: no whole PNG image ({error}); copy it again"
+        ) from error

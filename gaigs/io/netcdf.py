@@ -12,14 +12,18 @@ from gaigs.io.files import atomic_write
 
 
 class Variable(NamedTuple):
-    """Real numbers or texts with a name for each dimension, and the attributes of the CF conventions."""
+    """Real numbers or texts with a name for each dimension, and the attributes of the CF
+    conventions.
+    """
 
     dimensions: tuple[str, ...]
     values: ndarray
     attributes: Mapping[str, Any] = {}
 
 
-def write_netcdf(file: Path, variables: Mapping[str, Variable], attributes: Mapping[str, Any]) -> None:
+def write_netcdf(
+    file: Path, variables: Mapping[str, Variable], attributes: Mapping[str, Any]
+) -> None:
     """Writes variables by name. A variable with the name of its only dimension is a coordinate.
 
     Texts become characters with a dimension of their own, which xarray joins.
@@ -29,7 +33,9 @@ def write_netcdf(file: Path, variables: Mapping[str, Variable], attributes: Mapp
         for name, (dimensions, values, own) in variables.items():
             if values.dtype.kind == "U":
                 rows = [text.encode() for text in values.tolist()]
-                values = np.array(rows, f"S{max(map(len, rows), default=0) or 1}")[:, None].view("S1")
+                values = np.array(rows, f"S{max(map(len, rows), default=0) or 1}")[:, None].view(
+                    "S1"
+                )
                 dimensions, own = (*dimensions, f"{name}_length"), {"_Encoding": "utf-8", **own}
             for dimension, size in zip(dimensions, values.shape, strict=True):
                 if dimension not in content.dimensions:

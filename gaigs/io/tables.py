@@ -1,4 +1,6 @@
-"""Text files of data sets: lines, tables of numbers, points and index files. Errors name file, line and content."""
+"""Text files of data sets: lines, tables of numbers, points and index files. Errors name file, line
+and content.
+"""
 
 import codecs
 import csv
@@ -29,7 +31,9 @@ NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNOR
 
 def quote(value: object) -> str:
     """A value as errors show it: printable and short."""
-    text = repr(value) if isinstance(value, str) else reprlib.repr(value)  # of few entries: aliases of YAML multiply
+    text = (
+        repr(value) if isinstance(value, str) else reprlib.repr(value)
+    )  # of few entries: aliases of YAML multiply
     return text if len(text) <= 100 else f"{text[:100]} ..."
 
 
@@ -43,12 +47,16 @@ def find_folder(root: str | Path) -> Path:
     """The folder of a data set; a ``FileNotFoundError`` if it does not exist."""
     root = Path(os.path.expanduser(root))
     if not os.path.isdir(root):  # Path.is_dir raises where a name is too long or a folder is closed
-        raise FileNotFoundError(f"{root} must be the folder of a data set, and is no folder; set the data's root")
+        raise FileNotFoundError(
+            f"{root} must be the folder of a data set, and is no folder; set the data's root"
+        )
     return root
 
 
 def find_file(file: str | Path, content: str, option: str = "the data's file") -> Path:
-    """The file of an option, as of a data set that is one file; a ``FileNotFoundError`` if it does not exist."""
+    """The file of an option, as of a data set that is one file; a ``FileNotFoundError`` if it does
+    not exist.
+    """
     file = Path(os.path.expanduser(file))
     if not os.path.isfile(file):
         raise FileNotFoundError(f"{file} must be {content}, and is no file; set {option}")
@@ -69,7 +77,8 @@ def check_empty(folder: Path) -> None:
 def read_lines(file: Path, content: str) -> list[str]:
     """Lines of a text file without the blank ones at its end; a ``ValueError`` for an empty file.
 
-    The text is UTF-8, UTF-16 with a byte order mark, or else of western Windows, which has the letters of Latin-1.
+    The text is UTF-8, UTF-16 with a byte order mark, or else of western Windows, which has the
+    letters of Latin-1.
     """
     if not os.path.isfile(file):  # reading a pipe would block
         state = "no file, but a folder, a device or a broken link" if has_file(file) else "missing"
@@ -87,15 +96,21 @@ def read_lines(file: Path, content: str) -> list[str]:
 
 
 def refuse(file: Path, wrong: Mapping[int, str], expected: str) -> None:
-    """Raises a ``ValueError`` that names the first wrong line and counts the others, given each content by number."""
+    """Raises a ``ValueError`` that names the first wrong line and counts the others, given each
+    content by number.
+    """
     if wrong:
         number, got = next(iter(wrong.items()))
-        others = {1: "", 2: " and 1 other line"}.get(len(wrong), f" and {len(wrong) - 1} other lines")
+        others = {1: "", 2: " and 1 other line"}.get(
+            len(wrong), f" and {len(wrong) - 1} other lines"
+        )
         raise ValueError(f"{file}, line {number}{others}: expected {expected}, got {got}")
 
 
 def read_points(file: Path, names: Sequence[str], content: str) -> list[list[float]]:
-    """Coordinates [m], one point a line; the first line may hold their names, and those of other columns."""
+    """Coordinates [m], one point a line; the first line may hold their names, and those of other
+    columns.
+    """
     lines = read_lines(file, content)
     delimiter = find_delimiter(lines)
     header = [cell.lower() for cell in split_cells(lines[0], delimiter)]
@@ -104,11 +119,15 @@ def read_points(file: Path, names: Sequence[str], content: str) -> list[list[flo
     if len(lines) == 1:
         raise ValueError(f"{file}: no positions below the header")
     rows = split_rows(file, lines, header, 1, delimiter).items()
-    return to_coordinates(file, {line: [cells[header.index(name)] for name in names] for line, cells in rows}, names)
+    return to_coordinates(
+        file, {line: [cells[header.index(name)] for name in names] for line, cells in rows}, names
+    )
 
 
 def read_walls(file: Path) -> Float[Tensor, "k 2 3"]:
-    """Walls of a floor plan, at z = 0 [m]: segments between consecutive vertices x,y of a file, two or more."""
+    """Walls of a floor plan, at z = 0 [m]: segments between consecutive vertices x,y of a file, two
+    or more.
+    """
     vertices = read_points(file, "xy", "consecutive wall vertices x,y [m], one a line")
     if len(vertices) == 1:
         raise ValueError(f"{file}: expected two wall vertices or more, got 1")
@@ -121,7 +140,9 @@ SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": 
 
 
 def find_delimiter(lines: Sequence[str]) -> str:
-    """The mark that separates the first three lines into equally many cells, two or more; or else a comma."""
+    """The mark that separates the first three lines into equally many cells, two or more; or else a
+    comma.
+    """
     for mark in SEPARATORS:
         counts = {len(split_cells(line, mark)) for line in lines[:3]}
         if len(counts) == 1 and counts != {1}:
@@ -135,8 +156,12 @@ def split_cells(line: str, delimiter: str = ",") -> list[str]:
         return line.split()
     try:
         # csv appends blanks behind a quoted cell to it.
-        line = re.sub(rf"(?<=\")[ \t]+(?={re.escape(delimiter)}|$)", "", line) if '"' in line else line
-        (cells,) = csv.reader([line], delimiter=delimiter, skipinitialspace=delimiter != "\t", strict=True)
+        line = (
+            re.sub(rf"(?<=\")[ \t]+(?={re.escape(delimiter)}|$)", "", line) if '"' in line else line
+        )
+        (cells,) = csv.reader(
+            [line], delimiter=delimiter, skipinitialspace=delimiter != "\t", strict=True
+        )
     except csv.Error:  # a quote inside a cell or without its end, or a cell of 100,000 characters
         cells = []
     return [cell.strip() for cell in cells] or [line]
@@ -145,7 +170,8 @@ def split_cells(line: str, delimiter: str = ",") -> list[str]:
 def split_rows(
     file: Path, lines: Sequence[str], names: Sequence[str], skip: int, delimiter: str
 ) -> dict[int, list[str]]:
-    """Cells of all lines but the first few; a ``ValueError`` unless each line has one for each name.
+    """Cells of all lines but the first few; a ``ValueError`` unless each line has one for each
+    name.
 
     A comma that separates no cells is a decimal one.
     """
@@ -207,7 +233,9 @@ class Table(NamedTuple):
     def column(self, name: str) -> int:
         """The number of a column; a ``ValueError`` if there is none of that name."""
         if name not in self.names:
-            raise ValueError(f"{self.file}, line 1: expected a column {quote(name)}, got {shortened(self.names)}")
+            raise ValueError(
+                f"{self.file}, line 1: expected a column {quote(name)}, got {shortened(self.names)}"
+            )
         return self.names.index(name)
 
 
@@ -215,11 +243,14 @@ def write_csv(file: Path, rows: Iterable[Sequence]) -> None:
     """Writes rows as a CSV table; texts as ``inert`` gives them."""
     with atomic_write(file) as part, part.open("w", encoding="utf-8", newline="") as opened:
         writer = csv.writer(opened, lineterminator="\n")
-        writer.writerows([inert(cell) if isinstance(cell, str) else cell for cell in row] for row in rows)
+        writer.writerows(
+            [inert(cell) if isinstance(cell, str) else cell for cell in row] for row in rows
+        )
 
 
 def inert(text: str) -> str:
-    """A text that no spreadsheet takes for a formula: before =, +, -, @, a tab or a return it has an apostrophe more.
+    """A text that no spreadsheet takes for a formula: before =, +, -, @, a tab or a return it has
+    an apostrophe more.
 
     Numbers stay as they are.
     """
@@ -241,7 +272,9 @@ def read_table(file: Path, content: str) -> Table:
         if not name.isprintable():
             raise ValueError(f"{file}, line 1: expected names of columns, got {quote(name)}")
         if name and names.count(name) > 1:
-            raise ValueError(f"{file}, line 1: expected each column once, got {quote(name)} {names.count(name)} times")
+            raise ValueError(
+                f"{file}, line 1: expected each column once, got {quote(name)} {names.count(name)} times"
+            )
     has_commas = delimiter != ","
     numbers: dict[str, float] = {}
 
@@ -249,7 +282,9 @@ def read_table(file: Path, content: str) -> Table:
         if cell not in numbers:
             text = re.sub(r"(?i)\s*dbm$", "", cell)
             value = to_number(text.replace(",", ".") if has_commas else text)
-            numbers[cell] = math.inf if math.isnan(value) and text.strip().lower() not in EMPTY else value
+            numbers[cell] = (
+                math.inf if math.isnan(value) and text.strip().lower() not in EMPTY else value
+            )
         return numbers[cell]
 
     rows, wrong = [], {}
@@ -267,7 +302,9 @@ def read_table(file: Path, content: str) -> Table:
 def to_numbers(
     file: Path, rows: Rows, names: Sequence[str], holds: Callable[[float], bool], expected: str
 ) -> list[list[float]]:
-    """Cells of a table as numbers; a ``ValueError`` where one is out of range. A cell without a number is NaN."""
+    """Cells of a table as numbers; a ``ValueError`` where one is out of range. A cell without a
+    number is NaN.
+    """
     numbers = [[to_number(cell) for cell in cells] for cells in rows.values()]
     wrong = {}
     for (line, cells), values in zip(rows.items(), numbers, strict=True):
@@ -278,7 +315,9 @@ def to_numbers(
 
 
 def to_coordinates(file: Path, rows: Rows, names: Sequence[str]) -> list[list[float]]:
-    """Cells of a table as coordinates [m]; a ``ValueError`` where one is not finite, or too far for float32."""
+    """Cells of a table as coordinates [m]; a ``ValueError`` where one is not finite, or too far for
+    float32.
+    """
     to_numbers(file, rows, names, math.isfinite, "a finite number")
     return to_numbers(file, rows, names, lambda value: abs(value) < FAR, WITHIN)
 
@@ -294,17 +333,27 @@ def to_index(text: str) -> int | None:
     if not (text.isascii() and text.isdecimal()):
         return None
     digits = text.lstrip("0")
-    return int(digits or "0") if len(digits) < 19 else sys.maxsize  # Python converts at most 4300 digits
+    return (
+        int(digits or "0") if len(digits) < 19 else sys.maxsize
+    )  # Python converts at most 4300 digits
 
 
-def read_parts(root: Path, parse: Callable[[str], Hashable | None], expected: str) -> tuple[list, list]:
-    """Distinct entries of ``train_index.txt`` and ``test_index.txt``, one a line; ``parse`` gives None for a defect."""
+def read_parts(
+    root: Path, parse: Callable[[str], Hashable | None], expected: str
+) -> tuple[list, list]:
+    """Distinct entries of ``train_index.txt`` and ``test_index.txt``, one a line; ``parse`` gives
+    None for a defect.
+    """
     places: dict[Hashable, str] = {}
     parts = []
     for file in (root / "train_index.txt", root / "test_index.txt"):
         lines = dict(enumerate(read_lines(file, expected), 1))
         entries = {number: parse(line.strip()) for number, line in lines.items()}
-        refuse(file, {number: quote(lines[number]) for number, entry in entries.items() if entry is None}, expected)
+        refuse(
+            file,
+            {number: quote(lines[number]) for number, entry in entries.items() if entry is None},
+            expected,
+        )
         repeated = {}
         for number, entry in entries.items():
             place = f"{file.name}, line {number}"
@@ -316,7 +365,9 @@ def read_parts(root: Path, parse: Callable[[str], Hashable | None], expected: st
 
 
 def number_places(points: Sequence[Sequence[float]]) -> tuple[list[tuple], Tensor]:
-    """Distinct points in the order of their first appearance, and the number of each point among them."""
+    """Distinct points in the order of their first appearance, and the number of each point among
+    them.
+    """
     numbers: dict[tuple, int] = {}
     index = [numbers.setdefault(tuple(point), len(numbers)) for point in points]
     return [*numbers], torch.tensor(index)

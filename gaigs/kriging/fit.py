@@ -1,4 +1,6 @@
-"""Hyperparameters of a Gaussian process over links, fitted by maximum likelihood of held-out labels."""
+"""Hyperparameters of a Gaussian process over links, fitted by maximum likelihood of held-out
+labels.
+"""
 
 import math
 from collections.abc import Callable
@@ -15,7 +17,15 @@ from gaigs.core.scene import Scene
 from gaigs.core.stages import end_in_time
 from gaigs.data import Links
 from gaigs.kriging.kernel import Process, kernel, kriging_weights
-from gaigs.kriging.links import PART, coordinates, distances, known_links, scale_bounds, scaled, single_readings
+from gaigs.kriging.links import (
+    PART,
+    coordinates,
+    distances,
+    known_links,
+    scale_bounds,
+    scaled,
+    single_readings,
+)
 
 
 class Hyperparameters(NamedTuple):
@@ -45,20 +55,28 @@ class HeldOut(NamedTuple):
 
     asked: Query
     around: Query  # links around each held-out link, one group after the other
-    products: Float[Tensor, "b j+1 j+1"]  # of the residuals of each held-out link and those around it
+    products: Float[
+        Tensor, "b j+1 j+1"
+    ]  # of the residuals of each held-out link and those around it
 
 
 LOUDEST = 10.0
-"""Largest residual of a channel, in median channels. Residuals within decimetres of a receiver are that large; a
-reading that is far too loud must not spoil the whole room."""
+"""Largest residual of a channel, in median channels. Residuals within decimetres of a receiver are
+that large; a reading that is far too loud must not spoil the whole room."""
 
 
 def damping(
-    residuals: Complex[Tensor, " k *shape"], labels: Complex[Tensor, " k *shape"], receivers: Int[Tensor, " k"]
+    residuals: Complex[Tensor, " k *shape"],
+    labels: Complex[Tensor, " k *shape"],
+    receivers: Int[Tensor, " k"],
 ) -> Float[Tensor, " k"]:
-    """Factors that limit the residuals of channels to ``LOUDEST`` times the median channel of each link's receiver."""
+    """Factors that limit the residuals of channels to ``LOUDEST`` times the median channel of each
+    link's receiver.
+    """
     sizes, usual = (
-        torch.cat([part.flatten(1).to(torch.complex128).norm(dim=1) for part in channels.split(PART)])
+        torch.cat(
+            [part.flatten(1).to(torch.complex128).norm(dim=1) for part in channels.split(PART)]
+        )
         for channels in (residuals, labels)
     )
     factors = torch.ones_like(sizes)
@@ -70,16 +88,23 @@ def damping(
 
 
 NUGGETS = (1e-4, 1e2)
-"""Bounds of the nugget. The lower keeps matrices regular in float64 if places are measured twice."""
+"""Bounds of the nugget. The lower keeps matrices regular in float64 if places are measured twice.
+"""
 
 EDGES = 8
-"""Longest correlation length, in longest edges of the box of places: beyond it the kernel is a line in the box."""
+"""Longest correlation length, in longest edges of the box of places: beyond it the kernel is a line
+in the box.
+"""
 
 
 def fit_hyperparameters(
-    scene: Scene, links: Links, residuals: Callable[[Int[Tensor, " j"]], Float[Tensor, "j m"]], most: int = 300
+    scene: Scene,
+    links: Links,
+    residuals: Callable[[Int[Tensor, " j"]], Float[Tensor, "j m"]],
+    most: int = 300,
 ) -> tuple[Hyperparameters, float]:
-    """Hyperparameters with the largest likelihood, and ``negative_log_likelihood``; -inf if all residuals are 0.
+    """Hyperparameters with the largest likelihood, and ``negative_log_likelihood``; -inf if all
+    residuals are 0.
 
     Args:
         scene: Receivers and task.
@@ -97,7 +122,10 @@ def fit_hyperparameters(
     held_out = [held for held in each_receiver if held is not None]
 
     def value(logarithms: Tensor) -> Tensor:
-        return sum((negative_log_likelihood(scene, held, *logarithms.exp()) for held in held_out), torch.zeros(()))
+        return sum(
+            (negative_log_likelihood(scene, held, *logarithms.exp()) for held in held_out),
+            torch.zeros(()),
+        )
 
     def cost(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
         with torch.enable_grad():
@@ -119,8 +147,8 @@ def fit_hyperparameters(
 
 
 FEWEST = 10
-"""Fewest validation links that choose hyperparameters, or whether paths are kriged, repeated readings as one: fewer
-ones overfit."""
+"""Fewest validation links that choose hyperparameters, or whether paths are kriged, repeated
+readings as one: fewer ones overfit."""
 
 AROUND = 64
 """Training links that predict each held-out link while hyperparameters are fitted."""
@@ -134,13 +162,18 @@ def hold_out(
     residuals: Callable[[Int[Tensor, " j"]], Float[Tensor, "j m"]],
     most: int,
 ) -> HeldOut | None:
-    """At most ``most`` held-out links of a receiver; None if their residuals are all 0 or no other place is known.
+    """At most ``most`` held-out links of a receiver; None if their residuals are all 0 or no other
+    place is known.
 
-    Validation links are held out from the training links. With fewer than ``FEWEST`` of them, training links are held
-    out one by one, each with all that share its place.
+    Validation links are held out from the training links. With fewer than ``FEWEST`` of them,
+    training links are held out one by one, each with all that share its place.
     """
     split, query = links.split, links.query
-    validation = split.validation if len(single_readings(links, split.validation)) >= FEWEST else split.validation[:0]
+    validation = (
+        split.validation
+        if len(single_readings(links, split.validation)) >= FEWEST
+        else split.validation[:0]
+    )
     receiver = query.receivers[known[0]]
     train, held = (part[query.receivers[part] == receiver] for part in (split.train, validation))
     train = train if len(train) else known
@@ -156,23 +189,31 @@ def hold_out(
     used, place = torch.cat((asked[:, None], around), 1).unique(return_inverse=True)
     left = residuals(used)
     left = left.to(torch.promote_types(left.dtype, torch.float64))
-    products = torch.stack([(some @ some.mH).real for some in (left[row] for row in place)]) / left.shape[1]
+    products = (
+        torch.stack([(some @ some.mH).real for some in (left[row] for row in place)])
+        / left.shape[1]
+    )
     return HeldOut(query[asked], query[around.flatten()], products) if products.any() else None
 
 
 def negative_log_likelihood(
     scene: Scene, held: HeldOut, length: Tensor, nugget: Tensor, scale: Tensor | float = math.nan
 ) -> Float[Tensor, ""]:
-    """-2 log p(held-out labels | labels around them) but for a constant, a mean over the label's numbers.
+    """-2 log p(held-out labels | labels around them) but for a constant, a mean over the label's
+    numbers.
 
     The signal's variance is the receiver's most likely one.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """
     asked, around = (coordinates(scene, query, scale) for query in (held.asked, held.around))
-    weights, variances = kriging_weights(asked, around.unflatten(0, (len(asked), -1)), length, nugget)
+    weights, variances = kriging_weights(
+        asked, around.unflatten(0, (len(asked), -1)), length, nugget
+    )
     own, cross, others = held.products[:, 0, 0], held.products[:, 0, 1:], held.products[:, 1:, 1:]
-    errors = own - 2 * (weights * cross).sum(1) + torch.einsum("bi,bij,bj->b", weights, others, weights)
+    errors = (
+        own - 2 * (weights * cross).sum(1) + torch.einsum("bi,bij,bj->b", weights, others, weights)
+    )
     # The difference of nearly equal numbers, rounded to float64's sixteen digits, may be negative.
     errors = errors.clamp_min(1e-12 * own.mean())
     return len(asked) * (errors / variances).mean().log() + variances.log().sum()
@@ -181,7 +222,9 @@ def negative_log_likelihood(
 def local_deviations(
     asked: Float[Tensor, "b d"], known: Float[Tensor, "k d"], process: Hyperparameters
 ) -> Float[Tensor, " b"]:
-    """Standard deviations of noisy labels over the signal's, given the nearest known places; see ``coordinates``."""
+    """Standard deviations of noisy labels over the signal's, given the nearest known places; see
+    ``coordinates``.
+    """
     count = min(AROUND, len(known))
     found = [asked.new_zeros(0)]
     for part in asked.split(1024):

@@ -1,4 +1,6 @@
-"""Links as look-ups see them: known links, distances between links, labels in the directions of a batch."""
+"""Links as look-ups see them: known links, distances between links, labels in the directions of a
+batch.
+"""
 
 import math
 from dataclasses import replace
@@ -17,9 +19,15 @@ PART = 256
 
 
 def known_links(links: Links) -> list[Int[Tensor, " k"]]:
-    """Training and validation links of each receiver; raises a ``ValueError`` for a receiver without."""
+    """Training and validation links of each receiver; raises a ``ValueError`` for a receiver
+    without.
+    """
     known = [links.known(receiver) for receiver in range(len(links.receivers))]
-    without = [receiver.name for receiver, index in zip(links.receivers, known, strict=True) if not len(index)]
+    without = [
+        receiver.name
+        for receiver, index in zip(links.receivers, known, strict=True)
+        if not len(index)
+    ]
     if without:
         kind = "known" if len(links.split.validation) else "training"
         raise ValueError(
@@ -29,7 +37,9 @@ def known_links(links: Links) -> list[Int[Tensor, " k"]]:
 
 
 def check_known(links: Links) -> None:
-    """Raises the ``ValueError`` of ``known_links`` for all known links, and for those of a validation."""
+    """Raises the ``ValueError`` of ``known_links`` for all known links, and for those of a
+    validation.
+    """
     known_links(links)
     known_links(replace(links, split=links.split.validating()))
 
@@ -47,7 +57,9 @@ FOLDS = 10
 
 
 def folds_of(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " k"]:
-    """Fold of some links, from 0; groups of the split, or places, are random whole folds, as the test is."""
+    """Fold of some links, from 0; groups of the split, or places, are random whole folds, as the
+    test is.
+    """
     groups = links.split.groups
     if groups is None:
         _, groups = links.query.transmitters.unique(dim=0, return_inverse=True)
@@ -57,20 +69,26 @@ def folds_of(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " k"]:
 
 
 def without_gross_errors(links: Links, size: float = 6.0) -> Links:
-    """Links of one number each without known levels that no room explains: one of them moves a whole fit.
+    """Links of one number each without known levels that no room explains: one of them moves a
+    whole fit.
 
-    Levels fall with the logarithm of the distance to their receiver. A level is left out if its error by this law is
-    more than ``size`` standard deviations, and as far from those of the five nearest levels of its receiver: what
-    neighbours share is a part of the room. So is what more than one in twenty have. The line has Cauchy's weights, so
-    few levels do not move it. The deviation is 1.48 times the median error, the larger one of the receiver and of all
-    receivers, 1 dB or more. Fewer than 20 known links keep all.
+    Levels fall with the logarithm of the distance to their receiver. A level is left out if its
+    error by this law is more than ``size`` standard deviations, and as far from those of the five
+    nearest levels of its receiver: what neighbours share is a part of the room. So is what more
+    than one in twenty have. The line has Cauchy's weights, so few levels do not move it. The
+    deviation is 1.48 times the median error, the larger one of the receiver and of all receivers, 1
+    dB or more. Fewer than 20 known links keep all.
 
     Source: Maronna, Martin and Yohai, Robust Statistics, 2006, sections 4.4 and 5.2.
     """
     index = links.split.known
     if len(index) < 20:
         return links
-    query, labels, positions = links.query[index], links.labels[index].double(), links.scene.positions(links.labels)
+    query, labels, positions = (
+        links.query[index],
+        links.labels[index].double(),
+        links.scene.positions(links.labels),
+    )
     lengths = (query.transmitters - positions[query.receivers]).norm(dim=1).clamp_min(0.1)
     errors = torch.zeros_like(labels)
     for receiver in query.receivers.unique():
@@ -84,16 +102,24 @@ def without_gross_errors(links: Links, size: float = 6.0) -> Links:
         far = own[errors[own].abs() > most]
         if len(own) > 5 and len(far):
             apart = distances(query.transmitters[far], query.transmitters[own])
-            around = own[apart.masked_fill(far[:, None] == own, math.inf).topk(5, largest=False).indices]
+            around = own[
+                apart.masked_fill(far[:, None] == own, math.inf).topk(5, largest=False).indices
+            ]
             alone = (errors[far, None] - errors[around]).abs().amin(1) > most
             kept[far] = ~alone | (alone.sum() > max(1, len(own) // 20))
     parts = links.split.parts()
-    train, validation = (parts[name][torch.isin(parts[name], index[kept])] for name in ("train", "validation"))
-    return replace(links, split=Split(links.split.name, train, validation, parts["test"], links.split.groups))
+    train, validation = (
+        parts[name][torch.isin(parts[name], index[kept])] for name in ("train", "validation")
+    )
+    return replace(
+        links, split=Split(links.split.name, train, validation, parts["test"], links.split.groups)
+    )
 
 
 def law_errors(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-    """Levels less those of a line over the logarithm of the distance, by least squares with Cauchy's weights."""
+    """Levels less those of a line over the logarithm of the distance, by least squares with
+    Cauchy's weights.
+    """
     weights = torch.ones_like(levels)
     for _ in range(20):
         shares = weights / weights.sum()
@@ -110,7 +136,9 @@ def deviation(errors: Float[Tensor, " k"]) -> Float[Tensor, ""]:
 
 
 def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]:
-    """One random link for each place, receiver and carrier: repeated readings have nearly the same error."""
+    """One random link for each place, receiver and carrier: repeated readings have nearly the same
+    error.
+    """
     if not len(index):
         return index
     _, which = links.query[index].unique(with_receivers=True)
@@ -120,7 +148,8 @@ def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]
 
 
 def coordinates(scene: Scene, query: Query, scale: float | Tensor) -> Float[Tensor, "b d"]:
-    """Points whose Euclidean distance is the distance of links, d² = |dx|² + (scale d ln f)²; float64.
+    """Points whose Euclidean distance is the distance of links, d² = |dx|² + (scale d ln f)²;
+    float64.
 
     ``scale`` [m] has no effect unless the training links have several carriers.
     """
@@ -149,21 +178,30 @@ AROUND = 8
 
 
 def chance_to_hear(
-    asked: Float[Tensor, "g d"], known: Float[Tensor, "k 3"], hears: Float[Tensor, "k r"], towards: float | Tensor
+    asked: Float[Tensor, "g d"],
+    known: Float[Tensor, "k 3"],
+    hears: Float[Tensor, "k r"],
+    towards: float | Tensor,
 ) -> Float[Tensor, "g r"]:
-    """Probability that each receiver hears a place: the share of the known places around that it hears.
+    """Probability that each receiver hears a place: the share of the known places around that it
+    hears.
 
-    One place more is counted, of which it hears the part ``towards``; ``hears`` has 1 where it hears a known place.
+    One place more is counted, of which it hears the part ``towards``; ``hears`` has 1 where it
+    hears a known place.
     """
     count = min(AROUND, len(known))
-    parts = (distances(part[:, :3], known).topk(count, largest=False).indices for part in asked.split(PART))
+    parts = (
+        distances(part[:, :3], known).topk(count, largest=False).indices
+        for part in asked.split(PART)
+    )
     return torch.cat([(hears[around].sum(1) + towards) / (count + 1) for around in parts])
 
 
 def scale_bounds(scene: Scene) -> tuple[float, float]:
     """Least and largest ``scale`` of ``coordinates`` that the training links can distinguish [m].
 
-    The least puts the whole band as far as the next place, the largest the next carrier as far as the longest edge.
+    The least puts the whole band as far as the next place, the largest the next carrier as far as
+    the longest edge.
     """
     logarithms = scene.frequencies.double().log()
     edge = (scene.upper - scene.lower).max().item()
@@ -181,7 +219,9 @@ def at_directions(values: Tensor, batch: Batch, scene: Scene) -> Tensor:
     return values[:, rows][:, :, columns] if isinstance(asked, Grid) else values[:, rows, columns]
 
 
-def _nearest(asked: Float[Tensor, " k"], own: Float[Tensor, " n"], period: float | None) -> Int[Tensor, " k"]:
+def _nearest(
+    asked: Float[Tensor, " k"], own: Float[Tensor, " n"], period: float | None
+) -> Int[Tensor, " k"]:
     """Index of the own angle nearest to each asked one; angles and period in [rad]."""
     apart = asked.double().cpu()[:, None] - own.double().cpu()
     if period is not None:

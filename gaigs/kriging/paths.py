@@ -1,4 +1,6 @@
-"""Kriged strengths of propagation paths: complex Gaussian processes of the place, one for each path."""
+"""Kriged strengths of propagation paths: complex Gaussian processes of the place, one for each
+path.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,7 +16,9 @@ from gaigs.kriging.kernel import kernel, resize
 from gaigs.kriging.links import distances
 
 JITTER = 1e-6
-"""Variance of the processes that is not shared by places, over their variance: for places that are measured twice."""
+"""Variance of the processes that is not shared by places, over their variance: for places that are
+measured twice.
+"""
 
 LEAST = 1e-4
 """Power of a link's noise over the link's, where the fit leaves nothing."""
@@ -44,10 +48,11 @@ class PathProcess(NamedTuple):
 class Equations:
     """Knowledge of k links about the processes u of their n paths.
 
-    The channel of a link is predicted as h + sum_i u_i m_i, with the field m_i of path i per unit of its process. With
-    the residual r, and noise of ``nugget`` times p, the log likelihood is -|r - sum_i u_i m_i|² / (nugget p): a
-    quadratic form. p is the mean power of the residual's numbers, plus ``LEAST`` times that of the label's, which has
-    the gain of the prediction: links in shadow have far larger residuals than others.
+    The channel of a link is predicted as h + sum_i u_i m_i, with the field m_i of path i per unit
+    of its process. With the residual r, and noise of ``nugget`` times p, the log likelihood is -|r
+    - sum_i u_i m_i|² / (nugget p): a quadratic form. p is the mean power of the residual's numbers,
+    plus ``LEAST`` times that of the label's, which has the gain of the prediction: links in shadow
+    have far larger residuals than others.
 
     Attributes:
         places: (k, 3) [m].
@@ -67,16 +72,23 @@ class Equations:
         labels: Complex[Tensor, "k e s"],
         residuals: Complex[Tensor, "k e s"],
     ) -> "Equations":
-        """From the fields m_i of each ``slice`` of the links, one after the other: all together may take gigabytes."""
+        """From the fields m_i of each ``slice`` of the links, one after the other: all together may
+        take gigabytes.
+        """
         grams, sides = [], []
         size = max(1, min(64, 300_000 // labels[0].numel()))
         for start in track(range(0, len(places), size), "kriging"):
             part = slice(start, start + size)
             fields = margins(part).flatten(2).to(torch.complex128)
-            left, whole = (channels[part].abs().double().square().mean((1, 2)) for channels in (residuals, labels))
+            left, whole = (
+                channels[part].abs().double().square().mean((1, 2))
+                for channels in (residuals, labels)
+            )
             powers = (left + LEAST * whole)[:, None, None]
             grams.append(fields.conj() @ fields.mT / powers)
-            sides.append((fields.conj() @ residuals[part].flatten(1)[..., None].to(fields) / powers)[..., 0])
+            sides.append(
+                (fields.conj() @ residuals[part].flatten(1)[..., None].to(fields) / powers)[..., 0]
+            )
         return cls(places.double(), torch.cat(grams), torch.cat(sides))
 
     def __getitem__(self, index: object) -> "Equations":
@@ -88,7 +100,8 @@ class PathField(nn.Module):
 
     Attributes:
         places: Of the known links (k, 3) [m].
-        weights: The mean of the processes at x are the covariances of x with the places times these (k, n).
+        weights: The mean of the processes at x are the covariances of x with the places times these
+            (k, n).
         precisions: Of each path's strength from each link alone (k, n).
     """
 
@@ -107,7 +120,10 @@ class PathField(nn.Module):
         identity = torch.eye(len(equations.places), dtype=torch.float64)
         covariances = kernel(equations.places, equations.places, process.length) + JITTER * identity
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(covariances))
-        grams, sides = equations.grams * (process.deviation**2 / process.nugget), equations.sides / process.nugget
+        grams, sides = (
+            equations.grams * (process.deviation**2 / process.nugget),
+            equations.sides / process.nugget,
+        )
         own = inverse.diagonal()[:, None, None] * torch.eye(grams.shape[1], dtype=torch.float64)
         precondition, inverse = torch.linalg.inv(grams + own), inverse.to(sides.dtype)
         times = lambda u: inverse @ u + (grams @ u[..., None])[..., 0]
@@ -126,9 +142,15 @@ class PathField(nn.Module):
 
         The ``AROUND`` nearest known links of each place count: this kernel hides those behind them.
         """
-        near = distances(places, self.places).topk(min(AROUND, len(self.places)), largest=False).indices
+        near = (
+            distances(places, self.places)
+            .topk(min(AROUND, len(self.places)), largest=False)
+            .indices
+        )
         around = self.places[near]
-        own, towards = (kernel(around, other, process.length) for other in (around, places[:, None]))
+        own, towards = (
+            kernel(around, other, process.length) for other in (around, places[:, None])
+        )
         found = []
         for precisions in self.precisions.unbind(1):
             roots = (precisions[near] * process.deviation**2).sqrt()[..., None]
@@ -145,7 +167,10 @@ class PathField(nn.Module):
 
 
 def conjugate_gradients(
-    times: Callable[[Tensor], Tensor], precondition: Callable[[Tensor], Tensor], right: Tensor, most: int = 300
+    times: Callable[[Tensor], Tensor],
+    precondition: Callable[[Tensor], Tensor],
+    right: Tensor,
+    most: int = 300,
 ) -> Tensor:
     """The x of times(x) = right for a Hermitian positive map, to a relative residual of 1e-6.
 

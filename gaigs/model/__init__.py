@@ -48,23 +48,28 @@ class Prediction(NamedTuple):
 class Model(nn.Module):
     """The contract of kind ``model``: ``forward`` takes a ``Batch`` and gives a ``Prediction``.
 
-    The state dict has all that ``predict`` needs. A model with parameters is trained. One without is a look-up: it
-    learns in ``fit`` only, see ``LookUp``. A model may also have the methods of ``OptionalMethods``.
+    The state dict has all that ``predict`` needs. A model with parameters is trained. One without
+    is a look-up: it learns in ``fit`` only, see ``LookUp``. A model may also have the methods of
+    ``OptionalMethods``.
 
     Args:
         scene: Receivers and task.
 
     Attributes:
         trained_by: Name of the component of kind ``training`` that trains it.
-        learning_rates: Default learning rate of each parameter group; ``training.learning_rates`` overrides it.
+        learning_rates: Default learning rate of each parameter group; ``training.learning_rates``
+            overrides it.
         penalty_weights: Default weight of each penalty; ``training.penalties`` overrides it.
-        chunk: Largest number of pairs of a link and a direction evaluated at a time; None: whole labels. Training sees
-            as many as ``training.thinning`` leaves.
+        chunk: Largest number of pairs of a link and a direction evaluated at a time; None: whole
+            labels. Training sees as many as ``training.thinning`` leaves.
         revisions: Fractions of the training after which ``OptionalMethods.revise`` is called.
-        any_frequency: True if channels are a function of frequency, read from ``scene.task.frequencies``.
+        any_frequency: True if channels are a function of frequency, read from
+            ``scene.task.frequencies``.
         configuration: Options that a registered model was made with; ``save`` stores them.
-        calibration: What intervals are made of; None if no validation links have measured the model's errors.
-        known_places: Keys of the training and validation places, ``Query.place_keys``; None if these are unknown.
+        calibration: What intervals are made of; None if no validation links have measured the
+            model's errors.
+        known_places: Keys of the training and validation places, ``Query.place_keys``; None if
+            these are unknown.
 
     Example:
         >>> class Nearest(gaigs.Model):
@@ -120,7 +125,8 @@ class Model(nn.Module):
         """Writes the model into one file, which ``gaigs.load`` reads anywhere, without the data.
 
         Raises:
-            ValueError: The model has no state, such as a look-up before its fit; or a part has no registered name.
+            ValueError: The model has no state, such as a look-up before its fit; or a part has no
+                registered name.
             OSError: The file cannot be written; an earlier file stays as it was.
 
         Example:
@@ -137,7 +143,9 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def evaluate(self, batch: Batch) -> Tensor:
-        """Values (b, *shape) of a batch in all its directions, ``chunk`` pairs of a link and a direction at a time."""
+        """Values (b, *shape) of a batch in all its directions, ``chunk`` pairs of a link and a
+        direction at a time.
+        """
         if self.chunk is None or batch.directions is None:
             return self(batch).value
         rays = batch.directions.flatten()
@@ -151,9 +159,13 @@ class Model(nn.Module):
         return torch.cat(values)
 
     @overload
-    def predict(self, transmitters: object, *options: Any, interval: None = None, **named: Any) -> Tensor: ...
+    def predict(
+        self, transmitters: object, *options: Any, interval: None = None, **named: Any
+    ) -> Tensor: ...
     @overload
-    def predict(self, transmitters: object, *options: Any, interval: float, **named: Any) -> Estimate: ...
+    def predict(
+        self, transmitters: object, *options: Any, interval: float, **named: Any
+    ) -> Estimate: ...
     def predict(  # type: ignore[misc]
         self,
         transmitters: object,
@@ -167,34 +179,40 @@ class Model(nn.Module):
         """Values for transmitters anywhere: a query, or a point, a list of points, or a grid.
 
         Args:
-            transmitters: Positions (..., 3), world frame [m], anything that becomes a float tensor; or a whole query.
-            receiver: Name or index of the receiver, or of that of each position; None: all receivers.
-            frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the training links'
-                only carrier.
-            batch_size: Links computed at a time, of all receivers at least those of one position; None: as many as have
-                ``NUMBERS`` numbers together.
+            transmitters: Positions (..., 3), world frame [m], anything that becomes a float tensor;
+                or a whole query.
+            receiver: Name or index of the receiver, or of that of each position; None: all
+                receivers.
+            frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the
+                training links' only carrier.
+            batch_size: Links computed at a time, of all receivers at least those of one position;
+                None: as many as have ``NUMBERS`` numbers together.
             directions: Directions to predict; None: the label's own, if it has directions.
-            frequencies: Subcarriers of channels to predict (s,) [Hz], also ones that no label had; None: the label's
-                own. A model without ``any_frequency``, such as ``knn``, gives the values of its nearest subcarriers.
-            interval: Probability with which an interval holds the label, between 0 and 1, e.g. 0.9; None: values alone.
+            frequencies: Subcarriers of channels to predict (s,) [Hz], also ones that no label had;
+                None: the label's own. A model without ``any_frequency``, such as ``knn``, gives the
+                values of its nearest subcarriers.
+            interval: Probability with which an interval holds the label, between 0 and 1, e.g. 0.9;
+                None: values alone.
 
         Returns:
-            Values (..., receivers, *shape), of the axes of the positions, of all receivers in the order of
-            ``model.scene.receivers``, of a single one too, and of the task's shape. With ``receiver`` (..., *shape); of
-            a query (b, *shape). They are scaled as the training labels (``model.scene.task.normalisation``), on the
-            model's device. With an interval an ``Estimate``: the value, its standard deviation, and the interval's
-            ends. Where arrays have different numbers of elements, channels of all receivers are a dictionary by name;
+            Values (..., receivers, *shape), of the axes of the positions, of all receivers in the
+            order of ``model.scene.receivers``, of a single one too, and of the task's shape. With
+            ``receiver`` (..., *shape); of a query (b, *shape). They are scaled as the training
+            labels (``model.scene.task.normalisation``), on the model's device. With an interval an
+            ``Estimate``: the value, its standard deviation, and the interval's ends. Where arrays
+            have different numbers of elements, channels of all receivers are a dictionary by name;
             channels of a named receiver have the elements of its array.
 
         Warns:
-            ExtrapolationWarning: A position is farther from the training transmitters' box than the diagonal of this
-                box and the receivers, or a frequency is outside the training links' band, or subcarriers are farther
-                from the band of the labels than it is wide, or the values are those of other subcarriers. Not for a
-                query.
+            ExtrapolationWarning: A position is farther from the training transmitters' box than the
+                diagonal of this box and the receivers, or a frequency is outside the training
+                links' band, or subcarriers are farther from the band of the labels than it is wide,
+                or the values are those of other subcarriers. Not for a query.
 
         Raises:
-            ValueError: The batch size is less than 1, or a position, receiver, frequency or direction is impossible; or
-                the labels have no subcarriers; or the model had too few validation links for the interval.
+            ValueError: The batch size is less than 1, or a position, receiver, frequency or
+                direction is impossible; or the labels have no subcarriers; or the model had too few
+                validation links for the interval.
 
         Example:
             >>> model = gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0))
@@ -213,13 +231,17 @@ class Model(nn.Module):
         """
         check_type("interval", interval, float | None)
         if interval is not None and not 0 < interval < 1:
-            raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
+            raise ValueError(
+                f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}"
+            )
         if interval is not None and self.calibration is None:
             raise ValueError(
                 "the model has no intervals: no held-out links have measured its errors\n"
                 "train it with split.validation above 0, on two places, runs or blocks or more, without data.band_train"
             )
-        parts, shape = self._values(transmitters, receiver, frequency, batch_size, directions, frequencies, interval)
+        parts, shape = self._values(
+            transmitters, receiver, frequency, batch_size, directions, frequencies, interval
+        )
         heard = transmitters.receivers if isinstance(transmitters, Query) else receiver
         if interval is None:
             return self._arranged(torch.cat([*parts]), shape, heard)
@@ -238,21 +260,27 @@ class Model(nn.Module):
         directions: Directions | None = None,
         frequencies: object = None,
     ) -> Iterator[Any]:
-        """The values of ``predict`` for a list of positions, a batch at a time, each computed when it is asked for.
+        """The values of ``predict`` for a list of positions, a batch at a time, each computed when
+        it is asked for.
 
-        A batch is (b, receivers, *shape), with a receiver (b, *shape). Arguments, warnings and errors are those of
-        ``predict``, and come at once. The positions of a grid are in the order of ``reshape(-1, 3)``; the last batch
-        may be smaller.
+        A batch is (b, receivers, *shape), with a receiver (b, *shape). Arguments, warnings and
+        errors are those of ``predict``, and come at once. The positions of a grid are in the order
+        of ``reshape(-1, 3)``; the last batch may be smaller.
         """
-        parts, shape = self._values(transmitters, receiver, frequency, batch_size, directions, frequencies)
+        parts, shape = self._values(
+            transmitters, receiver, frequency, batch_size, directions, frequencies
+        )
         heard = transmitters.receivers if isinstance(transmitters, Query) else receiver
         last = shape[-1:] if heard is None else ()  # the receivers
-        return (self._arranged(part, (len(part) // math.prod(last), *last), heard) for part in parts)
+        return (
+            self._arranged(part, (len(part) // math.prod(last), *last), heard) for part in parts
+        )
 
     def _arranged(self, values: Tensor, axes: tuple[int, ...], receiver: object) -> Any:
         """Values of links (b, ...) with the axes of ``Query.from_positions``.
 
-        Where arrays have different numbers of elements, a dictionary by receiver or, of one receiver, its own elements.
+        Where arrays have different numbers of elements, a dictionary by receiver or, of one
+        receiver, its own elements.
         """
         receivers, values = self.scene.receivers, values.reshape((*axes, *values.shape[1:]))
         if not self.lacks_elements:
@@ -260,7 +288,10 @@ class Model(nn.Module):
         is_channel = values.ndim > len(axes)
         own = lambda part, one: part[..., : len(one.array), :] if is_channel else part
         if receiver is None:
-            return {one.name: own(values.select(len(axes) - 1, k), one) for k, one in enumerate(receivers)}
+            return {
+                one.name: own(values.select(len(axes) - 1, k), one)
+                for k, one in enumerate(receivers)
+            }
         number = as_receivers(receiver, [one.name for one in receivers])
         return values if number.ndim else own(values, receivers[int(number)])
 
@@ -268,7 +299,10 @@ class Model(nn.Module):
     def lacks_elements(self) -> bool:
         """True for channels if an array has fewer elements than another one."""
         task = self.scene.task
-        return isinstance(task, Csi) and min(len(one.array) for one in self.scene.receivers) < task.elements
+        return (
+            isinstance(task, Csi)
+            and min(len(one.array) for one in self.scene.receivers) < task.elements
+        )
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Model":
         """A copy of a model with ``any_frequency`` whose labels have other subcarriers [Hz]."""
@@ -282,17 +316,23 @@ class Model(nn.Module):
     def _values(
         self, transmitters, receiver, frequency, batch_size, directions, frequencies, interval=None
     ) -> tuple[Iterator[Any], tuple[int, ...]]:
-        """Values, or estimates of an interval, for the checked arguments of ``predict``, a batch at a time; and the
-        links' axes, see ``Query.from_positions``."""
+        """Values, or estimates of an interval, for the checked arguments of ``predict``, a batch at
+        a time; and the links' axes, see ``Query.from_positions``."""
         scene = self.scene
         directions = as_directions(directions, scene.task.directions, scene.task.name)
         names = [receiver.name for receiver in scene.receivers]
-        query, shape = Query.from_positions(transmitters, receiver, frequency, names, scene.frequencies)
-        every = shape[-1] if receiver is None and not isinstance(transmitters, Query) else 1  # links of each position
+        query, shape = Query.from_positions(
+            transmitters, receiver, frequency, names, scene.frequencies
+        )
+        every = (
+            shape[-1] if receiver is None and not isinstance(transmitters, Query) else 1
+        )  # links of each position
         model, chosen, messages = self, None, []
         if frequencies is not None:
             if not isinstance(scene.task, Csi):
-                raise ValueError(f"labels of task {scene.task.name!r} have no subcarriers; leave frequencies out")
+                raise ValueError(
+                    f"labels of task {scene.task.name!r} have no subcarriers; leave frequencies out"
+                )
             asked = as_subcarriers(frequencies)
             apart, chosen = (scene.task.frequencies - asked[:, None]).abs().min(1)
             is_known = (apart <= 1e-9 * asked).all()  # float64 computes them no better
@@ -306,25 +346,36 @@ class Model(nn.Module):
                         f"{high - low:.4g} Hz: phases may be off"
                     ]
             elif not is_known:
-                messages = [f"values are those of the nearest subcarriers with labels, up to {apart.max():.7g} Hz away"]
+                messages = [
+                    f"values are those of the nearest subcarriers with labels, up to {apart.max():.7g} Hz away"
+                ]
         if not isinstance(transmitters, Query):
             for message in messages + extrapolations(query[::every], scene):
-                warnings.warn(message, ExtrapolationWarning, stacklevel=3)  # names the line that called ``predict``
+                warnings.warn(
+                    message, ExtrapolationWarning, stacklevel=3
+                )  # names the line that called ``predict``
         check_type("batch_size", batch_size, int | None)
         if batch_size is None:
             batch_size = min(MOST, max(16, NUMBERS // math.prod(model.scene.task.shape)))
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
         batch_size = max(1, batch_size // every) * every
-        query, directions = query.to(self.device), None if directions is None else directions.to(self.device)
+        query, directions = (
+            query.to(self.device),
+            None if directions is None else directions.to(self.device),
+        )
         count = math.ceil(len(query) / batch_size)
         parts = track(query.parts(batch_size), "predictions", count, is_fixed=True)
         batches = (Batch(part, directions) for part in parts)
         if interval is not None:
             if messages or model is not self:
-                raise ValueError("intervals are those of the labels' own subcarriers; leave frequencies out")
+                raise ValueError(
+                    "intervals are those of the labels' own subcarriers; leave frequencies out"
+                )
             estimates = (self._estimate(batch, float(interval)) for batch in batches)
-            pick = lambda part: part if part is None or part.ndim < 3 or chosen is None else part[..., chosen]
+            pick = lambda part: (
+                part if part is None or part.ndim < 3 or chosen is None else part[..., chosen]
+            )
             return (Estimate(*map(pick, estimate)) for estimate in estimates), shape
         values = map(model._answer, batches)
         return values if chosen is None else (part[..., chosen] for part in values), shape
@@ -348,10 +399,11 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def spread(self, batch: Batch, value: Tensor) -> Tensor:
-        """Standard deviation of the labels as the model knows it, (b,) or of each number; a calibration scales it.
+        """Standard deviation of the labels as the model knows it, (b,) or of each number; a
+        calibration scales it.
 
-        By default 1, of channels the root mean square of each link's value. It is NaN at elements that a receiver's
-        array lacks, which have no error.
+        By default 1, of channels the root mean square of each link's value. It is NaN at elements
+        that a receiver's array lacks, which have no error.
         """
         found = call_optional(self, "deviations", batch)
         if found is None and value.is_complex():
@@ -366,7 +418,9 @@ class Model(nn.Module):
 
 
 class OptionalMethods(Protocol):
-    """Methods that a model may have beside those of ``Model``; ``call_optional`` calls one if it is there."""
+    """Methods that a model may have beside those of ``Model``; ``call_optional`` calls one if it is
+    there.
+    """
 
     def facts(self) -> dict[str, object]:
         """Entries of ``metrics.json`` beside the model's sizes; plain values by name."""
@@ -375,11 +429,13 @@ class OptionalMethods(Protocol):
         """The rendering alone of a batch, to be timed."""
 
     def learnt_room(self, links: Links | None = None) -> object:
-        """The room learnt from the links, a ``gaigs.planes.learnt_room.LearntRoom`` for figures; without links that
-        of the state alone."""
+        """The room learnt from the links, a ``gaigs.planes.learnt_room.LearntRoom`` for figures;
+        without links that of the state alone."""
 
     def learnt_paths(self, query: Query) -> object:
-        """The strongest paths of some links together, a list of ``gaigs.planes.learnt_room.LearntPath``."""
+        """The strongest paths of some links together, a list of
+        ``gaigs.planes.learnt_room.LearntPath``.
+        """
 
     def export(self, folder: Path) -> None:
         """Writes files for other programs into a run's folder."""
@@ -388,17 +444,23 @@ class OptionalMethods(Protocol):
         """The Gaussian process of a receiver's labels, which plans surveys."""
 
     def deviations(self, batch: Batch) -> Tensor:
-        """Standard deviations of the labels (b,), root mean squares over all their numbers, or of each number
-        (b, *shape); but for a common factor."""
+        """Standard deviations of the labels (b,), root mean squares over all their numbers, or of
+        each number (b, *shape); but for a common factor."""
 
     def refit(self, links: Links) -> None:
-        """As ``fit``, for some of the links of an earlier fit, whose choices may stay; it may be faster."""
+        """As ``fit``, for some of the links of an earlier fit, whose choices may stay; it may be
+        faster.
+        """
 
-    def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
-        """Changes the model between two training steps, such as by a search, and gives a sentence for the log.
+    def revise(
+        self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]
+    ) -> str:
+        """Changes the model between two training steps, such as by a search, and gives a sentence
+        for the log.
 
-        ``number`` is an index into ``Model.revisions``. The batches are some training links, thinned as in a step, and
-        some validation links. Parameters keep their shapes, and the state dict has every decision.
+        ``number`` is an index into ``Model.revisions``. The batches are some training links,
+        thinned as in a step, and some validation links. Parameters keep their shapes, and the state
+        dict has every decision.
         """
 
 
@@ -408,7 +470,8 @@ def call_optional(model: Model, method: str, *arguments: object) -> Any:
 
 
 class LookUp(Model):
-    """Base of a model that keeps its known links: they are its state, with the attributes of the names ``learnt``.
+    """Base of a model that keeps its known links: they are its state, with the attributes of the
+    names ``learnt``.
 
     It answers on the processor.
 
@@ -426,7 +489,9 @@ class LookUp(Model):
         return self
 
     def get_extra_state(self) -> dict:
-        """Known links and ``learnt``; labels in bytes if all are 255ths from 0 to 1, as of 8-bit images."""
+        """Known links and ``learnt``; labels in bytes if all are 255ths from 0 to 1, as of 8-bit
+        images.
+        """
         if self.links is None:
             raise ValueError(f"model {name_of(self)!r} has no links to save; fit it first")
         index, labels = torch.cat([*self.known]), []
@@ -442,13 +507,17 @@ class LookUp(Model):
         labels = [part / 255 if part.dtype == torch.uint8 else part for part in state["labels"]]
         self.links = Batch(Query(**state["query"]), None, torch.cat(labels))
         receivers = self.links.query.receivers
-        self.known = [(receivers == number).nonzero()[:, 0] for number in range(len(self.scene.receivers))]
+        self.known = [
+            (receivers == number).nonzero()[:, 0] for number in range(len(self.scene.receivers))
+        ]
         for name in self.learnt:
             setattr(self, name, state[name])
 
 
 class Wrapper(Model):
-    """Base of a model around an ``underlying`` one, whose room, Gaussians, rendering and files are its own."""
+    """Base of a model around an ``underlying`` one, whose room, Gaussians, rendering and files are
+    its own.
+    """
 
     @property
     @abstractmethod
@@ -473,8 +542,8 @@ class Wrapper(Model):
 
 
 def extrapolations(query: Query, scene: Scene) -> list[str]:
-    """Sentences on positions farther from the training transmitters' box than the scene's extent, and on carriers
-    outside the training links' band."""
+    """Sentences on positions farther from the training transmitters' box than the scene's extent,
+    and on carriers outside the training links' band."""
     messages, points = [], query.transmitters
     distances = (points - points.clamp(scene.lower.to(points), scene.upper.to(points))).norm(dim=-1)
     if count := int((distances > scene.extent).sum()):
@@ -483,7 +552,10 @@ def extrapolations(query: Query, scene: Scene) -> list[str]:
             f"transmitters, which with the receivers is {scene.extent:.3g} m across: nothing was measured near there"
         )
     if query.frequencies is not None and scene.has_band:
-        asked, (low, high) = query.frequencies.double(), scene.frequencies.double()[[0, -1]].tolist()
+        asked, (low, high) = (
+            query.frequencies.double(),
+            scene.frequencies.double()[[0, -1]].tolist(),
+        )
         outside = asked[(asked < low * (1 - ROUNDING)) | (asked > high * (1 + ROUNDING))]
         if len(outside):
             span = " to ".join(dict.fromkeys((f"{outside.amin():.7g}", f"{outside.amax():.7g}")))

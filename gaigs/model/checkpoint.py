@@ -1,4 +1,6 @@
-"""Complete checkpoints: configuration, scene, split and weights in one file, loaded without the data."""
+"""Complete checkpoints: configuration, scene, split and weights in one file, loaded without the
+data.
+"""
 
 import hashlib
 import io
@@ -24,8 +26,8 @@ VERSION = 3
 """Format that is written, and the only one that is read."""
 
 SEAL = b"gaigs sha256 "
-"""Precedes the digest of all bytes before, which ends the file. Both are the comment of the zip archive that
-``torch.save`` writes, so the file stays an archive."""
+"""Precedes the digest of all bytes before, which ends the file. Both are the comment of the zip
+archive that ``torch.save`` writes, so the file stays an archive."""
 
 DIGEST = 64
 """Length of the digest in hexadecimal digits."""
@@ -34,7 +36,9 @@ DIGEST = 64
 def seal(path: Path) -> None:
     """Appends the seal to a file of ``torch.save``, by which ``read`` detects any changed bit."""
     content = path.read_bytes()
-    sealed = content[:-2] + (len(SEAL) + DIGEST).to_bytes(2, "little") + SEAL  # the length of the archive's comment
+    sealed = (
+        content[:-2] + (len(SEAL) + DIGEST).to_bytes(2, "little") + SEAL
+    )  # the length of the archive's comment
     path.write_bytes(sealed + hashlib.sha256(sealed).hexdigest().encode())
 
 
@@ -67,19 +71,27 @@ def read(path: str | Path) -> dict:
         # A view can be far larger than the numbers behind it; those of a model are not.
         if sum(tensor.nbytes for _, tensor in _tensors(content, "")) > 4 * len(data) + 2**26:
             raise ValueError("larger than the file")
-    except Exception as error:  # any error of zip readers and unpicklers; torch's own message advises to run code
+    except (
+        Exception
+    ) as error:  # any error of zip readers and unpicklers; torch's own message advises to run code
         if lacks_memory(error):
             raise
-        raise ValueError(f"{path} is damaged, or no checkpoint of this gaigs\ntake a copy, or train again") from None
+        raise ValueError(
+            f"{path} is damaged, or no checkpoint of this gaigs\ntake a copy, or train again"
+        ) from None
     part = content.get(KEY) if isinstance(content, dict) else None
     if not isinstance(part, dict):
         raise ValueError(f"{path} is no checkpoint of gaigs: it lacks the entry {KEY!r}")
     if (version := part.get("version")) != VERSION:
-        raise ValueError(f"{path} has checkpoint format {version!r}, not {VERSION}; use the gaigs that wrote it")
+        raise ValueError(
+            f"{path} has checkpoint format {version!r}, not {VERSION}; use the gaigs that wrote it"
+        )
     needed = {"state_dict": content, "model": part, "scene": part}
     lacking = [name for name, there in needed.items() if not isinstance(there.get(name), dict)]
     if lacking:
-        raise ValueError(f"{path} is no complete checkpoint: it lacks {', '.join(lacking)}\ntrain again")
+        raise ValueError(
+            f"{path} is no complete checkpoint: it lacks {', '.join(lacking)}\ntrain again"
+        )
     return content
 
 
@@ -87,10 +99,15 @@ def save(model: nn.Module, path: str | Path) -> None:
     """Writes a model with its configuration and scene; see ``gaigs.Model.save``."""
     state = model.state_dict()
     if not state:
-        raise ValueError(f"model {name_of(model)!r} has no state: keep what it learns in buffers, or use model.LookUp")
+        raise ValueError(
+            f"model {name_of(model)!r} has no state: keep what it learns in buffers, or use model.LookUp"
+        )
     part = {"version": VERSION, "scene": model.scene.state(), **described(model)}
     part["plugins"] = digests(part["model"], part["scene"]["task"])
-    weights = {f"model.{key}": value.cpu() if isinstance(value, Tensor) else value for key, value in state.items()}
+    weights = {
+        f"model.{key}": value.cpu() if isinstance(value, Tensor) else value
+        for key, value in state.items()
+    }
     write({KEY: part, "state_dict": weights}, Path(path))
 
 
@@ -109,13 +126,19 @@ def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Modul
         fresh = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         unset = {name for name, value in fresh.items() if not value.isfinite().all()}
         model.load_state_dict(weights)
-        _check_finite("weights", {name: value for name, value in weights.items() if name not in unset})
+        _check_finite(
+            "weights", {name: value for name, value in weights.items() if name not in unset}
+        )
         model.calibrate(content[KEY].get("calibration"))
         model.known_places = content[KEY].get("known_places")
     except Exception as error:  # any error of a constructor with damaged options
         if lacks_memory(error):
             raise
-        cause = str(error) if isinstance(error, ValueError | ImportError) else f"{type(error).__name__}: {error}"
+        cause = (
+            str(error)
+            if isinstance(error, ValueError | ImportError)
+            else f"{type(error).__name__}: {error}"
+        )
         message = f"cannot make the model of {path}: {cause if cause.count(chr(10)) < 2 else ' '.join(cause.split())}"
         raise (ImportError if isinstance(error, ImportError) else ValueError)(message) from error
     return model.eval()
@@ -127,27 +150,43 @@ def trained_weights(content: dict) -> dict:
     if "trained" not in content[KEY]:
         return weights
     part = f"model.{content[KEY]['trained']}."
-    return {f"model.{key.removeprefix(part)}": value for key, value in weights.items() if key.startswith(part)}
+    return {
+        f"model.{key.removeprefix(part)}": value
+        for key, value in weights.items()
+        if key.startswith(part)
+    }
 
 
 def described(model: nn.Module) -> dict:
-    """A model's configuration and, if it has them, its calibration and the keys of the places that it knows."""
+    """A model's configuration and, if it has them, its calibration and the keys of the places that
+    it knows.
+    """
     calibration = None if model.calibration is None else model.calibration.state()
-    return {"model": configuration_of(model), "calibration": calibration, "known_places": model.known_places}
+    return {
+        "model": configuration_of(model),
+        "calibration": calibration,
+        "known_places": model.known_places,
+    }
 
 
 def update(path: Path, model: nn.Module, trained: str | None = None) -> None:
-    """Gives a checkpoint its model's calibration; or another model of the scene, whose part ``trained`` was trained."""
+    """Gives a checkpoint its model's calibration; or another model of the scene, whose part
+    ``trained`` was trained.
+    """
     content = read(path)
     content[KEY] |= described(model)
     if trained is not None:
         content[KEY]["trained"] = trained
-        content["state_dict"] = {f"model.{key}": value.cpu() for key, value in model.state_dict().items()}
+        content["state_dict"] = {
+            f"model.{key}": value.cpu() for key, value in model.state_dict().items()
+        }
     write(content, path)
 
 
 def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
-    """All tensors in nested mappings and lists, with their places; a ``ValueError`` if these nest without an end."""
+    """All tensors in nested mappings and lists, with their places; a ``ValueError`` if these nest
+    without an end.
+    """
     parts = [(name, value, 0)]
     for count in itertools.count():
         if not parts:

@@ -30,15 +30,18 @@ class Ensemble(Wrapper):
         >>> len(model.members)
         2
 
-    Source: Lakshminarayanan, Pritzel and Blundell, Simple and scalable predictive uncertainty estimation using deep
-    ensembles, 2017.
+    Source: Lakshminarayanan, Pritzel and Blundell, Simple and scalable predictive uncertainty
+    estimation using deep ensembles, 2017.
     """
 
     typical: Tensor
 
     def __init__(self, scene: Scene, members: list):
         super().__init__(scene)
-        built = [one if isinstance(one, Model) else registry("model").build(one, scene=scene) for one in members]
+        built = [
+            one if isinstance(one, Model) else registry("model").build(one, scene=scene)
+            for one in members
+        ]
         self.members = nn.ModuleList(built)
         self.chunk, self.any_frequency = built[0].chunk, built[0].any_frequency
         self.register_buffer("typical", torch.tensor(0.0))

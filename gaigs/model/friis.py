@@ -18,12 +18,14 @@ from gaigs.registry import register
 
 @register("model", "friis")
 class Friis(Model):
-    """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element, with one complex gain g for each receiver.
+    """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element, with one complex gain g for
+    each receiver.
 
-    a is the elements' pattern towards the transmitter. The gain, ``fit_gain`` of the known links, contains transmit
-    power, cables and the clock's phase. The sign of the phase is estimated from the known links, as both time
-    conventions are in use. If phases are declared known but show no sign, the gain is 0. With fewer than ``TELLING``
-    links a receiver the sign is -1. NaN before ``fit``.
+    a is the elements' pattern towards the transmitter. The gain, ``fit_gain`` of the known links,
+    contains transmit power, cables and the clock's phase. The sign of the phase is estimated from
+    the known links, as both time conventions are in use. If phases are declared known but show no
+    sign, the gain is 0. With fewer than ``TELLING`` links a receiver the sign is -1. NaN before
+    ``fit``.
 
     Raises:
         ValueError: The labels are not channels, or their number of elements is not the array's.
@@ -36,7 +38,9 @@ class Friis(Model):
     def __init__(self, scene: Scene):
         super().__init__(scene)
         self.task = check_elements("model 'friis'", scene, pads=True)
-        self.register_buffer("gains", torch.full((len(scene.receivers),), torch.nan, dtype=torch.complex64))
+        self.register_buffer(
+            "gains", torch.full((len(scene.receivers),), torch.nan, dtype=torch.complex64)
+        )
         self.register_buffer("sign", torch.tensor(-1))
 
     @property
@@ -57,7 +61,9 @@ class Friis(Model):
         self.gains.zero_()
         has_gain = sign != 0 or len(index) < TELLING * len(known)
         for receiver, own in enumerate(known if has_gain else ()):
-            self.gains[receiver] = fit_gain(links.labels[own], self._waves(links.query[own])).to(self.gains)
+            self.gains[receiver] = fit_gain(links.labels[own], self._waves(links.query[own])).to(
+                self.gains
+            )
 
     def forward(self, batch: Batch) -> Prediction:
         waves = self._waves(batch.query).to(self.gains)

@@ -83,10 +83,20 @@ class GaussianSplatting(Model):
         self.trend = None
         if trend is not None:
             self.trend = build_trend(trend, scene)
-            if isinstance(self.trend, LookUp) or not self.trend.state_dict() or [*self.trend.parameters()]:
-                raise ValueError(f"task.trend.name cannot be {name_of(self.trend)}; take mean, path_loss or friis")
-            self.register_buffer("level", torch.zeros(()))  # of the untrained map, in the label's unit
-        self.pooling = registry("pooling").build(self.own_pooling(scene) if pooling is None else pooling, scene=scene)
+            if (
+                isinstance(self.trend, LookUp)
+                or not self.trend.state_dict()
+                or [*self.trend.parameters()]
+            ):
+                raise ValueError(
+                    f"task.trend.name cannot be {name_of(self.trend)}; take mean, path_loss or friis"
+                )
+            self.register_buffer(
+                "level", torch.zeros(())
+            )  # of the untrained map, in the label's unit
+        self.pooling = registry("pooling").build(
+            self.own_pooling(scene) if pooling is None else pooling, scene=scene
+        )
         self.projection: Any = None
         self.rasterizer: Any = None
         zone = self.pooling.zone
@@ -97,7 +107,14 @@ class GaussianSplatting(Model):
                     "leave out projection and rasterizer (~projection ~rasterizer, None in Python)"
                 )
             amplitudes = torch.zeros(1, 0, dtype=torch.complex64)
-            paths = torch.zeros(1, 0, 3), torch.zeros(1, 0, 3, 3), amplitudes, torch.zeros(1, 0), torch.zeros(0), None
+            paths = (
+                torch.zeros(1, 0, 3),
+                torch.zeros(1, 0, 3, 3),
+                amplitudes,
+                torch.zeros(1, 0),
+                torch.zeros(0),
+                None,
+            )
             self._check_gives(ReceivedPaths(*paths, scene.receivers[0], torch.tensor([1e9])))
         else:
             if projection is None or rasterizer is None:
@@ -107,7 +124,9 @@ class GaussianSplatting(Model):
                 )
             grid = self.pooling.grid or scene.task.directions
             if grid is None:
-                raise ValueError(f"labels of task {scene.task.name!r} have no directions; take the task's own pooling")
+                raise ValueError(
+                    f"labels of task {scene.task.name!r} have no directions; take the task's own pooling"
+                )
             self._check_gives(torch.zeros(1, self.pooling.channels, *grid.shape))
             self.projection = registry("projection").build(projection, pixel=grid.pitch)
             self.rasterizer = registry("rasterizer").build(rasterizer)
@@ -118,17 +137,27 @@ class GaussianSplatting(Model):
         self.placement = registry("placement").build(placement, scene=scene, channels=channels)
         own = name_of(self.placement)
         if self.placement.model not in (None, self.name):
-            raise ValueError(f"placement {own!r} makes another predictor; set model={self.placement.model}")
+            raise ValueError(
+                f"placement {own!r} makes another predictor; set model={self.placement.model}"
+            )
         if self.own_placement not in (None, own):
             needed = f"placement={self.own_placement}"
-            raise ValueError(f"model {self.name!r} takes {needed}, got {own}; take +experiment={self.name}")
+            raise ValueError(
+                f"model {self.name!r} takes {needed}, got {own}; take +experiment={self.name}"
+            )
         self.gaussians = None
         if gaussians is not None:
-            self.gaussians = call("gaussians", Gaussians, gaussians, scene=scene, zone=zone, channels=channels)
+            self.gaussians = call(
+                "gaussians", Gaussians, gaussians, scene=scene, zone=zone, channels=channels
+            )
             if self.placement.has_own and self.gaussians.degree:
-                raise ValueError(f"placement {own!r} needs gaussians.degree=0, got {self.gaussians.degree}")
+                raise ValueError(
+                    f"placement {own!r} needs gaussians.degree=0, got {self.gaussians.degree}"
+                )
         elif not self.placement.has_own:
-            raise ValueError(f"placement {own!r} places free Gaussians alone; set gaussians=lattice")
+            raise ValueError(
+                f"placement {own!r} places free Gaussians alone; set gaussians=lattice"
+            )
         component: Any = deformation
         if not is_built(deformation):
             component = registry("deformation").get(
@@ -137,7 +166,11 @@ class GaussianSplatting(Model):
         self.tokenizer, context = None, {"scene": scene, "channels": channels}
         if component.reads_tokens:
             parts = self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
-            context["tokenizer_widths"] = parts.scene_width, parts.gaussian_width, parts.transmitter_width
+            context["tokenizer_widths"] = (
+                parts.scene_width,
+                parts.gaussian_width,
+                parts.transmitter_width,
+            )
         self.deformation = registry("deformation").build(deformation, **context)
 
     @property
@@ -183,11 +216,15 @@ class GaussianSplatting(Model):
     def forward(self, batch: Batch) -> Prediction:
         own = next(self.parameters())
         if torch.is_autocast_enabled(own.device.type) or torch.finfo(own.dtype).bits < 32:
-            raise ValueError("angles and phases of Gaussians need float32; set trainer.precision to 32-true or 64-true")
+            raise ValueError(
+                "angles and phases of Gaussians need float32; set trainer.precision to 32-true or 64-true"
+            )
         query = batch.query
         # Receivers share what a place excites, unless a part looks at the receiver.
         parts = self.placement, self.tokenizer, self.deformation
-        places, which = query.unique(with_receivers=any(getattr(part, "sees_receivers", False) for part in parts))
+        places, which = query.unique(
+            with_receivers=any(getattr(part, "sees_receivers", False) for part in parts)
+        )
         return self.respond(self.excite(places), which, batch)
 
     def respond(self, excited: Excited, which: Int[Tensor, " b"], batch: Batch) -> Prediction:
@@ -206,7 +243,9 @@ class GaussianSplatting(Model):
                 received = torch.cat([self.rasterizer(*arguments)[0] for arguments in calls])
             value = self.pooling(received, own, batch.directions)
             if not self.takes_paths and self.pooling.grid is None and batch.directions is not None:
-                value = value.reshape(len(own), *batch.directions.shape)  # a list of rays was rendered as one row
+                value = value.reshape(
+                    len(own), *batch.directions.shape
+                )  # a list of rays was rendered as one row
             values.append(value)
         value = self.on_trend(torch.cat(values)[torch.cat(links).argsort()], batch)
         penalties = {}
@@ -220,7 +259,9 @@ class GaussianSplatting(Model):
 
     @property
     def any_frequency(self) -> bool:  # type: ignore[override]
-        return isinstance(self.pooling, ChannelPooling) and (self.trend is None or self.trend.any_frequency)
+        return isinstance(self.pooling, ChannelPooling) and (
+            self.trend is None or self.trend.any_frequency
+        )
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups = {}
@@ -279,10 +320,14 @@ class GaussianSplatting(Model):
             scales = scales + residuals.delta_scales
         return Excited(placed, residuals, semi_axes(quats, scales))
 
-    def paths(self, excited: Excited, which: Int[Tensor, " b"], receiver: int, query: Query) -> ReceivedPaths:
+    def paths(
+        self, excited: Excited, which: Int[Tensor, " b"], receiver: int, query: Query
+    ) -> ReceivedPaths:
         """The paths of some queries, each with its place ``which``, to one receiver."""
         placed = excited.placed
-        means, axes = (part if len(part) == 1 else part[which] for part in (placed.means, excited.semi_axes))
+        means, axes = (
+            part if len(part) == 1 else part[which] for part in (placed.means, excited.semi_axes)
+        )
         signal, opacities, _ = self._strengths(excited, which)
         amplitudes = torch.complex(signal[..., 0], signal[..., 1]) * opacities
         b, n = amplitudes.shape
@@ -299,13 +344,21 @@ class GaussianSplatting(Model):
 
     def carriers(self, query: Query) -> Float[Tensor, " b"]:
         """The links' frequencies [Hz]; single antennas hear powers alike at any, so they need none."""
-        is_known = query.frequencies is not None or len(self.scene.frequencies) or self.scene.task.dtype.is_complex
+        is_known = (
+            query.frequencies is not None
+            or len(self.scene.frequencies)
+            or self.scene.task.dtype.is_complex
+        )
         if not is_known and all(len(receiver.array) == 1 for receiver in self.scene.receivers):
             return query.transmitters.new_ones(len(query))
         return carriers(self.scene, query)
 
     def _splats(
-        self, excited: Excited, which: Int[Tensor, " b"], receiver: int, directions: Directions | None
+        self,
+        excited: Excited,
+        which: Int[Tensor, " b"],
+        receiver: int,
+        directions: Directions | None,
     ) -> list[tuple]:
         """The rasterizer's arguments: Gaussians on the receiver's plane, for all queries at once unless they move."""
         placed, axes = excited.placed, excited.semi_axes
@@ -314,7 +367,10 @@ class GaussianSplatting(Model):
         plane = self.projection.plane(directions.to(placed.means.device).to(placed.means.dtype))
         means = placed.means
         if not len(means):  # no query: Gaussians that follow it may stand anywhere
-            means, axes = means.new_zeros(1, means.shape[1], 3), means.new_ones(1, means.shape[1], 3, 3)
+            means, axes = (
+                means.new_zeros(1, means.shape[1], 3),
+                means.new_ones(1, means.shape[1], 3, 3),
+            )
         calls = []
         for row in [which] if len(means) == 1 else which.split(1):
             stands = means[0] if len(means) == 1 else means[row][0]
@@ -347,14 +403,20 @@ class GaussianSplatting(Model):
 
     def _check_gives(self, received: Tensor | ReceivedPaths) -> None:
         """Raises a ``ValueError`` unless the pooling gives labels of the task's shape."""
-        query = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long), torch.tensor([1e9]))  # any carrier
+        query = Query(
+            torch.zeros(1, 3), torch.zeros(1, dtype=torch.long), torch.tensor([1e9])
+        )  # any carrier
         gives, task = tuple(self.pooling(received, query).shape[1:]), self.scene.task
         if gives != task.shape:
             own = f"labels of task {task.name!r}, {task.shape}"
-            raise ValueError(f"pooling {name_of(self.pooling)!r} gives {gives}, not {own}; take the task's own pooling")
+            raise ValueError(
+                f"pooling {name_of(self.pooling)!r} gives {gives}, not {own}; take the task's own pooling"
+            )
 
 
-def _towards(bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]) -> Float[Tensor, "*b n c 1"]:
+def _towards(
+    bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]
+) -> Float[Tensor, "*b n c 1"]:
     """Signal of Gaussians towards transmitters at these offsets [m], before the factor of the constant harmonic."""
     if bands.shape[-1] == 1:
         return bands

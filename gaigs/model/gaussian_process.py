@@ -1,4 +1,6 @@
-"""Gaussian process regression over a trend (kriging): the strongest simple predictor from positions."""
+"""Gaussian process regression over a trend (kriging): the strongest simple predictor from
+positions.
+"""
 
 import math
 from collections.abc import Iterator
@@ -29,47 +31,61 @@ from gaigs.model import LookUp, Model, Prediction, build_trend
 from gaigs.registry import name_of, register
 
 NEIGHBOURS = 300
-"""Known links that enter each prediction of local kriging: with this kernel near links screen those behind them."""
+"""Known links that enter each prediction of local kriging: with this kernel near links screen those
+behind them.
+"""
 
 
 @register("model", "gaussian_process")
 class GaussianProcess(LookUp):
-    """label = trend + z + noise, z a Gaussian process over places with the Matern-1/2 kernel exp(-d / l).
+    """label = trend + z + noise, z a Gaussian process over places with the Matern-1/2 kernel exp(-d
+    / l).
 
-    d is the distance of transmitters. With several carriers it is the distance in place and frequency,
-    d² = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are processes of their own with one
-    kernel.
+    d is the distance of transmitters. With several carriers it is the distance in place and
+    frequency, d² = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are
+    processes of their own with one kernel.
 
-    Length l [m], nugget (variance of the noise over that of the signal) and s [m] maximise the likelihood of the
-    validation links given the training links around them, see ``gaigs.kriging.fit``. All receivers share the three.
-    The signal's variance is each receiver's most likely one.
+    Length l [m], nugget (variance of the noise over that of the signal) and s [m] maximise the
+    likelihood of the validation links given the training links around them, see
+    ``gaigs.kriging.fit``. All receivers share the three. The signal's variance is each receiver's
+    most likely one.
 
-    Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` instead: kernel, noise and trend are those
-    with which folds of the known links are most likely, and each receiver has hyperparameters of its own. Of a receiver
-    with more than ``LIMIT`` known links an even part is used.
+    Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` instead: kernel, noise and
+    trend are those with which folds of the known links are most likely, and each receiver has
+    hyperparameters of its own. Of a receiver with more than ``LIMIT`` known links an even part is
+    used.
 
-    A receiver with more than ``LIMIT`` known links is predicted from the ``NEIGHBOURS`` nearest to each query (local
-    kriging). Residuals of channels are limited to ``kriging.fit.LOUDEST`` times the receiver's median channel.
+    A receiver with more than ``LIMIT`` known links is predicted from the ``NEIGHBOURS`` nearest to
+    each query (local kriging). Residuals of channels are limited to ``kriging.fit.LOUDEST`` times
+    the receiver's median channel.
 
     Args:
-        trend: Configuration of the model whose residuals the process describes. None: ``friis`` for channels, else each
-            receiver's mean label; for labels of one real number this or ``path_loss``.
+        trend: Configuration of the model whose residuals the process describes. None: ``friis`` for
+            channels, else each receiver's mean label; for labels of one real number this or
+            ``path_loss``.
 
     Raises:
         ValueError: The trend is a trained model.
 
-    Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7 and 5.4.2.
+    Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7
+    and 5.4.2.
     """
 
     learnt = ("chosen",)
 
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
-        names = ("mean", "path_loss") if scene.task.is_scalar else ("friis" if isinstance(scene.task, Csi) else "mean",)
+        names = (
+            ("mean", "path_loss")
+            if scene.task.is_scalar
+            else ("friis" if isinstance(scene.task, Csi) else "mean",)
+        )
         given = [{"name": name} for name in names] if trend is None else [trend]
         self.trends = tuple(build_trend(one, scene) for one in given)
         if any([*built.parameters()] for built in self.trends):
-            raise ValueError(f"model.trend cannot be trained, got {trend['name']}; take mean, path_loss or friis")
+            raise ValueError(
+                f"model.trend cannot be trained, got {trend['name']}; take mean, path_loss or friis"
+            )
         self.chosen = 0
         self.scalar = nn.ModuleList([ScalarProcess(scene)] if scene.task.is_scalar else [])
         self.factors: Tensor | None = None
@@ -92,8 +108,8 @@ class GaussianProcess(LookUp):
         self._fit(links, chooses=True)
 
     def refit(self, links: Links) -> None:
-        """As ``fit``, for some of the known links: hyperparameters stay; of labels of one number kernel, noise and the
-        choice of the trend."""
+        """As ``fit``, for some of the known links: hyperparameters stay; of labels of one number
+        kernel, noise and the choice of the trend."""
         self._fit(links, chooses=False)
 
     @torch.no_grad()
@@ -128,14 +144,21 @@ class GaussianProcess(LookUp):
             # Without a factor, the mean square instead of the most likely variance.
             wide = left.to(torch.promote_types(left.dtype, torch.float64))
             root = (1 + self.process.nugget) ** 0.5
-            white = wide / root if factor is None else torch.linalg.solve_triangular(factor.to(wide), wide, upper=False)
+            white = (
+                wide / root
+                if factor is None
+                else torch.linalg.solve_triangular(factor.to(wide), wide, upper=False)
+            )
             self.signals.append(white.abs().square().mean().sqrt().item())
 
     def _fit_scalar(self, links: Links, chooses: bool) -> None:
         index = torch.cat(known_links(links))
         query, process = links.query[index], self.scalar[0]
         left = lambda trend: (links.labels[index] - trend(Batch(query)).value).double()
-        known, folds = (coordinates(self.scene, query, 1.0), query.receivers), folds_of(links, index)
+        known, folds = (
+            (coordinates(self.scene, query, 1.0), query.receivers),
+            folds_of(links, index),
+        )
         with stage("gaussian_process", len(self.trends) + 4 if chooses else 1):
             if chooses:
                 self.chosen = process.fit(*known, [left(trend) for trend in self.trends], folds)
@@ -157,8 +180,14 @@ class GaussianProcess(LookUp):
         return self.trend.at_frequencies(frequencies)
 
     def facts(self) -> dict[str, object]:
-        """``length_m``, ``nugget``, with several carriers ``frequency_scale_m``; of scalars the other choices."""
-        return {**self.scalar[0].facts(), "trend": name_of(self.trend)} if self.scalar else {**self.process.facts()}
+        """``length_m``, ``nugget``, with several carriers ``frequency_scale_m``; of scalars the
+        other choices.
+        """
+        return (
+            {**self.scalar[0].facts(), "trend": name_of(self.trend)}
+            if self.scalar
+            else {**self.process.facts()}
+        )
 
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query
@@ -180,7 +209,10 @@ class GaussianProcess(LookUp):
         places = self._places(query)
         found = torch.zeros_like(places[:, 0])
         for receiver in query.receivers.unique().tolist():
-            own, known = query.receivers == receiver, self._places(self.links.query[self.known[receiver]])
+            own, known = (
+                query.receivers == receiver,
+                self._places(self.links.query[self.known[receiver]]),
+            )
             found[own] = self.signals[receiver] * local_deviations(places[own], known, self.process)
         return found
 
@@ -198,10 +230,16 @@ class GaussianProcess(LookUp):
         """Cholesky factor of a receiver's covariances; None for local kriging."""
         if len(index) > LIMIT:
             return None
-        return cholesky_factor(self._places(self.links.query[index]), self.process.length, self.process.nugget)
+        return cholesky_factor(
+            self._places(self.links.query[index]), self.process.length, self.process.nugget
+        )
 
-    def _solve(self, index: Int[Tensor, " k"], factor: Tensor | None) -> tuple[Tensor | None, Tensor | None]:
-        """A receiver's residuals over their covariances or, if smaller, the covariances' factor; None for neither."""
+    def _solve(
+        self, index: Int[Tensor, " k"], factor: Tensor | None
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """A receiver's residuals over their covariances or, if smaller, the covariances' factor;
+        None for neither.
+        """
         if factor is None or math.prod(self.scene.task.shape) >= len(index):
             return None, factor
         residuals = torch.cat([*self._residuals(index)]).reshape(len(index), -1)

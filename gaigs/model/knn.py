@@ -10,7 +10,14 @@ from torch import Tensor
 from gaigs.core.query import Batch, Query, evenly
 from gaigs.core.scene import Scene
 from gaigs.data import Links
-from gaigs.kriging.links import at_directions, coordinates, distances, folds_of, known_links, scale_bounds
+from gaigs.kriging.links import (
+    at_directions,
+    coordinates,
+    distances,
+    folds_of,
+    known_links,
+    scale_bounds,
+)
 from gaigs.model import LookUp, Prediction
 from gaigs.registry import register
 
@@ -22,18 +29,20 @@ COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 class KNearestNeighbours(LookUp):
     """The mean of the k known labels nearest to the transmitter, weighted by 1 / distance^power.
 
-    Links as near as the k-th count too, so that the order of links does not matter. Channels of unknown phase are
-    aligned to the nearest. The look-up keeps all links, one byte a pixel for images.
+    Links as near as the k-th count too, so that the order of links does not matter. Channels of
+    unknown phase are aligned to the nearest. The look-up keeps all links, one byte a pixel for
+    images.
 
-    Where the training links have several carriers, the distance is that in place and frequency,
-    d² = |dx|² + (s d ln f)². ``fit`` takes the scale s [m] with the least squared error of known links that are
-    predicted from those at other places.
+    Where the training links have several carriers, the distance is that in place and frequency, d²
+    = |dx|² + (s d ln f)². ``fit`` takes the scale s [m] with the least squared error of known links
+    that are predicted from those at other places.
 
     Args:
-        k: Number of neighbours; with fewer known links, all of them. None: 3, or of noisy labels that of ``COUNTS``
-            with the least error of known links that are predicted from those of other folds, see
-            ``gaigs.kriging.links.folds_of``.
-        power: Exponent of the distance; 0 weights all neighbours equally. None: 2, or 1 of noisy labels.
+        k: Number of neighbours; with fewer known links, all of them. None: 3, or of noisy labels
+            that of ``COUNTS`` with the least error of known links that are predicted from those of
+            other folds, see ``gaigs.kriging.links.folds_of``.
+        power: Exponent of the distance; 0 weights all neighbours equally. None: 2, or 1 of noisy
+            labels.
 
     Source: reference look-up of the data sets' own README; Shepard, 1968.
     """
@@ -52,11 +61,20 @@ class KNearestNeighbours(LookUp):
         self.scale = math.nan
 
     def fit(self, links: Links) -> None:
-        """Keeps the links, and chooses the scale of frequencies, and the number of neighbours if it is None."""
-        self.links, self.known, self.scale, self.chosen = links, known_links(links), math.nan, self.k or 3
+        """Keeps the links, and chooses the scale of frequencies, and the number of neighbours if it
+        is None.
+        """
+        self.links, self.known, self.scale, self.chosen = (
+            links,
+            known_links(links),
+            math.nan,
+            self.k or 3,
+        )
         if self.scene.has_band:
             low, high = scale_bounds(self.scene)
-            scales = torch.logspace(math.log10(low), math.log10(high), 16, dtype=torch.float64).tolist()
+            scales = torch.logspace(
+                math.log10(low), math.log10(high), 16, dtype=torch.float64
+            ).tolist()
             self.scale = min(scales, key=self._squared_error)
         if self.k is None:
             folds = [folds_of(links, index) for index in self.known]
@@ -76,12 +94,18 @@ class KNearestNeighbours(LookUp):
             labels[own] = self._look_up(apart, self.known[receiver])
         return Prediction(at_directions(labels, batch, self.scene), {})
 
-    def _distances(self, query: Query, index: Int[Tensor, " k"], scale: float) -> Float[Tensor, "b k"]:
-        asked, known = (coordinates(self.scene, part, scale) for part in (query, self.links.query[index]))
+    def _distances(
+        self, query: Query, index: Int[Tensor, " k"], scale: float
+    ) -> Float[Tensor, "b k"]:
+        asked, known = (
+            coordinates(self.scene, part, scale) for part in (query, self.links.query[index])
+        )
         return distances(asked, known)
 
     def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, " k"]) -> Tensor:
-        """Labels from those of known links and their distances; links at an infinite distance are left out."""
+        """Labels from those of known links and their distances; links at an infinite distance are
+        left out.
+        """
         farthest = apart.topk(min(self.chosen, len(index)), largest=False).values[:, -1:]
         near = (apart <= farthest) & apart.isfinite()
         # A transmitter within a micrometre of a measured one gets that label.
@@ -95,11 +119,19 @@ class KNearestNeighbours(LookUp):
         rows = []
         for own, first in zip(weights[:, used], apart[:, used].argmin(1).tolist(), strict=True):
             near = own.nonzero()[:, 0]
-            rows.append(torch.tensordot(own[near].to(labels), align(labels[near], labels[first : first + 1]), 1))
+            rows.append(
+                torch.tensordot(
+                    own[near].to(labels), align(labels[near], labels[first : first + 1]), 1
+                )
+            )
         return torch.stack(rows)
 
-    def _held_out(self, folds: Sequence[Int[Tensor, " _"]] | None = None) -> Iterator[tuple[Tensor, Tensor]]:
-        """Labels of known links, and what links of other folds predict for them, or for None those at other places."""
+    def _held_out(
+        self, folds: Sequence[Int[Tensor, " _"]] | None = None
+    ) -> Iterator[tuple[Tensor, Tensor]]:
+        """Labels of known links, and what links of other folds predict for them, or for None those
+        at other places.
+        """
         for receiver, index in enumerate(self.known):
             for rows in evenly(torch.arange(len(index)), max(1, 256 // len(self.known))).split(32):
                 asked, known = self.links.query[index[rows]], self.links.query[index]
@@ -110,16 +142,24 @@ class KNearestNeighbours(LookUp):
                 found = apart.isfinite().any(1)  # a place may be the only one
                 if found.any():
                     values = self._look_up(apart[found], index)
-                    yield self.scene.task.align(self.links.labels[index[rows[found]]], values), values
+                    yield (
+                        self.scene.task.align(self.links.labels[index[rows[found]]], values),
+                        values,
+                    )
 
     def _squared_error(self, scale: float) -> float:
         self.scale = scale
-        errors = [(values - labels).abs().double().square().flatten() for labels, values in self._held_out()]
+        errors = [
+            (values - labels).abs().double().square().flatten()
+            for labels, values in self._held_out()
+        ]
         return torch.cat(errors).mean().item() if errors else 0.0
 
     def _rank(self, count: int, folds: Sequence[Int[Tensor, " _"]]) -> float:
         """Mean score of known links by some neighbours, an error or a negative similarity."""
         self.chosen, task = count, self.scene.task
-        scores = [task.scores(labels, values)[task.monitor] for labels, values in self._held_out(folds)]
+        scores = [
+            task.scores(labels, values)[task.monitor] for labels, values in self._held_out(folds)
+        ]
         mean = torch.cat(scores).mean().item() if scores else 0.0
         return -mean if task.higher_is_better else mean

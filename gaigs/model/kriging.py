@@ -19,7 +19,15 @@ from gaigs.data import Links
 from gaigs.kriging.field import Field
 from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters
 from gaigs.kriging.kernel import LIMIT, Process
-from gaigs.kriging.links import PART, coordinates, folds_of, scaled, single_readings, thinned, without_gross_errors
+from gaigs.kriging.links import (
+    PART,
+    coordinates,
+    folds_of,
+    scaled,
+    single_readings,
+    thinned,
+    without_gross_errors,
+)
 from gaigs.kriging.paths import Equations, PathField, PathProcess
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, Wrapper, call_optional
@@ -33,35 +41,42 @@ WEIGHTS = (1.0, 0.75, 0.5, 0.25, 0.0)
 
 @register("model", "kriging")
 class Kriging(Wrapper):
-    """weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend, z the kriged residual.
+    """weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend, z the
+    kriged residual.
 
-    The trend is a trained model. The fallback is a model that is fitted at once. z is the mean of a Gaussian process
-    over places, as in ``gaigs.model.gaussian_process``, and 0 far from all known links. With a trend weight of 0 and a
-    weight of 1 this is that process, but for the hyperparameters of labels of one real number.
+    The trend is a trained model. The fallback is a model that is fitted at once. z is the mean of a
+    Gaussian process over places, as in ``gaigs.model.gaussian_process``, and 0 far from all known
+    links. With a trend weight of 0 and a weight of 1 this is that process, but for the
+    hyperparameters of labels of one real number.
 
-    Trend weight, length and nugget maximise the likelihood of the validation links given the training links around
-    them. The weight is the one with which the validation links, predicted from the training links, score best: the
-    likelihood alone would trust kriging too far where cubes of space are held out.
+    Trend weight, length and nugget maximise the likelihood of the validation links given the
+    training links around them. The weight is the one with which the validation links, predicted
+    from the training links, score best: the likelihood alone would trust kriging too far where
+    cubes of space are held out.
 
-    Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` as z, with hyperparameters of each receiver.
-    Their trend weight is the mean of the candidates, each as likely as it makes the validation links, with all readings
-    of a place as one: without such links a half. Their weight is 1.
+    Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` as z, with hyperparameters
+    of each receiver. Their trend weight is the mean of the candidates, each as likely as it makes
+    the validation links, with all readings of a place as one: without such links a half. Their
+    weight is 1.
 
-    Of a trend whose paths have ``margins``, strengths are kriged path by path, and phases stay those of the geometry.
-    The process is always the same, and the weight 1 or 0. Where the validation links say that kriged labels are better
-    by more than chance, as of places closer than half a wavelength, those are taken.
+    Of a trend whose paths have ``margins``, strengths are kriged path by path, and phases stay
+    those of the geometry. The process is always the same, and the weight 1 or 0. Where the
+    validation links say that kriged labels are better by more than chance, as of places closer than
+    half a wavelength, those are taken.
 
-    A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal components. Of a receiver
-    with more than ``LIMIT`` known links an even part is used.
+    A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal
+    components. Of a receiver with more than ``LIMIT`` known links an even part is used.
 
     Args:
         trend: The trained model, or its configuration if a state is to be loaded.
-        fallback: Configuration of the model that takes the rest of the trend weight; None: each receiver's mean label.
+        fallback: Configuration of the model that takes the rest of the trend weight; None: each
+            receiver's mean label.
 
     Raises:
         ValueError: The trend has no training, or the fallback is trained or needs its data.
 
-    Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7 and 5.4.2.
+    Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7
+    and 5.4.2.
     """
 
     trend_weight: Tensor
@@ -70,12 +85,20 @@ class Kriging(Wrapper):
 
     def __init__(self, scene: Scene, trend: dict | Model, fallback: dict | None = None):
         super().__init__(scene)
-        self.trend = trend if isinstance(trend, Model) else registry("model").build(trend, scene=scene)
+        self.trend = (
+            trend if isinstance(trend, Model) else registry("model").build(trend, scene=scene)
+        )
         if not [*self.trend.parameters()]:
-            raise ValueError(f"kriging needs a trained model, got {name_of(self.trend)}; leave kriging out")
+            raise ValueError(
+                f"kriging needs a trained model, got {name_of(self.trend)}; leave kriging out"
+            )
         self.fallback_options = {"name": "mean"} if fallback is None else fallback
         self.fallback = registry("model").build(self.fallback_options, scene=scene)
-        if isinstance(self.fallback, LookUp) or not self.fallback.state_dict() or [*self.fallback.parameters()]:
+        if (
+            isinstance(self.fallback, LookUp)
+            or not self.fallback.state_dict()
+            or [*self.fallback.parameters()]
+        ):
             name = self.fallback_options["name"]
             raise ValueError(f"kriging_fallback cannot be {name}; take mean, path_loss or friis")
         self.chunk = self.trend.chunk
@@ -103,10 +126,12 @@ class Kriging(Wrapper):
 
     @torch.no_grad()
     def krige(self, links: Links, is_final: bool = True, by_paths: bool | None = None) -> "Kriging":
-        """Fits, and gives the validation model: the same weights and hyperparameters on the training links alone.
+        """Fits, and gives the validation model: the same weights and hyperparameters on the
+        training links alone.
 
-        If not ``is_final``, only the validation model is fitted, without a word. ``by_paths`` says if strengths of
-        paths are kriged, or whole labels; None: ``FEWEST`` validation links or more choose.
+        If not ``is_final``, only the validation model is fitted, without a word. ``by_paths`` says
+        if strengths of paths are kriged, or whole labels; None: ``FEWEST`` validation links or more
+        choose.
         """
         if self.is_scalar:
             links = without_gross_errors(links)
@@ -120,8 +145,13 @@ class Kriging(Wrapper):
         if by_paths or (has_paths and by_paths is None and is_few):
             return self._krige_paths(links, values, is_final)
         if has_paths and by_paths is None:
-            models = self._krige_labels(links, values, False), self._krige_paths(links, values, is_final)
-            scores = self._validation_scores(links, (predicted(model, links, held) for model in models))
+            models = (
+                self._krige_labels(links, values, False),
+                self._krige_paths(links, values, is_final),
+            )
+            scores = self._validation_scores(
+                links, (predicted(model, links, held) for model in models)
+            )
             if not is_surely_better(*scores):
                 return models[1]
             if is_final:
@@ -134,9 +164,11 @@ class Kriging(Wrapper):
         return self._krige_labels(links, values, is_final)
 
     def _most(self, links: Links) -> int:
-        """Most known links of a receiver: ``LIMIT``, or those whose three predictions take a third of the time left.
+        """Most known links of a receiver: ``LIMIT``, or those whose three predictions take a third
+        of the time left.
 
-        The trained model predicts the links once, and once more for each half of the validation links.
+        The trained model predicts the links once, and once more for each half of the validation
+        links.
         """
         if math.isinf(stages.left()):
             return LIMIT
@@ -147,7 +179,9 @@ class Kriging(Wrapper):
         each = max(time.monotonic() - began, 1e-9) / len(some)
         return int(min(LIMIT, max(100, stages.left() / 9 / each / len(links.receivers))))
 
-    def _validation_scores(self, links: Links, values: Iterable[Tensor]) -> list[Float[Tensor, " k"]]:
+    def _validation_scores(
+        self, links: Links, values: Iterable[Tensor]
+    ) -> list[Float[Tensor, " k"]]:
         """Monitored scores of predictions of the validation links, higher ones better."""
         task, labels = links.task, links.labels[links.split.validation]
         sign = 1 if task.higher_is_better else -1
@@ -160,10 +194,13 @@ class Kriging(Wrapper):
         model = self._validation_model(links, values)
         is_unlearnt = False
         if len(held):
-            own, other = self._validation_scores(links, (trend, predicted(model.fallback, links, held)))
+            own, other = self._validation_scores(
+                links, (trend, predicted(model.fallback, links, held))
+            )
             is_unlearnt = is_surely_better(other, own)
         if is_unlearnt and not self.is_scalar:
-            # The likelihood may still mix it in: where the score is higher without it, it is left out.
+            # The likelihood may still mix it in: where the score is higher without it, it is left
+            # out.
             models = model, self._validation_model(links, values, (0.0,))
             scores = self._validation_scores(links, (predicted(one, links, held) for one in models))
             model = models[int(scores[1].mean() > scores[0].mean())]
@@ -182,8 +219,12 @@ class Kriging(Wrapper):
             self._log()
         return model
 
-    def _validation_model(self, links: Links, values: Tensor, weights: Sequence[float] = WEIGHTS) -> "Kriging":
-        """Fits weights and hyperparameters, the trend weight one of ``weights``; a model of the training links."""
+    def _validation_model(
+        self, links: Links, values: Tensor, weights: Sequence[float] = WEIGHTS
+    ) -> "Kriging":
+        """Fits weights and hyperparameters, the trend weight one of ``weights``; a model of the
+        training links.
+        """
         split = links.split
         self._fit_trend_weight(links, values, weights)
         training = replace(links, split=split.validating())
@@ -207,8 +248,8 @@ class Kriging(Wrapper):
     def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` for a trend of paths.
 
-        The weight is 1 if ``FEWEST`` validation links or more have a mean score that rises by more than 1.5 standard
-        errors, else 0.
+        The weight is 1 if ``FEWEST`` validation links or more have a mean score that rises by more
+        than 1.5 standard errors, else 0.
         """
         self._make_fields(True)
         split, task, index = links.split, links.task, links.split.known
@@ -217,13 +258,22 @@ class Kriging(Wrapper):
         residuals = aligned - values
         trend: Any = self.trend
         device = self.weight.device
-        equations, own = [], [(query.receivers == receiver).nonzero()[:, 0] for receiver in range(len(self.fields))]
+        equations, own = (
+            [],
+            [(query.receivers == receiver).nonzero()[:, 0] for receiver in range(len(self.fields))],
+        )
         for rows in own:
             margins = lambda part, rows=rows: trend.margins(query[rows[part]].to(device)).cpu()
-            equations.append(Equations.of(query.transmitters[rows], margins, aligned[rows], residuals[rows]))
+            equations.append(
+                Equations.of(query.transmitters[rows], margins, aligned[rows], residuals[rows])
+            )
         validation_model = Kriging(self.scene, self.trend, self.fallback_options)
         held = torch.arange(len(split.train), len(index))
-        plain, kriged, process = values[held], values[held].clone(), PathProcess.usual(self.scene.spacing)
+        plain, kriged, process = (
+            values[held],
+            values[held].clone(),
+            PathProcess.usual(self.scene.spacing),
+        )
         for rows, field, known_ones in zip(own, validation_model.fields, equations, strict=True):
             field.solve(known_ones[rows < len(split.train)], process)
             for row in stages.track(rows[rows >= len(split.train)].tolist(), "kriging"):
@@ -231,7 +281,9 @@ class Kriging(Wrapper):
                 margins = trend.margins(query[row : row + 1].to(device)).cpu()[0]
                 kriged[row - len(split.train)] += torch.tensordot(strengths.to(kriged), margins, 1)
         enough = len(single_readings(links, split.validation)) >= FEWEST
-        helps = enough and is_surely_better(*self._validation_scores(links, (kriged, plain)), errors=1.5)
+        helps = enough and is_surely_better(
+            *self._validation_scores(links, (kriged, plain)), errors=1.5
+        )
         for model in (self, validation_model) if is_final else (validation_model,):
             model.trend_weight.fill_(1)
             model.weight.fill_(helps)
@@ -263,7 +315,10 @@ class Kriging(Wrapper):
         return (PathProcess if self.by_paths else Hyperparameters)(*self.hyperparameters.tolist())
 
     def _log(self) -> None:
-        log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()))
+        log.info(
+            "kriging: %s",
+            ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()),
+        )
 
     def deviations(self, batch: Batch) -> Tensor:
         """Standard deviations of the labels; of spectra means over their pixels.
@@ -274,7 +329,9 @@ class Kriging(Wrapper):
         if self.is_scalar:
             return self.process.deviations(coordinates(self.scene, query, 1.0), query.receivers)
         process = self._hyperparameters
-        places = query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
+        places = (
+            query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
+        )
         found = places.new_zeros(len(query), *(self.scene.task.shape if self.by_paths else ()))
         trend: Any = self.trend
         for receiver in query.receivers.unique().tolist():
@@ -288,30 +345,49 @@ class Kriging(Wrapper):
         return found.sqrt()
 
     def _fit_trend_weight(self, links: Links, values: Tensor, weights: Sequence[float]) -> None:
-        """Fits the trend weight, one of ``weights``, and the hyperparameters; ``values`` as for ``_krige_labels``."""
+        """Fits the trend weight, one of ``weights``, and the hyperparameters; ``values`` as for
+        ``_krige_labels``.
+        """
         index = links.split.known
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
         residuals: dict[float, Any] = {trend_weight: [] for trend_weight in weights}
         for part in torch.arange(len(index)).split(PART):
-            trio = links.labels[index[part]], values[part], predicted(self.fallback, links, index[part])
+            trio = (
+                links.labels[index[part]],
+                values[part],
+                predicted(self.fallback, links, index[part]),
+            )
             # Labels that are never turned count number by number, and few numbers are enough.
-            labels, trend, fallback = map(thin_labels, trio) if type(links.task).align is Task.align else trio
+            labels, trend, fallback = (
+                map(thin_labels, trio) if type(links.task).align is Task.align else trio
+            )
             for trend_weight, parts in residuals.items():
                 mean = blend(links.task, trend, fallback, trend_weight)
                 parts.append(thin_labels(links.task.align(labels, mean) - mean))
 
         if self.is_scalar:
             query = links.query[index]
-            left = [torch.cat(residuals[trend_weight]).flatten().double() for trend_weight in WEIGHTS]
-            readings, folds = (coordinates(self.scene, query, 1.0), query.receivers), folds_of(links, index)
-            # Training links' own residuals are too small, as the trend was trained on them: validation links decide.
-            held = torch.arange(len(links.split.train), len(index)) if len(links.split.validation) else None
+            left = [
+                torch.cat(residuals[trend_weight]).flatten().double() for trend_weight in WEIGHTS
+            ]
+            readings, folds = (
+                (coordinates(self.scene, query, 1.0), query.receivers),
+                folds_of(links, index),
+            )
+            # Training links' own residuals are too small, as the trend was trained on them:
+            # validation links decide.
+            held = (
+                torch.arange(len(links.split.train), len(index))
+                if len(links.split.validation)
+                else None
+            )
 
             def refit(values: Tensor) -> float:
                 self.process.logarithms, self.process.choice = start
                 return self.process.refit(*readings, values, folds, held)
 
-            # Maximisations of the likelihood: 5 of the fit, 2 of each refit, or 1 without validation links.
+            # Maximisations of the likelihood: 5 of the fit, 2 of each refit, or 1 without
+            # validation links.
             with stages.stage("kriging", 6 if held is None else 5 + 2 * (len(left) + 1)):
                 self.process.cpu().fit(*readings, left[-1:], folds)
                 start = self.process.logarithms, self.process.choice
@@ -320,7 +396,9 @@ class Kriging(Wrapper):
                     # Readings at one place err together: they count as one.
                     each = len(held) / len(query.transmitters[held].unique(dim=0))
                     costs = torch.tensor([refit(values) for values in left], dtype=torch.float64)
-                    shares = torch.softmax(-costs.clamp_min(-1e300) / each, 0)  # -inf if a trend explains all
+                    shares = torch.softmax(
+                        -costs.clamp_min(-1e300) / each, 0
+                    )  # -inf if a trend explains all
                 refit(shares @ torch.stack(left))
             self.trend_weight.fill_(shares @ torch.tensor(WEIGHTS, dtype=torch.float64))
             return
@@ -328,10 +406,17 @@ class Kriging(Wrapper):
         def fitted(trend_weight: float, **options: int) -> tuple[Hyperparameters, float]:
             left = torch.cat(residuals[trend_weight])
             if left.is_complex():
-                left = left * damping(left, thin_labels(links.labels[index]), links.query.receivers[index])[:, None]
+                left = (
+                    left
+                    * damping(left, thin_labels(links.labels[index]), links.query.receivers[index])[
+                        :, None
+                    ]
+                )
             return fit_hyperparameters(self.scene, links, lambda some: left[rows[some]], **options)
 
-        found = {trend_weight: fitted(trend_weight) for trend_weight in stages.track(weights, "kriging")}
+        found = {
+            trend_weight: fitted(trend_weight) for trend_weight in stages.track(weights, "kriging")
+        }
         best = min(weights, key=lambda trend_weight: found[trend_weight][1])
         # Residuals of a good trend correlate weakly with position: few links would overfit.
         process, _ = fitted(best, most=1000) if best else found[best]
@@ -347,7 +432,12 @@ class Kriging(Wrapper):
             left = torch.empty(len(rows), *self.scene.task.shape, dtype=self.scene.task.dtype)
             for part in torch.arange(len(rows)).split(PART):
                 some = rows[part]
-                mean = blend(links.task, values[some], predicted(self.fallback, links, index[some]), trend_weight)
+                mean = blend(
+                    links.task,
+                    values[some],
+                    predicted(self.fallback, links, index[some]),
+                    trend_weight,
+                )
                 left[part] = (links.task.align(labels[some], mean) - mean).to(left)
             if left.is_complex():
                 left = left * damping(left, labels[rows], query.receivers[rows])[:, None, None]
@@ -361,11 +451,14 @@ class Kriging(Wrapper):
         process = self._hyperparameters
         for receiver, field in enumerate(stages.track(self.fields, "kriging")):
             rows = (query.receivers == receiver).nonzero()[:, 0]
-            field.solve(coordinates(self.scene, query[rows], process.scale), residuals(rows), process)
+            field.solve(
+                coordinates(self.scene, query[rows], process.scale), residuals(rows), process
+            )
 
     def forward(self, batch: Batch) -> Prediction:
         query, trend_weight, weight = batch.query, self.trend_weight.item(), self.weight.item()
-        # A part without weight is not evaluated: that would cost its time, and a NaN of it would count.
+        # A part without weight is not evaluated: that would cost its time, and a NaN of it would
+        # count.
         trend = self.trend(batch).value if trend_weight > 0 or weight < 1 else None
         if weight == 0:
             return Prediction(trend, {})
@@ -375,7 +468,9 @@ class Kriging(Wrapper):
             levels = self.process(coordinates(self.scene, query, 1.0), query.receivers).to(value)
             return Prediction(blend(task, value + levels, trend, weight), {})
         process = self._hyperparameters
-        places = query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
+        places = (
+            query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
+        )
         for receiver in query.receivers.unique().tolist():
             own = query.receivers == receiver
             if self.by_paths:
@@ -391,7 +486,9 @@ class Kriging(Wrapper):
         return self._alone.any_frequency
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
-        """The trend alone, or the fallback: residuals at other frequencies do not correlate with the known ones."""
+        """The trend alone, or the fallback: residuals at other frequencies do not correlate with
+        the known ones.
+        """
         return self._alone.at_frequencies(frequencies)
 
     @property
@@ -404,7 +501,10 @@ class Kriging(Wrapper):
 
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
-        facts: dict[str, Any] = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
+        facts: dict[str, Any] = {
+            "weight": self.weight.item(),
+            "trend_weight": self.trend_weight.item(),
+        }
         if self.is_scalar:
             facts |= {**self.process.facts(), "links": len(self.process.places)}
             return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
@@ -417,23 +517,31 @@ class Kriging(Wrapper):
 
 
 def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -> Tensor:
-    """weight one + (1 - weight) other, a tensor of its own; of channels of unknown phase, ``one`` is aligned to
-    ``other``. A part without weight may be None: it is not read, since a NaN of it would count.
+    """weight one + (1 - weight) other, a tensor of its own; of channels of unknown phase, ``one``
+    is aligned to ``other``. A part without weight may be None: it is not read, since a NaN of it
+    would count.
     """
     if weight in (0, 1):
         return (one if weight else other).clone()
     return torch.add(weight * task.align(one, other), other, alpha=1 - weight)
 
 
-def is_surely_better(one: Float[Tensor, " k"], other: Float[Tensor, " k"], *, errors: float = 2.0) -> bool:
+def is_surely_better(
+    one: Float[Tensor, " k"], other: Float[Tensor, " k"], *, errors: float = 2.0
+) -> bool:
     """True if scores are higher by more than some standard errors; False of fewer than two."""
     gain = one - other
     return len(gain) > 1 and bool(gain.mean() > errors * gain.std() / math.sqrt(len(gain)))
 
 
 def predicted(
-    model: Model, links: Links, index: Int[Tensor, " k"], frequencies: Float[Tensor, " s"] | None = None
+    model: Model,
+    links: Links,
+    index: Int[Tensor, " k"],
+    frequencies: Float[Tensor, " s"] | None = None,
 ) -> Tensor:
-    """Predictions of a model for some links, on the CPU; of channels at other subcarriers, if they are given [Hz]."""
+    """Predictions of a model for some links, on the CPU; of channels at other subcarriers, if they
+    are given [Hz].
+    """
     values = model.predict_batches(links.query[index], batch_size=64, frequencies=frequencies)
     return torch.cat([part.cpu() for part in values])

@@ -27,7 +27,9 @@ class Mean(Model):
         for receiver, index in enumerate(known_links(links)):
             wide = torch.promote_types(self.scene.task.dtype, torch.float64)
             first, align = links.labels[index[:1]], self.scene.task.align
-            total = sum(align(links.labels[part], first).sum(0).to(wide) for part in index.split(256))
+            total = sum(
+                align(links.labels[part], first).sum(0).to(wide) for part in index.split(256)
+            )
             self.means[receiver] = (total / len(index)).to(self.means)
 
     def forward(self, batch: Batch) -> Prediction:

@@ -43,12 +43,14 @@ log = logging.getLogger(__name__)
 class MirroredSplatting(GaussianSplatting):
     """The splatting pipeline with Gaussians at mirror images, learnt from coarse to fine.
 
-    ``ChannelSearch`` locates planes of channels before the training, ``LagSearch`` those of spectra. Of signal strength
-    powers come first, which teach obstacles; then ``LevelSearch`` locates planes by phases. Where frequencies are
-    unknown, powers add to the end. Labels that none of them can read start from the faces of the box; each plane is
-    then turned square to the others and moved along its normal to the least error.
+    ``ChannelSearch`` locates planes of channels before the training, ``LagSearch`` those of
+    spectra. Of signal strength powers come first, which teach obstacles; then ``LevelSearch``
+    locates planes by phases. Where frequencies are unknown, powers add to the end. Labels that none
+    of them can read start from the faces of the box; each plane is then turned square to the others
+    and moved along its normal to the least error.
 
-    Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that suits it.
+    Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that
+    suits it.
 
     Source: ours; docs/methods.md.
     """
@@ -71,7 +73,17 @@ class MirroredSplatting(GaussianSplatting):
         gaussians: Mapping | None = None,
         trend: str | Mapping | Model | None = None,
     ):
-        super().__init__(scene, placement, tokenizer, deformation, projection, rasterizer, pooling, gaussians, trend)
+        super().__init__(
+            scene,
+            placement,
+            tokenizer,
+            deformation,
+            projection,
+            rasterizer,
+            pooling,
+            gaussians,
+            trend,
+        )
 
     @staticmethod
     def own_pooling(scene: Scene) -> str:
@@ -84,9 +96,9 @@ class MirroredSplatting(GaussianSplatting):
         """Fits the pipeline, and keeps some links for the report of the paths' powers.
 
         Spectra start from planes that ``LagSearch`` finds in them, channels without a trend from
-        those of ``ChannelSearch``; channels of fewer than ``FEWEST`` numbers from free space, and then the faces of the
-        box. Each receiver's gain is that over its training links, as of ``friis``, or 0.1 where phases say nothing: a
-        louder start would be worse than nothing.
+        those of ``ChannelSearch``; channels of fewer than ``FEWEST`` numbers from free space, and
+        then the faces of the box. Each receiver's gain is that over its training links, as of
+        ``friis``, or 0.1 where phases say nothing: a louder start would be worse than nothing.
         """
         super().fit(links)
         self.places = export.some(links.query[links.split.train])
@@ -95,7 +107,10 @@ class MirroredSplatting(GaussianSplatting):
         searches = is_known and self.placement.order > 0 and not self.placement.fixed
         if searches and isinstance(self.pooling, PathSpectrum):
             search = LagSearch(
-                links, carriers(self.scene, links.query), self.pooling.beamformer.lags, self.placement.order
+                links,
+                carriers(self.scene, links.query),
+                self.pooling.beamformer.lags,
+                self.placement.order,
             )
             for doubt in search.doubts:
                 log.warning("%s", doubt)
@@ -106,13 +121,21 @@ class MirroredSplatting(GaussianSplatting):
             trend = 0 * links.labels if self.trend is None else self.trend(batch).value.cpu()
             own = trend, self._start(), self.placement.used.tolist(), self.placement.order
             self.levels = LevelSearch(links, carriers(self.scene, links.query), *own)
-        if not (isinstance(task, Csi) and isinstance(self.pooling, ChannelPooling)) or self.trend is not None:
+        if (
+            not (isinstance(task, Csi) and isinstance(self.pooling, ChannelPooling))
+            or self.trend is not None
+        ):
             return
         train, sign, frequencies = links.split.train, int(self.pooling.sign), task.frequencies
         labels, query = links.labels[train], links.query[train]
-        waves = direct_gains(self.scene, query)[:, None, None] * direct_waves(self.scene, query, frequencies, sign)
+        waves = direct_gains(self.scene, query)[:, None, None] * direct_waves(
+            self.scene, query, frequencies, sign
+        )
         own = [query.receivers == receiver for receiver in range(len(self.scene.receivers))]
-        gains = torch.stack([fit_gain(labels[some], waves[some]) for some in own]) / self.pooling.strength.cpu()
+        gains = (
+            torch.stack([fit_gain(labels[some], waves[some]) for some in own])
+            / self.pooling.strength.cpu()
+        )
         gains = torch.where((gains != 0) & (sign != 0), gains, 0.1)
         placement = self.placement
         start = placement.planes[placement.used if placement.walls else placement.used[:0]].cpu()
@@ -137,7 +160,9 @@ class MirroredSplatting(GaussianSplatting):
         return super().predicts_untrained or bool(self.placement.is_bare)
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Loss) -> str:
-        """Lets phases count, and locates planes by them, unless a search has found them; drops what does not help."""
+        """Lets phases count, and locates planes by them, unless a search has found them; drops what
+        does not help.
+        """
         placement = self.placement
         # The labels are sums of waves: powers say nothing alone, and phases count from the start.
         adds_waves = not isinstance(self.pooling, LagPooling)
@@ -145,7 +170,9 @@ class MirroredSplatting(GaussianSplatting):
             placement.enable_reflections()
         # Of planes that a search has found early, too: each path costs time in every step.
         if number == len(self.revisions) - 1 or (number == 1 and placement.found):
-            return prune(placement, [batch for batch in (train, validation) if batch is not None], loss)
+            return prune(
+                placement, [batch for batch in (train, validation) if batch is not None], loss
+            )
         if number < 2 and not adds_waves:
             return "planes stay where they are"
         try:
@@ -157,9 +184,7 @@ class MirroredSplatting(GaussianSplatting):
             if self.levels is not None:
                 placement.locate()
         if self.levels is not None:
-            return (
-                f"{len(self.levels.locate(placement))} planes located by phases, {int(placement.located.sum())} in all"
-            )
+            return f"{len(self.levels.locate(placement))} planes located by phases, {int(placement.located.sum())} in all"
         if placement.fixed or placement.found:
             return "phases count"
         before = loss(train)
@@ -199,7 +224,9 @@ class MirroredSplatting(GaussianSplatting):
 
     @torch.no_grad()
     def margins(self, query: Query) -> Complex[Tensor, "b n e s"]:
-        """Channels by which each path of links to one receiver may deviate, for kriging; see ``Mirrored.margins``."""
+        """Channels by which each path of links to one receiver may deviate, for kriging; see
+        ``Mirrored.margins``.
+        """
         with self.placement.holding():
             self.placement.held = self.placement.margins(query)
             which = torch.arange(len(query), device=query.transmitters.device)
@@ -221,7 +248,8 @@ class MirroredSplatting(GaussianSplatting):
         """Numbers of planes and paths, and the part of each plane, beside the rasterizer."""
         placement = self.placement
         facts = super().facts() | {
-            "num_gaussians": int(placement.kept.sum()) + (0 if self.gaussians is None else len(self.gaussians)),
+            "num_gaussians": int(placement.kept.sum())
+            + (0 if self.gaussians is None else len(self.gaussians)),
             "num_gaussians_start": int(placement.most),
             "planes_kept": len(placement.used),
             "paths_kept": int(placement.kept.sum()),
@@ -232,8 +260,8 @@ class MirroredSplatting(GaussianSplatting):
     def export(self, folder: Path) -> None:
         """Writes ``planes.obj`` and ``obstacles.ply`` beside the free Gaussians.
 
-        Planes end where the paths of the training links meet them; of a loaded model, the paths of links all over the
-        training transmitters' box.
+        Planes end where the paths of the training links meet them; of a loaded model, the paths of
+        links all over the training transmitters' box.
         """
         super().export(folder)
         export.export(self.placement, self.traced, folder)

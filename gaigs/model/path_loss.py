@@ -16,42 +16,54 @@ from gaigs.registry import register
 class PathLoss(Model):
     """T - 10 gamma log10(distance / 1 m) for each receiver; NaN before ``fit``.
 
-    It is meant for RSSI [dBm], and accepts any task of one real number a link. T is that of least squares. So is gamma,
-    but drawn towards the mean of all receivers as far as chance explains their scatter: a few readings alone give wild
-    slopes. Negative exponents are kept: there distance explains nothing. If all links of a receiver are equally long,
-    gamma is that mean; without any other receiver 2, as in free space. Distances below 0.1 m count as 0.1 m: within
+    It is meant for RSSI [dBm], and accepts any task of one real number a link. T is that of least
+    squares. So is gamma, but drawn towards the mean of all receivers as far as chance explains
+    their scatter: a few readings alone give wild slopes. Negative exponents are kept: there
+    distance explains nothing. If all links of a receiver are equally long, gamma is that mean;
+    without any other receiver 2, as in free space. Distances below 0.1 m count as 0.1 m: within
     about a wavelength the field does not follow the law.
 
     Raises:
         ValueError: A label is more than one real number.
 
-    Source: Rappaport, Wireless Communications, 2nd edition, section 4.9; DerSimonian and Laird, Meta-analysis in
-    clinical trials, 1986.
+    Source: Rappaport, Wireless Communications, 2nd edition, section 4.9; DerSimonian and Laird,
+    Meta-analysis in clinical trials, 1986.
     """
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
         if not scene.task.is_scalar:
             own = f"labels of task {scene.task.name!r}"
-            raise ValueError(f"model 'path_loss' predicts one real number a link, not {own}; take mean or knn")
+            raise ValueError(
+                f"model 'path_loss' predicts one real number a link, not {own}; take mean or knn"
+            )
         self.register_buffer("levels", torch.full((len(scene.receivers),), torch.nan))  # T [dBm]
         self.register_buffer("exponents", torch.full((len(scene.receivers),), torch.nan))  # gamma
 
     def fit(self, links: Links) -> None:
-        """Fits level and exponent of each receiver; see ``without_gross_errors`` for levels that do not count."""
+        """Fits level and exponent of each receiver; see ``without_gross_errors`` for levels that do
+        not count.
+        """
         lines = []
         links = without_gross_errors(links)
         for index in known_links(links):
             labels = links.labels[index].double()
-            decades = self._decades(links.query.transmitters[index].double(), links.query.receivers[index])
+            decades = self._decades(
+                links.query.transmitters[index].double(), links.query.receivers[index]
+            )
             level, centre = labels.mean(), decades.mean()
             labels, steps = labels - level, -10 * (decades - centre)
-            # Below a ratio of 1.01 one unit of the exponent changes the labels by less than 0.05 dB.
+            # Below a ratio of 1.01 one unit of the exponent changes the labels by less than 0.05
+            # dB.
             is_spread = 10 ** (decades.max() - decades.min()) >= 1.01
             weight = steps.square().sum() * is_spread
             exponent = steps @ labels / weight if is_spread else weight
             errors = (labels - exponent * steps).square().sum()
-            lines.append(torch.stack((level, centre, exponent, weight, errors, len(index) - 1 - is_spread.to(weight))))
+            lines.append(
+                torch.stack(
+                    (level, centre, exponent, weight, errors, len(index) - 1 - is_spread.to(weight))
+                )
+            )
         levels, centres, exponents, weights, errors, freedom = torch.stack(lines, 1)
         noise = errors.sum() / freedom.sum() if freedom.sum() else errors.new_tensor(torch.nan)
         exponents = shrunk(exponents, weights, noise)
@@ -63,9 +75,16 @@ class PathLoss(Model):
         decades = self._decades(batch.query.transmitters, receivers)
         return Prediction(self.levels[receivers] - 10 * self.exponents[receivers] * decades, {})
 
-    def _decades(self, transmitters: Float[Tensor, "b 3"], receivers: Int[Tensor, " b"]) -> Float[Tensor, " b"]:
+    def _decades(
+        self, transmitters: Float[Tensor, "b 3"], receivers: Int[Tensor, " b"]
+    ) -> Float[Tensor, " b"]:
         """log10 of the distances in [m]."""
-        return (transmitters - self.scene.positions(transmitters)[receivers]).norm(dim=-1).clamp_min(0.1).log10()
+        return (
+            (transmitters - self.scene.positions(transmitters)[receivers])
+            .norm(dim=-1)
+            .clamp_min(0.1)
+            .log10()
+        )
 
 
 def shrunk(
@@ -76,7 +95,8 @@ def shrunk(
     Args:
         exponents: Of least squares.
         weights: Inverse variances of their errors, for noise of variance 1; 0 without an exponent.
-        noise: Variance of the labels about the law; NaN if too few of them say it, and the mean counts alone.
+        noise: Variance of the labels about the law; NaN if too few of them say it, and the mean
+            counts alone.
     """
     total = weights.sum()
     if not total:
@@ -86,7 +106,11 @@ def shrunk(
     noise = noise.clamp_min(1e-12)
     squares = weights @ (exponents - weights @ exponents / total).square()
     chance = ((weights > 0).sum() - 1) * noise
-    scatter = ((squares - chance) / (total - weights.square().sum() / total)).nan_to_num(0, posinf=0).clamp_min(0)
+    scatter = (
+        ((squares - chance) / (total - weights.square().sum() / total))
+        .nan_to_num(0, posinf=0)
+        .clamp_min(0)
+    )
     precisions = weights / (scatter * weights + noise)  # of the exponents about the mean
     shares = scatter * precisions
     return shares * exponents + (1 - shares) * (precisions @ exponents / precisions.sum())

@@ -31,10 +31,12 @@ TOLERANCE = 0.02
 
 
 class Planes(NamedTuple):
-    """All learnt planes: unit normals out of the room, offsets from the world's origin [m]; float64.
+    """All learnt planes: unit normals out of the room, offsets from the world's origin [m];
+    float64.
 
-    ``losses`` are the least losses of a reflection at normal incidence [dB], ``middles`` the points with them [m],
-    ``extents`` the standard deviations of the reflecting areas along the world's axes [m].
+    ``losses`` are the least losses of a reflection at normal incidence [dB], ``middles`` the points
+    with them [m], ``extents`` the standard deviations of the reflecting areas along the world's
+    axes [m].
     """
 
     normals: Float[ndarray, "w 3"]
@@ -47,8 +49,8 @@ class Planes(NamedTuple):
 class TracedPaths(NamedTuple):
     """Powers and bounces of the kept paths of some links.
 
-    ``powers`` include free space, 0 for no path; ``bounces`` are points on the planes of each sequence, NaN for a
-    missing plane [m].
+    ``powers`` include free space, 0 for no path; ``bounces`` are points on the planes of each
+    sequence, NaN for a missing plane [m].
     """
 
     sequences: Int[ndarray, "n order"]
@@ -78,8 +80,12 @@ def all_over(scene: Scene) -> Query:
     """Links evenly spread over the training transmitters' box, the receivers and the carriers."""
     number = torch.arange(256)
     shares = torch.quasirandom.SobolEngine(3).draw(len(number)).to(scene.lower)
-    carriers = scene.frequencies[number % len(scene.frequencies)] if len(scene.frequencies) else None
-    return Query(scene.lower + (scene.upper - scene.lower) * shares, number % len(scene.receivers), carriers)
+    carriers = (
+        scene.frequencies[number % len(scene.frequencies)] if len(scene.frequencies) else None
+    )
+    return Query(
+        scene.lower + (scene.upper - scene.lower) * shares, number % len(scene.receivers), carriers
+    )
 
 
 @torch.no_grad()
@@ -97,12 +103,19 @@ def trace_paths(placement: Mirrored, query: Query) -> TracedPaths:
         for back, (first, met) in enumerate(folded.parts(folded.bounces), 1):
             points[:, first:, -back] = met + placement.middle
         bounces.append(points)
-    parts = sequences, torch.cat(powers).double(), torch.cat(bounces), query.transmitters, torch.cat(receivers)
+    parts = (
+        sequences,
+        torch.cat(powers).double(),
+        torch.cat(bounces),
+        query.transmitters,
+        torch.cat(receivers),
+    )
     return TracedPaths(*(part.cpu().numpy() for part in parts))
 
 
 def facts(placement: Mirrored, query: Query) -> dict[str, list]:
-    """Tables of planes, strongest first, and of paths by their number of bounces, for ``metrics.json``.
+    """Tables of planes, strongest first, and of paths by their number of bounces, for
+    ``metrics.json``.
 
     ``unseen`` has a sentence for each axis that places do not span, see ``Scene.flat_axes``.
 
@@ -131,29 +144,38 @@ def facts(placement: Mirrored, query: Query) -> dict[str, list]:
     paths = []
     for bounces in range(found.sequences.shape[1] + 1):
         own = counts == bounces
-        paths.append({"bounces": bounces, "kept": int(own.sum()), "share": round(means[own].sum().item(), 5)})
+        paths.append(
+            {"bounces": bounces, "kept": int(own.sum()), "share": round(means[own].sum().item(), 5)}
+        )
     unseen = [str(flat) for flat in placement.scene.flat_axes]
     return {"planes": planes, "paths": paths} | ({"unseen": unseen} if unseen else {})
 
 
 def other_offset(scene: Scene, planes: Planes, number: int) -> float | None:
-    """Offset at which a plane would reflect paths of the same lengths [m]; None without one, see ``FlatAxis``."""
+    """Offset at which a plane would reflect paths of the same lengths [m]; None without one, see
+    ``FlatAxis``.
+    """
     normal = planes.normals[number]
     for flat in scene.flat_axes:
         if abs(normal[flat.axis]) > 0.99:
-            return float(normal[flat.axis] * (flat.transmitters + flat.receivers) - planes.offsets[number])
+            return float(
+                normal[flat.axis] * (flat.transmitters + flat.receivers) - planes.offsets[number]
+            )
     return None
 
 
 @torch.no_grad()
 def _planes(placement: Mirrored, found: TracedPaths) -> Planes:
-    permittivities = torch.complex(1 + placement.log_permittivities.exp(), -placement.log_conductivities.exp())
+    permittivities = torch.complex(
+        1 + placement.log_permittivities.exp(), -placement.log_conductivities.exp()
+    )
     reflected, _ = fresnel(permittivities, torch.ones_like(permittivities.real))
     gains = reflected.abs().log() + placement.plane_gains
     middles = placement.middles + placement.middle.double()
     parts = placement.normals, placement.planes[:, 3], gains, middles, placement.log_extents.exp()
     normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in parts)
-    # The middle of the reflecting area need not lie on the plane: take the plane's point with the least loss.
+    # The middle of the reflecting area need not lie on the plane: take the plane's point with the
+    # least loss.
     steep = extents**2 * normals
     spread = (steep * normals).sum(1)
     apart = offsets - (normals * middles).sum(1)
@@ -175,9 +197,10 @@ def _plane_shares(found: TracedPaths) -> dict[int, float]:
 def outlines(placement: Mirrored, found: TracedPaths) -> list[LearntPlane]:
     """The planes as convex polygons, strongest first.
 
-    A wall has all transmitters and receivers on one side. It reaches to the other walls, to the edge of its reflecting
-    area, or to the box around the paths' ends, whichever is nearest. Any other plane, such as furniture, is the
-    rectangle around its bounces, within walls and box. Planes without paths, or outside the box, are left out.
+    A wall has all transmitters and receivers on one side. It reaches to the other walls, to the
+    edge of its reflecting area, or to the box around the paths' ends, whichever is nearest. Any
+    other plane, such as furniture, is the rectangle around its bounces, within walls and box.
+    Planes without paths, or outside the box, are left out.
     """
     normals, offsets, _, middles, extents = _planes(placement, found)
     shares = _plane_shares(found)
@@ -186,8 +209,12 @@ def outlines(placement: Mirrored, found: TracedPaths) -> list[LearntPlane]:
     seen = seen[~np.isnan(seen).any(1)]
     lower, upper = seen.min(0), seen.max(0)
     diagonal = np.linalg.norm(upper - lower)
-    box = _sides(lower - 0.1 * diagonal, upper + 0.1 * diagonal)  # so large that planes meet within it
-    walls = [k for k in shares if (found.ends @ normals[k] - offsets[k] <= TOLERANCE * diagonal).all()]
+    box = _sides(
+        lower - 0.1 * diagonal, upper + 0.1 * diagonal
+    )  # so large that planes meet within it
+    walls = [
+        k for k in shares if (found.ends @ normals[k] - offsets[k] <= TOLERANCE * diagonal).all()
+    ]
     drawn = []
     for number, share in shares.items():
         normal, offset = normals[number], offsets[number]
@@ -200,7 +227,9 @@ def outlines(placement: Mirrored, found: TracedPaths) -> list[LearntPlane]:
         level = level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
         basis = np.stack((level, np.cross(normal, level)), 1)
         # Walls that face the same way, such as one behind another, do not cut each other.
-        sides = box + [(normals[k], offsets[k]) for k in walls if k != number and normals[k] @ normal < 0.9]
+        sides = box + [
+            (normals[k], offsets[k]) for k in walls if k != number and normals[k] @ normal < 0.9
+        ]
         if number in walls:
             middle = (lower + upper) / 2
             middle = middle - (middle @ normal - offset) * normal
@@ -214,7 +243,9 @@ def outlines(placement: Mirrored, found: TracedPaths) -> list[LearntPlane]:
             flat = (points - middle) @ basis
             low, high = flat.min(0) - TOLERANCE * diagonal, flat.max(0) + TOLERANCE * diagonal
         # Counterclockwise against the normal.
-        flat = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
+        flat = np.array(
+            [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
+        )
         corners = middle + flat @ basis.T
         for side in sides:
             corners = _cut(corners, *side)
@@ -223,13 +254,17 @@ def outlines(placement: Mirrored, found: TracedPaths) -> list[LearntPlane]:
     return drawn
 
 
-def _sides(lower: Float[ndarray, "3"], upper: Float[ndarray, "3"]) -> list[tuple[Float[ndarray, "3"], np.floating]]:
+def _sides(
+    lower: Float[ndarray, "3"], upper: Float[ndarray, "3"]
+) -> list[tuple[Float[ndarray, "3"], np.floating]]:
     """A box as six planes: normals outwards, and offsets [m]."""
     axes = np.eye(3)
     return [*zip(axes, upper, strict=True), *zip(-axes, -lower, strict=True)]
 
 
-def _cut(corners: Float[ndarray, "c 3"], normal: Float[ndarray, "3"], offset: np.floating) -> Float[ndarray, "k 3"]:
+def _cut(
+    corners: Float[ndarray, "c 3"], normal: Float[ndarray, "3"], offset: np.floating
+) -> Float[ndarray, "k 3"]:
     """The part of a convex polygon with normal . x <= offset.
 
     Source: Sutherland and Hodgman, Reentrant polygon clipping, 1974.
@@ -248,11 +283,15 @@ def _cut(corners: Float[ndarray, "c 3"], normal: Float[ndarray, "3"], offset: np
 
 @torch.no_grad()
 def learnt_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
-    """The room by the training links, and the strongest paths of the first test transmitter, for figures.
+    """The room by the training links, and the strongest paths of the first test transmitter, for
+    figures.
 
     Without links it is the room by links ``all_over`` the scene, without paths.
     """
-    found = trace_paths(placement, all_over(placement.scene) if links is None else some(links.query[links.split.train]))
+    found = trace_paths(
+        placement,
+        all_over(placement.scene) if links is None else some(links.query[links.split.train]),
+    )
     matter = None
     if placement.obstacles is not None:
         blobs = placement.obstacles
@@ -273,22 +312,29 @@ def learnt_paths(placement: Mirrored, query: Query) -> list[LearntPath]:
     heard = trace_paths(placement, query)
     powers = heard.powers / heard.powers.max(initial=np.finfo(float).tiny)
     paths = []
-    for link, path in zip(*np.unravel_index(np.argsort(-powers, axis=None)[:20], powers.shape), strict=True):
+    for link, path in zip(
+        *np.unravel_index(np.argsort(-powers, axis=None)[:20], powers.shape), strict=True
+    ):
         if powers[link, path] >= 1e-3:
             bounces = heard.bounces[link, path][heard.sequences[path] >= 0]
-            points = np.concatenate((heard.transmitters[link, None], bounces, heard.receivers[link, None]))
+            points = np.concatenate(
+                (heard.transmitters[link, None], bounces, heard.receivers[link, None])
+            )
             paths.append(LearntPath(points, 10 * math.log10(powers[link, path])))
     return paths
 
 
 @torch.no_grad()
 def export(placement: Mirrored, query: Query, folder: Path) -> None:
-    """Writes ``planes.obj``, the planes as far as the query's paths reach, and ``obstacles.ply`` for any obstacles."""
+    """Writes ``planes.obj``, the planes as far as the query's paths reach, and ``obstacles.ply``
+    for any obstacles.
+    """
     write_text(folder / "planes.obj", wavefront_obj(placement, trace_paths(placement, query)))
     blobs = placement.obstacles
     if blobs is None:
         return
-    # Grey, and as opaque as the share of power lost through the middle of an obstacle of its mean width.
+    # Grey, and as opaque as the share of power lost through the middle of an obstacle of its mean
+    # width.
     depths = blobs.densities * math.sqrt(2 * math.pi) * blobs.widths.log().mean(1).exp()
     parts = {
         "means": blobs.centres + placement.middle,

@@ -7,9 +7,11 @@ from numpy import ndarray
 
 
 class LearntPlane(NamedTuple):
-    """The drawn part of a learnt plane: its number in ``metrics.json``, its share of the received power.
+    """The drawn part of a learnt plane: its number in ``metrics.json``, its share of the received
+    power.
 
-    ``corners`` are a convex polygon, counterclockwise as seen from outside the room [m]; the unit normal points out.
+    ``corners`` are a convex polygon, counterclockwise as seen from outside the room [m]; the unit
+    normal points out.
     """
 
     number: int
@@ -19,7 +21,9 @@ class LearntPlane(NamedTuple):
 
 
 class Matter(NamedTuple):
-    """Obstacles: centres [m], standard deviations along the world's axes [m], densities at the centres [dB/m]."""
+    """Obstacles: centres [m], standard deviations along the world's axes [m], densities at the
+    centres [dB/m].
+    """
 
     centres: Float[ndarray, "k 3"]
     widths: Float[ndarray, "k 3"]
@@ -27,7 +31,9 @@ class Matter(NamedTuple):
 
 
 class LearntPath(NamedTuple):
-    """Transmitter, bounces and receiver of a path [m], and its power relative to the strongest path [dB]."""
+    """Transmitter, bounces and receiver of a path [m], and its power relative to the strongest path
+    [dB].
+    """
 
     points: Float[ndarray, "p 3"]
     power_db: float

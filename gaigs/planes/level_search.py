@@ -28,8 +28,8 @@ CLEAR = 3.0
 """Least fall of the errors by a plane whose phases count [standard errors]."""
 
 CHANCE, SHUFFLES = 1.1, 4
-"""Least ratio of this fall to the largest one by chance, and how often that is tried: with errors that have changed
-their links. Of few links some plane always explains much."""
+"""Least ratio of this fall to the largest one by chance, and how often that is tried: with errors
+that have changed their links. Of few links some plane always explains much."""
 
 TRIED = 4
 """Maxima of the periodograms whose errors are compared."""
@@ -45,7 +45,9 @@ class ReceiverLevels(ReceiverLags):
         return 10 * self.lags[:, 0].real.log10()
 
     def errors(self, lags: Complex[Tensor, "b 1"]) -> Float[Tensor, " b"]:
-        """Log of 1 + the squared error of each level over ``SCALE``; the receiver's gain does not count."""
+        """Log of 1 + the squared error of each level over ``SCALE``; the receiver's gain does not
+        count.
+        """
         errors = 10 * lags[:, 0].real.clamp_min(1e-12).log10() - self.levels
         return ((errors - errors.detach().median()) / SCALE).square().log1p()
 
@@ -53,9 +55,10 @@ class ReceiverLevels(ReceiverLags):
 class LevelSearch(LagSearch):
     """Planes whose reflections interfere in received levels.
 
-    A level is one number, so phases say nothing before a model knows from powers what obstacles let through. Then
-    planes are located one after the other, the clearest first, by the periodogram of ``LagSearch``. Only paths at
-    located planes interfere; the others add as powers, because a wrong phase would be worse than none.
+    A level is one number, so phases say nothing before a model knows from powers what obstacles let
+    through. Then planes are located one after the other, the clearest first, by the periodogram of
+    ``LagSearch``. Only paths at located planes interfere; the others add as powers, because a wrong
+    phase would be worse than none.
 
     Args:
         links: Their training links count; of the task ``rssi``. Readings at one place count as one.
@@ -95,7 +98,9 @@ class LevelSearch(LagSearch):
 
     @torch.no_grad()
     def locate(self, placement: Mirrored) -> list[int]:
-        """Puts planes where they are clear, and lets paths at them interfere; the result are their numbers."""
+        """Puts planes where they are clear, and lets paths at them interfere; the result are their
+        numbers.
+        """
         found: list[int] = []
         least = 0.0
         while left := [k for k, number in enumerate(self.numbers) if not placement.located[number]]:
@@ -104,10 +109,14 @@ class LevelSearch(LagSearch):
             planes = torch.where(located[:, None], own, self.start)
             passing = self.passing(placement, planes)
             is_unknown = self.known is None and not located.any()
-            learnt = 0.0 if placement.log_bandwidth is None else placement.log_bandwidth.exp().item()
+            learnt = (
+                0.0 if placement.log_bandwidth is None else placement.log_bandwidth.exp().item()
+            )
             bandwidths = self.bandwidths(None if is_unknown else learnt)
             trials = []
-            for self.bandwidth, k in track([*itertools.product(bandwidths, left)], "search of planes"):
+            for self.bandwidth, k in track(
+                [*itertools.product(bandwidths, left)], "search of planes"
+            ):
                 if is_up():
                     return found
                 trials.append((*self.clearest(planes, passing, located, k), self.bandwidth, k))
@@ -125,9 +134,11 @@ class LevelSearch(LagSearch):
         return found
 
     def passing(self, placement: Mirrored, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b v"]:
-        """Field of the direct path and of that at each plane in a model, over what this search expects; at most 1.
+        """Field of the direct path and of that at each plane in a model, over what this search
+        expects; at most 1.
 
-        Near Brewster's angle the search expects next to nothing, which another plane would multiply.
+        Near Brewster's angle the search expects next to nothing, which another plane would
+        multiply.
         """
         parts = []
         for receiver, query in zip(self.receivers, self.queries, strict=True):
@@ -155,7 +166,9 @@ class LevelSearch(LagSearch):
         for _ in track(range(SHUFFLES), "search of planes"):
             shuffled = []
             for receiver, own in self.each(passing):
-                powers = self.received(receiver.paths(planes, sequences, own), self.phased(sequences, located))
+                powers = self.received(
+                    receiver.paths(planes, sequences, own), self.phased(sequences, located)
+                )
                 errors = receiver.lags / powers.real.clamp_min(1e-12)
                 errors = errors[torch.randperm(len(errors), generator=generator)]
                 shuffled.append(replace(receiver, lags=powers * errors))
@@ -170,9 +183,15 @@ class LevelSearch(LagSearch):
         return largest
 
     def clearest(
-        self, planes: Float[Tensor, "w 4"], passing: Float[Tensor, "b v"], located: Bool[Tensor, " w"], k: int
+        self,
+        planes: Float[Tensor, "w 4"],
+        passing: Float[Tensor, "b v"],
+        located: Bool[Tensor, " w"],
+        k: int,
     ) -> tuple[float, Float[Tensor, "4"]]:
-        """Where plane k makes the errors fall most clearly if its phases count, and by how many standard errors."""
+        """Where plane k makes the errors fall most clearly if its phases count, and by how many
+        standard errors.
+        """
         sequences = self.sequences(planes)
         phased = self.phased(sequences, located)
         known, before, waves = phased & ~(sequences == k).any(1), [], []
@@ -181,27 +200,41 @@ class LevelSearch(LagSearch):
             before.append(self.received(paths, phased))
             slopes = receiver.slopes(before[-1])[:, 0]
             waves.append(((slopes * fields * known * own[:, k + 1, None])[..., None], lengths))
-        peaks = [peak for normal in square_normals(planes[:, :3], k) for peak in self.peaks(waves, normal, planes[k])]
+        peaks = [
+            peak
+            for normal in square_normals(planes[:, :3], k)
+            for peak in self.peaks(waves, normal, planes[k])
+        ]
         peaks.sort(key=lambda peak: -peak.score)
-        phased, found = self.phased(sequences, located.index_fill(0, torch.tensor(k), True)), [(0.0, planes[k])]
+        phased, found = (
+            self.phased(sequences, located.index_fill(0, torch.tensor(k), True)),
+            [(0.0, planes[k])],
+        )
         for peak in peaks[:TRIED]:
             moved, gains = torch.cat((planes[:k], peak.plane[None], planes[k + 1 :])), []
             for (receiver, own), old in zip(self.each(passing), before, strict=True):
                 new = self.received(receiver.paths(moved, sequences, own), phased)
-                # Half of the interference: errors then follow its phase more than its strength, which is uncertain.
+                # Half of the interference: errors then follow its phase more than its strength,
+                # which is uncertain.
                 gains.append(receiver.errors(old) - receiver.errors((old + new) / 2))
             mean, deviation = (part.item() for part in reversed(torch.std_mean(torch.cat(gains))))
             found.append((mean / max(deviation, 1e-12) * math.sqrt(len(passing)), peak.plane))
         return max(found, key=lambda trial: trial[0])
 
-    def phased(self, sequences: Int[Tensor, "n order"], located: Bool[Tensor, " w"]) -> Bool[Tensor, " n"]:
+    def phased(
+        self, sequences: Int[Tensor, "n order"], located: Bool[Tensor, " w"]
+    ) -> Bool[Tensor, " n"]:
         """True for paths whose planes are all located."""
         return torch.cat((located, located.new_ones(1)))[sequences].all(1)  # -1 is the last one
 
-    def received(self, paths: tuple[Tensor, Tensor, Tensor], phased: Bool[Tensor, " n"]) -> Complex[Tensor, "b 1"]:
+    def received(
+        self, paths: tuple[Tensor, Tensor, Tensor], phased: Bool[Tensor, " n"]
+    ) -> Complex[Tensor, "b 1"]:
         """Powers of paths, of which some interfere."""
         fields, _, lengths = paths
         waves, ways = fields[:, phased], lengths[:, phased]
         likeness = sinc(self.bandwidth / speed_of_light * (ways[:, :, None] - ways[:, None]))
-        powers = (fields[:, ~phased].abs().square()).sum(1) + ((likeness * waves[:, None]).sum(2) * waves.conj()).sum(1)
+        powers = (fields[:, ~phased].abs().square()).sum(1) + (
+            (likeness * waves[:, None]).sum(2) * waves.conj()
+        ).sum(1)
         return powers[:, None]

@@ -1,4 +1,6 @@
-"""What searches for planes in all kinds of labels share: a Hough transform over normals and offsets."""
+"""What searches for planes in all kinds of labels share: a Hough transform over normals and
+offsets.
+"""
 
 from collections.abc import Callable
 from functools import cached_property
@@ -14,13 +16,15 @@ from gaigs.splatting.placement.mirrored.reflections import reflection_points, se
 
 
 class PlaneSearch:
-    """Planes of a room about its middle: there single precision suffices, and a plane that turns stays near.
+    """Planes of a room about its middle: there single precision suffices, and a plane that turns
+    stays near.
 
     Args:
         points: Transmitters and receivers (n, 3) [m].
 
     Attributes:
-        receivers: Each with its ``position`` and the ``places`` of its transmitters, about the middle [m].
+        receivers: Each with its ``position`` and the ``places`` of its transmitters, about the
+            middle [m].
         middle: Of the points (3,) [m].
         points: The same about the middle.
         diagonal: Of their box [m].
@@ -37,7 +41,9 @@ class PlaneSearch:
 
     @cached_property
     def generator(self) -> torch.Generator:
-        """Made when it is first used: a search that draws nothing leaves the training's random numbers alone."""
+        """Made when it is first used: a search that draws nothing leaves the training's random
+        numbers alone.
+        """
         return torch.Generator().manual_seed(int(torch.randint(2**31, ())))
 
     def words(self, plane: Float[Tensor, "4"]) -> str:
@@ -45,7 +51,9 @@ class PlaneSearch:
         *normal, offset = seen_from(plane, -self.middle).tolist()
         return "plane ({:.2f}, {:.2f}, {:.2f}) at {:.2f} m".format(*normal, offset)
 
-    def grid(self, normals: Float[Tensor, "n 3"], count: int, margin: float) -> Float[Tensor, "n k 4"]:
+    def grid(
+        self, normals: Float[Tensor, "n 3"], count: int, margin: float
+    ) -> Float[Tensor, "n k 4"]:
         """Planes at ``count`` offsets of each normal, up to a margin [diagonals] beyond all points."""
         along, beyond = self.points @ normals.mT, margin * self.diagonal
         low, high = along.amin(0) - beyond, along.amax(0) + beyond
@@ -55,7 +63,9 @@ class PlaneSearch:
     def alike(self, planes: Float[Tensor, "k 4"], plane: Float[Tensor, "4"]) -> Bool[Tensor, " k"]:
         """True for planes within 16 degrees and three hundredths of the room of one."""
         cosines = planes[:, :3] @ plane[:3]
-        return (cosines.abs() > 0.96) & ((planes[:, 3] * cosines.sign() - plane[3]).abs() < 0.03 * self.diagonal)
+        return (cosines.abs() > 0.96) & (
+            (planes[:, 3] * cosines.sign() - plane[3]).abs() < 0.03 * self.diagonal
+        )
 
     def best(
         self,
@@ -64,7 +74,9 @@ class PlaneSearch:
         score: Callable[[Float[Tensor, "c 4"]], Float[Tensor, " c"]],
         known: Float[Tensor, "w 4"],
     ) -> list[tuple[Float[Tensor, "4"], float]]:
-        """At most three planes apart from known ones, with their scores: the highest maxima of a grid, sharpened."""
+        """At most three planes apart from known ones, with their scores: the highest maxima of a
+        grid, sharpened.
+        """
         scores = scores.clone()
         for plane in known:
             scores[self.alike(grid, plane)] = 0
@@ -86,20 +98,31 @@ class PlaneSearch:
         found: list[tuple[Tensor, float]] = []
         for number in highest.argsort(descending=True).tolist():
             others = [*known, *(plane for plane, _ in found)]
-            if len(found) < 3 and not any(self.alike(tried[number, None], plane) for plane in others):
+            if len(found) < 3 and not any(
+                self.alike(tried[number, None], plane) for plane in others
+            ):
                 found.append((tried[number], highest[number].item()))
         return found
 
     def pivots(self, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "w 3"]:
-        """Mean point at which each plane reflects [m]: turned about it, a plane changes the lengths least."""
+        """Mean point at which each plane reflects [m]: turned about it, a plane changes the lengths
+        least.
+        """
         ends = [(part.places, part.position.expand_as(part.places)) for part in self.receivers]
         return torch.cat([reflection_points(*pair, planes) for pair in ends]).mean(0)
 
     @torch.enable_grad()
     def descend(
-        self, loss: Callable[..., Tensor], planes: Float[Tensor, "w 4"], others: list[Tensor], steps: int, rate: float
+        self,
+        loss: Callable[..., Tensor],
+        planes: Float[Tensor, "w 4"],
+        others: list[Tensor],
+        steps: int,
+        rate: float,
     ) -> list[Tensor]:
-        """Adam on planes, which turn about their pivots, and on other parameters of a loss; ``rate`` in [m] a step."""
+        """Adam on planes, which turn about their pivots, and on other parameters of a loss;
+        ``rate`` in [m] a step.
+        """
         if not len(planes):
             return [planes, *others]
         pivots = self.pivots(planes)
@@ -109,8 +132,12 @@ class PlaneSearch:
 
         def now() -> Float[Tensor, "w 4"]:
             # Lengths change by about twice a shift [m], and by some metres times a turn [rad].
-            normals = functional.normalize(planes[:, :3] + 0.4 * (shifts[:, 1:, None] * axes).sum(1), dim=1)
-            return torch.cat((normals, ((normals * pivots).sum(1) + heights + shifts[:, 0])[:, None]), 1)
+            normals = functional.normalize(
+                planes[:, :3] + 0.4 * (shifts[:, 1:, None] * axes).sum(1), dim=1
+            )
+            return torch.cat(
+                (normals, ((normals * pivots).sum(1) + heights + shifts[:, 0])[:, None]), 1
+            )
 
         optimizer = torch.optim.Adam([{"params": [shifts]}, {"params": others}])
         for step in track(range(steps)):

@@ -18,7 +18,9 @@ from gaigs.splatting.placement.mirrored.reflections import square_normals
 log = logging.getLogger(__name__)
 
 NEGLIGIBLE = 1e-6
-"""Power of a path over the strongest one's below which it is dropped in any case: hundreds would take long."""
+"""Power of a path over the strongest one's below which it is dropped in any case: hundreds would
+take long.
+"""
 
 Loss = Callable[[Batch], float]
 """Loss of the model as it stands, on a batch."""
@@ -35,23 +37,31 @@ def thinned(batch: Batch, rows: int) -> Batch:
 
 @torch.no_grad()
 def move_planes(model, batch: Batch, wavelength: float, least: float) -> list[float]:
-    """Moves each used plane along its normal, or one that is square to the others, to the least error.
+    """Moves each used plane along its normal, or one that is square to the others, to the least
+    error.
 
-    The strongest plane comes first. ``least`` is the least distance searched on either side [m], up to ``WIDEST``
-    wavelengths. The result are the moves [m]. If a map is drawn, which takes long, planes keep their normals.
+    The strongest plane comes first. ``least`` is the least distance searched on either side [m], up
+    to ``WIDEST`` wavelengths. The result are the moves [m]. If a map is drawn, which takes long,
+    planes keep their normals.
     """
     placement: Mirrored = model.placement
     placement.enable_phases(wavelength)  # adds the steps so far to the planes
     some, reach = thinned(batch, 12), max(4.0 * wavelength, min(least, WIDEST * wavelength))
     if least > reach:  # steps cannot be coarser than a fraction of the wavelength
-        log.info("planes are searched within %.3g m, not %.3g m; placement.walls can start nearer", reach, least)
+        log.info(
+            "planes are searched within %.3g m, not %.3g m; placement.walls can start nearer",
+            reach,
+            least,
+        )
     planes = by_strength(placement, batch)
     moves = track(planes, "search of planes")
     return [_move(model, plane, reach, wavelength, some, model.takes_paths) for plane in moves]
 
 
 def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, square: bool) -> float:
-    """Moves a plane along its normal, or along one of ``square_normals``, to the least error; returns the move [m]."""
+    """Moves a plane along its normal, or along one of ``square_normals``, to the least error;
+    returns the move [m].
+    """
     placement: Mirrored = model.placement
     origin = placement.origin[plane]
     step = wavelength / 10  # a reflected path changes by twice of it
@@ -59,7 +69,11 @@ def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, squa
     moves = moves[moves.abs().argsort(stable=True)]  # of equal errors the least move
     tried = []
     used = placement.used.tolist()
-    for normal in square_normals(placement.normals[used], used.index(plane)) if square else (origin[:3].clone(),):
+    for normal in (
+        square_normals(placement.normals[used], used.index(plane))
+        if square
+        else (origin[:3].clone(),)
+    ):
         origin[:3] = normal
         errors = _errors_of_moves(model, batch, plane, moves)
         best = int(errors.argmin())
@@ -69,8 +83,12 @@ def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, squa
     return move
 
 
-def _errors_of_moves(model, batch: Batch, plane: int, moves: Float[Tensor, " m"]) -> Float[Tensor, " m"]:
-    """Mean absolute error, of channels log share, with a plane moved along its normal [m] and strengths held."""
+def _errors_of_moves(
+    model, batch: Batch, plane: int, moves: Float[Tensor, " m"]
+) -> Float[Tensor, " m"]:
+    """Mean absolute error, of channels log share, with a plane moved along its normal [m] and
+    strengths held.
+    """
     placement, query, labels, count = model.placement, batch.query, batch.labels, len(batch.query)
     errors = []
     with placement.holding():
@@ -82,10 +100,14 @@ def _errors_of_moves(model, batch: Batch, plane: int, moves: Float[Tensor, " m"]
             placement.held, placement.tried = held[rows], placement.offsets.repeat(len(rows), 1)
             placement.tried[:, plane] += some.repeat_interleave(count)
             moved = Batch(query[rows], batch.directions)
-            value = model.respond(model.excite(moved.query), torch.arange(len(rows), device=rows.device), moved).value
+            value = model.respond(
+                model.excite(moved.query), torch.arange(len(rows), device=rows.device), moved
+            ).value
             label = model.scene.task.align(labels[rows], value)
             error, label = (part.reshape(len(rows), -1) for part in (value - label, label))
-            if error.is_complex():  # a loud channel must not rule, and a weak one has no squares in float32
+            if (
+                error.is_complex()
+            ):  # a loud channel must not rule, and a weak one has no squares in float32
                 largest = label.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
                 apart = log_share(error / largest, label / largest)
             else:
@@ -95,13 +117,17 @@ def _errors_of_moves(model, batch: Batch, plane: int, moves: Float[Tensor, " m"]
 
 
 def prune(placement: Mirrored, batches: list[Batch], loss: Loss) -> str:
-    """Drops planes, then paths, that hardly lower any batch's loss, weakest first; returns a sentence for the log."""
+    """Drops planes, then paths, that hardly lower any batch's loss, weakest first; returns a
+    sentence for the log.
+    """
     planes, paths = len(placement.used), int(placement.kept.sum())
     before = [loss(batch) for batch in batches]
 
     def is_good(kept: Bool[Tensor, " n"]) -> bool:
         placement.kept.copy_(kept)
-        return all(loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True))
+        return all(
+            loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True)
+        )
 
     best = placement.kept.clone()
     shares = torch.stack([_shares(placement, batch) for batch in batches]).amax(0)
@@ -126,7 +152,9 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss) -> str:
 def by_strength(placement: Mirrored, batch: Batch) -> list[int]:
     """Used planes, strongest received power first."""
     shares, sequences = _shares(placement, batch), placement.sequences[placement.kept]
-    return sorted(placement.used.tolist(), key=lambda plane: -shares[(sequences == plane).any(1)].sum().item())
+    return sorted(
+        placement.used.tolist(), key=lambda plane: -shares[(sequences == plane).any(1)].sum().item()
+    )
 
 
 def _shares(placement: Mirrored, batch: Batch) -> Float[Tensor, " n"]:

@@ -68,13 +68,17 @@ class Holder:
         return re.split("[.:]", self.target)[0]
 
     def owns(self, component: object) -> bool:
-        """True if a component comes from the holder's file or, for an entry point, from its package."""
+        """True if a component comes from the holder's file or, for an entry point, from its
+        package.
+        """
         module = getattr(component, "__module__", "")
         return module == self.target if self.file else module.split(".")[0] == self.package
 
     @property
     def folder(self) -> Path | None:
-        """Folder of an entry point's top-level package, which is not imported; None if it does not exist."""
+        """Folder of an entry point's top-level package, which is not imported; None if it does not
+        exist.
+        """
         if self.root is not None:
             return self.root / self.package
         spec = find_spec(self.package)  # imports nothing, as the name has no dots
@@ -82,9 +86,15 @@ class Holder:
 
     @property
     def digest(self) -> str:
-        """Digest of the sources: the file in ./plugins or the package, and other plug-ins there that it imports."""
+        """Digest of the sources: the file in ./plugins or the package, and other plug-ins there
+        that it imports.
+        """
         place = self.file or self.folder
-        if self.file is not None and self.root is not None and self.file.parent != self.root / "plugins":
+        if (
+            self.file is not None
+            and self.root is not None
+            and self.file.parent != self.root / "plugins"
+        ):
             place = self.root / "plugins" / self.file.relative_to(self.root / "plugins").parts[0]
         digest = hashlib.sha256()
         for file in sorted(_with_imports(place)) if place else ():
@@ -93,7 +103,8 @@ class Holder:
 
 
 def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:
-    """The holders of a kind's names, or of one name: gaigs, then installed packages, then ./plugins.
+    """The holders of a kind's names, or of one name: gaigs, then installed packages, then
+    ./plugins.
 
     The second list has the unreadable files, each with the cause.
     """
@@ -103,27 +114,41 @@ def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list
     dropped, causes = _scan(kind, Path.cwd() / "plugins", "plugins", root=Path.cwd())
     targets = {(holder.name, holder.target) for holder in installed}
     # A package in ./plugins may be installed as well.
-    holders = built_in + installed + [holder for holder in dropped if (holder.name, holder.target) not in targets]
+    holders = (
+        built_in
+        + installed
+        + [holder for holder in dropped if (holder.name, holder.target) not in targets]
+    )
     return [holder for holder in holders if name in (None, holder.name)], unreadable + causes
 
 
 def plugin_packages(kinds: Iterable[str]) -> list[Path]:
-    """Folders of the packages with an entry point of gaigs, installed or in ./plugins; none is imported."""
+    """Folders of the packages with an entry point of gaigs, installed or in ./plugins; none is
+    imported.
+    """
     holders = [holder for kind in kinds for holder in _installed_holders(kind)]
     holders += _scan(None, Path.cwd() / "plugins", "plugins", root=Path.cwd())[0]
-    return [holder.folder for holder in holders if holder.file is None and holder.folder is not None]
+    return [
+        holder.folder for holder in holders if holder.file is None and holder.folder is not None
+    ]
 
 
 def _installed_holders(kind: str) -> list[Holder]:
     # An installation changes a folder of sys.path.
-    path = tuple((folder, os.stat(folder or ".").st_mtime_ns) for folder in sys.path if os.path.isdir(folder or "."))
+    path = tuple(
+        (folder, os.stat(folder or ".").st_mtime_ns)
+        for folder in sys.path
+        if os.path.isdir(folder or ".")
+    )
     points = _installed(f"gaigs.{kind}", path)
     return [Holder(p.name, f"distribution {p.dist.name} {p.dist.version}", p.value) for p in points]
 
 
 @functools.lru_cache
 def _installed(group: str, _: tuple) -> metadata.EntryPoints:
-    """Entry points of a group. They stand in a file of each package on ``sys.path``, and reading these is slow."""
+    """Entry points of a group. They stand in a file of each package on ``sys.path``, and reading
+    these is slow.
+    """
     return metadata.entry_points(group=group)
 
 
@@ -139,13 +164,17 @@ def _with_imports(place: Path) -> set[Path]:
         for file in files - found:
             lines = re.findall(r"^\s*(?:from|import)\s(.*)", file.read_text(errors="replace"), re.M)
             words = {word for line in lines for word in re.findall(r"(?:plugins\.)?(\w+)", line)}
-            paths = [root / name for root in roots for word in words for name in (word, f"{word}.py")]
+            paths = [
+                root / name for root in roots for word in words for name in (word, f"{word}.py")
+            ]
             places += [path for path in paths if path.exists()]
         found |= files
     return found
 
 
-def _scan(kind: str | None, folder: Path, package: str, root: Path | None = None) -> tuple[list[Holder], list[str]]:
+def _scan(
+    kind: str | None, folder: Path, package: str, root: Path | None = None
+) -> tuple[list[Holder], list[str]]:
     """Holders of a kind, or of all kinds, in a folder's files, and the files that cannot be read."""
     holders, unreadable = [], []
     for module, file in _files(folder, package):
@@ -165,7 +194,9 @@ def _scan(kind: str | None, folder: Path, package: str, root: Path | None = None
 
 
 def _files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
-    """Modules and their files in a folder and its packages, and of an installable project its pyproject.toml."""
+    """Modules and their files in a folder and its packages, and of an installable project its
+    pyproject.toml.
+    """
     for path in sorted(folder.glob("[!_.]*")):
         if path.suffix == ".py":
             yield f"{package}.{path.stem}", path
@@ -177,16 +208,24 @@ def _files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
 
 
 def sources(folder: Path, project: str = "[!_.]*") -> list[Path]:
-    """The folders with the packages of the installable projects in a folder: ``src`` if it exists, else their own."""
+    """The folders with the packages of the installable projects in a folder: ``src`` if it exists,
+    else their own.
+    """
     places = [file.parent for file in sorted(folder.glob(f"{project}/pyproject.toml"))]
     return [place / "src" if (place / "src").is_dir() else place for place in places]
 
 
 @functools.cache  # called for each kind
 def _claims(file: Path, *_state: int) -> list[tuple[str, str, str]]:
-    """Kind, name and target that a file's top-level ``@register(kind, name)`` decorators or entry points claim."""
+    """Kind, name and target that a file's top-level ``@register(kind, name)`` decorators or entry
+    points claim.
+    """
     if file.name == "pyproject.toml":
-        groups = tomllib.loads(file.read_text(encoding="utf-8")).get("project", {}).get("entry-points", {})
+        groups = (
+            tomllib.loads(file.read_text(encoding="utf-8"))
+            .get("project", {})
+            .get("entry-points", {})
+        )
         return [
             (group.removeprefix("gaigs."), name, str(target))
             for group, points in groups.items()
@@ -212,4 +251,8 @@ def is_plain(value: object) -> bool:
     if isinstance(value, list | tuple):
         return all(map(is_plain, value))
     # A subclass, such as numpy's float64 or a text of an Enum, is no configuration's value.
-    return value is None or type(value) in (bool, int, float) or (type(value) is str and "${" not in value)
+    return (
+        value is None
+        or type(value) in (bool, int, float)
+        or (type(value) is str and "${" not in value)
+    )

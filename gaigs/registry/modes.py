@@ -11,9 +11,11 @@ _callers: list[Any] = []  # the default dtype that each call found
 
 @contextlib.contextmanager
 def usual_modes() -> Iterator[None]:
-    """Float32 as torch's default dtype, and no inference mode, while gaigs computes; also a decorator.
+    """Float32 as torch's default dtype, and no inference mode, while gaigs computes; also a
+    decorator.
 
-    Threads share the default dtype: the first one in sets it, the last one out restores it. Lightning changes it.
+    Threads share the default dtype: the first one in sets it, the last one out restores it.
+    Lightning changes it.
     """
     import torch  # slow to import
 
@@ -23,7 +25,11 @@ def usual_modes() -> Iterator[None]:
             torch.set_default_dtype(torch.float32)
     try:
         # Leaving an inference mode that is none would switch gradients on.
-        with torch.inference_mode(False) if torch.is_inference_mode_enabled() else contextlib.nullcontext():
+        with (
+            torch.inference_mode(False)
+            if torch.is_inference_mode_enabled()
+            else contextlib.nullcontext()
+        ):
             yield
     finally:
         with _switching:

@@ -1,4 +1,6 @@
-"""``python -m gaigs.report FOLDER``: the runs of a Hydra multirun as one table, and their spread over seeds."""
+"""``python -m gaigs.report FOLDER``: the runs of a Hydra multirun as one table, and their spread
+over seeds.
+"""
 
 from argparse import ArgumentParser
 from pathlib import Path
@@ -14,7 +16,9 @@ def main() -> None:
     parser = ArgumentParser(prog="python -m gaigs.report", description=__doc__)
     about = "folder that Hydra made for python -m gaigs --multirun ..., or one above several"
     parser.add_argument("folder", type=Path, help=about)
-    parser.add_argument("--format", default="png", help="of the figure files: png, pdf or svg, or several: png,pdf")
+    parser.add_argument(
+        "--format", default="png", help="of the figure files: png, pdf or svg, or several: png,pdf"
+    )
     given = parser.parse_args()
     try:
         with figure_formats(given.format.split(",")):

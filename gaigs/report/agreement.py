@@ -34,12 +34,22 @@ class Cell(NamedTuple):
 
 
 def write(
-    folder: Path, task: Task, cells: Sequence[Cell], rows: Mapping[str, Mapping], split: str, remarks: Sequence[str]
+    folder: Path,
+    task: Task,
+    cells: Sequence[Cell],
+    rows: Mapping[str, Mapping],
+    split: str,
+    remarks: Sequence[str],
 ) -> str:
-    """Writes ``agreement.md`` and ``agreement.png``, and returns the page; ``rows`` are metrics by predictor."""
+    """Writes ``agreement.md`` and ``agreement.png``, and returns the page; ``rows`` are metrics by
+    predictor.
+    """
     score, titles = task.pair_score, {name: metric.title for name, metric in task.metrics().items()}
     at = {(cell.distance, cell.separation): cell for cell in cells}
-    distances, columns = dict.fromkeys(cell.distance for cell in cells), sorted({cell.separation for cell in cells})
+    distances, columns = (
+        dict.fromkeys(cell.distance for cell in cells),
+        sorted({cell.separation for cell in cells}),
+    )
 
     def text(cell: Cell | None) -> str:
         if cell is None:
@@ -48,16 +58,23 @@ def write(
         return f"{median} ({low} to {high}), {cell.pairs:,}"
 
     lines = [["distance [m]", *map(_separation, columns)]]
-    lines += [[_distance(row), *(text(at.get((row, column))) for column in columns)] for row in distances]
+    lines += [
+        [_distance(row), *(text(at.get((row, column))) for column in columns)] for row in distances
+    ]
     about = f"Median {score} of two labels, 10th to 90th percentile, and number of pairs"
     by = "by the distance of their places and by how many measurements apart they are"
     parts = [f"{about}, {by}:\n\n{markdown(lines)}"]
     if rows:
-        lines = [[name, *(_number(row[key], title) for key, title in titles.items())] for name, row in rows.items()]
+        lines = [
+            [name, *(_number(row[key], title) for key, title in titles.items())]
+            for name, row in rows.items()
+        ]
         lines = [["predicted by", *titles.values()], *lines]
         parts.append(f"What that lets expect on split {split}:\n\n{markdown(lines)}")
     compared = [cell.compared for cell in cells if cell.compared < cell.pairs]
-    drawn = [f"of a cell with more, {max(compared):,} random pairs are compared"] if compared else []
+    drawn = (
+        [f"of a cell with more, {max(compared):,} random pairs are compared"] if compared else []
+    )
     parts.append("".join(f"- {remark}\n" for remark in [*remarks, *drawn]))
     page = "\n".join(parts)
     write_text(folder / "agreement.md", page)
@@ -78,10 +95,21 @@ def figure(score: str, cells: Sequence[Cell]) -> Figure:
             x = [distances.index(cell.distance) + shift for cell in own]
             low, median, high = np.array([cell.quantiles for cell in own]).T
             (colour, dash), marker = LINES[number % len(LINES)], "os^Dv"[number % 5]
-            look = {"color": colour, "linestyle": dash, "marker": marker, "markersize": 3.5, "elinewidth": 0.6}
+            look = {
+                "color": colour,
+                "linestyle": dash,
+                "marker": marker,
+                "markersize": 3.5,
+                "elinewidth": 0.6,
+            }
             ax.errorbar(x, median, [median - low, high - median], label=_separation(column), **look)
         ax.set(xlabel="distance of the places [m]", ylabel=f"{score} of two labels")
-        ax.set_xticks(range(len(distances)), [_distance(distance) for distance in distances], rotation=40, ha="right")
+        ax.set_xticks(
+            range(len(distances)),
+            [_distance(distance) for distance in distances],
+            rotation=40,
+            ha="right",
+        )
         ax.grid(axis="y")
         figure.legend(loc="outside upper center", ncols=2, title="measurements apart")
     return figure

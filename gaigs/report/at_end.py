@@ -14,7 +14,9 @@ folders: list[tuple[Path, str | list[str]]] = []
 
 
 class AtEnd(Callback):
-    """Requests the report of a multirun. ``main`` writes it, as Hydra calls no callback after a failed job."""
+    """Requests the report of a multirun. ``main`` writes it, as Hydra calls no callback after a
+    failed job.
+    """
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         """Remembers the folder and the formats."""
@@ -34,6 +36,8 @@ def write() -> None:
             with figure_formats(formats):
                 Console(emoji=False).print(report(folder))
         except Exception as error:  # a failed report must not look like a failed job
-            print(f"gaigs: no report: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr)
+            print(
+                f"gaigs: no report: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr
+            )
         else:
             print(f"report: {folder}; python -m gaigs.report {folder} writes it anew")

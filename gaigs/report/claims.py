@@ -1,4 +1,6 @@
-"""Claims of the paper on its parts, tested by runs of variants: differences by seed, with an interval."""
+"""Claims of the paper on its parts, tested by runs of variants: differences by seed, with an
+interval.
+"""
 
 import math
 import statistics
@@ -31,7 +33,8 @@ class Claim(NamedTuple):
 
     Attributes:
         claim: The claim in a few words.
-        better, than: Two variants, files of ``conf/variant``; the claim says that the first is better.
+        better, than: Two variants, files of ``conf/variant``; the claim says that the first is
+            better.
         source: Place in the paper.
         published: Published ``gain`` and its ``source``, by task.
     """
@@ -44,10 +47,15 @@ class Claim(NamedTuple):
 
 
 def read_claims(file: Path | None = None) -> list[Claim]:
-    """Contents of ``claims.yaml``, by default that of gaigs; a ValueError for a file of another form."""
+    """Contents of ``claims.yaml``, by default that of gaigs; a ValueError for a file of another
+    form.
+    """
     file = file or conf_dir() / "claims.yaml"
     try:
-        return [Claim(**({"published": {}} | parts)) for parts in yaml.safe_load(file.read_text())["claims"]]
+        return [
+            Claim(**({"published": {}} | parts))
+            for parts in yaml.safe_load(file.read_text())["claims"]
+        ]
     except (KeyError, TypeError, ValueError, yaml.YAMLError) as error:
         raise ValueError(f"{file} must have the form of conf/claims.yaml: {error!r}") from error
 
@@ -56,23 +64,32 @@ def interval(gains: Sequence[float]) -> tuple[float, float] | None:
     """Ends of the interval of Student's t around the mean of gains; None for a single one."""
     if len(gains) < 2:
         return None
-    half = t.ppf((1 + CONFIDENCE) / 2, len(gains) - 1) * statistics.stdev(gains) / math.sqrt(len(gains))
+    half = (
+        t.ppf((1 + CONFIDENCE) / 2, len(gains) - 1)
+        * statistics.stdev(gains)
+        / math.sqrt(len(gains))
+    )
     mean = statistics.mean(gains)
     return mean - half, mean + half
 
 
 def compare(runs: Sequence[Run], claims: Sequence[Claim]) -> list[dict]:
-    """Rows of ``claims.csv``, in the order of the claims; a claim is left out if one of its variants has no run.
+    """Rows of ``claims.csv``, in the order of the claims; a claim is left out if one of its
+    variants has no run.
 
-    Runs are of one setting if they differ only in variant, seed and options that change no result. A seed that was run
-    twice counts once.
+    Runs are of one setting if they differ only in variant, seed and options that change no result.
+    A seed that was run twice counts once.
     """
-    keys = dict.fromkeys(key for run in runs for key in run.overrides if key not in ("variant", "seed", *HARMLESS))
+    keys = dict.fromkeys(
+        key for run in runs for key in run.overrides if key not in ("variant", "seed", *HARMLESS)
+    )
     varied = [key for key in keys if len({run.overrides.get(key) for run in runs}) > 1]
     settings: dict[str, dict[str, dict[int, dict]]] = {}  # metrics by setting, variant and seed
     for run in runs:
         if run.metrics is not None and "variant" in run.overrides:
-            setting = " ".join(f"{key}={run.overrides[key]}" for key in varied if key in run.overrides)
+            setting = " ".join(
+                f"{key}={run.overrides[key]}" for key in varied if key in run.overrides
+            )
             seeds = settings.setdefault(setting, {}).setdefault(run.overrides["variant"], {})
             seeds.setdefault(run.metrics["seed"], run.metrics)
     rows = []
@@ -80,14 +97,20 @@ def compare(runs: Sequence[Run], claims: Sequence[Claim]) -> list[dict]:
         for setting, variants in settings.items():
             better, than = (variants.get(name, {}) for name in (claim.better, claim.than))
             if seeds := sorted(better.keys() & than.keys()):
-                rows.append(_row(claim, setting, *([side[seed] for seed in seeds] for side in (better, than))))
+                rows.append(
+                    _row(
+                        claim, setting, *([side[seed] for seed in seeds] for side in (better, than))
+                    )
+                )
     return rows
 
 
 def _row(claim: Claim, setting: str, *sides: Sequence[Mapping]) -> dict:
     task = sides[0][0]["task"]
     name, metric = headline(task, sides[0][0]["models"])
-    better, than = ([next(iter(metrics["models"].values()))[name] for metrics in side] for side in sides)
+    better, than = (
+        [next(iter(metrics["models"].values()))[name] for metrics in side] for side in sides
+    )
     sign = 1 if metric.higher_is_better else -1
     gains = [sign * (a - b) for a, b in zip(better, than, strict=True)]
     low, high = interval(gains) or (None, None)
@@ -115,7 +138,9 @@ def _row(claim: Claim, setting: str, *sides: Sequence[Mapping]) -> dict:
 
 
 def write_claims(folder: Path, runs: Sequence[Run]) -> Table | None:
-    """Writes ``claims.md`` and ``claims.csv``; None, and no files, if no claim has runs of both its variants."""
+    """Writes ``claims.md`` and ``claims.csv``; None, and no files, if no claim has runs of both its
+    variants.
+    """
     claims = read_claims()
     rows = compare(runs, claims)
     if not rows:
@@ -129,7 +154,9 @@ def write_claims(folder: Path, runs: Sequence[Run]) -> Table | None:
     for row in rows:
         notes[f"- {row['claim']}: {row['source']}\n"] = None
         if (gain := row["published gain"]) is not None:
-            notes[f"- published gain {_signed(gain)}: {published[row['claim']][row['task']]['source']}\n"] = None
+            notes[
+                f"- published gain {_signed(gain)}: {published[row['claim']][row['task']]['source']}\n"
+            ] = None
     failed = [f"{run.name}: {run.failure or 'unfinished'}\n" for run in runs if run.metrics is None]
     table = markdown([[*lines[0]], *([*line.values()] for line in lines)])
     remarks = "".join([*notes, *(f"- without a result: {failure}" for failure in failed)])
@@ -149,7 +176,9 @@ def _line(row: Mapping) -> dict[str, str]:
         "setting": row["setting"],
         "compared": f"{row['better']}, {row['than']}",
         "score": row["score"],
-        "published gain": "none" if row["published gain"] is None else _signed(row["published gain"]),
+        "published gain": "none"
+        if row["published gain"] is None
+        else _signed(row["published gain"]),
         "with": written(row["better's score"]),
         "without": written(row["than's score"]),
         "ours": f"{_signed(row['gain'])}{ends}",

@@ -40,11 +40,17 @@ def cdf(
     """
     with rc_context(STYLE):
         longest = max(map(len, values))
-        ncols = 3 if longest <= 12 else 2 if longest <= 20 else 1  # letters that fit a part of a column
-        figure = Figure(figsize=(COLUMN, 2.45 + 0.15 * math.ceil(len(values) / ncols)), layout="constrained")
+        ncols = (
+            3 if longest <= 12 else 2 if longest <= 20 else 1
+        )  # letters that fit a part of a column
+        figure = Figure(
+            figsize=(COLUMN, 2.45 + 0.15 * math.ceil(len(values) / ncols)), layout="constrained"
+        )
         ax = figure.subplots()
         ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)
-        for (name, sample), (colour, dash) in zip(values.items(), looks(values).values(), strict=True):
+        for (name, sample), (colour, dash) in zip(
+            values.items(), looks(values).values(), strict=True
+        ):
             median = float(np.median(sample))
             ax.ecdf(
                 sample,
@@ -53,7 +59,15 @@ def cdf(
                 zorder=2.5 if name == next(iter(values)) else 2,
                 label=f"{name} {median:#.3g}",
             )
-            ax.plot(median, 0.5, "o", color=colour, markersize=4, markeredgecolor="white", markeredgewidth=0.6)
+            ax.plot(
+                median,
+                0.5,
+                "o",
+                color=colour,
+                markersize=4,
+                markeredgecolor="white",
+                markeredgewidth=0.6,
+            )
         label = textwrap.fill(f"{quantity}, split {split}", LABEL)
         ax.set(xlabel=label, ylabel=f"share of test {samples}", ylim=(0, 1.01))
         ax.set_xlim(*limits)
@@ -64,12 +78,15 @@ def cdf(
 
 
 def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
-    """Steps and values of every quantity in files of Lightning's CSVLogger; empty cells are left out.
+    """Steps and values of every quantity in files of Lightning's CSVLogger; empty cells are left
+    out.
 
-    A killed run may leave an empty file or a cut last row. Both are skipped; the next start has logged them again.
+    A killed run may leave an empty file or a cut last row. Both are skipped; the next start has
+    logged them again.
 
     Args:
-        paths: One file for each start of the run; a later file replaces earlier ones from its first step on.
+        paths: One file for each start of the run; a later file replaces earlier ones from its first
+            step on.
     """
     curves: dict[str, dict[float, float]] = {}
     for path in paths:
@@ -86,16 +103,24 @@ def read_curves(paths: Sequence[Path]) -> dict[str, tuple[ndarray, ndarray]]:
                 for name in reader.fieldnames:
                     if row[name] and name not in ("step", "epoch"):
                         curves.setdefault(name, {})[float(row["step"])] = float(row[name])
-    return {name: tuple(np.array(sorted(points.items())).T) for name, points in curves.items() if points}
+    return {
+        name: tuple(np.array(sorted(points.items())).T) for name, points in curves.items() if points
+    }
 
 
 def read_log(folder: Path) -> dict[str, tuple[ndarray, ndarray]]:
-    """The curves in the log of a run's folder, of all its starts; empty for a run without a training."""
-    return read_curves(sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime))
+    """The curves in the log of a run's folder, of all its starts; empty for a run without a
+    training.
+    """
+    return read_curves(
+        sorted(folder.glob("log/*/metrics.csv"), key=lambda file: file.stat().st_mtime)
+    )
 
 
 def read_validations(folder: Path, score: str) -> list[tuple[int, float, float]]:
-    """Step, time since the start [s], NaN if unknown, and mean score of each validation in a run's log."""
+    """Step, time since the start [s], NaN if unknown, and mean score of each validation in a run's
+    log.
+    """
     curves = read_log(folder)
     seconds = dict(zip(*curves.get("seconds", ((), ())), strict=True))
     found = zip(*curves.get(f"validation/{score}", ((), ())), strict=True)
@@ -103,17 +128,32 @@ def read_validations(folder: Path, score: str) -> list[tuple[int, float, float]]
 
 
 def loss_curves(curves: Mapping[str, tuple[ndarray, ndarray]]) -> Figure:
-    """Training loss with its terms (``train/...``), penalties and validation scores against steps, a panel each."""
-    titles = {"train": "loss and its terms", "penalty": "penalties, unweighted", "validation": "validation score"}
+    """Training loss with its terms (``train/...``), penalties and validation scores against steps,
+    a panel each.
+    """
+    titles = {
+        "train": "loss and its terms",
+        "penalty": "penalties, unweighted",
+        "validation": "validation score",
+    }
     panels = {
-        group: {name.removeprefix(f"{group}/"): curve for name, curve in curves.items() if name.startswith(f"{group}/")}
+        group: {
+            name.removeprefix(f"{group}/"): curve
+            for name, curve in curves.items()
+            if name.startswith(f"{group}/")
+        }
         for group in titles
     }
-    panels = {group: dict(sorted(names.items(), key=lambda name: name[0] != "loss")) for group, names in panels.items()}
+    panels = {
+        group: dict(sorted(names.items(), key=lambda name: name[0] != "loss"))
+        for group, names in panels.items()
+    }
     panels = {group: names for group, names in panels.items() if names}
     with rc_context(STYLE):
         figure = Figure(figsize=(min(COLUMN * len(panels), PAGE), 2.6), layout="constrained")
-        for ax, (group, names) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+        for ax, (group, names) in zip(
+            figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
+        ):
             for (name, curve), (colour, dash) in zip(names.items(), cycle(LINES), strict=False):
                 _draw_smoothed(ax, *curve, color=colour, linestyle=dash, label=name)
             ax.set(xlabel="step", title=titles[group])
@@ -135,8 +175,8 @@ def speed_against_error(
 ) -> Figure:
     """Score of each run against each kind of time, one panel a kind; NaN if a time is unknown.
 
-    The baselines' scores are horizontal lines, named by their model first. Runs of several models, one a run, have the
-    models' colours.
+    The baselines' scores are horizontal lines, named by their model first. Runs of several models,
+    one a run, have the models' colours.
     """
     systems = looks(dict.fromkeys([*models, *(name.partition(" ")[0] for name in baselines)]))
     with rc_context(STYLE):
@@ -158,14 +198,21 @@ def speed_against_error(
             if len(known) and 0 < 10 * known.min() < known.max():
                 ax.set_xscale("log")
                 ticks = LogLocator(subs=(1, 2, 5))
-                ax.xaxis.set(major_locator=ticks, major_formatter="{x:g}", minor_locator=NullLocator())
+                ax.xaxis.set(
+                    major_locator=ticks, major_formatter="{x:g}", minor_locator=NullLocator()
+                )
         axes[0].set_ylabel(score_label)
-        figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=key_columns)
+        figure.legend(
+            *axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=key_columns
+        )
     return figure
 
 
-def learning_curves(curves: Mapping[str, Sequence], baselines: Mapping[str, float], score: Metric) -> Figure:
-    """Validation scores over the time of training [s], both by system; baselines are horizontal lines.
+def learning_curves(
+    curves: Mapping[str, Sequence], baselines: Mapping[str, float], score: Metric
+) -> Figure:
+    """Validation scores over the time of training [s], both by system; baselines are horizontal
+    lines.
 
     Errors have a logarithmic axis, so that large ones at the start leave space for small ones.
     """
@@ -176,12 +223,16 @@ def learning_curves(curves: Mapping[str, Sequence], baselines: Mapping[str, floa
         systems = looks([*curves, *baselines])
         for name, (times, scores) in curves.items():
             colour, dash = systems[name]
-            ax.plot(times, scores, marker=".", markersize=4, color=colour, linestyle=dash, label=name)
+            ax.plot(
+                times, scores, marker=".", markersize=4, color=colour, linestyle=dash, label=name
+            )
         for name, value in baselines.items():
             colour, dash = systems[name]
             ax.axhline(value, color=colour, linestyle=dash, linewidth=0.7, zorder=0, label=name)
         ax.set(xlabel="training [s]", ylabel=f"{score.title}, validation")
-        if not score.higher_is_better and all(value > 0 for line in ax.lines for value in line.get_ydata()):
+        if not score.higher_is_better and all(
+            value > 0 for line in ax.lines for value in line.get_ydata()
+        ):
             ax.set_yscale("log")
             _round_ticks(ax, (1, 2, 3, 4, 5, 6, 8))
         ax.grid()
@@ -191,7 +242,9 @@ def learning_curves(curves: Mapping[str, Sequence], baselines: Mapping[str, floa
 
 def _round_ticks(ax: Axes, steps: Sequence[int]) -> None:
     """Ticks of a logarithmic axis at these multiples of powers of ten, as plain numbers."""
-    ax.yaxis.set(major_locator=LogLocator(subs=steps), major_formatter="{x:g}", minor_locator=NullLocator())
+    ax.yaxis.set(
+        major_locator=LogLocator(subs=steps), major_formatter="{x:g}", minor_locator=NullLocator()
+    )
 
 
 def _draw_smoothed(ax: Axes, steps, values, **line) -> None:

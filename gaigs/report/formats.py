@@ -16,7 +16,9 @@ def figure_formats(format: str | list[str] = "png") -> Iterator[None]:
     """Figures within the context are written in these formats; a ``ValueError`` for an unknown one."""
     formats = [format] if isinstance(format, str) else format
     if not formats or not {*formats} <= {*FORMATS}:
-        raise ValueError(f"figures.format must be one or several of {', '.join(FORMATS)}, got {format!r}")
+        raise ValueError(
+            f"figures.format must be one or several of {', '.join(FORMATS)}, got {format!r}"
+        )
     token = chosen.set(tuple(formats))
     try:
         yield

@@ -1,4 +1,6 @@
-"""The runs of a Hydra multirun, or of several: one table, their spread over seeds, their speed against their error."""
+"""The runs of a Hydra multirun, or of several: one table, their spread over seeds, their speed
+against their error.
+"""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,9 +17,20 @@ from gaigs.report.claims import write_claims
 from gaigs.report.curves import speed_against_error
 from gaigs.report.runs import Run, by_seed, read_runs, train_seconds
 from gaigs.report.style import save
-from gaigs.report.table import Spread, columns_of, markdown, task_class, terminal, write_csv, written
+from gaigs.report.table import (
+    Spread,
+    columns_of,
+    markdown,
+    task_class,
+    terminal,
+    write_csv,
+    written,
+)
 
-COSTS = {key: systems.COSTS[key] for key in ("train_seconds", "num_gaussians", "num_parameters", "inference_ms")}
+COSTS = {
+    key: systems.COSTS[key]
+    for key in ("train_seconds", "num_gaussians", "num_parameters", "inference_ms")
+}
 """Titles of the costs in a table of runs."""
 
 INTERVALS = {
@@ -36,7 +49,9 @@ SEEDS = "Runs that differ in the seed alone: mean ± standard deviation (n - 1),
 
 
 def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
-    """Rows of the table: runs, then their baselines, once for each split; and the settings that all runs share."""
+    """Rows of the table: runs, then their baselines, once for each split; and the settings that all
+    runs share.
+    """
     shared: dict[str, object] = {}
 
     def differing(keys: Sequence[str], sources: Sequence[Mapping]) -> list[str]:
@@ -46,15 +61,25 @@ def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
 
     typed = [run.overrides for run in runs]
     varied = differing(columns_of(typed), typed)
-    facts = differing(("split", "seed", "device"), [run.metrics for run in runs if run.metrics is not None])
+    facts = differing(
+        ("split", "seed", "device"), [run.metrics for run in runs if run.metrics is not None]
+    )
 
     rows, baselines = [], {}
     for name, overrides, metrics, *_ in runs:
-        row = {"run": name, "status": "unfinished", "model": ""} | {key: overrides.get(key, "") for key in varied}
+        row = {"run": name, "status": "unfinished", "model": ""} | {
+            key: overrides.get(key, "") for key in varied
+        }
         if metrics is not None:
             (own, scores), *others = metrics["models"].items()
-            row |= {"status": "done", "model": row["model"] or own} | {key: metrics[key] for key in facts}
-            row |= scores | {key: metrics.get(key) for key in COSTS} | {"train_seconds": train_seconds(metrics)}
+            row |= {"status": "done", "model": row["model"] or own} | {
+                key: metrics[key] for key in facts
+            }
+            row |= (
+                scores
+                | {key: metrics.get(key) for key in COSTS}
+                | {"train_seconds": train_seconds(metrics)}
+            )
             for model, scores in others:
                 if model == f"{own}_trend":  # the run's own model without its kriging
                     continue
@@ -70,7 +95,11 @@ def ablation(runs: list[Run]) -> tuple[list[dict], dict]:
 def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
     """Rows of groups of runs that differ in ``seed`` alone, where two seeds or more have ended."""
     done = [run for run in runs if run.metrics is not None]
-    varied = [key for key in columns_of([run.overrides for run in done]) if key != "seed" and key not in shared]
+    varied = [
+        key
+        for key in columns_of([run.overrides for run in done])
+        if key != "seed" and key not in shared
+    ]
     rows = []
     for group in by_seed(done):
         found = [run.metrics for run in group]
@@ -89,10 +118,11 @@ def over_seeds(runs: list[Run], shared: Mapping) -> list[dict]:
 
 
 def report(folder: str | Path) -> Group:
-    """Writes ``ablation.csv``, ``ablation.md`` and, if a run has ended, ``speed_against_error.png`` into a folder.
+    """Writes ``ablation.csv``, ``ablation.md`` and, if a run has ended, ``speed_against_error.png``
+    into a folder.
 
-    Runs of several models also get the files of ``gaigs.report.systems``, and runs of variants those of
-    ``gaigs.report.claims``. Runs of several tasks get the latter only.
+    Runs of several models also get the files of ``gaigs.report.systems``, and runs of variants
+    those of ``gaigs.report.claims``. Runs of several tasks get the latter only.
 
     Args:
         folder: Folder of a Hydra multirun, or one above several.
@@ -112,7 +142,9 @@ def report(folder: str | Path) -> Group:
         if claims is not None:
             return Group(claims)
         listed = ", ".join(f"{task} in {name}" for task, name in tasks.items())
-        raise ValueError(f"the runs of a table must be of one task, got {listed}; pass a folder with runs of one")
+        raise ValueError(
+            f"the runs of a table must be of one task, got {listed}; pass a folder with runs of one"
+        )
     known = task_class(next(iter(tasks))).metrics() if tasks else {}
     titles = {name: metric.title for name, metric in known.items()} | INTERVALS | COSTS
     rows, shared = ablation(runs)
@@ -122,7 +154,9 @@ def report(folder: str | Path) -> Group:
     doubts = [f"{run.name}: {doubt}" for run in runs for doubt in run.doubts]
 
     write_csv(folder / "ablation.csv", rows + groups, ("_sd", "_least"))
-    page = f"{_markdown(rows, titles)}\n{caption}\n" + "".join(f"- without a result: {why}\n" for why in failures)
+    page = f"{_markdown(rows, titles)}\n{caption}\n" + "".join(
+        f"- without a result: {why}\n" for why in failures
+    )
     page += "".join(f"- {doubt}\n" for doubt in doubts)
     if groups:
         page += f"\n{SEEDS}\n\n{_markdown(groups, titles)}"
@@ -150,19 +184,30 @@ def report(folder: str | Path) -> Group:
 def _speed(runs: list[Run], rows: list[dict], shared: Mapping, titles: Mapping[str, str]) -> Figure:
     metric = next(iter(titles))
     done = [(run, row) for run, row in zip(runs, rows, strict=False) if run.metrics is not None]
-    varied = [{key: value for key, value in run.overrides.items() if key not in shared} for run, _ in done]
+    varied = [
+        {key: value for key, value in run.overrides.items() if key not in shared} for run, _ in done
+    ]
     names = [" ".join(f"{key}={value}" for key, value in overrides.items()) for overrides in varied]
     if "" in names or len(set(names)) < len(names):
         names = [run.name for run, _ in done]
-    numbers = lambda key: np.array([np.nan if row.get(key) is None else row[key] for _, row in done], float)
-    times = {"inference [ms a transmitter]": numbers("inference_ms"), "training [s]": numbers("train_seconds")}
-    baselines = {f"{row['model']} {row.get('split', '')}".strip(): row[metric] for row in rows[len(runs) :]}
+    numbers = lambda key: np.array(
+        [np.nan if row.get(key) is None else row[key] for _, row in done], float
+    )
+    times = {
+        "inference [ms a transmitter]": numbers("inference_ms"),
+        "training [s]": numbers("train_seconds"),
+    }
+    baselines = {
+        f"{row['model']} {row.get('split', '')}".strip(): row[metric] for row in rows[len(runs) :]
+    }
     models = [row["model"] for _, row in done]
     return speed_against_error(names, numbers(metric), times, titles[metric], baselines, models)
 
 
 def _text(value: float | int | str | Spread | None, between: str) -> str:
-    return written(value) + (f"{between}least {written(value.least)}" if isinstance(value, Spread) else "")
+    return written(value) + (
+        f"{between}least {written(value.least)}" if isinstance(value, Spread) else ""
+    )
 
 
 def _markdown(rows: list[dict], titles: Mapping[str, str]) -> str:
@@ -171,7 +216,9 @@ def _markdown(rows: list[dict], titles: Mapping[str, str]) -> str:
     return markdown([[titles.get(column, column) for column in columns], *cells])
 
 
-def _terminal(title: str, rows: list[dict], titles: Mapping[str, str], hidden: set[str], caption: str) -> Table:
+def _terminal(
+    title: str, rows: list[dict], titles: Mapping[str, str], hidden: set[str], caption: str
+) -> Table:
     columns = [column for column in columns_of(rows) if column not in hidden]
     heads = {titles.get(column, column.replace(".", ".\n")): column in titles for column in columns}
     lines = [[escape(_text(row.get(column), "\n")) for column in columns] for row in rows]

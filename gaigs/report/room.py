@@ -1,4 +1,6 @@
-"""The room from above and from the side: transmitters, receivers, walls, Gaussians, and learnt planes and paths."""
+"""The room from above and from the side: transmitters, receivers, walls, Gaussians, and learnt
+planes and paths.
+"""
 
 import numpy as np
 import torch
@@ -25,19 +27,28 @@ VIEWS = ((1, 2), (2, 1))
 
 
 @torch.no_grad()
-def room(links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | None = None) -> Figure:
+def room(
+    links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | None = None
+) -> Figure:
     """Plan (x, y) and side view (x, z) of the room, to one scale.
 
-    The 600 strongest Gaussians by |signal| times opacity are drawn, as ellipses of one standard deviation. The box
-    holds transmitters, receivers, walls and the middle 80 % of these Gaussians along each axis. Line widths of learnt
-    planes grow with their share of the power. Colour shows the loss by obstacles along the line of sight.
+    The 600 strongest Gaussians by |signal| times opacity are drawn, as ellipses of one standard
+    deviation. The box holds transmitters, receivers, walls and the middle 80 % of these Gaussians
+    along each axis. Line widths of learnt planes grow with their share of the power. Colour shows
+    the loss by obstacles along the line of sight.
     """
-    train, test = (links.query.transmitters[part].numpy() for part in (links.split.train, links.split.test))
+    train, test = (
+        links.query.transmitters[part].numpy() for part in (links.split.train, links.split.test)
+    )
     receivers, edges = _receivers(links), links.edges.numpy()
-    has_axes = all(len(one.array) > 1 or links.task.directions is not None for one in links.receivers)
+    has_axes = all(
+        len(one.array) > 1 or links.task.directions is not None for one in links.receivers
+    )
     corners = [train, test, receivers, edges.reshape(-1, 3)]
     if gaussians is not None:
-        strengths = (gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)).cpu().numpy()
+        strengths = (
+            (gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)).cpu().numpy()
+        )
         strongest = np.argsort(strengths)[-600:]  # more would hide each other
         parts = gaussians.means.cpu().numpy(), gaussians.covariances.cpu().numpy(), strengths
         means, covariances, strengths = (part[strongest] for part in parts)
@@ -52,22 +63,33 @@ def room(links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | 
             if learnt is not None and learnt.matter is not None:
                 obstacles.append(_draw_matter(ax, learnt.matter, up, along))
             if gaussians is not None:
-                ellipses = _draw_gaussians(ax, means[:, view], covariances[:, view][:, :, view], strengths)
+                ellipses = _draw_gaussians(
+                    ax, means[:, view], covariances[:, view][:, :, view], strengths
+                )
             if learnt is not None:
                 _draw_planes(ax, learnt.planes, view, along)
             _draw_walls(ax, edges[..., view])
             ax.plot(*train[:, view].T, ".", color="0.2", markersize=2, label="transmitters, train")
             ax.plot(*test[:, view].T, ".", color=ORANGE, markersize=3, label="transmitters, test")
-            _draw_receivers(ax, receivers[:, view], "receivers, axes of the array" if has_axes else "receivers")
+            _draw_receivers(
+                ax, receivers[:, view], "receivers, axes of the array" if has_axes else "receivers"
+            )
             for receiver in links.receivers if has_axes else ():
-                _draw_axes(ax, receiver.pose.position.numpy()[view], arrow * receiver.pose.rotation.numpy()[view])
+                _draw_axes(
+                    ax,
+                    receiver.pose.position.numpy()[view],
+                    arrow * receiver.pose.rotation.numpy()[view],
+                )
         bar = {"aspect": 30, "shrink": 0.7}
         if gaussians is not None:
             label = f"|signal| × opacity, {len(means):,} strongest of {len(gaussians.means):,} Gaussians"
             figure.colorbar(ellipses, ax=axes, label=label, extend="max", **bar)
         if obstacles:
-            # The scale spans at least 1 dB, so that a negligible loss is pale, and 40 dB, where nothing is left to see.
-            highest = min(40.0, max(1.0, *(np.quantile(image.get_array().data, 0.99) for image in obstacles)))
+            # The scale spans at least 1 dB, so that a negligible loss is pale, and 40 dB, where
+            # nothing is left to see.
+            highest = min(
+                40.0, max(1.0, *(np.quantile(image.get_array().data, 0.99) for image in obstacles))
+            )
             for image in obstacles:
                 image.set_clim(0, highest)
             label = "loss by obstacles along the line of sight [dB]"
@@ -77,7 +99,9 @@ def room(links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | 
 
 
 def paths(links: Links, learnt: LearntRoom) -> Figure:
-    """The learnt paths of a transmitter, at least one, folded through the room, in plan (x, y) and side view (x, z)."""
+    """The learnt paths of a transmitter, at least one, folded through the room, in plan (x, y) and
+    side view (x, z).
+    """
     receivers, edges = _receivers(links), links.edges.numpy()
     points = [path.points for path in learnt.paths]
     corners = [receivers, edges.reshape(-1, 3), *points]
@@ -90,9 +114,13 @@ def paths(links: Links, learnt: LearntRoom) -> Figure:
             _draw_walls(ax, edges[..., view])
             lines = _draw_paths(ax, learnt.paths, view)
             _draw_receivers(ax, receivers[:, view], "receivers")
-            ax.plot(*points[0][0, view], "o", color=ORANGE, markeredgecolor="white", label="transmitter")
+            ax.plot(
+                *points[0][0, view], "o", color=ORANGE, markeredgecolor="white", label="transmitter"
+            )
         x, y, z = points[0][0]
-        axes[0].set_title(f"The {len(points)} strongest paths of a transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m")
+        axes[0].set_title(
+            f"The {len(points)} strongest paths of a transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m"
+        )
         label = "power over that of the strongest path [dB]"
         figure.colorbar(lines, ax=axes, label=label, aspect=30, shrink=0.7)
         _legend(figure, axes[0])
@@ -119,10 +147,17 @@ def _views(corners: Float[ndarray, "k 3"]) -> tuple[Figure, tuple[Axes, Axes], n
     lower, upper = lower - 1.2 * arrow, upper + 1.2 * arrow
     width, depth, height = upper - lower
     inches = min(5.8 / width, 6.8 / (depth + height))  # of one metre on the page
-    figure = Figure(figsize=(width * inches + 1.3, (depth + height) * inches + 1.0), layout="compressed")
+    figure = Figure(
+        figsize=(width * inches + 1.3, (depth + height) * inches + 1.0), layout="compressed"
+    )
     plan, side = figure.subplots(2, 1, sharex=True, height_ratios=(depth, height))
     for ax, (up, _) in zip((plan, side), VIEWS, strict=True):
-        ax.set(xlim=(lower[0], upper[0]), ylim=(lower[up], upper[up]), ylabel="xyz"[up] + " [m]", aspect="equal")
+        ax.set(
+            xlim=(lower[0], upper[0]),
+            ylim=(lower[up], upper[up]),
+            ylabel="xyz"[up] + " [m]",
+            aspect="equal",
+        )
     side.set_xlabel("x [m]")
     return figure, (plan, side), arrow
 
@@ -134,10 +169,15 @@ def _legend(figure: Figure, ax: Axes) -> None:
 
 
 def _draw_gaussians(
-    ax: Axes, means: Float[ndarray, "n 2"], covariances: Float[ndarray, "n 2 2"], strengths: Float[ndarray, " n"]
+    ax: Axes,
+    means: Float[ndarray, "n 2"],
+    covariances: Float[ndarray, "n 2 2"],
+    strengths: Float[ndarray, " n"],
 ) -> EllipseCollection:
     variances, axes = np.linalg.eigh(covariances)  # ascending
-    minor, major = 2 * np.sqrt(variances.clip(0)).T  # rounding can leave a flat ellipse a variance below zero
+    minor, major = (
+        2 * np.sqrt(variances.clip(0)).T
+    )  # rounding can leave a flat ellipse a variance below zero
     ellipses = EllipseCollection(
         major,
         minor,
@@ -157,7 +197,9 @@ def _draw_gaussians(
 
 
 def _draw_planes(ax: Axes, planes: list[LearntPlane], view: list[int], along: int) -> None:
-    """Outlines with their share of the power. A plane that faces the reader would cover the room and is left out."""
+    """Outlines with their share of the power. A plane that faces the reader would cover the room
+    and is left out.
+    """
     # The limit is above 1 / sqrt(2), so that each plane is in one view at least.
     shown = [plane for plane in planes if abs(plane.normal[along]) < 0.77 and plane.share >= SHOWN]
     if not shown:
@@ -179,7 +221,11 @@ def _draw_planes(ax: Axes, planes: list[LearntPlane], view: list[int], along: in
         edge = plane.corners[:, view].mean(0) + (flat @ outward).max() * outward
         sideways = np.array((-outward[1], outward[0])) * np.ptp(flat @ (-outward[1], outward[0]))
         places = [edge + share * sideways for share in (0, 0.2, -0.2, 0.4, -0.4)]
-        free = (place for place in places if all((np.abs(place - other) > needed).any() for other in taken))
+        free = (
+            place
+            for place in places
+            if all((np.abs(place - other) > needed).any() for other in taken)
+        )
         place = next(free, edge)
         taken.append(place)
         across, upwards = np.round(outward).astype(int) + 1
@@ -219,7 +265,9 @@ def _draw_paths(ax: Axes, paths: list[LearntPath], view: list[int]) -> LineColle
     lines = LineCollection(
         [path.points[:, view] for path in ordered],
         array=powers,
-        cmap=ListedColormap(colormaps["plasma_r"](np.linspace(0.12, 1, 256))),  # paler colours vanish on white
+        cmap=ListedColormap(
+            colormaps["plasma_r"](np.linspace(0.12, 1, 256))
+        ),  # paler colours vanish on white
         clim=(lowest, 0),
         linewidths=0.8 + 1.4 * (1 - powers / lowest),
     )

@@ -27,7 +27,8 @@ def figures_of(task: type[Task]) -> figures.TaskFigures:
 
 
 def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
-    """Draws the room, the losses and the figures of the task from the files of a run into ``figures``.
+    """Draws the room, the losses and the figures of the task from the files of a run into
+    ``figures``.
 
     The model's ``primitives`` and ``learnt_room`` are drawn if it has them.
     """

@@ -63,19 +63,35 @@ def by_seed(runs: Sequence[Run]) -> list[list[Run]]:
 
 
 def read_metrics(file: Path) -> dict:
-    """Contents of a run's ``metrics.json``; a ValueError for a damaged file or a task that is not installed."""
+    """Contents of a run's ``metrics.json``; a ValueError for a damaged file or a task that is not
+    installed.
+    """
     try:
         metrics = json.loads(file.read_text())
         task, models = metrics["task"], metrics["models"]
         if not models:
             raise ValueError("no model")
         first, _ = headline(task, models)
-        for key, kind in (("split", str), ("seed", int), ("device", str), ("train_seconds", float | None)):
+        for key, kind in (
+            ("split", str),
+            ("seed", int),
+            ("device", str),
+            ("train_seconds", float | None),
+        ):
             check_type(repr(key), metrics.get(key), kind)
-        for models in (metrics["models"], metrics.get("validation") or {}, *(metrics.get("receivers") or {}).values()):
+        for models in (
+            metrics["models"],
+            metrics.get("validation") or {},
+            *(metrics.get("receivers") or {}).values(),
+        ):
             for scores in models.values():
                 check_type(repr(first), scores[first], float)
-    except (AttributeError, KeyError, TypeError, ValueError) as error:  # JSON and encodings raise a ValueError
+    except (
+        AttributeError,
+        KeyError,
+        TypeError,
+        ValueError,
+    ) as error:  # JSON and encodings raise a ValueError
         raise ValueError(
             f"cannot read {file} ({type(error).__name__}: {error})\n"
             "move it elsewhere, and start the run again, which does not train a second time"
@@ -88,7 +104,9 @@ def _read_yaml(file: Path, kind: type) -> Any:
         content = OmegaConf.to_container(OmegaConf.load(file), resolve=kind is dict)
         check_type("its content", content, kind)
     except (OmegaConfBaseException, yaml.YAMLError, TypeError, ValueError, OSError) as error:
-        raise ValueError(f"cannot parse {file}, which Hydra wrote: {' '.join(str(error).split())}") from error
+        raise ValueError(
+            f"cannot parse {file}, which Hydra wrote: {' '.join(str(error).split())}"
+        ) from error
     return content
 
 
@@ -103,17 +121,27 @@ def read_runs(folder: Path) -> list[Run]:
     for path in folder.glob("**/.hydra/overrides.yaml"):
         own, started = path.parents[1], path.parent / "config.yaml"
         stored, file = own / "config.yaml", own / "metrics.json"
-        if stored.is_file() and started.is_file() and differences(_read_yaml(stored, dict), _read_yaml(started, dict)):
+        if (
+            stored.is_file()
+            and started.is_file()
+            and differences(_read_yaml(stored, dict), _read_yaml(started, dict))
+        ):
             raise ValueError(
                 f"{own} holds a run of another configuration than the one last started there, and Hydra has rewritten "
                 "its overrides\nstart the first multirun again"
             )
         typed = (override.partition("=") for override in _read_yaml(path, list))
-        overrides = {key.lstrip("+"): re.sub(r"\\(.)", r"\1", value) for key, _, value in typed}  # without escapes
-        config: dict = next((_read_yaml(path, dict) for path in (stored, started) if path.is_file()), {})
+        overrides = {
+            key.lstrip("+"): re.sub(r"\\(.)", r"\1", value) for key, _, value in typed
+        }  # without escapes
+        config: dict = next(
+            (_read_yaml(path, dict) for path in (stored, started) if path.is_file()), {}
+        )
         metrics, failure = (read_metrics(file), None) if file.is_file() else (None, _failure(own))
         doubts = _correct(overrides, config)
-        runs.append(Run(own.relative_to(folder).as_posix(), overrides, metrics, failure, own, doubts))
+        runs.append(
+            Run(own.relative_to(folder).as_posix(), overrides, metrics, failure, own, doubts)
+        )
         configs.append(config)
     if not runs:
         raise FileNotFoundError(
@@ -122,16 +150,19 @@ def read_runs(folder: Path) -> list[Run]:
         )
     runs = _tell_apart(runs, configs)
     # Text and numbers alternate, so that equal types are compared.
-    parts = lambda name: [int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))]
+    parts = lambda name: [
+        int(part) if i % 2 else part for i, part in enumerate(re.split(r"([0-9]+)", name))
+    ]
     runs.sort(key=lambda run: parts(run.name))
     return runs
 
 
 def _correct(overrides: dict[str, str], config: dict) -> tuple[str, ...]:
-    """Replaces overrides that differ from the run's configuration by its values; returns a sentence for each.
+    """Replaces overrides that differ from the run's configuration by its values; returns a sentence
+    for each.
 
-    Presets without a name of their own, such as experiments, are not in the configuration. A tokenizer that no part
-    reads becomes ``none``.
+    Presets without a name of their own, such as experiments, are not in the configuration. A
+    tokenizer that no part reads becomes ``none``.
     """
     doubts = []
     for key, value in overrides.items():
@@ -145,7 +176,9 @@ def _correct(overrides: dict[str, str], config: dict) -> tuple[str, ...]:
             known = [there if "${" in value or isinstance(there, list) else _parsed(value)]
         if there is not MISSING and there not in known:
             overrides[key] = str(there)
-            doubts.append(f".hydra/overrides.yaml has {key}={value}, and config.yaml {there}, which counts")
+            doubts.append(
+                f".hydra/overrides.yaml has {key}={value}, and config.yaml {there}, which counts"
+            )
     if "tokenizer" in overrides and _is_unread("tokenizer", config):
         overrides["tokenizer"] = "none"
     return tuple(doubts)
@@ -165,18 +198,25 @@ def _is_unread(key: str, config: Mapping) -> bool:
 
 
 def _tell_apart(runs: list[Run], configs: list[dict]) -> list[Run]:
-    """Runs with the same overrides, though they differ in more than the seed, with values of their configurations."""
+    """Runs with the same overrides, though they differ in more than the seed, with values of their
+    configurations.
+    """
     own = {}
     for run, config in zip(runs, configs, strict=True):
         parts = {key: value for key, value in config.items() if not _is_unread(key, config)}
         # A model's configuration repeats those of its parts.
-        alone = {key: value for key, value in (config.get("model") or {}).items() if key not in config}
+        alone = {
+            key: value for key, value in (config.get("model") or {}).items() if key not in config
+        }
         own[run.folder] = parts | {"model": alone}
     for group in by_seed(runs):
         first, *others = (own[run.folder] for run in group)
         keys = dict.fromkeys(key for other in others for key in differences(first, other))
         for key in (key for key in keys if key.rpartition(".")[2] != "seed"):
-            values = {run.folder: str(OmegaConf.select(OmegaConf.create(own[run.folder]), key)) for run in group}
+            values = {
+                run.folder: str(OmegaConf.select(OmegaConf.create(own[run.folder]), key))
+                for run in group
+            }
             usual = Counter(values.values()).most_common(1)[0][0]
             for run in group:
                 run.overrides[key.removesuffix(".name")] = value = values[run.folder]

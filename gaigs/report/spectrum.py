@@ -28,14 +28,20 @@ class SpectrumFigures(TaskFigures):
         file = folder / "predictions.npz"
         shown = read_examples(file, "ssim")
         grid = task.directions
-        elevations, azimuths = (np.rad2deg(angles.numpy()) for angles in (grid.elevations, grid.azimuths))
+        elevations, azimuths = (
+            np.rad2deg(angles.numpy()) for angles in (grid.elevations, grid.azimuths)
+        )
         return {
             "spectra": spectra(shown, elevations, azimuths),
             "spectra_polar": spectra(shown, elevations, azimuths, polar=True),
-            "ssim_cdf": cdf(own_scores(file, "ssim"), "SSIM", "spectra", links.split.name, (None, 1)),
+            "ssim_cdf": cdf(
+                own_scores(file, "ssim"), "SSIM", "spectra", links.split.name, (None, 1)
+            ),
         }
 
-    def of_systems(self, task: type[Spectrum], files: Mapping[str, Path], split: str) -> dict[str, Figure]:
+    def of_systems(
+        self, task: type[Spectrum], files: Mapping[str, Path], split: str
+    ) -> dict[str, Figure]:
         scores = scores_of_systems(files, "ssim")
         order = np.argsort(np.mean([scores[name] for name in files], 0))
         median = order[round(0.5 * (len(order) - 1))]
@@ -52,11 +58,15 @@ class SpectrumFigures(TaskFigures):
 
 
 def spectra(
-    shown: Examples, elevations: Float[ndarray, " rows"], azimuths: Float[ndarray, " columns"], polar: bool = False
+    shown: Examples,
+    elevations: Float[ndarray, " rows"],
+    azimuths: Float[ndarray, " columns"],
+    polar: bool = False,
 ) -> Figure:
     """Label, prediction and signed error over azimuth and elevation [deg], one transmitter a row.
 
-    A polar figure has the zenith in the middle. Amplitudes outside [0, 1] take the colour of the nearer end.
+    A polar figure has the zenith in the middle. Amplitudes outside [0, 1] take the colour of the
+    nearer end.
     """
     labels, predictions = shown.labels.astype(np.float32), shown.predictions.astype(np.float32)
     errors = predictions - labels
@@ -70,14 +80,24 @@ def spectra(
     draw = _draw_sky if polar else _draw_plane
     edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)
     with rc_context(STYLE):
-        figure = Figure(figsize=(PAGE, (2.2 if polar else 0.95) * len(labels) + 0.75), layout="constrained")
-        axes = figure.subplots(len(labels), 3, squeeze=False, subplot_kw={"projection": "polar"} if polar else {})
+        figure = Figure(
+            figsize=(PAGE, (2.2 if polar else 0.95) * len(labels) + 0.75), layout="constrained"
+        )
+        axes = figure.subplots(
+            len(labels), 3, squeeze=False, subplot_kw={"projection": "polar"} if polar else {}
+        )
         for panels, (values, colours, titles) in zip(axes.T, columns, strict=True):
             for ax, value, title in zip(panels, values, titles, strict=True):
                 image = draw(ax, *edges, value, colours)
                 ax.set_title(title)
         bar = {"location": "bottom", "shrink": 0.7}
-        figure.colorbar(axes[0, 0].collections[0], ax=axes[:, :2], label="normalised amplitude", aspect=45, **bar)
+        figure.colorbar(
+            axes[0, 0].collections[0],
+            ax=axes[:, :2],
+            label="normalised amplitude",
+            aspect=45,
+            **bar,
+        )
         figure.colorbar(image, ax=axes[:, 2], label="prediction − label", aspect=22, **bar)
         if not polar:
             for ax in axes.flat:
@@ -90,7 +110,9 @@ def side_by_side(
     elevations: Float[ndarray, " rows"],
     azimuths: Float[ndarray, " columns"],
 ) -> Figure:
-    """Spectra by title on one grid [deg], e.g. a measured one and its predictions by several systems."""
+    """Spectra by title on one grid [deg], e.g. a measured one and its predictions by several
+    systems.
+    """
     columns = min(4, len(panels))
     rows = ceil(len(panels) / columns)
     edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)
@@ -107,12 +129,16 @@ def side_by_side(
             if index + columns >= len(panels):  # the lowest panel of its column
                 ax.set_xlabel("azimuth [deg]")
                 ax.tick_params(labelbottom=True)
-        figure.colorbar(image, ax=axes, label="normalised amplitude", location="bottom", shrink=0.5, aspect=45)
+        figure.colorbar(
+            image, ax=axes, label="normalised amplitude", location="bottom", shrink=0.5, aspect=45
+        )
     return figure
 
 
 def _edges(centres: Float[ndarray, " n"], lowest: float, highest: float) -> Float[ndarray, " n+1"]:
-    """Borders of the pixels: half-way between their centres, and as far outside the first and the last."""
+    """Borders of the pixels: half-way between their centres, and as far outside the first and the
+    last.
+    """
     middle = (centres[1:] + centres[:-1]) / 2
     ends = 2 * centres[0] - middle[0], 2 * centres[-1] - middle[-1]
     return np.concatenate((ends[:1], middle, ends[1:])).clip(lowest, highest)
@@ -129,7 +155,9 @@ def _draw_plane(ax: Axes, azimuths, elevations, values, colours):
 
 def _draw_sky(ax: Axes, azimuths, elevations, values, colours):
     image = ax.pcolormesh(np.deg2rad(azimuths), 90 - elevations, values, rasterized=True, **colours)
-    ink = "0.3" if colours["vmin"] < 0 else "white"  # the middle of the error's scale is white itself
+    ink = (
+        "0.3" if colours["vmin"] < 0 else "white"
+    )  # the middle of the error's scale is white itself
     ax.set_ylim(0, 90 - elevations.min())
     ax.set_yticks((30, 60), ("60°", "30°"), color=ink, size=6)
     ax.set_xticks(np.deg2rad((0, 90, 180, 270)), ("0°", "90°", "180°", "270°"))

@@ -26,11 +26,13 @@ log = logging.getLogger(__name__)
 
 
 def run(config: dict, folder: Path) -> dict | None:
-    """Trains, tests, and writes the run folder; resumes a run of the same configuration that was stopped there.
+    """Trains, tests, and writes the run folder; resumes a run of the same configuration that was
+    stopped there.
 
     Args:
         config: The resolved configuration.
-        folder: The run folder of docs/start.md. A finished run is not repeated. One run holds the folder at a time.
+        folder: The run folder of docs/start.md. A finished run is not repeated. One run holds the
+            folder at a time.
 
     Returns:
         The contents of ``metrics.json``; None in all but the first of several processes.
@@ -58,7 +60,9 @@ def run(config: dict, folder: Path) -> dict | None:
                 metrics = train_and_test(config, folder)
                 if math.isfinite(watch.limit):
                     metrics |= {"max_time": watch.limit, "left_out": watch.left_out}
-                if not is_configuration(folder / "config.yaml"):  # loggers make a removed folder again
+                if not is_configuration(
+                    folder / "config.yaml"
+                ):  # loggers make a removed folder again
                     store(config, folder)
                 write_text(finished, json.dumps(metrics, indent=2) + "\n")
     console = Console(emoji=False)
@@ -74,18 +78,19 @@ def load(path: str | Path, trust: bool = False) -> Model:
     It needs neither data nor Hydra.
 
     Args:
-        path: ``best.ckpt`` or ``last.ckpt`` of a run, a file of ``Model.save``, or the folder of a run.
-        trust: True to import any plug-in of ./plugins that the file names; else only one whose source is the recorded
-            one. Installed packages are always imported.
+        path: ``best.ckpt`` or ``last.ckpt`` of a run, a file of ``Model.save``, or the folder of a
+            run.
+        trust: True to import any plug-in of ./plugins that the file names; else only one whose
+            source is the recorded one. Installed packages are always imported.
 
     Returns:
         The model in evaluation mode, on the CPU: ``load(path).predict(transmitters)``.
 
     Raises:
         FileNotFoundError: The file or folder does not exist, or the run is not finished.
-        ValueError: The file is damaged or of another format, a component is not installed, or the weights do not fit
-            the configuration or are not finite; or the run is not finished, or its data were arrays; or a plug-in of
-            ./plugins has another source.
+        ValueError: The file is damaged or of another format, a component is not installed, or the
+            weights do not fit the configuration or are not finite; or the run is not finished, or
+            its data were arrays; or a plug-in of ./plugins has another source.
         ImportError: A component cannot be imported.
 
     Example:
@@ -106,7 +111,9 @@ def load(path: str | Path, trust: bool = False) -> Model:
         )
     model: Any = checkpoint.load(folder / "best.ckpt", trust, stored_software(folder))
     if config["kriging"] and not hasattr(model, "krige"):
-        raise ValueError(f"the run in {folder} is not finished: it lacks its kriging\nstart it again, it goes on")
+        raise ValueError(
+            f"the run in {folder} is not finished: it lacks its kriging\nstart it again, it goes on"
+        )
     warn_of_changes(folder, config["model"])
     return model
 
@@ -115,7 +122,9 @@ def configuration_of(folder: str | Path) -> dict:
     """The configuration of a run."""
     path = Path(folder) / "config.yaml"
     if not is_configuration(path):
-        raise FileNotFoundError(f"{folder} holds no run; give the folder with config.yaml, such as runs/room")
+        raise FileNotFoundError(
+            f"{folder} holds no run; give the folder with config.yaml, such as runs/room"
+        )
     config: Any = OmegaConf.to_container(OmegaConf.load(path))
     return config
 
@@ -124,7 +133,9 @@ def links_of(folder: str | Path, trust: bool) -> Links:
     """The links of a run, read again, by a reader that ``load`` would import."""
     config = configuration_of(folder)
     if config["data"]["name"] == "arrays":
-        raise ValueError(f"the data of {folder} were arrays, which are not stored; use the model in Python")
+        raise ValueError(
+            f"the data of {folder} were arrays, which are not stored; use the model in Python"
+        )
     with only_recorded(None if trust else stored_software(Path(folder))):
         return data.load(config["data"], config["split"], config["task"]["name"])
 
@@ -136,7 +147,9 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     lightning.seed_everything(config["seed"], verbose=False)
     links = data.load(config["data"], config["split"], config["task"]["name"])
     if not len(links.split.test):
-        raise ValueError("a run takes links to test on; set split.test above 0, or use gaigs.train in Python")
+        raise ValueError(
+            "a run takes links to test on; set split.test above 0, or use gaigs.train in Python"
+        )
     # Slow to import: errors in data come first.
     from gaigs.runs import evaluation
     from gaigs.runs.training import count_gaussians, fit
@@ -149,7 +162,9 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     log.info("data: %s; split %s: %s", config["data"]["name"], links.split.name, sizes)
     scene = links.scene
     box = " x ".join(f"{edge:.2f}" for edge in scene.upper - scene.lower)
-    log.info("data: training transmitters within %s m%s", box, links.remarks and f"; {links.remarks}")
+    log.info(
+        "data: training transmitters within %s m%s", box, links.remarks and f"; {links.remarks}"
+    )
     loss = registry("loss").build(config["loss"], task=task)
     baselines = evaluation.build_baselines(config["baselines"], name, scene)
     if baselines:
@@ -179,7 +194,9 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "num_parameters": sum(parameter.numel() for parameter in model.parameters()),
         "checkpoint_bytes": best.stat().st_size if best.is_file() else None,
         "models": {name: evaluation.summary(task, values) for name, values in scores.items()},
-        "validation": {name: evaluation.summary(task, values) for name, values in validation.items()},
+        "validation": {
+            name: evaluation.summary(task, values) for name, values in validation.items()
+        },
         "validation_score": validation[name][task.monitor].mean().item() if validation else None,
         "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
     } | (call_optional(model, "facts") or {})

@@ -20,7 +20,15 @@ from rich.jupyter import JupyterMixin
 from rich.markup import escape
 from torch import Tensor
 
-from gaigs.calibration import Calibration, fewest, holds, interval_scores, nearest, summarise_intervals, thinned
+from gaigs.calibration import (
+    Calibration,
+    fewest,
+    holds,
+    interval_scores,
+    nearest,
+    summarise_intervals,
+    thinned,
+)
 from gaigs.configuration import composed, files_of
 from gaigs.core import stages
 from gaigs.core.query import Batch, Query, evenly
@@ -45,24 +53,29 @@ CALIBRATION_FOLDS, MOST = 5, 1000
 """Folds of known links that calibrate a look-up, and most links that they ask for."""
 
 INTERVALS = "interval_"
-"""Beginning of the names of scores of intervals; ``interval_places`` has the number of each link's place."""
+"""Beginning of the names of scores of intervals; ``interval_places`` has the number of each link's
+place.
+"""
 
 Scores = dict[str, dict[str, Tensor]]
 """Scores of every link, by the names of model and score."""
 
 
 def build_baselines(configurations: Sequence, own: str, scene: Scene) -> dict[str, Model]:
-    """The baselines of a run by name, not fitted; the one with the name ``own`` of the run's model is left out.
+    """The baselines of a run by name, not fitted; the one with the name ``own`` of the run's model
+    is left out.
 
     Raises:
-        ValueError: A baseline has no name, an unknown one or options that do not fit, has to be trained, or two have
-            the same name.
+        ValueError: A baseline has no name, an unknown one or options that do not fit, has to be
+            trained, or two have the same name.
     """
     models: dict[str, Model | None] = {}
     for config in configurations:
         config = {"name": config} if isinstance(config, str) else config
         if not isinstance(config, Mapping) or "name" not in config:
-            raise ValueError(f"baselines must be names or model configurations with a name, got {config!r}")
+            raise ValueError(
+                f"baselines must be names or model configurations with a name, got {config!r}"
+            )
         name = config["name"]
         if name in models:
             raise ValueError(f"baselines must have different names, got {name!r} twice")
@@ -85,7 +98,9 @@ def fitted(look_up: Model, links: Links) -> Model:
 
 
 def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor) -> Tensor:
-    """The model's own deviations of some links, ``Model.spread``, on the CPU; ``values`` are its predictions."""
+    """The model's own deviations of some links, ``Model.spread``, on the CPU; ``values`` are its
+    predictions.
+    """
     parts = zip(links.query[index].parts(BATCH), values.split(BATCH), strict=True)
     device, directions = model.device, links.task.directions
     batches = ((Batch(query, directions).to(device), part.to(device)) for query, part in parts)
@@ -93,7 +108,9 @@ def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor
 
 
 def calibrated(model: Model, links: Links) -> Calibration | None:
-    """The calibration of a model, by errors at links that it has not seen, see ``unseen``; None without such links."""
+    """The calibration of a model, by errors at links that it has not seen, see ``unseen``; None
+    without such links.
+    """
     if links.held_out is not None:
         return None
     asked, values, deviations, near = [], [], [], []
@@ -102,9 +119,13 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
             break
         asked.append(part)
         values.append(predicted(one, links, part))
-        if isinstance(one, GaussianProcess | Kriging) and isinstance(model, GaussianProcess | Kriging):
+        if isinstance(one, GaussianProcess | Kriging) and isinstance(
+            model, GaussianProcess | Kriging
+        ):
             for process, whole in zip(one.scalar, model.scalar, strict=True):
-                process.take(whole)  # a fold's hyperparameters may state larger or smaller deviations everywhere
+                process.take(
+                    whole
+                )  # a fold's hyperparameters may state larger or smaller deviations everywhere
         deviations.append(spreads(one, links, part, values[-1]))
         there = links.query[known]
         near.append(nearest(links.query[part], there.transmitters, there.receivers))
@@ -125,19 +146,26 @@ def fold_count(model: Model) -> int:
     return 1 if is_trained(model) else CALIBRATION_FOLDS
 
 
-def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"], Int[Tensor, " j"]]]:
-    """Models like a model, links that they have not seen, and the links that they know; each when it is asked for.
+def unseen(
+    model: Model, links: Links
+) -> Iterator[tuple[Model, Int[Tensor, " k"], Int[Tensor, " j"]]]:
+    """Models like a model, links that they have not seen, and the links that they know; each when
+    it is asked for.
 
-    A look-up is fitted anew without each fold of the known links; so are estimated places of receivers. A trained model
-    has the validation links; the step of its training stays the one chosen on all of them. Kriging is fitted anew to
-    the training links, and its weights and hyperparameters are chosen for each half of the validation links by the
-    other half; one group alone chooses, too. Of repeated readings one calibrates, see ``single_readings``. The time
-    limit of a run leaves later folds out.
+    A look-up is fitted anew without each fold of the known links; so are estimated places of
+    receivers. A trained model has the validation links; the step of its training stays the one
+    chosen on all of them. Kriging is fitted anew to the training links, and its weights and
+    hyperparameters are chosen for each half of the validation links by the other half; one group
+    alone chooses, too. Of repeated readings one calibrates, see ``single_readings``. The time limit
+    of a run leaves later folds out.
     """
     split, validation, receivers = links.split, links.split.validation, links.query.receivers
     if not (is_trained(model) or isinstance(model, Kriging)):
         index = split.known
-        folds, asked = folds_of(links, index) % CALIBRATION_FOLDS, evenly(single_readings(links, index), MOST)
+        folds, asked = (
+            folds_of(links, index) % CALIBRATION_FOLDS,
+            evenly(single_readings(links, index), MOST),
+        )
         for fold in range(CALIBRATION_FOLDS):
             if stages.is_up():
                 return
@@ -147,7 +175,9 @@ def unseen(model: Model, links: Links) -> Iterator[tuple[Model, Int[Tensor, " k"
             known, part = index[is_known], index[~is_known & torch.isin(index, asked)]
             if len(part):
                 rest = replace(links, split=split.only(known))
-                memo: dict[int, Any] = {id(model.links): model.links} if hasattr(model, "links") else {}
+                memo: dict[int, Any] = (
+                    {id(model.links): model.links} if hasattr(model, "links") else {}
+                )
                 if links.uncertainties is not None and links.uncertainties.any():
                     at_all = torch.where(links.uncertainties > 0, math.inf, 0.0)
                     rest = with_places(replace(rest, uncertainties=at_all))
@@ -179,7 +209,8 @@ class Evaluation(JupyterMixin):
     Attributes:
         task: Task of the labels.
         split: Name of the split.
-        scores: Scores of every test link (k,), by the names of model and score; the evaluated model first.
+        scores: Scores of every test link (k,), by the names of model and score; the evaluated model
+            first.
         device: Name of the device that computed them.
     """
 
@@ -194,7 +225,12 @@ class Evaluation(JupyterMixin):
         return {name: summary(self.task, values) for name, values in self.scores.items()}
 
     def __rich__(self) -> Group:
-        facts = {"task": self.task.name, "split": self.split, "device": self.device, "models": self.models}
+        facts = {
+            "task": self.task.name,
+            "split": self.split,
+            "device": self.device,
+            "models": self.models,
+        }
         return Group(metrics_table(facts), escape(verdict(facts)))
 
     def __str__(self) -> str:
@@ -204,7 +240,8 @@ class Evaluation(JupyterMixin):
 
 
 def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> Evaluation:
-    """Scores of a model on the test links, beside those of baselines that are fitted to the other links.
+    """Scores of a model on the test links, beside those of baselines that are fitted to the other
+    links.
 
     Args:
         model: A trained, fitted or loaded model, of the same receivers and task.
@@ -213,10 +250,11 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
 
     Raises:
         TypeError: The model is not a ``gaigs.Model``, or the links are not ``gaigs.Links``.
-        ValueError: There are no test links, the links have other receivers or another task, or a baseline has to be
-            trained.
+        ValueError: There are no test links, the links have other receivers or another task, or a
+            baseline has to be trained.
 
-    It warns of test links at places that the model has learnt from, where those are not official ones.
+    It warns of test links at places that the model has learnt from, where those are not official
+    ones.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=50)
@@ -229,22 +267,26 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
         evaluated on ...
     """
     if not isinstance(model, Model) or not isinstance(links, Links):
-        raise TypeError(f"evaluate takes a model and links, got {type(model).__name__} and {type(links).__name__}")
+        raise TypeError(
+            f"evaluate takes a model and links, got {type(model).__name__} and {type(links).__name__}"
+        )
     check_fit(links, model.scene)
     if not len(links.split.test):
         raise ValueError("links must have some to test on; take another split")
     if model.known_places is not None:
-        known, test = (links.query[part].place_keys for part in (links.split.known, links.split.test))
+        known, test = (
+            links.query[part].place_keys for part in (links.split.known, links.split.test)
+        )
         if seen := int((torch.isin(test, model.known_places) & ~torch.isin(test, known)).sum()):
-            words = (
-                "%s has learnt from the places of %d of %d test links\ntake links of the split and seed of its training"
-            )
+            words = "%s has learnt from the places of %d of %d test links\ntake links of the split and seed of its training"
             log.warning(words, name_of(model), seen, len(test))
     task = (links.held_out or links).task
     own = name_of(model.trend if isinstance(model, Kriging) else model)
     models = {own: model} | ({f"{own}_trend": model.trend} if isinstance(model, Kriging) else {})
     if baselines is None:
-        baselines = composed([f"task={task.name}"], {})["baselines"] if files_of("task", task.name) else ()
+        baselines = (
+            composed([f"task={task.name}"], {})["baselines"] if files_of("task", task.name) else ()
+        )
     baselines = [baselines] if isinstance(baselines, str) else baselines
     scores = score(models, build_baselines(baselines, own, links.scene), links)
     return Evaluation(task, links.split.name, scores, device_name(model.device))
@@ -270,11 +312,12 @@ def score(
     folder: Path | None = None,
     has_intervals: bool = True,
 ) -> Scores:
-    """Scores of every test link by fitted models and by look-ups; a folder gets predictions of the first.
+    """Scores of every test link by fitted models and by look-ups; a folder gets predictions of the
+    first.
 
-    Look-ups and models with a calibration have scores of intervals too. If subcarriers are held out,
-    ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as an uplink is taken for a
-    downlink.
+    Look-ups and models with a calibration have scores of intervals too. If subcarriers are held
+    out, ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as an
+    uplink is taken for a downlink.
     """
     asked, index = links.held_out or links, links.split.test
     task: Any = asked.task
@@ -289,13 +332,21 @@ def score(
     if query.frequencies is not None:
         content["frequencies"] = query.frequencies.numpy()
     if task.directions is not None:
-        content |= {"elevations": task.directions.elevations.numpy(), "azimuths": task.directions.azimuths.numpy()}
+        content |= {
+            "elevations": task.directions.elevations.numpy(),
+            "azimuths": task.directions.azimuths.numpy(),
+        }
     scores = {}
 
     def add(key: str, values: Tensor) -> None:
         scores[key] = task.scores(labels, values)
         content.setdefault("prediction", task.packed(values))
-        content.update({f"{kind}_{key}": array for kind, array in task.stored(labels, values, scores[key]).items()})
+        content.update(
+            {
+                f"{kind}_{key}": array
+                for kind, array in task.stored(labels, values, scores[key]).items()
+            }
+        )
 
     frequencies = None if links.held_out is None else task.frequencies
     keys, gone = [*models, *look_ups], list[str]()
@@ -315,17 +366,31 @@ def score(
             continue
         values = predicted(model, links, index, frequencies)
         add(key, values)
-        calibration = model.calibration if key in models or not has_intervals else calibrated(model, links)
+        calibration = (
+            model.calibration if key in models or not has_intervals else calibrated(model, links)
+        )
         enough = calibration is not None and calibration.gives(0.9)
         if has_intervals and frequencies is None and key == next(iter(models), None) and not enough:
             count = 0 if calibration is None else int(calibration.counts.min())
-            log.warning("%s has no intervals: %d links calibrate them, and %d are needed", key, count, fewest(0.9))
+            log.warning(
+                "%s has no intervals: %d links calibrate them, and %d are needed",
+                key,
+                count,
+                fewest(0.9),
+            )
         if has_intervals and frequencies is None and enough:
             deviations = spreads(model, links, index, values)
-            batches = torch.arange(len(index)).split(BATCH)  # estimates take ten times the memory of labels
+            batches = torch.arange(len(index)).split(
+                BATCH
+            )  # estimates take ten times the memory of labels
             if key == next(iter(models), None):
-                stated = (calibration.estimate(values[some], deviations[some], query[some], 0.9) for some in batches)
-                content["deviation"] = np.concatenate([task.packed(estimate.std) for estimate in stated])
+                stated = (
+                    calibration.estimate(values[some], deviations[some], query[some], 0.9)
+                    for some in batches
+                )
+                content["deviation"] = np.concatenate(
+                    [task.packed(estimate.std) for estimate in stated]
+                )
             aligned, thin_values, thin_deviations = thinned(task, labels, values, deviations)
             parts = []
             for some in batches:
@@ -336,9 +401,13 @@ def score(
             found["calibration_links"] = torch.full((len(index),), float(calibration.counts.sum()))
             found["places"] = query.place_keys.unique(return_inverse=True)[1].double()
             scores[key] |= {f"{INTERVALS}{name}": score for name, score in found.items()}
-            content[f"shares_{key}"] = shares(calibration, aligned, thin_values, thin_deviations, query)
+            content[f"shares_{key}"] = shares(
+                calibration, aligned, thin_values, thin_deviations, query
+            )
     if gone:
-        stages.leave_out(f"no {'test' if has_intervals else 'validation'} scores of {', '.join(gone)}")
+        stages.leave_out(
+            f"no {'test' if has_intervals else 'validation'} scores of {', '.join(gone)}"
+        )
     if links.held_out is not None:
         known: Any = links.task
         closest = (known.frequencies - frequencies[:, None]).abs().argmin(1)
@@ -349,8 +418,12 @@ def score(
     return scores
 
 
-def shares(calibration: Calibration, labels: Tensor, values: Tensor, deviations: Tensor, query: Query) -> np.ndarray:
-    """Shares of the aligned labels of at most 300 links within intervals of the levels 0.05 to 0.95 (19,)."""
+def shares(
+    calibration: Calibration, labels: Tensor, values: Tensor, deviations: Tensor, query: Query
+) -> np.ndarray:
+    """Shares of the aligned labels of at most 300 links within intervals of the levels 0.05 to 0.95
+    (19,).
+    """
     some = evenly(torch.arange(len(labels)), 300)
     labels, values, deviations, query = labels[some], values[some], deviations[some], query[some]
     found = []
@@ -364,7 +437,9 @@ def shares(calibration: Calibration, labels: Tensor, values: Tensor, deviations:
 
 
 def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links) -> Scores:
-    """Scores of every validation link, by models that have not been fitted to these links; empty without such links."""
+    """Scores of every validation link, by models that have not been fitted to these links; empty
+    without such links.
+    """
     if not len(links.split.validation):
         return {}
     held_out = replace(links, split=links.split.validating(), held_out=None)
@@ -376,7 +451,9 @@ def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
     receivers = links.query.receivers[links.split.test]
     return {
         receiver.name: {
-            name: links.task.summarise({key: score[receivers == i] for key, score in own_scores(values).items()})
+            name: links.task.summarise(
+                {key: score[receivers == i] for key, score in own_scores(values).items()}
+            )
             for name, values in scores.items()
         }
         for i, receiver in enumerate(links.receivers)

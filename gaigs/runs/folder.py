@@ -1,4 +1,6 @@
-"""The run folder: its claim by one configuration, and the checks before a training is resumed there."""
+"""The run folder: its claim by one configuration, and the checks before a training is resumed
+there.
+"""
 
 import hashlib
 import json
@@ -25,11 +27,24 @@ def claim(folder: Path, config: dict) -> None:
     """Writes the configuration into a run folder, unless a run can be resumed there.
 
     Raises:
-        ValueError: The folder holds a run of another configuration or software, or files of something else.
+        ValueError: The folder holds a run of another configuration or software, or files of
+            something else.
     """
     file = folder / "config.yaml"
-    names = ("config.yaml", "software.json", "best.ckpt", "log", "predictions.npz", "gaussians.ply", "radio_map.npz")
-    there = [name for name in (*names, "figures", "last.ckpt", "metrics.json") if (folder / name).exists()]
+    names = (
+        "config.yaml",
+        "software.json",
+        "best.ckpt",
+        "log",
+        "predictions.npz",
+        "gaussians.ply",
+        "radio_map.npz",
+    )
+    there = [
+        name
+        for name in (*names, "figures", "last.ckpt", "metrics.json")
+        if (folder / name).exists()
+    ]
     if there and not is_configuration(file):
         raise ValueError(f"{folder} holds {', '.join(there)} of something else\n{ANOTHER}")
     for place in (folder, folder / "figures", *folder.glob("members/*")):
@@ -46,7 +61,11 @@ def claim(folder: Path, config: dict) -> None:
 
     differing = differences(there, config)
     if differing:
-        keys = [key for key in differing if not (key.startswith("model.") and key.removeprefix("model.") in differing)]
+        keys = [
+            key
+            for key in differing
+            if not (key.startswith("model.") and key.removeprefix("model.") in differing)
+        ]
         listed = "; ".join("{} was {!r}, is {!r}".format(key, *differing[key]) for key in keys)
         raise ValueError(f"{folder} holds a run of another configuration: {listed}\n{ANOTHER}")
 
@@ -72,11 +91,17 @@ def stored_software(folder: Path) -> dict[str, str]:
 
 
 def warn_of_changes(folder: Path, model: dict) -> None:
-    """Warns if sources of a model's plug-ins have changed since its run: stored numbers then mean something else."""
+    """Warns if sources of a model's plug-ins have changed since its run: stored numbers then mean
+    something else.
+    """
     there = stored_software(folder)
     changed = [key for key, digest in digests(model).items() if there.get(key, digest) != digest]
     if changed:
-        log.warning("the source of %s has changed since %s was trained: predictions differ", ", ".join(changed), folder)
+        log.warning(
+            "the source of %s has changed since %s was trained: predictions differ",
+            ", ".join(changed),
+            folder,
+        )
 
 
 def check_software(folder: Path, config: dict) -> None:
@@ -85,8 +110,14 @@ def check_software(folder: Path, config: dict) -> None:
     series = lambda version: ".".join(version.split(".")[:2])
     began = str(there.get("gaigs", "0.1 or earlier"))
     if series(began) != series(here["gaigs"]):
-        raise ValueError(f"{folder} was begun by gaigs {began}, and this is {here['gaigs']}\n{ANOTHER}")
-    changed = sorted(key for key in here.keys() | there.keys() if key != "gaigs" and here.get(key) != there.get(key))
+        raise ValueError(
+            f"{folder} was begun by gaigs {began}, and this is {here['gaigs']}\n{ANOTHER}"
+        )
+    changed = sorted(
+        key
+        for key in here.keys() | there.keys()
+        if key != "gaigs" and here.get(key) != there.get(key)
+    )
     if changed:
         raise ValueError(
             f"the source of {', '.join(changed)} has changed since {folder} was begun\nrestore it, or {ANOTHER}"
@@ -103,7 +134,9 @@ def is_configuration(file: Path) -> bool:
 
 
 def check_same_links(there: dict, here: dict, path: Path) -> None:
-    """Checks that a training is resumed with its own links, so that no test link has been trained on."""
+    """Checks that a training is resumed with its own links, so that no test link has been trained
+    on.
+    """
     parts = ("train", "validation", "test")
     same = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
     same = same and are_alike(there.get("scene"), here.get("scene"))
@@ -115,7 +148,9 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
 
 
 def fingerprint(links: Links) -> str:
-    """A digest of queries, receivers, and labels in memory; labels in files would have to be decoded."""
+    """A digest of queries, receivers, and labels in memory; labels in files would have to be
+    decoded.
+    """
     parts = [links.query.transmitters, links.query.receivers]
     for receiver in links.receivers:
         parts += [receiver.pose.position, receiver.pose.rotation, receiver.array.elements]

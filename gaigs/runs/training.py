@@ -44,21 +44,29 @@ from gaigs.training.revision import Revision
 log = logging.getLogger(__name__)
 
 
-def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Path | None = None, **options) -> Model:
-    """Trains a model on links as the command line does, by the preset of the model and the links' task.
+def train(
+    model: str | Model,
+    links: Links,
+    /,
+    *overrides: str,
+    folder: str | Path | None = None,
+    **options,
+) -> Model:
+    """Trains a model on links as the command line does, by the preset of the model and the links'
+    task.
 
     Args:
-        model: Name of a registered model; or a model, which is trained in place, of a kriged one a copy of
-            its trend.
+        model: Name of a registered model; or a model, which is trained in place, of a kriged one a
+            copy of its trend.
         links: Links to learn from; validation links choose the best step. Test links are not used.
         overrides: Command-line words, e.g. ``"variant=ga"`` or ``"trainer.max_steps=300"``.
-        folder: Gets the configuration, the log and the checkpoints; the same call resumes a stopped training there.
-            None: no files.
+        folder: Gets the configuration, the log and the checkpoints; the same call resumes a stopped
+            training there. None: no files.
         options: Values by their keys or names, as in ``gaigs.compose``: ``max_steps=300, seed=0``.
 
     Returns:
-        The model with the best validation score, on the CPU and in evaluation mode, as ``gaigs.load`` gives it; with
-        ``mirrored`` a kriged model.
+        The model with the best validation score, on the CPU and in evaluation mode, as
+        ``gaigs.load`` gives it; with ``mirrored`` a kriged model.
 
     Raises:
         TypeError: An option has the wrong type.
@@ -72,30 +80,49 @@ def train(model: str | Model, links: Links, /, *overrides: str, folder: str | Pa
         torch.Size([2, 1, 90, 360])
     """
     if not isinstance(model, str | Model) or not isinstance(links, Links):
-        raise TypeError(f"train takes a model and links, got {type(model).__name__} and {type(links).__name__}")
-    own = None if isinstance(model, str) else copy.deepcopy(model.trend) if isinstance(model, Kriging) else model
+        raise TypeError(
+            f"train takes a model and links, got {type(model).__name__} and {type(links).__name__}"
+        )
+    own = (
+        None
+        if isinstance(model, str)
+        else copy.deepcopy(model.trend)
+        if isinstance(model, Kriging)
+        else model
+    )
     if isinstance(own, Ensemble):
         members = "members" if own is model else "trend.members"
-        raise ValueError(f"an ensemble cannot be trained further; train one of its models, {members}[0]")
+        raise ValueError(
+            f"an ensemble cannot be trained further; train one of its models, {members}[0]"
+        )
     check_fit(links, own and own.scene)
     name = model if own is None else configuration_of(own)["name"]
     if experiments := [word for word in overrides if word.startswith("+experiment=")]:
-        raise ValueError(f"leave out {experiments[0]}: train takes the experiment of the model and the task")
-    words, parts = preset(name, links.task.name), {k: v for k, v in options.items() if hasattr(v, "configuration")}
+        raise ValueError(
+            f"leave out {experiments[0]}: train takes the experiment of the model and the task"
+        )
+    words, parts = (
+        preset(name, links.task.name),
+        {k: v for k, v in options.items() if hasattr(v, "configuration")},
+    )
     config = composed([*words, *overrides], options)
     if overrides or options:
         usual = composed(words, {})
         if config["data"] != usual["data"] or config["split"] != usual["split"]:
             raise ValueError("train takes no options of data and split; pass them to gaigs.links")
         if own is not None and (config["model"] != usual["model"] or parts.keys() - {"loss"}):
-            raise ValueError("train takes no options of a model that is made already; pass them to its constructor")
+            raise ValueError(
+                "train takes no options of a model that is made already; pass them to its constructor"
+            )
     config |= {"data": {"name": "arrays"}, "split": {"name": links.split.name}, **links.origin}
     if own is not None:
         config["model"] = configuration_of(own)
     with contextlib.ExitStack() as stack:
         stack.enter_context(limited_threads(config["threads"]))
         stack.enter_context(isolate_rng())
-        place = Path(stack.enter_context(tempfile.TemporaryDirectory()) if folder is None else folder)
+        place = Path(
+            stack.enter_context(tempfile.TemporaryDirectory()) if folder is None else folder
+        )
         place.mkdir(parents=True, exist_ok=True)
         stack.enter_context(only_run(place))
         claim(place, config)
@@ -111,10 +138,12 @@ class Fitted(NamedTuple):
     """Result of ``fit``.
 
     Attributes:
-        models: The model by its name; a kriged one is followed by the trained model alone, ``<name>_trend``.
+        models: The model by its name; a kriged one is followed by the trained model alone,
+            ``<name>_trend``.
         unseen: The same, not fitted to validation links; empty for a model without a training.
         start: Number of Gaussians before the training.
-        seconds: Duration of ``Model.fit``, as of a search for planes, and of the training; None without one.
+        seconds: Duration of ``Model.fit``, as of a search for planes, and of the training; None
+            without one.
         kriging_seconds: Duration of kriging; None without it.
     """
 
@@ -126,27 +155,40 @@ class Fitted(NamedTuple):
 
 
 def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
-    """Builds, fits, trains and kriges a model as configured; None in all but the first of several processes."""
+    """Builds, fits, trains and kriges a model as configured; None in all but the first of several
+    processes.
+    """
     name = config["model"]["name"]
     if config["ensemble"] < 1:
         raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
     if model is None:
         model = registry("model").build(config["model"], scene=links.scene)
     if isinstance(model, Kriging):
-        raise ValueError("model=kriging has no training of its own; choose a trained model, and set kriging=true")
+        raise ValueError(
+            "model=kriging has no training of its own; choose a trained model, and set kriging=true"
+        )
     if config["kriging"]:
         check_known(links)  # a training comes before
-    make_kriged = lambda trend: Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
+    make_kriged = lambda trend: (
+        Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
+    )
     kriged = make_kriged(model)
-    parts = {key: part["name"] for key, part in config["model"].items() if isinstance(part, dict) and "name" in part}
+    parts = {
+        key: part["name"]
+        for key, part in config["model"].items()
+        if isinstance(part, dict) and "name" in part
+    }
     if "tokenizer" in parts and getattr(model, "tokenizer", model) is None:
-        if parts["tokenizer"] != registry("model").options(name).get("tokenizer", parts["tokenizer"]):
+        if parts["tokenizer"] != registry("model").options(name).get(
+            "tokenizer", parts["tokenizer"]
+        ):
             words = "tokenizer=%s is not read, as deformation=%s takes no tokens"
             log.warning(words, parts["tokenizer"], parts["deformation"])
         parts["tokenizer"] = "none"
     log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
     began, places = time.monotonic(), links.query[links.split.known].place_keys.unique()
-    # Shares of the run's limit at which parts end: the search 0.3, the training 0.5, kriging and intervals 0.8.
+    # Shares of the run's limit at which parts end: the search 0.3, the training 0.5, kriging and
+    # intervals 0.8.
     with stages.stage(until=0.3 if is_trained(model) else 0.8):
         model.fit(links)
         if stages.is_up():
@@ -187,8 +229,12 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     return Fitted(models, unseen, start, seconds, kriging_seconds)
 
 
-def with_others(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> tuple[Ensemble, float]:
-    """An ensemble of a trained model and of others with the next seeds, each trained in a folder of its own."""
+def with_others(
+    model: Model, loss: Loss, links: Links, config: dict, folder: Path
+) -> tuple[Ensemble, float]:
+    """An ensemble of a trained model and of others with the next seeds, each trained in a folder of
+    its own.
+    """
     members, total = [model], 0.0
     for number in range(1, config["ensemble"]):
         place, seed = folder / "members" / str(number), config["seed"] + number
@@ -207,22 +253,37 @@ def with_others(model: Model, loss: Loss, links: Links, config: dict, folder: Pa
     return ensemble, total
 
 
-def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, searched: float) -> tuple[Model, float]:
+def descend(
+    model: Model, loss: Loss, links: Links, config: dict, folder: Path, searched: float
+) -> tuple[Model, float]:
     """Trains a model by gradient descent, which ``Model.fit`` has prepared in ``searched`` [s].
 
     Returns:
-        The model at the step with the best validation score, or at the last step without validation links; and the
-        duration of both [s], summed over the parts of an interrupted run.
+        The model at the step with the best validation score, or at the last step without validation
+        links; and the duration of both [s], summed over the parts of an interrupted run.
     """
     split = {"name": links.split.name, **links.split.parts()}
-    identity = {"version": checkpoint.VERSION, "model": config["model"], "scene": links.scene.state(), "split": split}
-    identity |= {"config": config, "links": fingerprint(links), "plugins": digests(config, links.scene.state()["task"])}
+    identity = {
+        "version": checkpoint.VERSION,
+        "model": config["model"],
+        "scene": links.scene.state(),
+        "split": split,
+    }
+    identity |= {
+        "config": config,
+        "links": fingerprint(links),
+        "plugins": digests(config, links.scene.state()["task"]),
+    }
     context = {"model": model, "loss": loss, "identity": identity, "seed": config["seed"]}
     module = registry("training").build(config["training"], **context)
     last, best = folder / "last.ckpt", folder / "best.ckpt"
     keep_last = KeepLast(last, config["save_every"])
     options, budget = make_budget(config["trainer"], searched)
-    callbacks = [budget, KeepBest(best, module.patience), keep_last]  # Lightning calls the last two after all others
+    callbacks = [
+        budget,
+        KeepBest(best, module.patience),
+        keep_last,
+    ]  # Lightning calls the last two after all others
     if module.density is not None:
         callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))
     if model.revisions:
@@ -234,18 +295,26 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
         try:
             loggers.append(TensorBoardLogger(folder, "tensorboard"))
         except ModuleNotFoundError as error:
-            raise ImportError("tensorboard=true needs TensorBoard: pip install 'gaigs[tensorboard]'") from error
+            raise ImportError(
+                "tensorboard=true needs TensorBoard: pip install 'gaigs[tensorboard]'"
+            ) from error
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
     for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
         logging.getLogger(name).setLevel(logging.WARNING)
     trainer = make_trainer(options, **context)
     if config["ensemble"] > 1 and trainer.world_size > 1:
-        raise ValueError("an ensemble trains in one process; set trainer.devices=1 and trainer.num_nodes=1")
+        raise ValueError(
+            "an ensemble trains in one process; set trainer.devices=1 and trainer.num_nodes=1"
+        )
     if math.isfinite(stages.left()) and trainer.world_size > 1:
         raise ValueError("max_time limits a run of one process; of several set trainer.max_time")
     steps = ENDLESS if trainer.max_steps == -1 else trainer.max_steps
     batches = Batches(links, links.split.train, module.batch_size, config["seed"], steps)
-    validation = InOrder(links, links.split.validation, module.batch_size) if len(links.split.validation) else None
+    validation = (
+        InOrder(links, links.split.validation, module.batch_size)
+        if len(links.split.validation)
+        else None
+    )
     resume = None
     if last.is_file():
         resume = last
@@ -253,14 +322,20 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
         check_same_links(content[checkpoint.KEY], identity, last)
         log.info("going on after step %d", content["global_step"])
         stages.current().began -= content["callbacks"][budget.state_key]["seconds"]
-    # Lightning converts after it has loaded a checkpoint, which would round the weights: so convert first.
+    # Lightning converts after it has loaded a checkpoint, which would round the weights: so convert
+    # first.
     module = trainer.precision_plugin.convert_module(module)
     handlers = {number: signal.getsignal(number) for number in STOPPING}
     module.train()  # a model that has been trained or loaded is in evaluation mode
     try:
         with warnings.catch_warnings():
-            # Warnings about Lightning's use of torch, splits without validation links, and few steps.
-            for message in (".*LeafSpec", "You defined a `validation_step` but", "The number of training batches"):
+            # Warnings about Lightning's use of torch, splits without validation links, and few
+            # steps.
+            for message in (
+                ".*LeafSpec",
+                "You defined a `validation_step` but",
+                "The number of training batches",
+            ):
                 warnings.filterwarnings("ignore", message)
             trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
     except Interrupted as stop:
@@ -278,7 +353,13 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
     if keep_last.received is not None:  # after the last step
         raise Stopped(f"stopped after step {trainer.global_step}", keep_last.received)
     seconds, steps, size = budget.seconds - budget.searched, trainer.global_step, module.batch_size
-    log.info("trained %d steps of %d places in %.0f s: %.1f steps/s", steps, size, seconds, steps / seconds)
+    log.info(
+        "trained %d steps of %d places in %.0f s: %.1f steps/s",
+        steps,
+        size,
+        seconds,
+        steps / seconds,
+    )
     if budget.seconds >= budget.end and steps < trainer.max_steps:
         stages.leave_out(f"the training ended after {steps} of {trainer.max_steps} steps")
     module.load_state_dict(checkpoint.trained_weights(checkpoint.read(best)))
@@ -287,7 +368,16 @@ def descend(model: Model, loss: Loss, links: Links, config: dict, folder: Path, 
 
 def resumable(last: Path, best: Path) -> dict:
     """The checkpoint to resume from; a ValueError if it or the best one is damaged."""
-    needed = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "epoch", "global_step", "split", "links")
+    needed = (
+        "optimizer_states",
+        "lr_schedulers",
+        "loops",
+        "callbacks",
+        "epoch",
+        "global_step",
+        "split",
+        "links",
+    )
     try:
         content = checkpoint.read(last)
         if lacking := [key for key in needed if key not in content | content[checkpoint.KEY]]:
@@ -303,9 +393,13 @@ def resumable(last: Path, best: Path) -> dict:
 
 
 def make_trainer(options: dict, **context: Any) -> lightning.Trainer:
-    """A trainer that can stop and resume at any step, in one process or several; a ``ValueError`` for other options."""
+    """A trainer that can stop and resume at any step, in one process or several; a ``ValueError``
+    for other options.
+    """
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "GPU available but not used")  # advice against an option that was chosen
+        warnings.filterwarnings(
+            "ignore", "GPU available but not used"
+        )  # advice against an option that was chosen
         trainer = call("trainer", lightning.Trainer, options, **context)
     # The first two set the limits of batches: 1 is one batch, 1.0 is all batches.
     usual = {"fast_dev_run": False, "overfit_batches": 0.0, "accumulate_grad_batches": 1}
@@ -324,7 +418,11 @@ def make_trainer(options: dict, **context: Any) -> lightning.Trainer:
         )
     is_sweep = HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
     # With other launchers the processes of one job would start the next job at different times.
-    if is_sweep and launcher is not None and not HydraConfig.get().launcher["_target_"].endswith("SlurmLauncher"):
+    if (
+        is_sweep
+        and launcher is not None
+        and not HydraConfig.get().launcher["_target_"].endswith("SlurmLauncher")
+    ):
         raise ValueError(
             "a job of a multirun must train in one process\n"
             "run it alone, or use hydra/launcher=submitit_slurm, which starts the processes of each job"

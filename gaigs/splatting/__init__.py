@@ -1,1 +1,3 @@
-"""The paper's pipeline: Gaussians, their placement, tokens, deformation, projection, rasterizer and pooling."""
+"""The paper's pipeline: Gaussians, their placement, tokens, deformation, projection, rasterizer and
+pooling.
+"""

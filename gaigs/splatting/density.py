@@ -26,7 +26,9 @@ def prune(gaussians: Gaussians, optimizer: Optimizer, gone: Bool[Tensor, " n"]) 
 
 
 def clone(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]) -> None:
-    """Doubles Gaussians in place, each with the opacity a' = 1 - sqrt(1 - a), so that both cover as much as one."""
+    """Doubles Gaussians in place, each with the opacity a' = 1 - sqrt(1 - a), so that both cover as
+    much as one.
+    """
     copies = _append(gaussians, optimizer, chosen)
     with torch.no_grad():
         # The logit of a' from the logit of a, accurate for opacities near 0 and 1.
@@ -34,7 +36,12 @@ def clone(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]
         gaussians.opacity_logits[copies] = nn.functional.softplus(logits).div(2).expm1().log()
 
 
-def split(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"], generator: torch.Generator) -> None:
+def split(
+    gaussians: Gaussians,
+    optimizer: Optimizer,
+    chosen: Bool[Tensor, " n"],
+    generator: torch.Generator,
+) -> None:
     """Replaces each chosen Gaussian by two smaller ones drawn from it."""
     halves = _append(gaussians, optimizer, chosen)
     with torch.no_grad():
@@ -44,10 +51,17 @@ def split(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]
         gaussians.log_scales[halves] -= math.log(1.6)  # as Kerbl et al. shrink them
 
 
-def _append(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]) -> Bool[Tensor, " m"]:
+def _append(
+    gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]
+) -> Bool[Tensor, " m"]:
     """Appends copies of the chosen Gaussians; gives a mask of originals and copies."""
     copy = lambda values: torch.cat((values, values[chosen]))
-    _rearrange(gaussians, optimizer, copy, lambda state: torch.cat((state, torch.zeros_like(state[chosen]))))
+    _rearrange(
+        gaussians,
+        optimizer,
+        copy,
+        lambda state: torch.cat((state, torch.zeros_like(state[chosen]))),
+    )
     return torch.cat((chosen, chosen[chosen]))
 
 
@@ -58,10 +72,15 @@ def _rearrange(gaussians: Gaussians, optimizer: Optimizer, pick: Pick, pick_stat
         new = nn.Parameter(pick(old.detach()), old.requires_grad)
         setattr(gaussians, name, new)
         for group in optimizer.param_groups:
-            group["params"] = [new if parameter is old else parameter for parameter in group["params"]]
+            group["params"] = [
+                new if parameter is old else parameter for parameter in group["params"]
+            ]
         if state := optimizer.state.pop(old, None):
-            # An entry has a row for each Gaussian (in Adafactor without all axes), or is one number.
+            # An entry has a row for each Gaussian (in Adafactor without all axes), or is one
+            # number.
             optimizer.state[new] = {
-                key: pick_state(value) if torch.is_tensor(value) and value.shape[:1] == old.shape[:1] else value
+                key: pick_state(value)
+                if torch.is_tensor(value) and value.shape[:1] == old.shape[:1]
+                else value
                 for key, value in state.items()
             }

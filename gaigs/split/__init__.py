@@ -1,6 +1,8 @@
-"""Splits of links into training, validation and test; only official parts may separate links of one row.
+"""Splits of links into training, validation and test; only official parts may separate links of one
+row.
 
-Fractions count places, not readings: all links of one place, receiver and carrier together count as one.
+Fractions count places, not readings: all links of one place, receiver and carrier together count as
+one.
 """
 
 from typing import NamedTuple
@@ -46,8 +48,8 @@ def part(
         links: All links.
         groups: Number of each link's group.
         test: Fraction of the links to test on; 0 for none.
-        validation: Fraction of the training links to validate on; 0 for none. None: 0.1, and of few links as many more
-            as intervals of 90 % need, see ``hold_out``.
+        validation: Fraction of the training links to validate on; 0 for none. None: 0.1, and of few
+            links as many more as intervals of 90 % need, see ``hold_out``.
         seed: Seed of all random numbers.
         train: Groups to train and validate on; None for all that do not test.
         rows: As of ``drawn``.
@@ -58,12 +60,21 @@ def part(
     check("test", test, 0 <= test < 1, "in [0, 1)")
     check_validation(validation)
     generator, votes = generator_of(seed), links.query.votes
-    training, testing, _ = hold_out("test", torch.arange(len(links)), groups, votes, test, generator, rows=rows)
+    training, testing, _ = hold_out(
+        "test", torch.arange(len(links)), groups, votes, test, generator, rows=rows
+    )
     if train is not None:
         order = drawn(groups, training, generator, rows)
-        check("train", train, 1 <= train <= len(order), f"in 1..{len(order)}, the places that do not test")
+        check(
+            "train",
+            train,
+            1 <= train <= len(order),
+            f"in 1..{len(order)}, the places that do not test",
+        )
         training = training[torch.isin(groups[training], order[:train])]
-    training, validating, share = hold_out("validation", training, groups, votes, validation, generator, rows=rows)
+    training, validating, share = hold_out(
+        "validation", training, groups, votes, validation, generator, rows=rows
+    )
     words = [name, f"test {test:g}", *([f"validation {share:g}"] if share else []), f"seed {seed}"]
     return Split(", ".join(words), training, validating, testing, groups)
 
@@ -76,7 +87,8 @@ def drawn(
 ) -> Int[Tensor, " g"]:
     """Groups of some links in random order.
 
-    With ``rows``, whose numbers are those of groups, it is the order of rows: a repeated place changes no other draw.
+    With ``rows``, whose numbers are those of groups, it is the order of rows: a repeated place
+    changes no other draw.
     """
     present = groups[links] if rows is None else torch.cat((groups[links], rows[links]))
     present = present.unique()
@@ -104,9 +116,10 @@ def hold_out(
 ) -> Parted:
     """Holds out random whole groups, as near to a fraction of some ascending links as possible.
 
-    With ``at_most`` it is not more than the fraction, if one group is not. The groups are those of all links of the
-    data; there must be two or more. Links count by their ``votes``. Without a fraction it is 0.1, but the nine links
-    that intervals of 90 % need where these are no more than 0.3. An error calls the fraction ``name``.
+    With ``at_most`` it is not more than the fraction, if one group is not. The groups are those of
+    all links of the data; there must be two or more. Links count by their ``votes``. Without a
+    fraction it is 0.1, but the nine links that intervals of 90 % need where these are no more than
+    0.3. An error calls the fraction ``name``.
     """
     if fraction == 0:
         return Parted(links, links[:0], 0.0)

@@ -8,15 +8,24 @@ from gaigs.split import check, part
 
 
 @register("split", "blocks")
-def blocks(links: Links, edge: float, test: float = 0.2, validation: float | None = None, seed: int = 0) -> Split:
+def blocks(
+    links: Links, edge: float, test: float = 0.2, validation: float | None = None, seed: int = 0
+) -> Split:
     """Random cubes test: places where nothing was measured.
 
     Args:
-        edge: Edge of a cube [m]; the first cube starts at the lower corner of all transmitters. Other options and
-            errors are those of ``gaigs.split.part``.
+        edge: Edge of a cube [m]; the first cube starts at the lower corner of all transmitters.
+            Other options and errors are those of ``gaigs.split.part``.
     """
     low, high = 1e-6, 1e6  # float32 has no finer resolution, and data no larger extent
     check("edge", edge, low <= edge <= high, f"from {low:g} to {high:g} m")
     places = links.query.transmitters.double()
     cubes = ((places - places.amin(0)) / edge).floor().long()
-    return part(f"blocks {edge:g} m", links, torch.unique(cubes, dim=0, return_inverse=True)[1], test, validation, seed)
+    return part(
+        f"blocks {edge:g} m",
+        links,
+        torch.unique(cubes, dim=0, return_inverse=True)[1],
+        test,
+        validation,
+        seed,
+    )

@@ -6,20 +6,24 @@ from gaigs.split import check, check_validation, generator_of, hold_out, places_
 
 
 @register("split", "official")
-def official(links: Links, length: int = 1, validation: float | None = None, seed: int = 0) -> Split:
+def official(
+    links: Links, length: int = 1, validation: float | None = None, seed: int = 0
+) -> Split:
     """The data's own training and test links; validation links are drawn from the training links.
 
     Args:
-        length: Rows in a run that validates; more than 1 if the test is a separate run. Runs are shorter where fewer
-            than four would validate.
-        validation: Fraction of the training links to validate on, with runs the most; 0 for none. None: 0.1, and of
-            few links more, see ``gaigs.split.hold_out``.
+        length: Rows in a run that validates; more than 1 if the test is a separate run. Runs are
+            shorter where fewer than four would validate.
+        validation: Fraction of the training links to validate on, with runs the most; 0 for none.
+            None: 0.1, and of few links more, see ``gaigs.split.hold_out``.
 
     Raises:
         ValueError: The data have no such parts, or an option is out of range.
     """
     if links.official is None:
-        raise ValueError("this data has no official split; choose split=random, sparse, runs or blocks")
+        raise ValueError(
+            "this data has no official split; choose split=random, sparse, runs or blocks"
+        )
     check("length", length, length >= 1, "a whole number of rows, at least 1")
     check_validation(validation)
     generator = generator_of(seed)
@@ -34,5 +38,8 @@ def official(links: Links, length: int = 1, validation: float | None = None, see
     )
     words = ["official"]
     if share:
-        words += [f"validation {share:g}{f' in runs of {length}' if has_runs else ''}", f"seed {seed}"]
+        words += [
+            f"validation {share:g}{f' in runs of {length}' if has_runs else ''}",
+            f"seed {seed}",
+        ]
     return Split(", ".join(words), train, validating, test, groups)

@@ -6,7 +6,9 @@ from gaigs.split import part, places_of, rows_of
 
 
 @register("split", "random")
-def random(links: Links, test: float = 0.2, validation: float | None = None, seed: int = 0) -> Split:
+def random(
+    links: Links, test: float = 0.2, validation: float | None = None, seed: int = 0
+) -> Split:
     """Random places test: interpolation, since a neighbour on a dense trajectory is always near.
 
     Options and errors are those of ``gaigs.split.part``.

@@ -6,7 +6,9 @@ from gaigs.split import part, runs_of
 
 
 @register("split", "runs")
-def runs(links: Links, length: int, test: float = 0.2, validation: float | None = None, seed: int = 0) -> Split:
+def runs(
+    links: Links, length: int, test: float = 0.2, validation: float | None = None, seed: int = 0
+) -> Split:
     """Random runs test: a trajectory with gaps.
 
     Args:

@@ -6,10 +6,16 @@ from gaigs.split import part, places_of, rows_of
 
 
 @register("split", "sparse")
-def sparse(links: Links, train: int, test: float = 0.2, validation: float | None = None, seed: int = 0) -> Split:
-    """Few random places train and validate, fewer as a subset of more; test places are those of ``random``.
+def sparse(
+    links: Links, train: int, test: float = 0.2, validation: float | None = None, seed: int = 0
+) -> Split:
+    """Few random places train and validate, fewer as a subset of more; test places are those of
+    ``random``.
 
     Args:
-        train: Places to train and validate on. Other options and errors are those of ``gaigs.split.part``.
+        train: Places to train and validate on. Other options and errors are those of
+            ``gaigs.split.part``.
     """
-    return part(f"sparse {train}", links, places_of(links), test, validation, seed, train, rows_of(links))
+    return part(
+        f"sparse {train}", links, places_of(links), test, validation, seed, train, rows_of(links)
+    )

@@ -20,7 +20,9 @@ def require(holds: object, rule: str) -> None:
 
 
 def require_refusal(call: Callable[[], object], rule: str) -> None:
-    """Raises an ``AssertionError`` with the rule unless a call raises a ``ValueError``, or a type checker's error."""
+    """Raises an ``AssertionError`` with the rule unless a call raises a ``ValueError``, or a type
+    checker's error.
+    """
     try:
         call()
     except (ValueError, TypeError):
@@ -35,7 +37,11 @@ def require_close(actual: Tensor, expected: Tensor, tolerance: float, rule: str)
     largest = max(1.0, expected.abs().max().item()) if expected.numel() else 1.0
     wide = torch.complex128 if expected.is_complex() else torch.float64
     torch.testing.assert_close(
-        actual.to(wide), expected.to(wide), rtol=0, atol=tolerance * largest, msg=lambda detail: f"{rule}\n{detail}"
+        actual.to(wide),
+        expected.to(wide),
+        rtol=0,
+        atol=tolerance * largest,
+        msg=lambda detail: f"{rule}\n{detail}",
     )
 
 
@@ -44,26 +50,46 @@ def require_same(actual: Tensor, expected: Tensor, rule: str) -> None:
     if actual.device.type == "cpu" or not (actual.is_floating_point() or actual.is_complex()):
         require(torch.equal(actual, expected), rule)
     else:
-        least = 1e3 * torch.finfo(actual.dtype).eps * (expected.abs().max().item() if expected.numel() else 0.0)
-        torch.testing.assert_close(actual, expected, rtol=0, atol=least, msg=lambda detail: f"{rule}\n{detail}")
+        least = (
+            1e3
+            * torch.finfo(actual.dtype).eps
+            * (expected.abs().max().item() if expected.numel() else 0.0)
+        )
+        torch.testing.assert_close(
+            actual, expected, rtol=0, atol=least, msg=lambda detail: f"{rule}\n{detail}"
+        )
 
 
 def require_tensor(
-    name: str, tensor: Tensor, shape: Sequence[int], dtype: torch.dtype, device: torch.device | str | None = None
+    name: str,
+    tensor: Tensor,
+    shape: Sequence[int],
+    dtype: torch.dtype,
+    device: torch.device | str | None = None,
 ) -> None:
     """Requires a finite tensor of that shape, dtype and type of device."""
-    require(tuple(tensor.shape) == tuple(shape), f"{name} must be of shape {tuple(shape)}, got {tuple(tensor.shape)}")
+    require(
+        tuple(tensor.shape) == tuple(shape),
+        f"{name} must be of shape {tuple(shape)}, got {tuple(tensor.shape)}",
+    )
     require(tensor.dtype == dtype, f"{name} must be {dtype} as its input, got {tensor.dtype}")
     same = device is None or tensor.device.type == torch.device(device).type
     require(same, f"{name} must be on {device} as its input, got {tensor.device}")
     require(tensor.isfinite().all(), f"{name} must be finite")
 
 
-def require_independence(result: Any, again: Any, alone: Any, per_query: Collection[str], tolerance: float) -> None:
-    """Requires named tuples of two calls to be the same, and one of the last query alone to equal the last row."""
+def require_independence(
+    result: Any, again: Any, alone: Any, per_query: Collection[str], tolerance: float
+) -> None:
+    """Requires named tuples of two calls to be the same, and one of the last query alone to equal
+    the last row.
+    """
     for name, whole, twice, single in zip(result._fields, result, again, alone, strict=True):
         if whole is None:
-            require(twice is None and single is None, f"{name} must be given for all queries or for none")
+            require(
+                twice is None and single is None,
+                f"{name} must be given for all queries or for none",
+            )
             continue
         require_same(whole, twice, f"two calls must give the same {name}")
         own = whole[-1:] if name in per_query else whole
@@ -71,15 +97,23 @@ def require_independence(result: Any, again: Any, alone: Any, per_query: Collect
 
 
 def require_gradients(outputs: Iterable[Tensor | None], leaves: Mapping[str, Tensor]) -> None:
-    """Requires finite gradients of a fixed function of the outputs; a leaf that has no influence needs none."""
-    given = [output for output in outputs if output is not None and output.requires_grad and output.numel()]
+    """Requires finite gradients of a fixed function of the outputs; a leaf that has no influence
+    needs none.
+    """
+    given = [
+        output
+        for output in outputs
+        if output is not None and output.requires_grad and output.numel()
+    ]
     if not given or not leaves:
         return
     gradients = torch.autograd.grad(
         sum(map(fixed_sum, given)), [*leaves.values()], allow_unused=True, retain_graph=True
     )
     for name, gradient in zip(leaves, gradients, strict=True):
-        require(gradient is None or gradient.isfinite().all(), f"the gradient of {name} must be finite")
+        require(
+            gradient is None or gradient.isfinite().all(), f"the gradient of {name} must be finite"
+        )
 
 
 def require_groups(groups: Mapping[str, Iterable[nn.Parameter]], module: nn.Module) -> None:
@@ -103,11 +137,19 @@ def random_places(scene: Scene, count: int, generator: torch.Generator) -> Tenso
 
 
 def random_query(
-    scene: Scene, count: int, generator: torch.Generator, dtype: torch.dtype, device: torch.device | str
+    scene: Scene,
+    count: int,
+    generator: torch.Generator,
+    dtype: torch.dtype,
+    device: torch.device | str,
 ) -> Query:
-    """Links from random places to the receivers in turn, at the scene's carriers in turn where there are any."""
+    """Links from random places to the receivers in turn, at the scene's carriers in turn where
+    there are any.
+    """
     number = torch.arange(count)
-    frequencies = scene.frequencies[number % len(scene.frequencies)] if len(scene.frequencies) else None
+    frequencies = (
+        scene.frequencies[number % len(scene.frequencies)] if len(scene.frequencies) else None
+    )
     places = random_places(scene, count, generator).to(dtype)
     return Query(places, number % len(scene.receivers), frequencies).to(device)
 

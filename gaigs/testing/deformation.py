@@ -13,23 +13,34 @@ from gaigs.testing import checks
 from gaigs.testing.checks import PRECISION, require, require_tensor
 
 
-def check_deformation(build: Callable[..., nn.Module], scene: Scene, device: torch.device | str = "cpu") -> None:
-    """Checks a deformation: residuals' shapes, dtype, gradients, attenuations in (0, 1], independence of the batch.
+def check_deformation(
+    build: Callable[..., nn.Module], scene: Scene, device: torch.device | str = "cpu"
+) -> None:
+    """Checks a deformation: residuals' shapes, dtype, gradients, attenuations in (0, 1],
+    independence of the batch.
 
     The contract is that of ``gaigs.splatting.deformation.Deformation``.
     ``build(scene=, channels=, tokenizer_widths=)`` makes it.
     """
     generator = torch.Generator().manual_seed(0)
-    cases = [(widths, 1) for widths in ((5, 4, 6), (5, 0, 0), (0, 4, 6), (0, 0, 0))] + [((5, 4, 6), 3)]
+    cases = [(widths, 1) for widths in ((5, 4, 6), (5, 0, 0), (0, 4, 6), (0, 0, 0))] + [
+        ((5, 4, 6), 3)
+    ]
     for widths, sets in cases:
         for dtype in PRECISION:
-            module = build(scene=scene, channels=2, tokenizer_widths=widths).to(device, dtype).eval()
+            module = (
+                build(scene=scene, channels=2, tokenizer_widths=widths).to(device, dtype).eval()
+            )
             for parameter in module.parameters():  # zero heads would hide earlier layers
-                parameter.data += 0.1 * torch.randn(parameter.shape, generator=generator).to(parameter)
+                parameter.data += 0.1 * torch.randn(parameter.shape, generator=generator).to(
+                    parameter
+                )
             for n, b in ((7, 3), (1, 1)):
                 if b < sets:
                     continue
-                random = lambda *shape, to=dtype: torch.randn(*shape, generator=generator).to(device, to)
+                random = lambda *shape, to=dtype: torch.randn(*shape, generator=generator).to(
+                    device, to
+                )
                 gaussians = random(n, widths[1]) if sets == 1 else random(b, n, widths[1])
                 tokens = Tokens(random(b, widths[0]), gaussians, random(b, widths[2]))
                 places = checks.random_places(scene, sets * n, generator).to(device, dtype)
@@ -46,12 +57,18 @@ def _check_call(module: nn.Module, tokens: Tokens | None, placed: Placed, query:
         gaussians = tokens.gaussians if tokens.gaussians.ndim == 2 else tokens.gaussians[-1:]
         last = Tokens(tokens.scene[-1:], gaussians, tokens.transmitters[-1:])
     residuals = module(tokens, placed, query)
-    require(isinstance(residuals, Residuals), f"a deformation must give Residuals, got {type(residuals).__name__}")
+    require(
+        isinstance(residuals, Residuals),
+        f"a deformation must give Residuals, got {type(residuals).__name__}",
+    )
     shapes = (b, n, 4), (b, n, 3), (b, n, 2, 1), (b, n), (b, n)
     for name, shape, residual in zip(Residuals._fields, shapes, residuals, strict=True):
         if residual is not None:
             require_tensor(name, residual, shape, dtype, device)
-    again, alone = module(tokens, placed, query), module(last, Placed(placed.means[-1:]), query[-1:])
+    again, alone = (
+        module(tokens, placed, query),
+        module(last, Placed(placed.means[-1:]), query[-1:]),
+    )
     checks.require_independence(residuals, again, alone, Residuals._fields, PRECISION[dtype])
     found = residuals.attenuations
     require(found is None or (found.gt(0) & found.le(1)).all(), "attenuations must lie in (0, 1]")

@@ -32,13 +32,15 @@ def check_training(
     links: Links,
     device: torch.device | str = "cpu",
 ) -> None:
-    """Checks a training: one step a batch, validation, results that follow from the seed, bit-exact resume.
+    """Checks a training: one step a batch, validation, results that follow from the seed, bit-exact
+    resume.
 
     The contract is that of ``gaigs.training.descent.Descent``.
 
     Args:
         build: Makes the training, given ``model``, ``loss``, ``identity`` and ``seed`` by name, as
-            ``functools.partial(registry("training").build, config)`` does; all learning rates are positive.
+            ``functools.partial(registry("training").build, config)`` does; all learning rates are
+            positive.
         build_model: Makes a model for a scene.
         links: Links with a split that validates.
     """
@@ -57,27 +59,50 @@ def check_training(
         return build(model=model, loss=loss, identity=identity, seed=0)
 
     module = make()
-    require(isinstance(module, lightning.LightningModule), f"a training must be a LightningModule, got {type(module)}")
+    require(
+        isinstance(module, lightning.LightningModule),
+        f"a training must be a LightningModule, got {type(module)}",
+    )
     require(isinstance(module.model, Model), "the training's model must be its attribute model")
-    require(module.task.name == links.task.name, "the training's task must be that of its model's scene")
+    require(
+        module.task.name == links.task.name, "the training's task must be that of its model's scene"
+    )
     size, patience, density = module.batch_size, module.patience, module.density
-    require(isinstance(size, int) and size >= 1, f"batch_size must be a number of places, got {size!r}")
+    require(
+        isinstance(size, int) and size >= 1, f"batch_size must be a number of places, got {size!r}"
+    )
     counts = patience is None or (isinstance(patience, int) and patience >= 1)
     require(counts, f"patience must be a number of validations or None, got {patience!r}")
-    require(density is None or isinstance(density, Mapping), f"density must be options or None, got {density!r}")
+    require(
+        density is None or isinstance(density, Mapping),
+        f"density must be options or None, got {density!r}",
+    )
     content: dict = {}
     module.on_save_checkpoint(content)
-    require(flat(content.get(KEY)) == flat(identity), f"a checkpoint must hold the identity as its entry {KEY!r}")
+    require(
+        flat(content.get(KEY)) == flat(identity),
+        f"a checkpoint must hold the identity as its entry {KEY!r}",
+    )
     other = f"none but {module.model.trained_by}"
-    require_refusal(lambda: make(trained_by=other), "a model of another training must be a ValueError")
+    require_refusal(
+        lambda: make(trained_by=other), "a model of another training must be a ValueError"
+    )
     before = _copy(module.model)
     with tempfile.TemporaryDirectory() as place:
         folder = Path(place)
         whole = _train(module, links, folder, device)
-        require(whole.steps == list(range(1, STEPS + 1)), f"{STEPS} batches must be as many steps, got {whole.steps}")
+        require(
+            whole.steps == list(range(1, STEPS + 1)),
+            f"{STEPS} batches must be as many steps, got {whole.steps}",
+        )
         finite = all(map(math.isfinite, whole.losses))
-        require(finite, f"each step must return its loss, for the progress line, got {whole.losses}")
-        after, names = whole.states[-1], {id(parameter): name for name, parameter in module.model.named_parameters()}
+        require(
+            finite, f"each step must return its loss, for the progress line, got {whole.losses}"
+        )
+        after, names = (
+            whole.states[-1],
+            {id(parameter): name for name, parameter in module.model.named_parameters()},
+        )
         for group, parameters in module.model.parameter_groups().items():
             own = [names[id(parameter)] for parameter in parameters if parameter.requires_grad]
             changed = any(not torch.equal(after[name], before[name]) for name in own)
@@ -88,7 +113,10 @@ def check_training(
         unlike = make()
         torch.manual_seed(1)  # another process starts from another state
         rest = _train(unlike, links, folder, device, resume=folder / f"{STOP}.ckpt")
-    require(rest.steps == whole.steps[STOP:], f"a resumed training must start where it stopped, got steps {rest.steps}")
+    require(
+        rest.steps == whole.steps[STOP:],
+        f"a resumed training must start where it stopped, got steps {rest.steps}",
+    )
     _compare(rest.states, whole.states[STOP:], "a resumed training must equal an uninterrupted one")
 
 
@@ -116,7 +144,11 @@ class _Course(Callback):
 def _train(module, links: Links, folder: Path, device, resume: Path | None = None) -> _Course:
     course = _Course(folder)
     with stopping(), warnings.catch_warnings():
-        for message in (".*LeafSpec", ".*does not have many workers", "GPU available but not used"):  # Lightning's
+        for message in (
+            ".*LeafSpec",
+            ".*does not have many workers",
+            "GPU available but not used",
+        ):  # Lightning's
             warnings.filterwarnings("ignore", message)
         trainer = lightning.Trainer(
             accelerator="gpu" if torch.device(device).type == "cuda" else "cpu", devices=1, max_epochs=-1,
@@ -135,9 +167,14 @@ def _check_validation(model: Model, links: Links, metrics: Mapping[str, float]) 
     device = next(model.parameters()).device
     values = model.eval().evaluate(batch.to(device)).cpu()
     scores = links.task.scores(batch.labels, values)
-    for name, expected in links.task.logged({name: score.mean().item() for name, score in scores.items()}).items():
+    for name, expected in links.task.logged(
+        {name: score.mean().item() for name, score in scores.items()}
+    ).items():
         logged = metrics.get(f"validation/{name}")
-        require(logged is not None, f"a validation must log validation/{name}, got {', '.join(metrics) or 'nothing'}")
+        require(
+            logged is not None,
+            f"a validation must log validation/{name}, got {', '.join(metrics) or 'nothing'}",
+        )
         rule = f"validation/{name} must be the mean score of the validation links"
         require_close(torch.tensor(logged), torch.tensor(expected), 1e-4, rule)
 

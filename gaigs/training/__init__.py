@@ -27,8 +27,14 @@ class MeanScores:
             self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
 
     def over_processes(self, strategy) -> dict[str, float]:
-        """The mean of each score, as of ``Task.logged``; every process has to call it with Lightning's strategy."""
+        """The mean of each score, as of ``Task.logged``; every process has to call it with
+        Lightning's strategy.
+        """
         names = list(self.sums)
-        totals = torch.tensor([self.count, *self.sums.values()], dtype=torch.float64, device=strategy.root_device)
+        totals = torch.tensor(
+            [self.count, *self.sums.values()], dtype=torch.float64, device=strategy.root_device
+        )
         count, *sums = strategy.reduce(totals, reduce_op="sum").tolist()
-        return self.task.logged({name: total / count for name, total in zip(names, sums, strict=True)})
+        return self.task.logged(
+            {name: total / count for name, total in zip(names, sums, strict=True)}
+        )

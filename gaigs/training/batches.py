@@ -20,11 +20,13 @@ def process() -> tuple[int, int]:
 
 
 class Batches:
-    """Batches of a fixed number of places with all their links, in an order that follows from seed and step alone.
+    """Batches of a fixed number of places with all their links, in an order that follows from seed
+    and step alone.
 
-    A place is a transmitter's position and frequency: its excitation is computed once for all receivers. Every pass
-    goes through all places once, in a new order. Each process gets every ``world_size``-th place of the batch, with the
-    weights (``Batch.shares``) that make the mean over processes the mean over the batch.
+    A place is a transmitter's position and frequency: its excitation is computed once for all
+    receivers. Every pass goes through all places once, in a new order. Each process gets every
+    ``world_size``-th place of the batch, with the weights (``Batch.shares``) that make the mean
+    over processes the mean over the batch.
 
     Args:
         index: Links to draw from.
@@ -49,14 +51,17 @@ class Batches:
         length = -(-len(self.places) // self.size)
         while self.position < self.steps:
             passed, within = divmod(self.position, length)
-            parts = torch.randperm(len(self.places), generator=seeded(self.seed, passed)).split(self.size)
+            parts = torch.randperm(len(self.places), generator=seeded(self.seed, passed)).split(
+                self.size
+            )
             for chosen in parts[within : within + self.steps - self.position]:
                 self.position += 1
                 yield self._share([self.places[i] for i in chosen.tolist()])
 
     def _share(self, places: list[Tensor]) -> Batch:
         rank, processes = process()
-        # A process without a place takes one with weight 0: every process has to take part in the step.
+        # A process without a place takes one with weight 0: every process has to take part in the
+        # step.
         own = places[rank::processes] or places[:1]
         batch = self.links.batch(torch.cat(own))
         if processes == 1:
@@ -73,7 +78,9 @@ class Batches:
 
 
 class InOrder:
-    """One pass over links in their order, ``size`` links a batch; each process gets every ``world_size``-th of them."""
+    """One pass over links in their order, ``size`` links a batch; each process gets every
+    ``world_size``-th of them.
+    """
 
     def __init__(self, links: Links, index: Int[Tensor, " k"], size: int):
         self.links = links
@@ -86,6 +93,7 @@ class InOrder:
         rank, processes = process()
         for part in self.parts:
             own = part[rank::processes]
-            # A process without a link takes one with weight 0: all go through the same number of batches.
+            # A process without a link takes one with weight 0: all go through the same number of
+            # batches.
             share = float(len(own) > 0)
             yield replace(self.links.batch(own if share else part[:1]), shares=(share, share))

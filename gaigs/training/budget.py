@@ -13,32 +13,43 @@ from gaigs.processes import is_first
 from gaigs.registry import check_type
 
 ENDLESS = 2**40
-"""More steps than any training has; without a number Lightning fetches batches ahead, which a resumption misses."""
+"""More steps than any training has; without a number Lightning fetches batches ahead, which a
+resumption misses.
+"""
 
 
 class Budget(Callback):
     """Measures a training's time, ends it when its time is up, and has it validate by time.
 
-    The clock of the first process decides for all, after each step. It starts with the search for planes, runs during
-    validations, and a resumed training starts with the time spent before. Lightning's own ``max_time`` gives each
-    process its own clock.
+    The clock of the first process decides for all, after each step. It starts with the search for
+    planes, runs during validations, and a resumed training starts with the time spent before.
+    Lightning's own ``max_time`` gives each process its own clock.
 
     Args:
-        max_time: Of the search and the training [s]; None if steps alone end it. The training has half of it or more.
-        every: Least time between validations [s], which take at most a fifth of the training; None: by steps.
-        searched: Duration of the search before the training [s]; of several processes the first one's counts.
+        max_time: Of the search and the training [s]; None if steps alone end it. The training has
+            half of it or more.
+        every: Least time between validations [s], which take at most a fifth of the training; None:
+            by steps.
+        searched: Duration of the search before the training [s]; of several processes the first
+            one's counts.
 
     Attributes:
-        end: Time at which the limit of the run ends the training, at least a second after the search [s]; or infinite.
+        end: Time at which the limit of the run ends the training, at least a second after the
+            search [s]; or infinite.
         share: Share of the training's time spent, the same in all processes; 0 without a limit.
     """
 
-    def __init__(self, max_time: float | None = None, every: float | None = None, searched: float = 0.0):
+    def __init__(
+        self, max_time: float | None = None, every: float | None = None, searched: float = 0.0
+    ):
         self.max_time, self.every, self.searched = max_time, every, searched
         self.share, self.end = 0.0, math.inf
         self.began = self.validated = searched  # the last validation, and its end [s]
         self.is_due = False
-        self.spent, self.start = searched, None  # time before the training [s], and its clock at the start
+        self.spent, self.start = (
+            searched,
+            None,
+        )  # time before the training [s], and its clock at the start
 
     @property
     def seconds(self) -> float:
@@ -48,16 +59,29 @@ class Budget(Callback):
     @property
     def limit(self) -> float:
         """Time at which the training ends [s]; infinite if steps alone end it."""
-        own = math.inf if self.max_time is None else max(self.max_time, self.searched + self.max_time / 2)
+        own = (
+            math.inf
+            if self.max_time is None
+            else max(self.max_time, self.searched + self.max_time / 2)
+        )
         return min(own, max(self.end, self.searched + 1.0))
 
     def state_dict(self) -> dict:
-        last = {"share": self.share, "began": self.began, "validated": self.validated, "is_due": self.is_due}
+        last = {
+            "share": self.share,
+            "began": self.began,
+            "validated": self.validated,
+            "is_due": self.is_due,
+        }
         return {"seconds": self.seconds, "searched": self.searched, **last}
 
     def load_state_dict(self, state: dict) -> None:
         self.spent, self.share, self.is_due = state["seconds"], state["share"], state["is_due"]
-        self.began, self.validated, self.searched = state["began"], state["validated"], state.get("searched", 0.0)
+        self.began, self.validated, self.searched = (
+            state["began"],
+            state["validated"],
+            state.get("searched", 0.0),
+        )
 
     def on_fit_start(self, trainer, module) -> None:
         own = self.searched, self.spent, self.began, self.validated
@@ -67,7 +91,9 @@ class Budget(Callback):
 
     def on_train_start(self, trainer, module) -> None:
         self.start = time.monotonic()
-        if self.is_due:  # the checkpoint was written after a validation, which is not to be repeated
+        if (
+            self.is_due
+        ):  # the checkpoint was written after a validation, which is not to be repeated
             trainer.val_check_batch = trainer.global_step
 
     def on_train_batch_end(self, trainer, module, *_) -> None:
@@ -106,21 +132,24 @@ class Budget(Callback):
 
 
 def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
-    """The options of Lightning's trainer without those of the budget, and the budget after a search [s].
+    """The options of Lightning's trainer without those of the budget, and the budget after a search
+    [s].
 
     The budget takes ``max_time`` and a ``val_check_interval`` that is a time.
 
     Raises:
         TypeError: A number of steps is not a whole number.
-        ValueError: A time is not as Lightning reads it, or less than a second; nothing ends the training; or an option
-            counts in epochs.
+        ValueError: A time is not as Lightning reads it, or less than a second; nothing ends the
+            training; or an option counts in epochs.
     """
     options = dict(options)
     max_time, every = options.pop("max_time", None), options.get("val_check_interval")
     if max_time is not None:
         max_time = seconds("trainer.max_time", max_time)
     elif options.get("max_steps", -1) == -1 and math.isinf(stages.left()):
-        raise ValueError("trainer.max_steps must be at least 1, got -1; time alone ends it with trainer.max_time")
+        raise ValueError(
+            "trainer.max_steps must be at least 1, got -1; time alone ends it with trainer.max_time"
+        )
     if isinstance(every, str | dict):
         every, options["val_check_interval"] = seconds("trainer.val_check_interval", every), ENDLESS
     else:
@@ -133,18 +162,26 @@ def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
     for option, only in (("max_epochs", -1), ("check_val_every_n_epoch", None)):
         epochs = options.get(option)
         if epochs not in (only, None):
-            raise ValueError(f"trainer.{option} must be {only or 'null'}, as steps or time count, got {epochs}")
+            raise ValueError(
+                f"trainer.{option} must be {only or 'null'}, as steps or time count, got {epochs}"
+            )
     return options, Budget(max_time, every, searched)
 
 
 def seconds(option: str, duration: object) -> float:
-    """A duration [s] as Lightning's ``Timer`` reads it: DD:HH:MM:SS, or a mapping such as ``{minutes: 3}``."""
+    """A duration [s] as Lightning's ``Timer`` reads it: DD:HH:MM:SS, or a mapping such as
+    ``{minutes: 3}``.
+    """
     try:
-        found = Timer(duration=duration).time_remaining() if isinstance(duration, str | dict) else None
+        found = (
+            Timer(duration=duration).time_remaining() if isinstance(duration, str | dict) else None
+        )
     except (MisconfigurationException, TypeError):
         found = None
     if not found or found < 1:
-        raise ValueError(f"{option} must be at least 1 s as 'DD:HH:MM:SS', in quotes in a file, got {duration!r}")
+        raise ValueError(
+            f"{option} must be at least 1 s as 'DD:HH:MM:SS', in quotes in a file, got {duration!r}"
+        )
     return found
 
 
@@ -167,7 +204,9 @@ def is_time_up(trainer) -> bool:
 
 
 def share_done(trainer) -> Callable[[int], float]:
-    """The share of a training done after a number of steps: of its steps or of its time, whichever is more."""
+    """The share of a training done after a number of steps: of its steps or of its time, whichever
+    is more.
+    """
 
     def share(step: int) -> float:
         by_steps = step / trainer.max_steps if trainer.max_steps > 0 else 0.0

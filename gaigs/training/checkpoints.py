@@ -17,14 +17,17 @@ from gaigs.training import MeanScores
 
 
 class KeepBest(Checkpoint):
-    """Writes the checkpoint of the best validation score (``Task.monitor``), or of the last step without validation.
+    """Writes the checkpoint of the best validation score (``Task.monitor``), or of the last step
+    without validation.
 
     After ``patience`` validations without a better score it stops the training.
     """
 
     def __init__(self, path: Path, patience: int | None):
         if patience is not None and patience < 1:
-            raise ValueError(f"training.patience must be at least 1 validation or null, got {patience}")
+            raise ValueError(
+                f"training.patience must be at least 1 validation or null, got {patience}"
+            )
         self.path, self.patience = path, patience
         self.best, self.waited = -math.inf, 0  # an error counts as its negative
 
@@ -81,12 +84,14 @@ class KeepBest(Checkpoint):
 
 
 class KeepLast(Checkpoint):
-    """Writes the checkpoint to go on from: at intervals [s], at a signal that stops a run, and at the end.
+    """Writes the checkpoint to go on from: at intervals [s], at a signal that stops a run, and at
+    the end.
 
-    It writes between two steps, after a due validation and the other callbacks, so that a training goes on as if it had
-    never stopped. At the first signal the training stops there, at the second at once. Several processes follow the
-    clock of the first, and stop together whichever of them got the signal. (Lightning's ``ModelCheckpoint`` saves
-    before a due validation, by each process's own clock.)
+    It writes between two steps, after a due validation and the other callbacks, so that a training
+    goes on as if it had never stopped. At the first signal the training stops there, at the second
+    at once. Several processes follow the clock of the first, and stop together whichever of them
+    got the signal. (Lightning's ``ModelCheckpoint`` saves before a due validation, by each
+    process's own clock.)
     """
 
     def __init__(self, path: Path, every: float | int):
@@ -113,7 +118,8 @@ class KeepLast(Checkpoint):
         self.saved = time.monotonic()
         if threading.current_thread() is threading.main_thread():  # others may set no handlers
             for number in STOPPING:
-                # After Lightning's handler of SIGTERM, which would talk to the other processes in the midst of a step.
+                # After Lightning's handler of SIGTERM, which would talk to the other processes in
+                # the midst of a step.
                 signal.signal(number, self.interrupt)
         if self.random is not None:
             torch.random.set_rng_state(self.random["processor"])
@@ -139,7 +145,9 @@ class KeepLast(Checkpoint):
         save(trainer, self.path)
         self.saved = time.monotonic()
         if anyone(self.received is not None):
-            raise Interrupted(f"stopped after step {trainer.global_step}", self.received or signal.SIGINT)
+            raise Interrupted(
+                f"stopped after step {trainer.global_step}", self.received or signal.SIGINT
+            )
 
 
 class Interrupted(Exception):
@@ -151,10 +159,16 @@ class Interrupted(Exception):
 
 
 def save(trainer, path: Path) -> None:
-    """Writes a checkpoint atomically, after the log of the steps before it; every process has to call it."""
+    """Writes a checkpoint atomically, after the log of the steps before it; every process has to
+    call it.
+    """
     for logger in trainer.loggers:
         logger.save()
-    with atomic_write(path) if trainer.is_global_zero else contextlib.nullcontext(path.with_suffix(".part")) as part:
+    with (
+        atomic_write(path)
+        if trainer.is_global_zero
+        else contextlib.nullcontext(path.with_suffix(".part")) as part
+    ):
         trainer.save_checkpoint(part, weights_only=False)  # the first process alone writes
         if trainer.is_global_zero:
             checkpoint.seal(part)

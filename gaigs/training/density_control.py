@@ -10,8 +10,9 @@ from gaigs.training import seeded
 class DensityControl(Callback):
     """Prunes, clones and splits Gaussians on a schedule.
 
-    The pull at a Gaussian is its mean positional gradient since the last round times its distance to the receivers'
-    middle. Of those pulled harder than ``gradient``, wide ones split and narrow ones are cloned.
+    The pull at a Gaussian is its mean positional gradient since the last round times its distance
+    to the receivers' middle. Of those pulled harder than ``gradient``, wide ones split and narrow
+    ones are cloned.
 
     Args:
         every: Steps between two rounds.
@@ -59,7 +60,9 @@ class DensityControl(Callback):
 
     def on_fit_start(self, trainer, module) -> None:
         if module.model.primitives is None:
-            raise ValueError("density needs a model with Gaussians, and this one has none; leave density out")
+            raise ValueError(
+                "density needs a model with Gaussians, and this one has none; leave density out"
+            )
 
     def on_before_optimizer_step(self, trainer, module, optimizer) -> None:
         gaussians = module.model.primitives
@@ -71,7 +74,11 @@ class DensityControl(Callback):
 
     @torch.no_grad()
     def on_train_batch_end(self, trainer, module, *_) -> None:
-        gaussians, optimizer, step = module.model.primitives, trainer.optimizers[0], trainer.global_step
+        gaussians, optimizer, step = (
+            module.model.primitives,
+            trainer.optimizers[0],
+            trainer.global_step,
+        )
         is_due = step % self.every == 0 and self.start <= step <= self.stop
         if not is_due or not gaussians.means.requires_grad:
             return
@@ -90,7 +97,8 @@ class DensityControl(Callback):
             density.prune(gaussians, optimizer, faint)
         self.steps = 0
         if trainer.world_size > 1:
-            # All processes have the same Gaussians, but Lightning's wrapper still holds the replaced parameters.
+            # All processes have the same Gaussians, but Lightning's wrapper still holds the
+            # replaced parameters.
             trainer.strategy.model = trainer.strategy._setup_model(module)
 
     def _distances(self, module) -> torch.Tensor:

@@ -31,12 +31,15 @@ class Descent(lightning.LightningModule):
         penalties: Weights of penalties by name, in place of ``Model.penalty_weights``.
         learning_rates: At the start, by parameter group, in place of ``Model.learning_rates``.
         optimizer, schedule: As ``gaigs.training.schedule`` takes them.
-        patience: Validations without a better score until the training stops; None: it goes on to the last step.
-        density: Options of ``gaigs.training.density_control.DensityControl``; None: a fixed number of Gaussians.
+        patience: Validations without a better score until the training stops; None: it goes on to
+            the last step.
+        density: Options of ``gaigs.training.density_control.DensityControl``; None: a fixed number
+            of Gaussians.
         links: Most links a step, drawn at random from those of its places; None: all.
 
     Raises:
-        ValueError: An option is out of range, or parameter groups and penalties are not those of the model.
+        ValueError: An option is out of range, or parameter groups and penalties are not those of
+            the model.
 
     Source: optimiser and schedules after the released configuration.
     """
@@ -62,15 +65,21 @@ class Descent(lightning.LightningModule):
     ):
         super().__init__()
         if model.trained_by != self.name:
-            raise ValueError(f"this model is trained by {model.trained_by!r}; set training={model.trained_by}")
+            raise ValueError(
+                f"this model is trained by {model.trained_by!r}; set training={model.trained_by}"
+            )
         if not jitter >= 0:
             raise ValueError(f"training.jitter must be at least 0 m, got {jitter}")
         if links is not None and links < 1:
             raise ValueError(f"training.links must be at least 1 link or null, got {links}")
         self.penalties = _overridden("training.penalties", model.penalty_weights, penalties)
-        self.learning_rates = _overridden("training.learning_rates", model.learning_rates, learning_rates)
+        self.learning_rates = _overridden(
+            "training.learning_rates", model.learning_rates, learning_rates
+        )
         if unset := model.parameter_groups().keys() - self.learning_rates.keys():
-            raise ValueError(f"the model has no learning rate for {', '.join(sorted(unset))}; add it to learning_rates")
+            raise ValueError(
+                f"the model has no learning rate for {', '.join(sorted(unset))}; add it to learning_rates"
+            )
         self.model, self.loss, self.identity, self.seed = model, loss, identity, seed
         self.links, self.batch_size, self.jitter = links, batch_size, jitter
         self.patience, self.density = patience, density
@@ -79,7 +88,9 @@ class Descent(lightning.LightningModule):
         self.thin = call("training.thinning", self.task.thinning, thinning)
 
     def configure_optimizers(self):
-        optimizer = make_optimizer(self.optimizer, self.model.parameter_groups(), self.learning_rates)
+        optimizer = make_optimizer(
+            self.optimizer, self.model.parameter_groups(), self.learning_rates
+        )
         schedule = make_schedule(self.schedule, optimizer, share_done(self.trainer))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
@@ -93,31 +104,48 @@ class Descent(lightning.LightningModule):
         """A batch as a step sees it: of some links, thinned, its places moved."""
         generator = seeded(self.seed, self.global_step)
         if self.links is not None and len(batch) > self.links:
-            some = torch.randperm(len(batch), generator=generator)[: self.links].sort().values.to(batch.labels.device)
+            some = (
+                torch.randperm(len(batch), generator=generator)[: self.links]
+                .sort()
+                .values.to(batch.labels.device)
+            )
             batch = replace(batch, query=batch.query[some], labels=batch.labels[some])
         batch = self.thin(batch, generator)
         if self.jitter:
             places, which = batch.query.unique(with_receivers=False)
-            moves = self.jitter * torch.randn(places.transmitters.shape, generator=generator).to(places.transmitters)
+            moves = self.jitter * torch.randn(places.transmitters.shape, generator=generator).to(
+                places.transmitters
+            )
             moved = (places.transmitters + moves)[which]
             batch = replace(batch, query=replace(batch.query, transmitters=moved))
         return batch
 
-    def add_up(self, loss: Tensor, terms: dict[str, Tensor], penalties: dict[str, Tensor], batch: Batch) -> Tensor:
+    def add_up(
+        self, loss: Tensor, terms: dict[str, Tensor], penalties: dict[str, Tensor], batch: Batch
+    ) -> Tensor:
         """The loss with its penalties, checked and logged."""
         links, places = batch.shares
         total = links * loss
         for name, penalty in penalties.items():
             if name not in self.penalties:
-                raise ValueError(f"the model has no weight of its penalty {name!r}; add it to penalty_weights")
+                raise ValueError(
+                    f"the model has no weight of its penalty {name!r}; add it to penalty_weights"
+                )
             total = total + self.penalties[name] * places * penalty
         if not torch.isfinite(total):
             raise self._diverged(total, terms, batch)
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
-            # Lightning would log after the step's callbacks, and a checkpoint written there would lack the row.
+            # Lightning would log after the step's callbacks, and a checkpoint written there would
+            # lack the row.
             shared = {name: links * term for name, term in terms.items()}
-            names = ["train/loss", *(f"train/{name}" for name in shared), *(f"penalty/{name}" for name in penalties)]
-            values = torch.stack([total, *shared.values(), *(places * penalty for penalty in penalties.values())])
+            names = [
+                "train/loss",
+                *(f"train/{name}" for name in shared),
+                *(f"penalty/{name}" for name in penalties),
+            ]
+            values = torch.stack(
+                [total, *shared.values(), *(places * penalty for penalty in penalties.values())]
+            )
             values = self.trainer.strategy.reduce(values.detach(), reduce_op="mean").tolist()
             values = dict(zip(names, values, strict=True))
             for logger in self.loggers:
@@ -152,7 +180,9 @@ class Descent(lightning.LightningModule):
         checkpoint[KEY] = self.identity
 
 
-def _overridden(option: str, defaults: Mapping[str, float], values: Mapping[str, float]) -> dict[str, float]:
+def _overridden(
+    option: str, defaults: Mapping[str, float], values: Mapping[str, float]
+) -> dict[str, float]:
     """A model's defaults with some of them replaced."""
     for name, value in values.items():
         if name not in defaults:

@@ -12,9 +12,11 @@ from gaigs.model import Model
 
 @torch.no_grad()
 def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
-    """Names the first quantity of a step's loss that is not finite, by a hook at each part of the model.
+    """Names the first quantity of a step's loss that is not finite, by a hook at each part of the
+    model.
 
-    It is the places, a parameter, the output of a part, the prediction, a penalty, or a term of the loss.
+    It is the places, a parameter, the output of a part, the prediction, a penalty, or a term of the
+    loss.
     """
     if not is_finite(batch.query.transmitters):
         return "the places as training.jitter moves them"
@@ -28,7 +30,11 @@ def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
         if not all(is_finite(value) for value in values if isinstance(value, Tensor)):
             found.append(f"the output of {name}")
 
-    hooks = [part.register_forward_hook(partial(look, name)) for name, part in model.named_modules() if name]
+    hooks = [
+        part.register_forward_hook(partial(look, name))
+        for name, part in model.named_modules()
+        if name
+    ]
     try:
         value, penalties = model(batch)
     finally:

@@ -9,7 +9,8 @@ from gaigs.training.budget import share_done
 
 
 class ProgressLine(ProgressBar):
-    """Steps, their rate, the time left, loss and validation score in one line of the first process's terminal.
+    """Steps, their rate, the time left, loss and validation score in one line of the first
+    process's terminal.
 
     Lightning's progress bars count the batches of an epoch, and a run counts steps.
     """
@@ -19,7 +20,11 @@ class ProgressLine(ProgressBar):
 
     def on_train_start(self, trainer, module) -> None:
         self.line = stages.make_bars(disable=not trainer.is_global_zero)
-        self.start, self.first, self.share_done = time.monotonic(), trainer.global_step, share_done(trainer)
+        self.start, self.first, self.share_done = (
+            time.monotonic(),
+            trainer.global_step,
+            share_done(trainer),
+        )
         self.task = self.line.add_task("training", total=1, **self._done(trainer), scores="")
         self.line.start()
         if trainer.is_global_zero:

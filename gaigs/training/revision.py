@@ -17,7 +17,9 @@ from gaigs.training.budget import is_time_up, time_share
 log = logging.getLogger(__name__)
 
 LINKS = 48
-"""Most training links, and validation links, of a revision: a search evaluates them hundreds of times."""
+"""Most training links, and validation links, of a revision: a search evaluates them hundreds of
+times.
+"""
 
 
 class _TimeUp(Exception):
@@ -26,7 +28,9 @@ class _TimeUp(Exception):
 
 @contextlib.contextmanager
 def _ending(trainer, model: nn.Module) -> Iterator[None]:
-    """Looks at the clock whenever a part of the model is called, and raises ``_TimeUp`` when the time is up."""
+    """Looks at the clock whenever a part of the model is called, and raises ``_TimeUp`` when the
+    time is up.
+    """
 
     def look(*_) -> None:
         if is_time_up(trainer):
@@ -43,9 +47,9 @@ def _ending(trainer, model: nn.Module) -> Iterator[None]:
 class Revision(Callback):
     """Calls ``Model.revise`` after the shares of the training in ``Model.revisions``.
 
-    Shares are of the training's steps or of its time, whichever comes first. A revision that is not done when the time
-    of the training is up leaves the model as it was. All processes choose the same links by the seed, so that they
-    decide alike.
+    Shares are of the training's steps or of its time, whichever comes first. A revision that is not
+    done when the time of the training is up leaves the model as it was. All processes choose the
+    same links by the seed, so that they decide alike.
     """
 
     def __init__(self, links: Links, seed: int):
@@ -69,7 +73,9 @@ class Revision(Callback):
     def _revise(self, trainer, module) -> None:
         time = time_share(trainer)
         for number, share in enumerate(module.model.revisions):
-            by_steps = trainer.max_steps > 0 and trainer.global_step == round(share * trainer.max_steps)
+            by_steps = trainer.max_steps > 0 and trainer.global_step == round(
+                share * trainer.max_steps
+            )
             if number in self.made or not (by_steps or (time is not None and time >= share)):
                 continue
             if is_time_up(trainer):
@@ -83,7 +89,10 @@ class Revision(Callback):
             try:
                 with _ending(trainer, module.model):
                     done = module.model.revise(
-                        number, train, validation, lambda batch: module.loss(module.model(batch).value, batch)[0].item()
+                        number,
+                        train,
+                        validation,
+                        lambda batch: module.loss(module.model(batch).value, batch)[0].item(),
                     )
             except _TimeUp:
                 module.model.load_state_dict(before)

@@ -18,21 +18,30 @@ def make_optimizer(
     """An optimizer of ``torch.optim`` with a learning rate for each group.
 
     Args:
-        config: ``_target_``, a class of ``torch.optim``, and its options. A weight decay acts on the group ``network``
-            alone: positions, scales and opacities have no reason to be small. On a CPU a step is fused if the class can
-            do it and no option says otherwise.
+        config: ``_target_``, a class of ``torch.optim``, and its options. A weight decay acts on
+            the group ``network`` alone: positions, scales and opacities have no reason to be small.
+            On a CPU a step is fused if the class can do it and no option says otherwise.
         groups: Parameters by name.
         rates: Learning rate of each group.
     """
     kind, options = _target("training.optimizer", config, torch.optim, Optimizer)
     if "lr" in options:
-        raise ValueError("training.optimizer takes no lr, as each group has its own; set training.learning_rates")
-    parts = [{"params": list(parameters), "lr": rates[name], "name": name} for name, parameters in groups.items()]
+        raise ValueError(
+            "training.optimizer takes no lr, as each group has its own; set training.learning_rates"
+        )
+    parts = [
+        {"params": list(parameters), "lr": rates[name], "name": name}
+        for name, parameters in groups.items()
+    ]
     parameters = [parameter for group in groups.values() for parameter in group]
-    implementations = {"fused", "foreach", "differentiable"} & inspect.signature(kind).parameters.keys()
+    implementations = {"fused", "foreach", "differentiable"} & inspect.signature(
+        kind
+    ).parameters.keys()
     on_cpu = all(p.is_floating_point() and p.device.type == "cpu" for p in parameters)
     if "fused" in implementations and on_cpu and not implementations & options.keys():
-        options["fused"] = True  # False would keep torch from the grouped steps that it takes by itself on a GPU
+        options["fused"] = (
+            True  # False would keep torch from the grouped steps that it takes by itself on a GPU
+        )
     optimizer = call("training.optimizer", kind, options, params=parts)
     for group in optimizer.param_groups:
         if group["name"] != "network" and "weight_decay" in group:
@@ -40,16 +49,26 @@ def make_optimizer(
     return optimizer
 
 
-def make_schedule(config: Mapping, optimizer: Optimizer, share_done: Callable[[int], float]) -> LRScheduler:
+def make_schedule(
+    config: Mapping, optimizer: Optimizer, share_done: Callable[[int], float]
+) -> LRScheduler:
     """A schedule of all of an optimizer's rates, to be stepped once a step.
 
     Args:
-        config: Options of ``warmup_and_decay``; or ``_target_``, a class of ``torch.optim.lr_scheduler``, with its own.
+        config: Options of ``warmup_and_decay``; or ``_target_``, a class of
+            ``torch.optim.lr_scheduler``, with its own.
         optimizer: The optimizer.
-        share_done: Share of the training done after a number of steps; a class of torch counts steps alone.
+        share_done: Share of the training done after a number of steps; a class of torch counts
+            steps alone.
     """
     if "_target_" not in config:
-        return call("training.schedule", warmup_and_decay, config, optimizer=optimizer, share_done=share_done)
+        return call(
+            "training.schedule",
+            warmup_and_decay,
+            config,
+            optimizer=optimizer,
+            share_done=share_done,
+        )
     kind, options = _target("training.schedule", config, lr_scheduler, LRScheduler)
     return call("training.schedule", kind, options, optimizer=optimizer)
 
@@ -57,12 +76,16 @@ def make_schedule(config: Mapping, optimizer: Optimizer, share_done: Callable[[i
 def warmup_and_decay(
     optimizer: Optimizer, share_done: Callable[[int], float], warmup: int, final: float
 ) -> LRScheduler:
-    """Rates rise linearly over ``warmup`` steps, and fall exponentially to the fraction ``final`` of themselves."""
+    """Rates rise linearly over ``warmup`` steps, and fall exponentially to the fraction ``final``
+    of themselves.
+    """
     if not 0 < final <= 1:
         raise ValueError(f"training.schedule.final must be in (0, 1], got {final}")
     if warmup < 0:
         raise ValueError(f"training.schedule.warmup must be at least 0 steps, got {warmup}")
-    return LambdaLR(optimizer, lambda step: min(1.0, (step + 1) / max(warmup, 1)) * final ** share_done(step))
+    return LambdaLR(
+        optimizer, lambda step: min(1.0, (step + 1) / max(warmup, 1)) * final ** share_done(step)
+    )
 
 
 def _target(option: str, config: Mapping, module: ModuleType, base: type) -> tuple[type, dict]:
@@ -70,6 +93,8 @@ def _target(option: str, config: Mapping, module: ModuleType, base: type) -> tup
     options = dict(config)
     target = str(options.pop("_target_", None))
     found = getattr(module, target.removeprefix(f"{module.__name__}."), None)
-    if not target.startswith(f"{module.__name__}.") or not (isinstance(found, type) and issubclass(found, base)):
+    if not target.startswith(f"{module.__name__}.") or not (
+        isinstance(found, type) and issubclass(found, base)
+    ):
         raise ValueError(f"{option}._target_ must be a class of {module.__name__}, got {target!r}")
     return found, options

@@ -23,7 +23,9 @@ def layout_of(signature):
 def pair(signature):
     """Our algebra, the reference's layout, and eight random pairs of multivectors."""
     algebra, layout = Algebra(*signature), layout_of(signature)
-    x, y = torch.randn(2, 8, algebra.size, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    x, y = torch.randn(
+        2, 8, algebra.size, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
     return algebra, layout, x, y
 
 
@@ -31,7 +33,12 @@ def reference(layout, function, *multivectors):
     """Results of the clifford package for a batch."""
     rows = zip(*(x.numpy() for x in multivectors), strict=True)
     return torch.from_numpy(
-        np.stack([function(*(layout.MultiVector(value=row.copy()) for row in values)).value for values in rows])
+        np.stack(
+            [
+                function(*(layout.MultiVector(value=row.copy()) for row in values)).value
+                for values in rows
+            ]
+        )
     )
 
 
@@ -48,7 +55,9 @@ def test_components_stand_in_the_order_of_the_reference(pair):
 
 
 def test_blades_have_the_usual_names():
-    assert PROJECTIVE.blades == tuple("1 e0 e1 e2 e3 e01 e02 e03 e12 e13 e23 e012 e013 e023 e123 e0123".split())
+    assert PROJECTIVE.blades == tuple(
+        "1 e0 e1 e2 e3 e01 e02 e03 e12 e13 e23 e012 e013 e023 e123 e0123".split()
+    )
     assert SPACETIME.blades[:6] == ("1", "e1", "e2", "e3", "e4", "e12")
     assert PROJECTIVE.blades[PROJECTIVE.homogeneous] == "e123"
 
@@ -56,7 +65,11 @@ def test_blades_have_the_usual_names():
 @signatures
 @pytest.mark.parametrize(
     ("name", "function"),
-    [("product", lambda x, y: x * y), ("wedge", lambda x, y: x ^ y), ("join", lambda x, y: x.vee(y))],
+    [
+        ("product", lambda x, y: x * y),
+        ("wedge", lambda x, y: x ^ y),
+        ("join", lambda x, y: x.vee(y)),
+    ],
 )
 def test_products_agree_with_clifford(pair, name, function):
     algebra, layout, x, y = pair
@@ -66,11 +79,15 @@ def test_products_agree_with_clifford(pair, name, function):
 @signatures
 def test_inner_products_involutions_and_grades_agree_with_clifford(pair):
     algebra, layout, x, y = pair
-    torch.testing.assert_close(algebra.inner(x, y), reference(layout, lambda x, y: (~x * y)(0), x, y)[:, 0])
+    torch.testing.assert_close(
+        algebra.inner(x, y), reference(layout, lambda x, y: (~x * y)(0), x, y)[:, 0]
+    )
     torch.testing.assert_close(algebra.reverse(x), reference(layout, lambda x: ~x, x))
     torch.testing.assert_close(algebra.involute(x), reference(layout, lambda x: x.gradeInvol(), x))
     for grade in range(algebra.dimension + 1):
-        torch.testing.assert_close(algebra.grade(x, grade), reference(layout, lambda x, g=grade: x(g), x))
+        torch.testing.assert_close(
+            algebra.grade(x, grade), reference(layout, lambda x, g=grade: x(g), x)
+        )
 
 
 @signatures

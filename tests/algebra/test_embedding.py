@@ -31,8 +31,12 @@ def test_three_points_join_in_their_plane(points):
 
 
 def test_two_parallel_mirrors_translate_by_twice_their_distance(points):
-    mirrors = embed_plane(torch.tensor([[0, 0, 2.0]]).double().expand(2, 3), torch.tensor([2.0, 5.0]).double())
-    moved = extract_point(PROJECTIVE.sandwich(PROJECTIVE.product(mirrors[1], mirrors[0]), embed_point(points)))
+    mirrors = embed_plane(
+        torch.tensor([[0, 0, 2.0]]).double().expand(2, 3), torch.tensor([2.0, 5.0]).double()
+    )
+    moved = extract_point(
+        PROJECTIVE.sandwich(PROJECTIVE.product(mirrors[1], mirrors[0]), embed_point(points))
+    )
     close(moved, points + torch.tensor([0, 0, 3.0]).double())
 
 

@@ -14,7 +14,9 @@ from gaigs.algebra.layers import (
     gated_gelu,
 )
 
-algebras = pytest.mark.parametrize("algebra", [PROJECTIVE, SPACETIME, Algebra(2, 0, 1), Algebra(1, 1, 1)], ids=str)
+algebras = pytest.mark.parametrize(
+    "algebra", [PROJECTIVE, SPACETIME, Algebra(2, 0, 1), Algebra(1, 1, 1)], ids=str
+)
 B, TOKENS, C, S = 2, 5, 4, 3
 
 
@@ -33,9 +35,18 @@ def reference_of(multivectors):
 
 
 LAYERS = {
-    "linear": (lambda algebra: EquivariantLinear(algebra, (C, 6), (S, 2)), lambda layer, x, s: layer(x, s)),
-    "bilinear": (lambda algebra: GeometricBilinear(algebra, C, S), lambda layer, x, s: layer(x, s, reference_of(x))),
-    "attention": (lambda algebra: GeometricAttention(algebra, C, 2, heads=2), lambda layer, x, s: layer(x, s[..., :2])),
+    "linear": (
+        lambda algebra: EquivariantLinear(algebra, (C, 6), (S, 2)),
+        lambda layer, x, s: layer(x, s),
+    ),
+    "bilinear": (
+        lambda algebra: GeometricBilinear(algebra, C, S),
+        lambda layer, x, s: layer(x, s, reference_of(x)),
+    ),
+    "attention": (
+        lambda algebra: GeometricAttention(algebra, C, 2, heads=2),
+        lambda layer, x, s: layer(x, s[..., :2]),
+    ),
     "block": (
         lambda algebra: GATrBlock(algebra, C, 2, heads=2),
         lambda layer, x, s: layer(x, s[..., :2], reference_of(x)),
@@ -60,11 +71,17 @@ def test_layers_are_equivariant(algebra, name, tokens, check_equivariance):
 
 @algebras
 def test_linear_has_every_equivariant_map(algebra, make_versor):
-    """Matrices that commute with mirrors in general position, counted as the null space of that condition."""
+    """Matrices that commute with mirrors in general position, counted as the null space of that
+    condition.
+    """
     eye = torch.eye(algebra.size, dtype=torch.float64)
     generator = torch.Generator().manual_seed(3)
-    actions = [algebra.sandwich(make_versor(algebra, 1, generator), eye).contiguous() for _ in range(6)]
-    condition = torch.cat([torch.kron(a, eye) - torch.kron(eye, a.mT.contiguous()) for a in actions])
+    actions = [
+        algebra.sandwich(make_versor(algebra, 1, generator), eye).contiguous() for _ in range(6)
+    ]
+    condition = torch.cat(
+        [torch.kron(a, eye) - torch.kron(eye, a.mT.contiguous()) for a in actions]
+    )
     singular = torch.linalg.svdvals(condition)
     layer = EquivariantLinear(algebra, (1, 1), (1, 1)).double()
     assert len(layer.weight) == (singular < 1e-9).sum()
@@ -94,7 +111,9 @@ def test_attention_sees_the_distance_of_points():
     query, key = layer.features(embed_point(points))
     logits = ((query @ layer.form) * key).sum(-1)
     squared = (points[0] - points[1]).square().sum(-1)
-    torch.testing.assert_close(logits, 1 - squared / (1 + HOMOGENEOUS_FLOOR) ** 2)  # 1 of the two e123
+    torch.testing.assert_close(
+        logits, 1 - squared / (1 + HOMOGENEOUS_FLOOR) ** 2
+    )  # 1 of the two e123
 
 
 @algebras
@@ -119,7 +138,9 @@ def test_block_has_the_right_gradients(algebra):
     block = GATrBlock(algebra, 2, 1, heads=1).double()
     multivectors, scalars = torch.randn(1, 3, 2, 16).double(), torch.randn(1, 3, 1).double()
     inputs = multivectors.requires_grad_(), scalars.requires_grad_()
-    assert torch.autograd.gradcheck(lambda x, s: block(x, s, reference_of(x)), inputs, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        lambda x, s: block(x, s, reference_of(x)), inputs, fast_mode=True
+    )
 
 
 def test_channels_that_cannot_be_shared_are_refused():
@@ -185,7 +206,10 @@ def test_the_first_token_of_a_group_sees_its_group_and_the_common_tokens(algebra
     scalars = torch.randn(b * size + alike, 4).double().requires_grad_()
     expected = [[], []]
     for i in range(b):
-        own = [torch.cat((x[i * size : (i + 1) * size], x[b * size :])) for x in (multivectors, scalars)]
+        own = [
+            torch.cat((x[i * size : (i + 1) * size], x[b * size :]))
+            for x in (multivectors, scalars)
+        ]
         attended = block.attention(*equivariant_norm(algebra, *own))
         for parts, token, change in zip(expected, own, attended, strict=True):
             parts.append((token + change)[:1])

@@ -32,7 +32,10 @@ class Squares(Benchmark):
             raise KeyboardInterrupt
         time.sleep(self.seconds)
         self.measured.append(side)
-        return [cell[0] | ({"area": float(side**2)} if side else {"status": f"{UNAVAILABLE}it has no side"})]
+        return [
+            cell[0]
+            | ({"area": float(side**2)} if side else {"status": f"{UNAVAILABLE}it has no side"})
+        ]
 
     def tables(self, rows):
         return table(rows, {"side": "side", "area": "area"})
@@ -98,11 +101,16 @@ def test_each_device_has_its_rows(tmp_path, monkeypatch):
     assert one.measured == []
 
 
-@pytest.mark.parametrize("content", [b"a,b\n1,2\n", b"device,kind,side,area,status\nhere,1\n", b""], ids=str)
+@pytest.mark.parametrize(
+    "content", [b"a,b\n1,2\n", b"device,kind,side,area,status\nhere,1\n", b""], ids=str
+)
 def test_a_foreign_or_damaged_file_is_kept(tmp_path, content):
     file = tmp_path / "squares.csv"
     file.write_bytes(content)
-    with pytest.raises(ValueError, match=r"squares\.csv must be CSV with the columns device, kind, side, area, status"):
+    with pytest.raises(
+        ValueError,
+        match=r"squares\.csv must be CSV with the columns device, kind, side, area, status",
+    ):
         Squares(tmp_path, [1]).run()
     assert file.read_bytes() == content
 

@@ -22,7 +22,9 @@ def test_rows_of_tiny_scenes(tmp_path, monkeypatch):
     own = ["--precisions", *precisions, "--rasterizers", "torch", "opencl", "--repeats", "2"]
     rasterizer.main([*TINY, *own, "--folder", str(tmp_path)])
     with open(tmp_path / "rasterizer.csv", newline="") as file:
-        found = {(row["scene"], row["rasterizer"], row["precision"]): row for row in csv.DictReader(file)}
+        found = {
+            (row["scene"], row["rasterizer"], row["precision"]): row for row in csv.DictReader(file)
+        }
     assert len(found) == 12
     row = found["common", "torch", "float32"]
     assert (row["repeats"], row["times"]) == ("2", "1")
@@ -56,7 +58,9 @@ def test_wrong_maps_and_gradients_are_seen(name):
     assert truth.errors(drawn, "cpu", torch.float64)["error"] < 1e-12
     assert truth.errors(wrong, "cpu", torch.float64)["error"] == pytest.approx(0.1, rel=0.2)
     halved = lambda signal: signal.detach() + 0.5 * (signal - signal.detach())
-    found = truth.errors(lambda splats, signal, *rest: drawn(splats, halved(signal), *rest), "cpu", torch.float64)
+    found = truth.errors(
+        lambda splats, signal, *rest: drawn(splats, halved(signal), *rest), "cpu", torch.float64
+    )
     assert found["error"] < 1e-12
     assert found["gradient_error"] == pytest.approx(0.5, rel=0.01)
 

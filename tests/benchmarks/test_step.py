@@ -18,7 +18,11 @@ def test_a_step_is_divided(tmp_path):
         rows = {row["part"]: row for row in csv.DictReader(file)}
     assert tuple(rows) == step.PARTS
     whole = rows["whole step"]
-    assert whole | {"repeats": "2", "gaussians": "10", "places": "3", "share": "1", "rasterizer": "torch"} == whole
+    assert (
+        whole
+        | {"repeats": "2", "gaussians": "10", "places": "3", "share": "1", "rasterizer": "torch"}
+        == whole
+    )
     assert all(float(row["ms"]) > 0 for row in rows.values())
     page = (tmp_path / "step.md").read_text()
     assert f"python benchmarks/step.py {' '.join(overrides)}\n" in page

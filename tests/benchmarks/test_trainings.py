@@ -1,4 +1,6 @@
-"""Benchmarks of whole trainings: one of a tiny system end to end, all others of trainings that are made up."""
+"""Benchmarks of whole trainings: one of a tiny system end to end, all others of trainings that are
+made up.
+"""
 
 import csv
 
@@ -37,7 +39,8 @@ def read(folder, name="accuracy"):
 
 @pytest.fixture
 def fake(monkeypatch):
-    """Trainings are made up: they have a score, by their configuration, or an error. Their models are noted.
+    """Trainings are made up: they have a score, by their configuration, or an error. Their models
+    are noted.
 
     Each is made once, on any machine: a benchmark trains on its GPU too.
     """
@@ -50,7 +53,11 @@ def fake(monkeypatch):
             if isinstance(score, BaseException):
                 raise score
             scores = {"ssim_median": score(config), "ssim_mean": score(config)}
-            metrics = dict.fromkeys(COSTS, 1.0) | {"task": "spectrum", "split": "official", "seed": config["seed"]}
+            metrics = dict.fromkeys(COSTS, 1.0) | {
+                "task": "spectrum",
+                "split": "official",
+                "seed": config["seed"],
+            }
             return metrics | {"models": {"own": scores}, "validation": {"own": scores}}
 
         monkeypatch.setattr("gaigs.run", run)
@@ -65,7 +72,10 @@ def test_a_system_is_trained_once_and_its_run_is_read_again(tmp_path, monkeypatc
     assert [*rows] == [("look-up", "mean"), ("system", "gaigs"), ("system", "friis")]
     own = rows["system", "gaigs"]
     assert (own["status"], own["task"], own["steps"]) == ("measured", "spectrum", "2")
-    assert "trainer.max_steps=2 trainer.max_time=00:00:01:00 trainer.val_check_interval=1 " in own["trainer"]
+    assert (
+        "trainer.max_steps=2 trainer.max_time=00:00:01:00 trainer.val_check_interval=1 "
+        in own["trainer"]
+    )
     assert own["scene"] == " ".join(word for word in TINY if not word.startswith("trainer."))
     assert rows["look-up", "mean"]["curve"] == ""
     times = [float(point.partition(":")[0]) for point in own["curve"].split()]
@@ -81,12 +91,16 @@ def test_a_system_is_trained_once_and_its_run_is_read_again(tmp_path, monkeypatc
     assert read(tmp_path)["system", "gaigs"] == own
 
 
-@pytest.mark.parametrize("error", [ZeroDivisionError("by zero"), FileNotFoundError("no weights")], ids=repr)
+@pytest.mark.parametrize(
+    "error", [ZeroDivisionError("by zero"), FileNotFoundError("no weights")], ids=repr
+)
 def test_a_defect_stops_no_other_system(tmp_path, fake, error):
     trained = fake(error)
     run_accuracy(tmp_path)
     assert trained == ["mean", "gaigs"]
-    assert {row["status"] for row in read(tmp_path).values()} == {f"unavailable: {type(error).__name__}: {error}"}
+    assert {row["status"] for row in read(tmp_path).values()} == {
+        f"unavailable: {type(error).__name__}: {error}"
+    }
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), MemoryError()], ids=repr)
@@ -125,7 +139,12 @@ def test_values_about_a_default():
 
 
 def test_overrides_of_a_row():
-    row = {"of": "model=gaigs kriging=true", "key": "model", "value": "mirrored", "default": "gaigs"}
+    row = {
+        "of": "model=gaigs kriging=true",
+        "key": "model",
+        "value": "mirrored",
+        "default": "gaigs",
+    }
     assert overrides_of(row) == ["kriging=true", "model=mirrored"]
     assert overrides_of(row | {"value": "gaigs"}) == ["model=gaigs", "kriging=true"]
 
@@ -135,17 +154,33 @@ def test_kriging_is_the_last_point_of_a_curve(tmp_path):
     log = "step,seconds,validation/ssim\n9,2.0,\n9,,0.5\n19,4.0,\n19,,0.6\n29,,0.61\n"
     (tmp_path / "log/version_0/metrics.csv").write_text(log)
     scores = {"ssim_median": 0.8, "ssim_mean": 0.7}
-    metrics = dict.fromkeys(COSTS) | {"task": "spectrum", "split": "official", "seed": 0, "train_seconds": 5.0}
+    metrics = dict.fromkeys(COSTS) | {
+        "task": "spectrum",
+        "split": "official",
+        "seed": 0,
+        "train_seconds": 5.0,
+    }
     metrics |= {"models": {"mirrored": scores}, "validation": {"mirrored": {"ssim_mean": 0.75}}}
-    assert results(metrics, tmp_path)["curve"] == "2.0:0.5 4.0:0.6", "a point without its time is left out"
+    assert results(metrics, tmp_path)["curve"] == "2.0:0.5 4.0:0.6", (
+        "a point without its time is left out"
+    )
     found = results(metrics | {"kriging": {"seconds": 3.0}}, tmp_path)
     assert found["curve"] == "2.0:0.5 4.0:0.6 8.0:0.75"
-    assert (found["train_seconds"], found["steps"], found["test"], found["compared"]) == (8.0, 30, 0.7, 0.8)
+    assert (found["train_seconds"], found["steps"], found["test"], found["compared"]) == (
+        8.0,
+        30,
+        0.7,
+        0.8,
+    )
 
 
 # --- tables of rows that are made up ---
 
-ROW = dict.fromkeys((*Accuracy.keys, *Accuracy.values), "") | {"device": "cpu", "task": "spectrum", "split": "official"}
+ROW = dict.fromkeys((*Accuracy.keys, *Accuracy.values), "") | {
+    "device": "cpu",
+    "task": "spectrum",
+    "split": "official",
+}
 ROW |= {"key": "model", "num_parameters": "7", "status": "measured"}
 
 
@@ -155,7 +190,13 @@ def row(axis, value, validation, test, ms, curve="", **more):
 
 
 def values(scores, task="spectrum", axis="Gaussians", key="gaussians.count", default="300", **more):
-    more |= {"task": task, "key": key, "default": default, "of": "model=gaigs", "train_seconds": "20"}
+    more |= {
+        "task": task,
+        "key": key,
+        "default": default,
+        "of": "model=gaigs",
+        "train_seconds": "20",
+    }
     return [row(axis, value, score, "", 3.0, **more) for value, score in scores.items()]
 
 
@@ -164,7 +205,17 @@ def test_times_to_levels_and_the_best_rows(options, monkeypatch):
         row("look-up", "knn", 0.7, 0.72, 1.0),
         row("system", "nerf2", 0.6, 0.55, 9.0, "1.5:0.5 3.0:0.6 8.0:0.55"),
         row("system", "gaigs", 0.9, 0.85, 8.0, "1.5:0.3 4.5:0.75 9.5:0.9"),
-        row("planes", "6", 0.8, 0.79, 2.0, "2:0.5 5:0.8", key="placement.planes", default="10", of="model=mirrored"),
+        row(
+            "planes",
+            "6",
+            0.8,
+            0.79,
+            2.0,
+            "2:0.5 5:0.8",
+            key="placement.planes",
+            default="10",
+            of="model=mirrored",
+        ),
     ]
     monkeypatch.setattr(Accuracy, "levels", {"ssim": [0.6, 0.95], "mae_db": [3]})
     text = Accuracy(options).tables(rows)
@@ -195,22 +246,35 @@ def test_the_smallest_within_the_tolerance_is_taken(task, scores, smallest):
     score = Score.of(task)
     rows = values(scores, task)
     rows[0]["test"] = "0.99"  # test links have no say
-    assert smallest_within(rows, Budgets.tolerance[score.unit or "ratio"], score)["value"] == smallest
+    assert (
+        smallest_within(rows, Budgets.tolerance[score.unit or "ratio"], score)["value"] == smallest
+    )
 
 
 def test_budgets_show_scatter_and_the_smallest_value(options):
     seeds = values({"0": 0.9, "1": 0.904, "2": 0.893}, axis="seeds", key="seed", default="0")
     text = Budgets(options).tables([*seeds, *values({"600": 0.903, "300": 0.9, "75": 0.89})])
-    assert "Seeds 0, 1, 2 score 0.900, 0.904, 0.893: they scatter by 0.0110, beyond the tolerance." in text
-    assert "| part | key | mean SSIM of the validation links by value | smallest within 0.005 | default now |" in text
     assert (
-        "| Gaussians | `gaussians.count` | 75: 0.890, 300: 0.900, 600: 0.903 | **300** | 300 | 3, 3 | 20, 20 |" in text
+        "Seeds 0, 1, 2 score 0.900, 0.904, 0.893: they scatter by 0.0110, beyond the tolerance."
+        in text
+    )
+    assert (
+        "| part | key | mean SSIM of the validation links by value | smallest within 0.005 | default now |"
+        in text
+    )
+    assert (
+        "| Gaussians | `gaussians.count` | 75: 0.890, 300: 0.900, 600: 0.903 | **300** | 300 | 3, 3 | 20, 20 |"
+        in text
     )
 
 
 def test_sections_have_their_unit_conditions_and_command(options):
     rows = values(
-        {"60": 4.0, "90": 3.5}, "rssi", default="30", scene="data.root=/a/b/flat seed=1", trainer="trainer.x=1"
+        {"60": 4.0, "90": 3.5},
+        "rssi",
+        default="30",
+        scene="data.root=/a/b/flat seed=1",
+        trainer="trainer.x=1",
     )
     text = Budgets(options).tables(rows + values({"300": 0.9}))
     assert "## rssi, data.root=flat seed=1, split official\n\ncpu; trainer.x=1\n" in text
@@ -227,6 +291,7 @@ def test_values_of_axes_are_trained_and_axes_without_a_key_left_out(tmp_path, fa
     assert len(trained) == 3
     text = (tmp_path / "budgets.md").read_text()
     assert (
-        "| Gaussians | `gaussians.count` | 5: 0.0500, 10: 0.100, 20: 0.200 | **20**, the largest tried | 10 |" in text
+        "| Gaussians | `gaussians.count` | 5: 0.0500, 10: 0.100, 20: 0.200 | **20**, the largest tried | 10 |"
+        in text
     )
     assert "pooling.grid" not in text

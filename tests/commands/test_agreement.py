@@ -21,7 +21,9 @@ PERFECT = {"spectrum": 1.0, "rssi": 0.0, "csi": 140.0}
 SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
 MORE = {"rssi": ["data.sensitivity=-300"], "csi": ["data.subcarriers=3"]}
 STEP, SLOPE, JUMP, LENGTH = 0.008, 20.0, 5.0, 200
-"""Of a transmitter's way [m]; of labels along it [dB/m]; between its passes [dB]; measurements of a pass."""
+"""Of a transmitter's way [m]; of labels along it [dB/m]; between its passes [dB]; measurements of a
+pass.
+"""
 
 
 def seeded():
@@ -43,7 +45,9 @@ def of_readings(places, labels, receivers=None):
 def two_passes():
     """The same way twice; labels follow the place, and are by a jump larger on the second pass."""
     x = STEP * torch.arange(LENGTH).repeat(2)
-    return of_readings(torch.stack((x, 0 * x, 0 * x), 1), SLOPE * x + JUMP * (torch.arange(2 * LENGTH) >= LENGTH))
+    return of_readings(
+        torch.stack((x, 0 * x, 0 * x), 1), SLOPE * x + JUMP * (torch.arange(2 * LENGTH) >= LENGTH)
+    )
 
 
 def by_bounds(found, monitor="mae_db"):
@@ -65,15 +69,21 @@ def test_a_jump_between_passes_is_seen_apart_from_the_slope_along_them():
     assert near.quantiles == pytest.approx((SLOPE * STEP,) * 3, abs=1e-4)
     again = cells[(0.0, 0.01), (31, math.inf)]
     assert again.pairs == 2 * (LENGTH - 1)
-    assert again.quantiles == pytest.approx((JUMP - SLOPE * STEP, JUMP, JUMP + SLOPE * STEP), abs=0.2)
+    assert again.quantiles == pytest.approx(
+        (JUMP - SLOPE * STEP, JUMP, JUMP + SLOPE * STEP), abs=0.2
+    )
 
 
 def test_expected_scores_on_a_split():
-    """The second pass tests: the nearest known label is always of the same place, and by the jump off."""
+    """The second pass tests: the nearest known label is always of the same place, and by the jump
+    off.
+    """
     links = two_passes()
     train, test = torch.arange(2 * LENGTH).split(LENGTH)
     links = replace(links, split=Split("second pass", train, test[:0], test))
-    rows, remarks = on_split(measure(links, seeded()), links, seeded(), [{"name": "knn", "k": 1, "power": 1.0}])
+    rows, remarks = on_split(
+        measure(links, seeded()), links, seeded(), [{"name": "knn", "k": 1, "power": 1.0}]
+    )
     assert rows["one label as near"]["mae_db"] == pytest.approx(JUMP, abs=1e-4)
     assert rows["mean of many as near"]["mae_db"] == pytest.approx(JUMP / math.sqrt(2), abs=1e-4)
     assert rows["`knn`"]["mae_db"] == pytest.approx(JUMP, abs=1e-4)
@@ -112,7 +122,10 @@ def test_pairs_are_those_of_one_receiver_and_carrier_each_once(counted):
         assert "drawn at random, with all others" in agreement._remarks(found)[1]
         assert (found.pairs.ravel() <= true).all()
         assert found.pairs.sum() > found.share * true.sum()
-    for cell, scores in found.scores.items():  # labels are the links' numbers: differences are the separations
+    for (
+        cell,
+        scores,
+    ) in found.scores.items():  # labels are the links' numbers: differences are the separations
         row, column = divmod(cell, len(found.separations) + 1)
         compared = scores["mae_db"].numpy()
         assert len(compared) == found.pairs[row, column]
@@ -123,10 +136,17 @@ def test_pairs_are_those_of_one_receiver_and_carrier_each_once(counted):
 
 def test_of_many_pairs_random_ones_are_compared():
     links, whole = two_passes(), measure(two_passes(), seeded())
-    found, again, other = (measure(links, np.random.default_rng(seed), block=10_000, most=30) for seed in (0, 0, 1))
+    found, again, other = (
+        measure(links, np.random.default_rng(seed), block=10_000, most=30) for seed in (0, 0, 1)
+    )
     assert np.array_equal(found.pairs, whole.pairs)
-    scores = [[values["mae_db"].tolist() for values in drawn.scores.values()] for drawn in (found, again, other)]
-    assert [len(values) for values in scores[0]] == [min(30, count) for count in found.pairs.ravel() if count]
+    scores = [
+        [values["mae_db"].tolist() for values in drawn.scores.values()]
+        for drawn in (found, again, other)
+    ]
+    assert [len(values) for values in scores[0]] == [
+        min(30, count) for count in found.pairs.ravel() if count
+    ]
     assert scores[0] == scores[1] != scores[2]
     (remark,) = agreement._remarks(found)
     assert "which counts as that of measurement" in remark
@@ -140,7 +160,9 @@ def test_files_in_no_order_are_noted():
     assert not found.has_order
     assert "columns tell nothing of time" in agreement._remarks(found)[0]
     cells = by_bounds(found)
-    medians = [cells[(0.5, 1.0), column].quantiles[1] for column in ((0, 3), (4, 30), (31, math.inf))]
+    medians = [
+        cells[(0.5, 1.0), column].quantiles[1] for column in ((0, 3), (4, 30), (31, math.inf))
+    ]
     assert max(medians) - min(medians) < 2
 
 
@@ -153,7 +175,10 @@ def test_test_links_without_a_known_link_are_left_out_and_counted():
     receivers[-3:] = 1
     links = replace(links, query=Query(links.query.transmitters, receivers))
     rows, remarks = on_split(measure(links, seeded()), links, seeded(), [])
-    assert remarks[0] == "3 test links have no known link of their receiver and carrier, and are left out"
+    assert (
+        remarks[0]
+        == "3 test links have no known link of their receiver and carrier, and are left out"
+    )
     assert [*rows] == ["one label as near", "mean of many as near"]
 
 
@@ -167,7 +192,9 @@ def test_nothing_is_expected_where_no_test_link_has_a_known_one():
 
 def test_baselines_of_large_labels_are_left_out():
     links = two_passes()
-    rows, remarks = on_split(measure(links, seeded()), links, seeded(), [{"name": "mean"}], looked_up=0)
+    rows, remarks = on_split(
+        measure(links, seeded()), links, seeded(), [{"name": "mean"}], looked_up=0
+    )
     assert [*rows] == ["one label as near", "mean of many as near"]
     assert remarks[-1].startswith("the baselines are left out")
 
@@ -176,8 +203,12 @@ def test_baselines_of_large_labels_are_left_out():
 
 
 def test_labels_at_one_place_are_refused():
-    with pytest.raises(ValueError, match=r"all 10 links have their transmitter at 1, 2, 3 m; check the positions"):
-        measure(of_readings(torch.tensor([[1.0, 2.0, 3.0]]).expand(10, 3), torch.zeros(10)), seeded())
+    with pytest.raises(
+        ValueError, match=r"all 10 links have their transmitter at 1, 2, 3 m; check the positions"
+    ):
+        measure(
+            of_readings(torch.tensor([[1.0, 2.0, 3.0]]).expand(10, 3), torch.zeros(10)), seeded()
+        )
 
 
 @pytest.mark.parametrize("n", [1, 2])

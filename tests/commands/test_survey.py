@@ -38,12 +38,16 @@ def variances(process, rows, asked):
     """Variances at places given some of the known readings, in numpy."""
     places, cover = process.places[rows], lambda a, b: process.covariances(a, b).numpy()
     own = cover(places, places) + np.diag(process.noises[rows])
-    return np.diag(cover(asked, asked) - cover(asked, places) @ np.linalg.solve(own, cover(places, asked)))
+    return np.diag(
+        cover(asked, asked) - cover(asked, places) @ np.linalg.solve(own, cover(places, asked))
+    )
 
 
 def test_covariances_are_those_given_the_readings():
     own, asked = process(), torch.rand(5, 3, dtype=torch.float64) * 4
-    np.testing.assert_allclose(posterior(own, asked).diagonal(), variances(own, range(12), asked), atol=1e-9)
+    np.testing.assert_allclose(
+        posterior(own, asked).diagonal(), variances(own, range(12), asked), atol=1e-9
+    )
 
 
 def test_losses_are_those_of_leaving_a_place_out():
@@ -74,7 +78,9 @@ def test_each_place_lowers_the_mean_variance_most():
             parts = []
             for own in processes:
                 extra = torch.stack([*known, candidate]).double()
-                noises = torch.cat((own.noises, torch.full((len(extra),), own.noise, dtype=torch.float64)))
+                noises = torch.cat(
+                    (own.noises, torch.full((len(extra),), own.noise, dtype=torch.float64))
+                )
                 more = replace(own, places=torch.cat((own.places, extra)), noises=noises)
                 parts.append(variances(more, range(len(more.places)), asked).mean())
             means.append(np.mean(parts))
@@ -84,7 +90,9 @@ def test_each_place_lowers_the_mean_variance_most():
 
 
 def test_a_receiver_counts_where_it_is_likely_to_be_heard():
-    near, far = (torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) * 3 + x for x in (0.0, 9.0))
+    near, far = (
+        torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) * 3 + x for x in (0.0, 9.0)
+    )
     both, first = process(), process()
     both, first = (
         replace(own, places=part.double(), noises=torch.full((len(part),), 0.3))
@@ -97,13 +105,19 @@ def test_a_receiver_counts_where_it_is_likely_to_be_heard():
 
 
 def test_plans_count_a_receiver_where_it_is_heard():
-    """One receiver is heard at x < 5 alone: plans do not go where it is unknown, and the error leaves it out there."""
+    """One receiver is heard at x < 5 alone: plans do not go where it is unknown, and the error
+    leaves it out there.
+    """
     rng = torch.Generator().manual_seed(0)
     places = torch.rand(80, 3, generator=rng) * torch.tensor([10.0, 4.0, 1.0])
     labels = -50 + 4 * torch.randn(80, 2, generator=rng)
     labels[places[:, 0] > 5, 1] = torch.nan
     stands = torch.tensor([[0.0, 0, 2], [10, 4, 2]])
-    model = fitted(gaigs.links(task="rssi", transmitters=places, receivers=stands, labels=labels, split="random"))
+    model = fitted(
+        gaigs.links(
+            task="rssi", transmitters=places, receivers=stands, labels=labels, split="random"
+        )
+    )
     region = torch.stack((places.amin(0), places.amax(0)))
     plan = gaigs.survey(model, region=region, count=6)
     assert (plan.places[:, 0] < 6).sum() >= 4
@@ -111,7 +125,10 @@ def test_plans_count_a_receiver_where_it_is_heard():
     processes = [with_trend(model.process_at(k), stands[k]) for k in range(2)]
     deviations = [(posterior(own, asked).diagonal() + own.noise).sqrt() for own in processes]
     left, right = asked[:, 0] < 4, asked[:, 0] > 6
-    parts = torch.cat((deviations[0], deviations[1][left])), torch.cat((deviations[0], deviations[1][left | right]))
+    parts = (
+        torch.cat((deviations[0], deviations[1][left])),
+        torch.cat((deviations[0], deviations[1][left | right])),
+    )
     heard, all_over = (MEAN * part.mean() for part in parts)
     assert abs(plan.errors[0] - heard) < 0.3 * (all_over - heard)
     assert plan.losses[plan.known[:, 0] > 6].mean() < plan.losses[plan.known[:, 0] < 4].mean()
@@ -138,10 +155,14 @@ def test_planned_places_are_worth_more_than_random_ones():
 
 
 def test_first_places_lie_nearer_to_the_region_than_random_ones():
-    candidates = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([8.0, 5.0, 0.5])
+    candidates = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [8.0, 5.0, 0.5]
+    )
     apart = lambda places: torch.cdist(candidates, places).amin(1).mean()
     plan = gaigs.survey(candidates=candidates, count=20)
-    assert apart(plan.places) < 0.9 * min(apart(candidates[20 * k : 20 * k + 20]) for k in range(20))
+    assert apart(plan.places) < 0.9 * min(
+        apart(candidates[20 * k : 20 * k + 20]) for k in range(20)
+    )
     assert torch.equal(gaigs.survey(candidates=candidates, count=8).places, plan.places[:8])
 
 
@@ -149,7 +170,9 @@ def test_places_that_the_trend_needs_are_not_superfluous():
     rng = torch.Generator().manual_seed(0)
     places, gateway = 8 * torch.rand(50, 3, generator=rng), torch.tensor([0.0, 0.0, 2.0])
     labels = -40 - 30 * (places - gateway).norm(dim=1).log10() + 2 * torch.randn(50, generator=rng)
-    links = gaigs.links(task="rssi", transmitters=places, receivers=gateway[None], labels=labels[:, None])
+    links = gaigs.links(
+        task="rssi", transmitters=places, receivers=gateway[None], labels=labels[:, None]
+    )
     plan = gaigs.survey(fitted(links), count=1)
     kept = plan.known[~plan.superfluous]
     assert len(kept) >= 6
@@ -164,7 +187,9 @@ def test_plans_are_written_and_wrong_ones_are_refused(tmp_path):
     plan.save(tmp_path / "survey.csv")
     lines = (tmp_path / "survey.csv").read_text().splitlines()
     assert lines[0] == "use,x,y,z,mean_error"
-    assert [line.split(",")[0] for line in lines[1:]] == ["measure"] * 4 + ["leave out"] * int(plan.superfluous.sum())
+    assert [line.split(",")[0] for line in lines[1:]] == ["measure"] * 4 + ["leave out"] * int(
+        plan.superfluous.sum()
+    )
     assert str(plan).startswith("4 more places bring the expected mean error from ")
     replace(plan, frame=Frame(32632, 5e5, 5.4e6)).save(tmp_path / "survey.csv")
     with (tmp_path / "survey.csv").open() as text:
@@ -184,9 +209,18 @@ def test_plans_are_written_and_wrong_ones_are_refused(tmp_path):
 
 
 def test_the_command_plans_by_a_finished_run(tmp_path, capsys):
-    words = ("+experiment=rssi", "model=gaussian_process", "data.transmitters=40", "data.order=0", "baselines=[]")
+    words = (
+        "+experiment=rssi",
+        "model=gaussian_process",
+        "data.transmitters=40",
+        "data.order=0",
+        "baselines=[]",
+    )
     gaigs.run(gaigs.compose(*words), tmp_path / "run")
-    gaigs.run(gaigs.compose("command=survey", f"folder={tmp_path / 'run'}", "survey.count=2"), tmp_path / "plan")
+    gaigs.run(
+        gaigs.compose("command=survey", f"folder={tmp_path / 'run'}", "survey.count=2"),
+        tmp_path / "plan",
+    )
     assert {path.name for path in (tmp_path / "plan").iterdir()} == {"survey.csv", "survey.png"}
     assert str(gaigs.survey(gaigs.load(tmp_path / "run"), count=2)) in capsys.readouterr().out
     with pytest.raises(FileNotFoundError, match="holds no run"):
@@ -196,14 +230,19 @@ def test_the_command_plans_by_a_finished_run(tmp_path, capsys):
 
 
 def test_the_command_plans_before_anything_is_measured(tmp_path, capsys):
-    gaigs.run(gaigs.compose("command=survey", "survey.region=[[0,0,1],[6,4,1]]", "survey.count=3"), tmp_path)
+    gaigs.run(
+        gaigs.compose("command=survey", "survey.region=[[0,0,1],[6,4,1]]", "survey.count=3"),
+        tmp_path,
+    )
     assert (tmp_path / "survey.png").is_file()
     lines = (tmp_path / "survey.csv").read_text().splitlines()
     assert len(lines) == 4
     assert all(line.startswith("measure,") and line.endswith(",") for line in lines[1:])
     assert "without a trained model their error is unknown" in capsys.readouterr().out
     (tmp_path / "places.csv").write_text("x,y,z\n0,0,1\n6,4,1\n6,0,1\n")
-    gaigs.run(gaigs.compose("command=survey", f"survey.candidates={tmp_path / 'places.csv'}"), tmp_path)
+    gaigs.run(
+        gaigs.compose("command=survey", f"survey.candidates={tmp_path / 'places.csv'}"), tmp_path
+    )
     assert sorted(line.split(",")[1:3] for line in (tmp_path / "survey.csv").read_text().splitlines()[1:]) == [
         ["0.000", "0.000"], ["6.000", "0.000"], ["6.000", "4.000"],
     ]  # fmt: skip
@@ -216,7 +255,11 @@ def test_losses_are_those_of_leaving_all_readings_of_a_place_out():
     known, _, losses, _ = without([own], asked, MEAN)
     error = lambda rows: MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
     for place, loss in zip(known, losses, strict=True):
-        rows = [row for row, there in enumerate(own.places.float()) if not torch.allclose(there[:3], place)]
+        rows = [
+            row
+            for row, there in enumerate(own.places.float())
+            if not torch.allclose(there[:3], place)
+        ]
         assert float(loss) == pytest.approx(error(rows) - error(range(len(often))), rel=0.1)
 
 
@@ -224,6 +267,8 @@ def test_no_place_lies_between_two_floors():
     rng = np.random.default_rng(0)
     places = np.concatenate((rng.uniform(0, 6, (40, 2)), np.repeat([[1.0], [4.0]], 20, 0)), 1)
     labels = rng.normal(-60, 8, (40, 2))
-    links = gaigs.links(task="rssi", transmitters=places, receivers=[[0, 0, 2], [6, 6, 5]], labels=labels)
+    links = gaigs.links(
+        task="rssi", transmitters=places, receivers=[[0, 0, 2], [6, 6, 5]], labels=labels
+    )
     heights = gaigs.survey(fitted(links), count=6).places[:, 2]
     assert {*heights.tolist()} == {1.0, 4.0}

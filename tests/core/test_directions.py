@@ -20,7 +20,10 @@ def test_the_default_is_the_grid_of_the_nerf2_spectra():
 
 
 def test_vectors_are_those_of_spherical_coordinates():
-    elevations, azimuths = GRID.elevations.double().numpy()[:, None], GRID.azimuths.double().numpy()[None]
+    elevations, azimuths = (
+        GRID.elevations.double().numpy()[:, None],
+        GRID.azimuths.double().numpy()[None],
+    )
     x, y = np.cos(elevations) * np.cos(azimuths), np.cos(elevations) * np.sin(azimuths)
     expected = np.stack(np.broadcast_arrays(x, y, np.sin(elevations)), -1)
     np.testing.assert_allclose(GRID.vectors(), expected, atol=1e-6)
@@ -56,7 +59,9 @@ def test_directions_go_to_another_dtype_and_device(directions):
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_solid_angles_are_the_integrals_of_the_rows(turned):
-    """A row of 10 degrees at elevation e spans sin(e + 5 deg) - sin(e - 5 deg), in proportion to cos e."""
+    """A row of 10 degrees at elevation e spans sin(e + 5 deg) - sin(e - 5 deg), in proportion to
+    cos e.
+    """
     grid = Grid(GRID.elevations.flip(0), GRID.azimuths) if turned else GRID
     shares = grid.solid_angles
     assert shares.shape == grid.shape
@@ -70,17 +75,24 @@ def test_pixels_of_a_sphere_are_of_equal_solid_angle(rows, columns):
     grid = Grid.sphere(rows, columns)
     assert grid.shape == (rows, columns)
     shares = grid.solid_angles
-    torch.testing.assert_close(shares, torch.full_like(shares, 1 / (rows * columns)), rtol=1e-5, atol=0)
+    torch.testing.assert_close(
+        shares, torch.full_like(shares, 1 / (rows * columns)), rtol=1e-5, atol=0
+    )
     vectors = grid.vectors().double().flatten(0, 1)
     np.testing.assert_allclose(vectors.mean(0), 0, atol=1e-6)
-    # The mean square along any axis of a sphere is 1/3; along z rows of equal width in height miss rows^-2 of it.
+    # The mean square along any axis of a sphere is 1/3; along z rows of equal width in height miss
+    # rows^-2 of it.
     height = (1 - rows**-2) / 3
-    np.testing.assert_allclose(vectors.square().mean(0), [(1 - height) / 2, (1 - height) / 2, height], atol=1e-6)
+    np.testing.assert_allclose(
+        vectors.square().mean(0), [(1 - height) / 2, (1 - height) / 2, height], atol=1e-6
+    )
 
 
 def test_grids_of_too_few_pixels_are_refused():
     for rows, columns in ((1, 8), (4, 2)):
-        with pytest.raises(ValueError, match=f"at least 2 rows and 3 columns, got {rows} x {columns}"):
+        with pytest.raises(
+            ValueError, match=f"at least 2 rows and 3 columns, got {rows} x {columns}"
+        ):
             Grid.sphere(rows, columns)
     with pytest.raises(ValueError, match="take at least 2 rows, got 1"):
         _ = Grid(torch.zeros(1), torch.zeros(4)).solid_angles

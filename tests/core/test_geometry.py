@@ -8,7 +8,14 @@ import torch
 from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 
-from gaigs.core.geometry import Pose, even_places, quaternions_to_rotations, sinc, spherical_harmonics, to_spherical
+from gaigs.core.geometry import (
+    Pose,
+    even_places,
+    quaternions_to_rotations,
+    sinc,
+    spherical_harmonics,
+    to_spherical,
+)
 
 
 @pytest.fixture
@@ -26,14 +33,18 @@ def test_the_length_of_a_quaternion_gets_no_gradient(quats):
     assert torch.autograd.gradcheck(quaternions_to_rotations, quats.requires_grad_())
     weights = torch.arange(9.0, dtype=torch.float64).view(3, 3)
     (gradient,) = torch.autograd.grad((quaternions_to_rotations(quats) * weights).sum(), quats)
-    torch.testing.assert_close((gradient * quats).sum(-1), torch.zeros(20, dtype=torch.float64), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        (gradient * quats).sum(-1), torch.zeros(20, dtype=torch.float64), rtol=0, atol=1e-12
+    )
 
 
 def test_a_point_on_an_axis_of_the_array_is_seen_there():
     turn = Rotation.from_euler("xyz", [10, 80, -30], degrees=True)
     pose = Pose.from_xyzw((4, 5, 6), turn.as_quat())
     for axis in range(3):
-        point = torch.tensor(np.array([4, 5, 6]) + 2 * turn.as_matrix()[:, axis], dtype=torch.float32)
+        point = torch.tensor(
+            np.array([4, 5, 6]) + 2 * turn.as_matrix()[:, axis], dtype=torch.float32
+        )
         torch.testing.assert_close(pose.local(point), 2 * torch.eye(3)[axis], rtol=0, atol=1e-5)
     points = torch.randn(7, 2, 3)
     torch.testing.assert_close(pose.world(pose.local(points)), points, rtol=0, atol=1e-5)
@@ -56,7 +67,17 @@ def test_impossible_poses_are_refused(position, quaternion, message):
 
 
 def test_directions_have_the_angles_of_the_convention():
-    points = torch.tensor([[2.0, 0, 0], [0, 3, 0], [-1, 0, 0], [0, -1, 0], [1, 1, math.sqrt(2)], [0, 0, 5], [0, 0, -5]])
+    points = torch.tensor(
+        [
+            [2.0, 0, 0],
+            [0, 3, 0],
+            [-1, 0, 0],
+            [0, -1, 0],
+            [1, 1, math.sqrt(2)],
+            [0, 0, 5],
+            [0, 0, -5],
+        ]
+    )
     azimuths, elevations, distances = to_spherical(points)
     torch.testing.assert_close(azimuths.rad2deg(), torch.tensor([0.0, 90, 180, -90, 45, 0, 0]))
     torch.testing.assert_close(elevations.rad2deg(), torch.tensor([0.0, 0, 0, 0, 45, 90, -90]))
@@ -87,12 +108,16 @@ def test_spherical_harmonics_are_scipys():
     for n in range(degree + 1):
         for m in range(-n, n + 1):
             waves = sph_harm_y(n, abs(m), math.pi / 2 - elevations, azimuths)
-            expected = waves.real if m == 0 else math.sqrt(2) * (waves.real if m > 0 else waves.imag)
+            expected = (
+                waves.real if m == 0 else math.sqrt(2) * (waves.real if m > 0 else waves.imag)
+            )
             np.testing.assert_allclose(found[:, n**2 + n + m], expected, rtol=0, atol=1e-12)
 
 
 def test_spherical_harmonics_have_finite_gradients_at_the_poles():
-    assert torch.autograd.gradcheck(lambda vectors: spherical_harmonics(vectors, 4), directions(5).requires_grad_())
+    assert torch.autograd.gradcheck(
+        lambda vectors: spherical_harmonics(vectors, 4), directions(5).requires_grad_()
+    )
 
 
 @pytest.mark.parametrize(
@@ -117,7 +142,9 @@ def test_places_in_a_box_are_about_as_many_as_asked_for_and_evenly_apart(edges, 
 
 
 def test_sinc_is_that_of_torch_also_at_0():
-    values = torch.tensor([0.0, -0.0, 1e-40, -1e-3, 0.3, 1.0, -2.5, 40.0], dtype=torch.float64, requires_grad=True)
+    values = torch.tensor(
+        [0.0, -0.0, 1e-40, -1e-3, 0.3, 1.0, -2.5, 40.0], dtype=torch.float64, requires_grad=True
+    )
     torch.testing.assert_close(sinc(values), torch.sinc(values))
     assert torch.autograd.gradcheck(sinc, values)
     zero = torch.zeros(1, requires_grad=True)

@@ -1,4 +1,6 @@
-"""Random phases are noticed in the training channels; phases that geometry explains are not taken for random."""
+"""Random phases are noticed in the training channels; phases that geometry explains are not taken
+for random.
+"""
 
 import logging
 from dataclasses import replace
@@ -25,7 +27,10 @@ def simulated(phase, **options):
 def undeclared(links, labels=None):
     """The same links with phases declared as known, divided anew."""
     task = Csi(links.task.elements, links.task.frequencies)
-    return divide(replace(links, task=task, labels=links.labels if labels is None else labels, remarks="a"), SPLIT)
+    return divide(
+        replace(links, task=task, labels=links.labels if labels is None else labels, remarks="a"),
+        SPLIT,
+    )
 
 
 @each
@@ -33,7 +38,9 @@ def test_a_random_phase_is_noticed_and_its_option_named(phase, caplog):
     for conjugate in (False, True):
         links = simulated(phase)
         with caplog.at_level(logging.WARNING):
-            remarks = undeclared(links, links.labels.conj().resolve_conj() if conjugate else None).remarks
+            remarks = undeclared(
+                links, links.labels.conj().resolve_conj() if conjugate else None
+            ).remarks
         if phase == "known":
             assert (remarks, caplog.text) == ("a", "")
         else:
@@ -54,9 +61,13 @@ def test_channels_unlike_the_direct_wave_tell_nothing(what):
     labels, query, task = links.labels.to(torch.complex128), links.query, links.task
     waves = direct_waves(links.scene, query, task.frequencies)
     if what == "noise":
-        labels = torch.randn(labels.shape, dtype=labels.dtype, generator=torch.Generator().manual_seed(0))
+        labels = torch.randn(
+            labels.shape, dtype=labels.dtype, generator=torch.Generator().manual_seed(0)
+        )
     if what == "reflection":  # by a wall behind the transmitters, which hides the direct path
-        images = query.transmitters * torch.tensor([-1.0, 1.0, 1.0]) + torch.tensor([14.0, 0.0, 0.0])
+        images = query.transmitters * torch.tensor([-1.0, 1.0, 1.0]) + torch.tensor(
+            [14.0, 0.0, 0.0]
+        )
         labels = direct_waves(links.scene, replace(query, transmitters=images), task.frequencies)
     count = 4 if what == "few" else len(labels)
     parts = (part[:count] for part in (labels, waves, query.receivers))
@@ -114,9 +125,13 @@ def test_the_sign_of_the_array_shows_through_what_is_unknown(phase):
 
 
 def turned(links, seed=0):
-    """The same links with another random phase each, and another delay and gain where they are unknown."""
+    """The same links with another random phase each, and another delay and gain where they are
+    unknown.
+    """
     generator = torch.Generator().manual_seed(seed)
-    angles, delays, gains = 2 * torch.rand(3, len(links), 1, 1, generator=generator, dtype=torch.float64) - 1
+    angles, delays, gains = (
+        2 * torch.rand(3, len(links), 1, 1, generator=generator, dtype=torch.float64) - 1
+    )
     offsets = links.task.frequencies - links.task.frequencies.mean()
     if links.task.phase == "per_link":
         delays, gains = 0 * delays, 0 * gains
@@ -128,7 +143,9 @@ def turned(links, seed=0):
 def trained(links):
     """A model as it is before its training, kriged."""
     torch.manual_seed(0)
-    model = registry("model").build({"name": "gaigs", "gaussians": {"count": 5}, "trend": "friis"}, scene=links.scene)
+    model = registry("model").build(
+        {"name": "gaigs", "gaussians": {"count": 5}, "trend": "friis"}, scene=links.scene
+    )
     model.fit(links)
     return Kriging(links.scene, model.eval(), {"name": "mean"})
 
@@ -139,7 +156,9 @@ def test_what_is_unknown_of_the_training_links_changes_no_score(name, phase):
     links = simulated(phase)
     scores = []
     for own in (links, turned(links)):
-        model = trained(own) if name == "kriging" else registry("model").build(name, scene=own.scene)
+        model = (
+            trained(own) if name == "kriging" else registry("model").build(name, scene=own.scene)
+        )
         model.fit(own)
         values = model.predict(links.query[links.split.test])
         scores.append(links.task.scores(links.labels[links.split.test], values)["snr_aligned_db"])

@@ -18,7 +18,10 @@ from gaigs.core.scene import carriers, check_elements, direct_gains, direct_wave
 from gaigs.testing import example_links
 
 FREQUENCIES = torch.tensor([2.40e9, 2.44e9, 2.48e9], dtype=torch.float64)
-POSES = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)), Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0))
+POSES = (
+    Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)),
+    Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0)),
+)
 
 
 def scene(array):
@@ -28,13 +31,19 @@ def scene(array):
 
 
 def ask(count, seed=0):
-    places = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor([6.0, 4.0, 2.0])
+    places = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor(
+        [6.0, 4.0, 2.0]
+    )
     return Query(places, torch.arange(count) % 2)
 
 
 def friis(distance, frequency, sign):
     wavelength = speed_of_light / frequency
-    return wavelength / (4 * math.pi * distance) * cmath.exp(sign * 2j * math.pi * distance / wavelength)
+    return (
+        wavelength
+        / (4 * math.pi * distance)
+        * cmath.exp(sign * 2j * math.pi * distance / wavelength)
+    )
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -85,7 +94,9 @@ def test_the_pattern_is_that_towards_the_transmitter():
         assert gain == pytest.approx(max(0, ray @ normal / np.linalg.norm(ray)), abs=1e-6)
     assert (gains == 0).any()
     assert (gains > 0.1).any()
-    assert torch.equal(direct_gains(scene(Array.planar(2, 2, 0.06)), query), torch.ones(40, dtype=torch.float64))
+    assert torch.equal(
+        direct_gains(scene(Array.planar(2, 2, 0.06)), query), torch.ones(40, dtype=torch.float64)
+    )
     on_top = Query(POSES[0].position[None], torch.tensor([0]))
     assert direct_gains(scene(Array.planar(2, 2, 0.06, "cosine")), on_top).item() == 1
 
@@ -102,7 +113,9 @@ def test_reflection_follows_snells_law(surface):
     inside = np.sqrt(1 - (np.sin(angles) / n) ** 2 + 0j)  # cosine of the angle of refraction
     te = (np.cos(angles) - n * inside) / (np.cos(angles) + n * inside)
     tm = (n * np.cos(angles) - inside) / (n * np.cos(angles) + inside)
-    for found, expected in zip(fresnel(SURFACES[surface], torch.from_numpy(np.cos(angles))), (te, tm), strict=True):
+    for found, expected in zip(
+        fresnel(SURFACES[surface], torch.from_numpy(np.cos(angles))), (te, tm), strict=True
+    ):
         np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9, atol=1e-12)
 
 
@@ -122,9 +135,13 @@ def test_a_slab_adds_its_inner_reflections(surface):
     root = np.sqrt(SURFACES[surface] - 1 + cosines**2)
     there_and_back = np.exp(-4j * np.pi * thickness * root)
     found = slab(SURFACES[surface], torch.from_numpy(cosines), thickness)
-    for reflected, one in zip(found, fresnel(SURFACES[surface], torch.from_numpy(cosines)), strict=True):
+    for reflected, one in zip(
+        found, fresnel(SURFACES[surface], torch.from_numpy(cosines)), strict=True
+    ):
         r = one.numpy()
-        inner = sum((1 - r**2) * -r * there_and_back * (r**2 * there_and_back) ** k for k in range(400))
+        inner = sum(
+            (1 - r**2) * -r * there_and_back * (r**2 * there_and_back) ** k for k in range(400)
+        )
         np.testing.assert_allclose(reflected.numpy(), r + inner, rtol=0, atol=1e-9)
         assert (reflected.abs() <= 1).all(), "no slab gains power"
 
@@ -164,11 +181,20 @@ def test_the_carrier_of_a_link_is_its_own_or_the_datas_only_one():
 
 
 def made(count=40, gains=(1.0, 1.0), clutter=0.0, seed=0):
-    """Channels of the direct wave, times a gain of each receiver, and waves of random phase beside it."""
+    """Channels of the direct wave, times a gain of each receiver, and waves of random phase beside
+    it.
+    """
     query = ask(count)
     waves = direct_waves(scene(Array.planar(2, 2, 0.06)), query, FREQUENCIES)
-    random = torch.randn(waves.shape, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed))
-    return query, waves, waves * torch.tensor(gains)[query.receivers][:, None, None] + clutter * waves.abs() * random
+    random = torch.randn(
+        waves.shape, dtype=torch.complex128, generator=torch.Generator().manual_seed(seed)
+    )
+    return (
+        query,
+        waves,
+        waves * torch.tensor(gains)[query.receivers][:, None, None]
+        + clutter * waves.abs() * random,
+    )
 
 
 @pytest.mark.parametrize("clutter", [0.0, 1.0])
@@ -182,7 +208,11 @@ def test_the_sign_follows_the_phases_of_the_direct_path(clutter):
 @pytest.mark.parametrize("seed", range(5))
 def test_random_phases_show_no_sign(seed):
     query, waves, _ = made(count=100)
-    phases = 2 * math.pi * torch.rand(100, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    phases = (
+        2
+        * math.pi
+        * torch.rand(100, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    )
     turned = waves * torch.polar(torch.ones_like(phases), phases)
     assert phase_sign(turned, waves, query.receivers) == 0
     assert array_sign(turned, waves) == -1

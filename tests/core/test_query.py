@@ -26,18 +26,30 @@ def ask(positions=PLACE, receiver=None, frequency=None, known=NONE):
         ([1.0, 2], r"\(..., 3\) positions \[m\], got shape \(2,\)"),
         (3.0, r"got shape \(\)"),
         ([[1.0, 2, 3], [0, math.nan, 1]], r"must be finite, got \[0.0, nan, 1.0\] in row 1"),
-        ([[1.0, 2, 3], [0, -1e5, 0]], r"within 1e5 m of the origin .*, got \[0.0, -100000.0, 0.0\] in row 1"),
-        (torch.ones(1, 3, dtype=torch.complex64), r"must be \(..., 3\) positions \[m\] in real numbers"),
+        (
+            [[1.0, 2, 3], [0, -1e5, 0]],
+            r"within 1e5 m of the origin .*, got \[0.0, -100000.0, 0.0\] in row 1",
+        ),
+        (
+            torch.ones(1, 3, dtype=torch.complex64),
+            r"must be \(..., 3\) positions \[m\] in real numbers",
+        ),
         ([[1.0, 2, 3], [1.0, 2]], r"in real numbers, got \[\[1.0, 2, 3\], \[1.0, 2\]\]"),
         ("west", "in real numbers, got 'west'"),
         (np.ones((1, 3), dtype=bool), "in real numbers"),
         (np.array([[1.0, 2, None]]), r"must be finite, got \[1.0, 2.0, nan\] in row 0"),
         (torch.eye(3).to_sparse(), "got a sparse_coo tensor; give a dense tensor with values"),
         (torch.zeros(1, 3, device="meta"), "got a meta tensor; give a dense tensor"),
-        (np.ma.array([[1.0, 2, 3]], mask=[[True, False, False]]), "in real numbers, got masked_array"),
+        (
+            np.ma.array([[1.0, 2, 3]], mask=[[True, False, False]]),
+            "in real numbers, got masked_array",
+        ),
         (replace(QUERY, transmitters=torch.full((2, 3), math.nan)), "transmitters must be finite"),
         (replace(QUERY, receivers=torch.full((2,), 9)), "receiver must be one of 0 = west"),
-        (replace(QUERY, frequencies=torch.full((2,), 60.0)), r"must be a carrier in Hz, .* got 60; in GHz\?"),
+        (
+            replace(QUERY, frequencies=torch.full((2,), 60.0)),
+            r"must be a carrier in Hz, .* got 60; in GHz\?",
+        ),
     ],
 )
 def test_impossible_positions_are_refused(positions, message):
@@ -88,8 +100,14 @@ def test_impossible_frequencies_are_refused(frequency, message, known):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"frequency": 1e9}, "the training links have no known carrier, so no other can be predicted; leave frequency"),
-        ({"frequency": 60e9, "known": ONE}, r"have one carrier, 2\.437123e\+09 Hz, so no other can be predicted"),
+        (
+            {"frequency": 1e9},
+            "the training links have no known carrier, so no other can be predicted; leave frequency",
+        ),
+        (
+            {"frequency": 60e9, "known": ONE},
+            r"have one carrier, 2\.437123e\+09 Hz, so no other can be predicted",
+        ),
         ({"frequency": float(ONE) * (1 + 2e-6), "known": ONE}, "have one carrier"),
         ({"known": BAND}, r"have 3 carriers, 1e\+09 to 4e\+09 Hz; choose one with frequency="),
         ({"positions": QUERY, "known": BAND}, "have 3 carriers"),
@@ -110,7 +128,11 @@ def test_one_value_or_one_for_each_position():
     assert query.transmitters.shape == (4, 3)
     assert query.receivers.tolist() == [0, 1, 1, 1]
     assert query.frequencies.tolist() == [2e9] * 4
-    for names in (["west", "east", "east"], np.array(["west", "east", "east"]), {"west": 0, "east": 1}.keys()):
+    for names in (
+        ["west", "east", "east"],
+        np.array(["west", "east", "east"]),
+        {"west": 0, "east": 1}.keys(),
+    ):
         assert ask(PLACE * len(names), names)[0].receivers.tolist() == [0, 1, 1][: len(names)]
     query, _ = ask(PLACE * 3, "east", BAND, BAND)
     assert query.receivers.tolist() == [1, 1, 1]
@@ -128,8 +150,14 @@ OWN = Grid.degrees(range(10, 90, 10), range(0, 360, 10))
 @pytest.mark.parametrize(
     ("directions", "message"),
     [
-        (Rays(torch.zeros(1), torch.tensor([90.0])), "azimuths must be .* rad, got 90; Grid.degrees takes degrees"),
-        (Rays(torch.tensor([-2.0]), torch.zeros(1)), "elevations must be .* -1.5708 to 1.5708 rad, got -2; Grid"),
+        (
+            Rays(torch.zeros(1), torch.tensor([90.0])),
+            "azimuths must be .* rad, got 90; Grid.degrees takes degrees",
+        ),
+        (
+            Rays(torch.tensor([-2.0]), torch.zeros(1)),
+            "elevations must be .* -1.5708 to 1.5708 rad, got -2; Grid",
+        ),
         (Grid(torch.tensor([math.nan]), torch.zeros(1)), "elevations must be .* rad, got nan"),
     ],
 )
@@ -169,7 +197,9 @@ def test_no_positions_are_an_empty_query():
 
 
 def test_all_receivers_have_a_last_axis():
-    query, shape = Query.from_positions(torch.arange(6.0).reshape(2, 3), None, BAND[:2], ["west", "east"], BAND)
+    query, shape = Query.from_positions(
+        torch.arange(6.0).reshape(2, 3), None, BAND[:2], ["west", "east"], BAND
+    )
     assert shape == (2, 2)
     assert query.transmitters[:, 0].tolist() == [0, 0, 3, 3]
     assert query.receivers.tolist() == [0, 1, 0, 1]
@@ -179,10 +209,14 @@ def test_all_receivers_have_a_last_axis():
 def test_directions_become_float32():
     assert as_directions(None, OWN, "spectrum") is OWN
     assert as_directions(None, None, "rssi") is None
-    with pytest.raises(ValueError, match="labels of task 'rssi' have no directions; leave directions out"):
+    with pytest.raises(
+        ValueError, match="labels of task 'rssi' have no directions; leave directions out"
+    ):
         as_directions(OWN, None, "rssi")
 
-    rays = as_directions(Rays(torch.full((3,), math.pi / 2 + 1e-5).double(), torch.arange(3.0)), OWN, "spectrum")
+    rays = as_directions(
+        Rays(torch.full((3,), math.pi / 2 + 1e-5).double(), torch.arange(3.0)), OWN, "spectrum"
+    )
     assert rays.azimuths.dtype == rays.elevations.dtype == torch.float32
 
 
@@ -222,7 +256,10 @@ def test_different_links_are_those_of_a_set(with_receivers, frequencies, dtype):
 
 @both
 def test_a_place_at_minus_zero_is_the_place_at_zero(with_receivers):
-    query = Query(torch.tensor([[0.0, 1, 2], [-0.0, 1, 2], [1e-30, 1, -0.0]]), torch.zeros(3, dtype=torch.long))
+    query = Query(
+        torch.tensor([[0.0, 1, 2], [-0.0, 1, 2], [1e-30, 1, -0.0]]),
+        torch.zeros(3, dtype=torch.long),
+    )
     _, which = query.unique(with_receivers)
     assert which[0] == which[1] != which[2]
 
@@ -244,14 +281,23 @@ def test_parts_are_the_links_in_their_order(size):
     assert [len(part) for part in parts[:-1]] == [size] * (len(parts) - 1)
     assert 1 <= len(parts[-1]) <= size
     for field in ("transmitters", "receivers", "frequencies"):
-        assert torch.equal(torch.cat([getattr(part, field) for part in parts]), getattr(query, field))
+        assert torch.equal(
+            torch.cat([getattr(part, field) for part in parts]), getattr(query, field)
+        )
     assert [len(part) for part in query[:0].parts(size)] == [0]
     assert make(frequencies=False)[torch.tensor([4, 4, 0])].frequencies is None
 
 
 def test_a_batch_goes_to_another_device_as_a_whole():
-    batch = Batch(make(), Grid.degrees(range(1, 4), range(5)), torch.zeros(60, 3, 5), (0.5, 0.25)).to("meta")
-    tensors = [batch.query.transmitters, batch.query.receivers, batch.query.frequencies, batch.labels]
+    batch = Batch(
+        make(), Grid.degrees(range(1, 4), range(5)), torch.zeros(60, 3, 5), (0.5, 0.25)
+    ).to("meta")
+    tensors = [
+        batch.query.transmitters,
+        batch.query.receivers,
+        batch.query.frequencies,
+        batch.labels,
+    ]
     tensors += [batch.directions.elevations, batch.directions.azimuths]
     assert {tensor.device.type for tensor in tensors} == {"meta"}
     assert batch.shares == (0.5, 0.25)

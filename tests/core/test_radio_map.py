@@ -34,12 +34,16 @@ class Slope(Model):
     def forward(self, batch):
         query = batch.query
         value = query.transmitters @ torch.tensor([1.0, 10, 100]) - 1000 * query.receivers
-        return Prediction(value if query.frequencies is None else value + query.frequencies / 1e9, {})
+        return Prediction(
+            value if query.frequencies is None else value + query.frequencies / 1e9, {}
+        )
 
 
 def scene(upper=(4.0, 2.0, 1.5), task=None, far=(5.0, 1.0, 2.5), frequencies=()):
     gateways = {"door": (0.0, -0.2, 2.0), "window": far}
-    receivers = tuple(Receiver(name, Pose(torch.tensor(p), torch.eye(3))) for name, p in gateways.items())
+    receivers = tuple(
+        Receiver(name, Pose(torch.tensor(p), torch.eye(3))) for name, p in gateways.items()
+    )
     corners = torch.tensor([1.0, 0.5, 0.5]), torch.tensor(upper)
     return Scene(receivers, *corners, 0.3, task or Rssi(), torch.tensor(frequencies))
 
@@ -49,7 +53,9 @@ def test_each_value_is_that_of_its_place_and_receiver():
     assert drawn.receivers == ("door", "window")
     assert drawn.height == 1.0
     assert drawn.values.shape == (2, len(drawn.y), len(drawn.x))
-    truth = drawn.x + 10 * drawn.y[:, None] + 100 * drawn.height - 1000 * np.arange(2)[:, None, None]
+    truth = (
+        drawn.x + 10 * drawn.y[:, None] + 100 * drawn.height - 1000 * np.arange(2)[:, None, None]
+    )
     np.testing.assert_allclose(drawn.values, truth, atol=1e-3)
 
 
@@ -61,12 +67,18 @@ def test_a_slow_model_draws_a_coarser_map_of_the_same_points(monkeypatch):
     assert doublings >= 1
     assert doublings == pytest.approx(round(doublings))
     assert FEWEST / 5 < len(coarse.x) * len(coarse.y) <= FEWEST
-    rows, columns = (np.isclose(a[:, None], b, atol=1e-9).any(1) for a, b in ((fine.y, coarse.y), (fine.x, coarse.x)))
+    rows, columns = (
+        np.isclose(a[:, None], b, atol=1e-9).any(1)
+        for a, b in ((fine.y, coarse.y), (fine.x, coarse.x))
+    )
     rows_there, columns_there = (
-        np.isclose(b[:, None], a, atol=1e-9).any(1) for a, b in ((fine.y, coarse.y), (fine.x, coarse.x))
+        np.isclose(b[:, None], a, atol=1e-9).any(1)
+        for a, b in ((fine.y, coarse.y), (fine.x, coarse.x))
     )
     np.testing.assert_allclose(
-        coarse.values[:, rows_there][..., columns_there], fine.values[:, rows][..., columns], atol=1e-3
+        coarse.values[:, rows_there][..., columns_there],
+        fine.values[:, rows][..., columns],
+        atol=1e-3,
     )
 
 
@@ -101,23 +113,33 @@ def test_height_and_receivers_may_be_chosen():
     assert repr(drawn) == (
         "<radio map of RSSI [dBm]: window; 9 x 14 points, x -0.50 to 6.00 and y -1.00 to 3.00, z 2.00 m>"
     )
-    assert drawn.values[0, 0, 0] == pytest.approx(drawn.x[0] + 10 * drawn.y[0] + 200 - 1000, abs=1e-3)
+    assert drawn.values[0, 0, 0] == pytest.approx(
+        drawn.x[0] + 10 * drawn.y[0] + 200 - 1000, abs=1e-3
+    )
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        *(({"pitch": pitch}, "pitch must be above 0, .* give at most") for pitch in (0, float("nan"), 1e9, 1e-9)),
+        *(
+            ({"pitch": pitch}, "pitch must be above 0, .* give at most")
+            for pitch in (0, float("nan"), 1e9, 1e-9)
+        ),
         ({"margin": -1.0}, "margin at least 0 .m., got height 1.0 and margin -1.0"),
         ({"height": float("inf")}, "height must be finite .* got height inf"),
-        ({"receivers": []}, r"receiver must be one of 0 = door, 1 = window, got \(0,\) of torch.float64"),
+        (
+            {"receivers": []},
+            r"receiver must be one of 0 = door, 1 = window, got \(0,\) of torch.float64",
+        ),
         ({"receivers": ["roof"]}, "receiver must be one of 0 = door, 1 = window, got 'roof'"),
     ],
 )
 def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         radio_map(Slope(scene()), **options)
-    with pytest.raises(TypeError, match=r"model must be one that gaigs\.load gives, got 'best\.ckpt'"):
+    with pytest.raises(
+        TypeError, match=r"model must be one that gaigs\.load gives, got 'best\.ckpt'"
+    ):
         radio_map("best.ckpt")
 
 
@@ -132,12 +154,17 @@ def test_another_file_is_no_map(content, tmp_path):
 @pytest.mark.parametrize(
     ("task", "message"),
     [
-        (Spectrum(*vars(Grid.degrees()).values(), ""), r"'spectrum', whose labels are \(90, 360\) of torch.float32"),
+        (
+            Spectrum(*vars(Grid.degrees()).values(), ""),
+            r"'spectrum', whose labels are \(90, 360\) of torch.float32",
+        ),
         (Narrow(1, torch.tensor([2.4e9])), r"'csi', whose labels are \(\) of torch.complex64"),
     ],
 )
 def test_a_task_without_one_real_number_a_link_is_refused(task, message):
-    with pytest.raises(ValueError, match=f"takes a model of one real number a link, got one of task {message}"):
+    with pytest.raises(
+        ValueError, match=f"takes a model of one real number a link, got one of task {message}"
+    ):
         radio_map(Slope(scene(task=task)))
 
 
@@ -156,7 +183,9 @@ def test_carrier_is_the_training_links_of_several_the_middle_one_or_the_one_aske
         np.testing.assert_allclose(drawn.values, unknown.values + used / 1e9, atol=1e-3)
     with pytest.raises(ValueError, match="frequency must be a carrier in Hz"):
         radio_map(Slope(scene()), frequency=-1.0)
-    with pytest.raises(ValueError, match=r"have one carrier, 7e\+09 Hz, so no other can be predicted"):
+    with pytest.raises(
+        ValueError, match=r"have one carrier, 7e\+09 Hz, so no other can be predicted"
+    ):
         radio_map(Slope(scene(frequencies=(7e9,))), frequency=9e9)
 
 
@@ -165,13 +194,19 @@ def test_a_band_is_left_with_one_warning(pitch):
     with pytest.warns(ExtrapolationWarning) as warned:
         radio_map(Slope(scene(frequencies=(5e9, 12e9))), pitch, margin=50.0, frequency=60e9)
     (only,) = warned
-    assert re.search(r"at 6e\+10 Hz, outside the training links' band of 5e\+09 to 1\.2e\+10 Hz", str(only.message))
+    assert re.search(
+        r"at 6e\+10 Hz, outside the training links' band of 5e\+09 to 1\.2e\+10 Hz",
+        str(only.message),
+    )
 
 
 @pytest.mark.parametrize("options", [{"height": 1200.0}, {"margin": 500.0}])
 def test_sizes_in_millimetres_warn(options):
     ((name, value),) = options.items()
-    with pytest.warns(ExtrapolationWarning, match=rf"^{name} puts transmitters .* is 5\.\d+ m across; is it in m\?$"):
+    with pytest.warns(
+        ExtrapolationWarning,
+        match=rf"^{name} puts transmitters .* is 5\.\d+ m across; is it in m\?$",
+    ):
         radio_map(Slope(scene()), 50.0 if name == "margin" else 2.0, **{name: value})
 
 
@@ -179,7 +214,15 @@ def test_file_holds_the_map_and_its_axes(tmp_path):
     drawn = radio_map(Slope(scene()), pitch=0.5)
     drawn.save(tmp_path / "floor")
     with np.load(tmp_path / "floor", allow_pickle=False) as file:
-        assert set(file.files) == {"values_dbm", "x", "y", "height", "receivers", "quantity", "unit"}
+        assert set(file.files) == {
+            "values_dbm",
+            "x",
+            "y",
+            "height",
+            "receivers",
+            "quantity",
+            "unit",
+        }
         assert file["values_dbm"].dtype == np.float32
         assert (str(file["quantity"]), str(file["unit"])) == ("RSSI", "dBm")
     same(RadioMap.load(tmp_path / "floor"), drawn)

@@ -40,9 +40,15 @@ def test_separate_floors_have_their_heights():
     scene = replace(links.scene, floors=floors_of(several))
     assert scene.height == floors_of(several)[0]
     assert torch.equal(Scene.from_state(stored(scene.state())).floors, scene.floors)
-    for heights in (rng.uniform(0, 30, 40), np.array([0.0, 1.9, 5.0, 6.5]), np.array([1.0, 1.0, 2.5])):
+    for heights in (
+        rng.uniform(0, 30, 40),
+        np.array([0.0, 1.9, 5.0, 6.5]),
+        np.array([1.0, 1.0, 2.5]),
+    ):
         assert not len(floors_of(places(heights)))
-    assert links.scene.height == pytest.approx((links.scene.lower[2] + links.scene.upper[2]).item() / 2)
+    assert links.scene.height == pytest.approx(
+        (links.scene.lower[2] + links.scene.upper[2]).item() / 2
+    )
 
 
 # --- arrays ---
@@ -52,7 +58,11 @@ def test_a_square_array_has_the_elements_of_the_nerf2_spectra():
     """Element 4 i + k stands i half wavelengths along x and k along y from the first."""
     wavelength = 0.046
     array = Array.planar(4, 4, wavelength / 2)
-    expected = [[(i - 1.5) * wavelength / 2, (k - 1.5) * wavelength / 2, 0] for i in range(4) for k in range(4)]
+    expected = [
+        [(i - 1.5) * wavelength / 2, (k - 1.5) * wavelength / 2, 0]
+        for i in range(4)
+        for k in range(4)
+    ]
     np.testing.assert_allclose(array.elements, expected, atol=1e-8)
     world = POSE.to(array.elements).world(array.elements)
     turned = POSE.position.numpy() + np.array(expected) @ POSE.rotation.numpy().T
@@ -69,7 +79,9 @@ def test_rows_lie_along_y_and_columns_along_x(rows, columns):
 
 
 def test_elements_of_an_array_have_places_in_the_room():
-    receiver = Receiver("door", Pose.from_xyzw([1.0, 2.0, 3.0], [0.0, 0.0, 1.0, 0.0]), Array.planar(2, 2, 1.0))
+    receiver = Receiver(
+        "door", Pose.from_xyzw([1.0, 2.0, 3.0], [0.0, 0.0, 1.0, 0.0]), Array.planar(2, 2, 1.0)
+    )
     places = receiver.pose.world(receiver.array.elements)
     assert places.tolist() == [[1.5, 2.5, 3.0], [1.5, 1.5, 3.0], [0.5, 2.5, 3.0], [0.5, 1.5, 3.0]]
     assert torch.equal(receiver.pose.local(places), receiver.array.elements)
@@ -91,13 +103,22 @@ def test_elements_hear_as_their_pattern_says():
         (lambda: Array(torch.zeros(0, 3)), r"must be \(e, 3\) positions \[m\], got \(0, 3\)"),
         (lambda: Array(torch.zeros(3)), r"got \(3,\)"),
         (lambda: Array(torch.zeros(4, 2)), r"got \(4, 2\)"),
-        (lambda: Array.planar(0, 4, 0.1), "at least 1 x 1 elements at a positive pitch, got 0 x 4 at 0.1 m"),
+        (
+            lambda: Array.planar(0, 4, 0.1),
+            "at least 1 x 1 elements at a positive pitch, got 0 x 4 at 0.1 m",
+        ),
         (lambda: Array.planar(4, -1, 0.1), "got 4 x -1"),
         (lambda: Array.planar(4, 4, 0.0), "at 0.0 m"),
         (lambda: Array.planar(4, 4, math.nan), "at nan m"),
         (lambda: Array.planar(4, 4, math.inf), "at inf m"),
-        (lambda: Receiver("door", Pose(torch.zeros(3), torch.eye(3) * 7)), "of receiver 'door' must have a rotation"),
-        (lambda: Receiver("door", Pose(torch.zeros(3), torch.eye(3).flip(0))), "must have a rotation"),
+        (
+            lambda: Receiver("door", Pose(torch.zeros(3), torch.eye(3) * 7)),
+            "of receiver 'door' must have a rotation",
+        ),
+        (
+            lambda: Receiver("door", Pose(torch.zeros(3), torch.eye(3).flip(0))),
+            "must have a rotation",
+        ),
     ],
 )
 def test_impossible_arrays_are_refused(make, message):
@@ -116,7 +137,9 @@ def scene():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_a_carriers_place_in_the_band_is_that_of_its_logarithm(scene, dtype):
     scene = replace(scene, frequencies=torch.tensor([1e9, 2e9, 8e9]))
-    query = Query(torch.zeros(4, 3, dtype=dtype), torch.zeros(4).long(), torch.tensor([1e9, 2e9, 8e9, 16e9]))
+    query = Query(
+        torch.zeros(4, 3, dtype=dtype), torch.zeros(4).long(), torch.tensor([1e9, 2e9, 8e9, 16e9])
+    )
     places = scene.band_positions(query)
     assert places.dtype == dtype
     np.testing.assert_allclose(places, [-1, -1 / 3, 1, 5 / 3], rtol=1e-6)
@@ -131,7 +154,9 @@ def test_a_band_needs_a_frequency(scene):
 # --- lags ---
 
 
-@pytest.mark.parametrize("array", [Array.single(), Array(torch.rand(5, 3)), Array.planar(2, 3, 0.1)])
+@pytest.mark.parametrize(
+    "array", [Array.single(), Array(torch.rand(5, 3)), Array.planar(2, 3, 0.1)]
+)
 def test_each_pair_of_elements_has_its_lag(array):
     steps, pairs, counts = array.lags
     count = len(array)
@@ -139,7 +164,9 @@ def test_each_pair_of_elements_has_its_lag(array):
         apart = array.elements[i].double() - array.elements[j].double()
         np.testing.assert_allclose(steps[pairs[k]], apart, atol=1e-9)
     assert counts.sum() == count**2
-    torch.testing.assert_close(steps, -steps.flip(0))  # opposite ones stand opposite, and 0 in the middle
+    torch.testing.assert_close(
+        steps, -steps.flip(0)
+    )  # opposite ones stand opposite, and 0 in the middle
     assert not steps[len(steps) // 2].any()
 
 
@@ -175,7 +202,12 @@ def test_frames_that_are_no_projected_metres_are_refused(frame, message):
 @pytest.mark.usefixtures("unchecked")
 def test_systems_in_metres_are_taken_and_those_of_utm_without_pyproj(monkeypatch):
     pytest.importorskip("pyproj")
-    for code, x, y in ((25832, 4.5e5, 5.4e6), (27700, 0.0, 0.0), (3857, 1e6, 6e6), (np.int64(32633), -8e4, 6.9e6)):
+    for code, x, y in (
+        (25832, 4.5e5, 5.4e6),
+        (27700, 0.0, 0.0),
+        (3857, 1e6, 6e6),
+        (np.int64(32633), -8e4, 6.9e6),
+    ):
         assert Frame(code, x, y).epsg == code
     monkeypatch.setitem(sys.modules, "pyproj", None)
     assert Frame(32632, 4.5e5, 5.4e6) == Frame(32632, 450000.0, 5400000.0)
@@ -184,9 +216,14 @@ def test_systems_in_metres_are_taken_and_those_of_utm_without_pyproj(monkeypatch
 
 
 def test_a_stored_scene_with_an_impossible_frame_has_none(scene, caplog):
-    for frame, expected in (((4326, 11.5, 48.1), None), ((32632, 4.5e5, 5.4e6), Frame(32632, 4.5e5, 5.4e6))):
+    for frame, expected in (
+        ((4326, 11.5, 48.1), None),
+        ((32632, 4.5e5, 5.4e6), Frame(32632, 4.5e5, 5.4e6)),
+    ):
         assert Scene.from_state(scene.state() | {"frame": frame}).frame == expected
-    assert caplog.text.count("predictions have no place on a map: a frame must be an EPSG code") == 1
+    assert (
+        caplog.text.count("predictions have no place on a map: a frame must be an EPSG code") == 1
+    )
 
 
 # --- states ---
@@ -195,8 +232,12 @@ def test_a_stored_scene_with_an_impossible_frame_has_none(scene, caplog):
 @pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
 def test_a_scene_comes_back_from_its_state(task):
     patches = Receiver("patches", POSE, Array.planar(2, 3, 0.1, "cosine"))
-    scene = replace(example_links(task).scene, frequencies=torch.tensor([2.4e9, 5.0e9]), bandwidth=499.2e6)
-    scene = replace(scene, receivers=(*scene.receivers, patches), frame=Frame(32632, np.float64(4.5e5), 5.4e6))
+    scene = replace(
+        example_links(task).scene, frequencies=torch.tensor([2.4e9, 5.0e9]), bandwidth=499.2e6
+    )
+    scene = replace(
+        scene, receivers=(*scene.receivers, patches), frame=Frame(32632, np.float64(4.5e5), 5.4e6)
+    )
     again = Scene.from_state(stored(scene.state()))
     for receiver, other in zip(scene.receivers, again.receivers, strict=True):
         assert other.name == receiver.name

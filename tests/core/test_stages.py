@@ -59,7 +59,10 @@ def terminal(monkeypatch):
 def test_open_stages_have_a_bar_each_with_an_estimate(terminal):
     with stages.watched() as watch, stages.stage("folds", 4) as folds:
         for number, _ in enumerate(stages.track(range(3), "kriging")):
-            assert [(bar.description, bar.completed) for bar in watch.bars.tasks] == [("folds", 0), ("kriging", number)]
+            assert [(bar.description, bar.completed) for bar in watch.bars.tasks] == [
+                ("folds", 0),
+                ("kriging", number),
+            ]
         folds.advance()
         (bar,) = watch.bars.tasks
         assert (bar.completed, bar.total, bar.fields["count"]) == (1, 4, "1/4")
@@ -68,7 +71,9 @@ def test_open_stages_have_a_bar_each_with_an_estimate(terminal):
     assert "-:--:--" in terminal.file.getvalue(), "time left"
 
 
-@pytest.mark.parametrize(("shown", "is_terminal", "name"), [(False, True, "a"), (True, False, "a"), (True, True, "")])
+@pytest.mark.parametrize(
+    ("shown", "is_terminal", "name"), [(False, True, "a"), (True, False, "a"), (True, True, "")]
+)
 def test_bars_are_silent_where_nobody_reads_them(terminal, shown, is_terminal, name):
     terminal._force_terminal = is_terminal
     with stages.watched(shown=shown) as watch:
@@ -95,8 +100,12 @@ def test_what_cannot_be_shortened_is_announced(clock, caplog):
         with stages.watched(limit):
             for _ in model.predict_batches([[1.0, 2.0, 1.0]] * 8, batch_size=1):
                 clock.now += 4.0
-        assert [record.message for record in caplog.records if record.name == "gaigs.core.stages"] == (
-            [] if limit == 40 else ["predictions: 28 s more, which cannot be shortened; max_time leaves 16 s"]
+        assert [
+            record.message for record in caplog.records if record.name == "gaigs.core.stages"
+        ] == (
+            []
+            if limit == 40
+            else ["predictions: 28 s more, which cannot be shortened; max_time leaves 16 s"]
         )
 
 
@@ -120,7 +129,9 @@ def test_a_fit_of_a_process_ends_with_its_stage(clock, monkeypatch):
 def test_kriging_takes_as_many_links_as_it_has_time_for(clock, monkeypatch):
     links = example_links("rssi")
     many = replace(links, split=replace(links.split, train=links.split.train.repeat(400)))
-    model = Kriging(links.scene, gaigs.train("gaigs", links, max_steps=1, count=10, enable_progress_bar=False))
+    model = Kriging(
+        links.scene, gaigs.train("gaigs", links, max_steps=1, count=10, enable_progress_bar=False)
+    )
     monkeypatch.setattr("gaigs.model.kriging.time", Clock(64.0))  # a second a link
     assert model._most(many) == 6000
     with stages.watched(9 * 250.0 * len(links.receivers)):
@@ -151,7 +162,10 @@ def test_a_limit_that_is_far_changes_nothing(unlimited, clock, monkeypatch, tmp_
     assert {"max_time", "left_out"}.isdisjoint(before)
     for part in ("models", "validation"):
         assert metrics[part] == before[part]
-    with np.load(folder / "predictions.npz") as there, np.load(tmp_path / "predictions.npz") as here:
+    with (
+        np.load(folder / "predictions.npz") as there,
+        np.load(tmp_path / "predictions.npz") as here,
+    ):
         for name in there.files:
             np.testing.assert_array_equal(here[name], there[name])
 
@@ -177,10 +191,20 @@ def test_a_run_whose_time_is_up_ends_with_what_it_has(clock, tmp_path):
 
 def test_train_takes_the_limit_of_all_its_parts(clock, caplog):
     clock.step = 1.0
-    small = {"max_steps": 3, "count": 10, "accelerator": "cpu", "enable_progress_bar": False, "kriging": True}
+    small = {
+        "max_steps": 3,
+        "count": 10,
+        "accelerator": "cpu",
+        "enable_progress_bar": False,
+        "kriging": True,
+    }
     gaigs.train("gaigs", example_links("rssi"), max_time="00:00:00:10", **small)
-    assert "max_time: the fit of kriging ended early" in [record.message for record in caplog.records]
-    with pytest.raises(ValueError, match=r"^max_time must be at least 1 s as 'DD:HH:MM:SS', .* got '60 s'$"):
+    assert "max_time: the fit of kriging ended early" in [
+        record.message for record in caplog.records
+    ]
+    with pytest.raises(
+        ValueError, match=r"^max_time must be at least 1 s as 'DD:HH:MM:SS', .* got '60 s'$"
+    ):
         gaigs.train("gaigs", example_links("rssi"), max_time="60 s", **small)
 
 
@@ -188,6 +212,8 @@ def test_time_alone_may_end_a_training_of_a_limited_run(clock):
     with stages.watched(60.0), stages.stage(until=0.5):
         clock.now = 10.0
         _, found = budget.make_budget({"max_steps": -1}, searched=4.0)
-        trainer = SimpleNamespace(strategy=SimpleNamespace(broadcast=lambda own: own), should_stop=False)
+        trainer = SimpleNamespace(
+            strategy=SimpleNamespace(broadcast=lambda own: own), should_stop=False
+        )
         found.on_fit_start(trainer, None)
     assert found.limit == 24.0, "20 s after the search"

@@ -1,4 +1,6 @@
-"""Data sets that tests of several files read, written by hand, and the configuration as a run composes it."""
+"""Data sets that tests of several files read, written by hand, and the configuration as a run
+composes it.
+"""
 
 import os
 import shutil
@@ -30,7 +32,9 @@ def rssi_folder(tmp_path):
     root.mkdir()
     (root / "tx_pos.csv").write_text("x,y,z\n" + "".join(f"{k}.5,{-k},0.25\n" for k in range(6)))
     (root / "gateway_rssi.csv").write_text(RSSI)
-    (root / "gateway_position.yml").write_text("east: [5.0, 1, 2]\nwest:\n- 0.5\n- 1\n- 2\nattic: [3, 1, 4.5]\n")
+    (root / "gateway_position.yml").write_text(
+        "east: [5.0, 1, 2]\nwest:\n- 0.5\n- 1\n- 2\nattic: [3, 1, 4.5]\n"
+    )
     (root / "train_index.txt").write_text("4\n0\n1\n")
     (root / "test_index.txt").write_text("5\n2\n")
     return root
@@ -65,9 +69,13 @@ def measured():
     """Finds a measured data set by name, or skips the test."""
 
     def find(name):
-        root = Path(os.environ.get("GAIGS_DATA", Path(__file__).parents[3] / "shared" / "data")) / name
+        root = (
+            Path(os.environ.get("GAIGS_DATA", Path(__file__).parents[3] / "shared" / "data")) / name
+        )
         if not root.is_dir():
-            pytest.skip(f"needs the measured data set {name}; set GAIGS_DATA to the folder that holds it")
+            pytest.skip(
+                f"needs the measured data set {name}; set GAIGS_DATA to the folder that holds it"
+            )
         return root
 
     return find

@@ -4,7 +4,9 @@ import re
 
 NUMBERS = """nan -nan inf -inf .inf .nan 0 -0 -0.0 1e300 -1e300 1e400 1e-300 -1e-300 1e38 -1e38 1e-45 99999.999 1e5 -1e5
 1_0 0x10 0b1 010 -010 1:30 2024-01-01 true null ~ 1e 1,5 1;5 "5" "5 5" '5' "5"6 １ ٣ 1d3 +5 -100 -99.999 -200 127
-9223372036854775808 18446744073709551616 !!float_5 !x_5 *a &a_5 {} [] [5] # : , - -- | > % @ ` \\""".replace("_5", " 5")
+9223372036854775808 18446744073709551616 !!float_5 !x_5 *a &a_5 {} [] [5] # : , - -- | > % @ ` \\""".replace(
+    "_5", " 5"
+)
 """Replacements of a number in a text, besides integers of hundreds and thousands of digits."""
 
 WORDS = [*NUMBERS.split(), "", " ", "9" * 400, "9" * 5000, "1" + "0" * 399]
@@ -36,7 +38,11 @@ def truncate(content, draw):
 
 def insert(content, draw):
     at = draw.randrange(len(content) + 1)
-    return content[:at] + draw.choice([draw.randbytes(3), b"\0", b'"', b"[", b"\\", b"\x0c", b"\xe9"]) + content[at:]
+    return (
+        content[:at]
+        + draw.choice([draw.randbytes(3), b"\0", b'"', b"[", b"\\", b"\x0c", b"\xe9"])
+        + content[at:]
+    )
 
 
 def renumber(content, draw):
@@ -53,7 +59,14 @@ def repeat_line(content, draw):
 
 def recode(content, draw):
     text = content.decode()
-    coded = {"utf-16": text, "utf-16-le": text, "utf-32": text, "latin-1": f"é{text}", "utf-8-sig": text, "cp500": text}
+    coded = {
+        "utf-16": text,
+        "utf-16-le": text,
+        "utf-32": text,
+        "latin-1": f"é{text}",
+        "utf-8-sig": text,
+        "cp500": text,
+    }
     name = draw.choice([*coded])
     return coded[name].encode(name)
 

@@ -27,7 +27,9 @@ def test_a_data_set_brings_its_options_task_and_split(configured, name):
     config, (task, split) = configured(f"data={name}"), CHOICES[name]
     named = inspect.signature(registry("data").get(name)).parameters
     defaults = {key: "???" if p.default is p.empty else p.default for key, p in named.items()}
-    defaults = {key: [*value] if isinstance(value, tuple) else value for key, value in defaults.items()}
+    defaults = {
+        key: [*value] if isinstance(value, tuple) else value for key, value in defaults.items()
+    }
     assert OmegaConf.to_container(config.data) == {"name": name, **defaults}
     assert config.task.name == task
     assert config.split == configured(f"data={name}", f"split={split}").split
@@ -36,4 +38,10 @@ def test_a_data_set_brings_its_options_task_and_split(configured, name):
 def test_a_split_on_the_command_line_precedes_the_datas_own(configured):
     config = configured("data=nerf2_rssi", "split=blocks", "split.edge=0.5")
     assert config.task.name == "rssi"
-    assert config.split == {"name": "blocks", "edge": 0.5, "test": 0.2, "validation": None, "seed": 0}
+    assert config.split == {
+        "name": "blocks",
+        "edge": 0.5,
+        "test": 0.2,
+        "validation": None,
+        "seed": 0,
+    }

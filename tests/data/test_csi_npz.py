@@ -20,7 +20,9 @@ RANDOM = {"name": "random", "validation": 0}
 
 
 def arrays():
-    """Ten links from five places to two of three receivers, of 3 elements at 4 subcarriers, out of order."""
+    """Ten links from five places to two of three receivers, of 3 elements at 4 subcarriers, out of
+    order.
+    """
     draw = np.random.default_rng(0)
     places = draw.uniform(-3, 3, (5, 3))
     return {
@@ -61,14 +63,19 @@ def test_every_channel_is_a_link(file):
     assert [r.name for r in links.receivers] == ["rx0", "rx2"]
     assert [r.pose.position.tolist() for r in links.receivers] == [[0, 0, 2.5], [4, 1, 2.25]]
     for receiver in links.receivers:
-        np.testing.assert_array_equal(receiver.array.elements, content["elements"].astype(np.float32))
+        np.testing.assert_array_equal(
+            receiver.array.elements, content["elements"].astype(np.float32)
+        )
         assert receiver.array.pattern == "isotropic"
         assert torch.equal(receiver.pose.rotation, torch.eye(3))
     assert (links.task.name, links.task.shape) == ("csi", (3, 4))
     np.testing.assert_array_equal(links.task.frequencies, content["frequencies"])
     assert links.query.frequencies.tolist() == pytest.approx([2.43e9] * 10, rel=1e-7)
     assert links.rows.tolist() == [0, 0, 1, 1, 2, 3, 4, 4, 3, 2]
-    assert links.remarks == "10 channels from 5 places at 2 receivers; receivers without links are left out: rx1"
+    assert (
+        links.remarks
+        == "10 channels from 5 places at 2 receivers; receivers without links are left out: rx1"
+    )
     check_data(links)
 
 
@@ -82,7 +89,9 @@ def test_channels_of_zeros_are_left_out_and_counted(file):
     np.testing.assert_array_equal(links.labels, h[kept].astype(np.complex64))
     np.testing.assert_array_equal(links.query.transmitters, arrays()["tx"][kept].astype(np.float32))
     assert links.query.receivers.tolist() == [1, 0, 1, 1, 0, 1, 0]
-    assert links.remarks.startswith("7 channels from 5 places at 2 receivers; 3 that are zero throughout are left out;")
+    assert links.remarks.startswith(
+        "7 channels from 5 places at 2 receivers; 3 that are zero throughout are left out;"
+    )
     check_data(links)
 
 
@@ -105,12 +114,19 @@ def test_other_arrays_are_named_and_not_read(file):
     [
         {"h": np.complex64, "tx": np.float32, "rx_index": np.uint8},
         {"h": ">c16", "tx": ">f8", "rx_index": ">i2", "frequencies": np.int64},
-        {"h": np.clongdouble, "rx": np.longdouble, "rx_index": np.uint64, "frequencies": np.float32},
+        {
+            "h": np.clongdouble,
+            "rx": np.longdouble,
+            "rx_index": np.uint64,
+            "frequencies": np.float32,
+        },
     ],
     ids=["narrow", "big-endian", "wide"],
 )
 def test_arrays_of_other_types_are_read(file, types):
-    links = read(changed(file, **{name: arrays()[name].astype(dtype) for name, dtype in types.items()}))
+    links = read(
+        changed(file, **{name: arrays()[name].astype(dtype) for name, dtype in types.items()})
+    )
     torch.testing.assert_close(links.labels, torch.from_numpy(arrays()["h"]).to(torch.complex64))
     assert links.query.receivers.tolist() == [0, 1, 0, 1, 1, 0, 0, 1, 1, 0]
     check_data(links)
@@ -132,20 +148,38 @@ DEFECTS = [
     ({"rx": np.ones(3)}, "rx: expected the shape (k, 3), got (3,)"),
     ({"h": np.ones((9, 3, 4), complex)}, "h: expected the shape (10, e, 4), got (9, 3, 4)"),
     ({"elements": np.ones((4, 3))}, "elements: expected the shape (3, 3), got (4, 3)"),
-    ({"h": np.ones((10, 4), complex)}, "(10, e, 4), got (10, 4); for one antenna add an axis, h[:, None, :]"),
-    ({"h": np.ones((10, 3, 4))}, "h: expected complex numbers, got float64; data.arrays={h: [RE, IM]} names"),
+    (
+        {"h": np.ones((10, 4), complex)},
+        "(10, e, 4), got (10, 4); for one antenna add an axis, h[:, None, :]",
+    ),
+    (
+        {"h": np.ones((10, 3, 4))},
+        "h: expected complex numbers, got float64; data.arrays={h: [RE, IM]} names",
+    ),
     ({"rx_index": np.zeros(10)}, "rx_index: expected whole numbers, got float64"),
     ({"h": np.ones((10, 0, 4), complex)}, "h: expected the shape (10, e, 4), got (10, 0, 4)"),
-    (put("rx_index", [3, 5], 3), "rx_index[3]: expected a row of rx, counted from 0, 0..2, got 3 (in 2 of 10 rows)"),
+    (
+        put("rx_index", [3, 5], 3),
+        "rx_index[3]: expected a row of rx, counted from 0, 0..2, got 3 (in 2 of 10 rows)",
+    ),
     (put("tx", (6, 1), np.nan), "tx[6, 1]: expected a number, got NaN (in 1 of 10 rows)"),
     (put("rx", (1, 0), -1e5), f"rx[1, 0]: {NEAR} -100000.0"),
-    ({"frequencies": np.array([-3e7, -1e7, 1e7, 3e7])}, f"frequencies[0]: {CARRIER} -30000000.0 (in 2 of 4 rows)"),
-    ({"frequencies": np.linspace(2400, 2460, 4)}, f"frequencies[0]: {CARRIER} 2400.0; in MHz? (in 4 of 4 rows)"),
+    (
+        {"frequencies": np.array([-3e7, -1e7, 1e7, 3e7])},
+        f"frequencies[0]: {CARRIER} -30000000.0 (in 2 of 4 rows)",
+    ),
+    (
+        {"frequencies": np.linspace(2400, 2460, 4)},
+        f"frequencies[0]: {CARRIER} 2400.0; in MHz? (in 4 of 4 rows)",
+    ),
     (put("frequencies", 1, 2.40e9), "frequencies: expected different ones, got one twice"),
     (put("h", (8, 1, 2), 1e19), f"h[8, 1, 2]: {LEVEL} (9.99"),
     ({"h": np.full((10, 3, 4), 1e-30j)}, f"h[0, 0, 0]: {LEVEL} 1.00000000"),
     (put("h", ([2, 8], 1, 2), np.nan), "h[2, 1, 2]: expected a number, got NaN (in 2 of 10 rows)"),
-    ({"h": np.zeros((10, 3, 4), complex)}, "h: expected a channel that is not zero throughout, got none"),
+    (
+        {"h": np.zeros((10, 3, 4), complex)},
+        "h: expected a channel that is not zero throughout, got none",
+    ),
     ({"tx": np.array([None] * 10)}, "tx: Object arrays cannot be loaded when allow_pickle=False"),
 ]
 
@@ -178,8 +212,12 @@ def damage(file):
 
 
 def halve(file):
-    """A header of half the precision, as one damaged byte writes it, with a correct checksum of the rest."""
-    changed(file, rx=np.ones((2000, 3)))  # zipfile compares checksums at the end, and reads 4 kB ahead
+    """A header of half the precision, as one damaged byte writes it, with a correct checksum of the
+    rest.
+    """
+    changed(
+        file, rx=np.ones((2000, 3))
+    )  # zipfile compares checksums at the end, and reads 4 kB ahead
     before, start, content = file.read_bytes().partition(b"rx.npy")
     assert b"'<f8'" in content[:200]
     file.write_bytes(before + start + content.replace(b"'<f8'", b"'<f4'", 1))
@@ -202,7 +240,10 @@ def repeat(file):
         (repeat, "tx: expected one array of real numbers of (n, 3), got 2"),
         (damage, "h: Bad CRC-32 for file 'h.npy'"),
         (single, ": a single array of shape (10, 3, 4); expected"),
-        (lambda file: file.write_text("tx,rx\n1,2\n"), "; expected an .npz file as numpy.savez writes it"),
+        (
+            lambda file: file.write_text("tx,rx\n1,2\n"),
+            "; expected an .npz file as numpy.savez writes it",
+        ),
     ],
 )
 def test_damaged_archives_are_refused(file, break_file, message):
@@ -222,7 +263,9 @@ def save_hdf5(file, content):
 
 
 def save_mat73(file, content):
-    """As MATLAB does: reversed axes, matrices alone, doubles alone, a compound type for complex numbers."""
+    """As MATLAB does: reversed axes, matrices alone, doubles alone, a compound type for complex
+    numbers.
+    """
     with h5py.File(file, "w", userblock_size=512) as stored:
         for name, array in content.items():
             array = np.atleast_2d(array).T
@@ -238,7 +281,12 @@ def save_mat73(file, content):
 
 @pytest.mark.parametrize(
     ("save", "name", "group"),
-    [(save_mat, "a.mat", ""), (save_mat73, "a.mat", ""), (save_hdf5, "a.h5", "room/"), (save_hdf5, "a.hdf5", "room/")],
+    [
+        (save_mat, "a.mat", ""),
+        (save_mat73, "a.mat", ""),
+        (save_hdf5, "a.h5", "room/"),
+        (save_hdf5, "a.hdf5", "room/"),
+    ],
 )
 def test_matlab_and_hdf5_files_have_the_same_links(file, tmp_path, save, name, group):
     save(tmp_path / name, arrays() | {"notes": np.ones(3)})
@@ -267,11 +315,17 @@ def test_parts_of_complex_numbers_are_joined(file):
     for axis, parts in ((0, "first"), (-1, "last")):
         changed(file, h=np.stack((h.real, h.imag), axis))
         assert torch.equal(csi_npz.read(file, parts=parts).labels, expected)
-        with pytest.raises(ValueError, match=r"h: expected complex numbers, got float64; .* data.parts=last or first"):
+        with pytest.raises(
+            ValueError,
+            match=r"h: expected complex numbers, got float64; .* data.parts=last or first",
+        ):
             csi_npz.read(file)  # may be amplitudes at two antennas
     for parts, given in (("first", np.abs(h)), ("last", h[..., :2])):
         changed(file, h=given)
-        with pytest.raises(ValueError, match=rf"data.parts={parts} is for real numbers with 2 along the {parts} axis"):
+        with pytest.raises(
+            ValueError,
+            match=rf"data.parts={parts} is for real numbers with 2 along the {parts} axis",
+        ):
             csi_npz.read(file, parts=parts)
     with pytest.raises(ValueError, match="must be first or last, the axis of"):
         csi_npz.read(file, parts="both")
@@ -284,7 +338,9 @@ def test_receivers_of_another_shape_are_named_before_their_index(tmp_path, rx):
     for save_one, name in ((save_hdf5, "a.h5"), (save, "a.npz")):
         save_one(tmp_path / name, content)
         names = {name: f"room/{name}" for name in content} if name == "a.h5" else {}
-        with pytest.raises(ValueError, match=rf"rx: expected the shape \(k, 3\), got {re.escape(str(rx.shape))}"):
+        with pytest.raises(
+            ValueError, match=rf"rx: expected the shape \(k, 3\), got {re.escape(str(rx.shape))}"
+        ):
             csi_npz.read(tmp_path / name, names)
 
 
@@ -295,7 +351,8 @@ def mistaken(amplitude, phase):
 
 @pytest.mark.parametrize("unit", ["linear", "dB"])
 @pytest.mark.parametrize(
-    ("phases", "word"), [("radians", "jp"), ("degrees", "deg2rad"), ("turn", "jp"), ("turn_deg", "deg2rad")]
+    ("phases", "word"),
+    [("radians", "jp"), ("degrees", "deg2rad"), ("turn", "jp"), ("turn_deg", "deg2rad")],
 )
 def test_amplitude_and_phase_as_parts_are_refused(file, unit, phases, word):
     draw = np.random.default_rng(0)
@@ -311,7 +368,12 @@ def test_amplitude_and_phase_as_parts_are_refused(file, unit, phases, word):
         with pytest.raises(ValueError, match=rf"h: (real|imaginary) parts are .*{mend}"):
             csi_npz.read(file, {"h": ["re", "im"]})
         with pytest.raises(ValueError, match=rf"labels: .*{mend}"):
-            gaigs.links(task=Csi(3, frequencies), transmitters=arrays()["tx"], receivers=[[0, 0, 2]], labels=wrong)
+            gaigs.links(
+                task=Csi(3, frequencies),
+                transmitters=arrays()["tx"],
+                receivers=[[0, 0, 2]],
+                labels=wrong,
+            )
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 3.0, 100.0])
@@ -320,7 +382,13 @@ def test_parts_of_true_channels_are_no_amplitudes(scale):
     draw = np.random.default_rng(0)
     h = scale * (draw.normal(size=2000) + 1j * draw.normal(size=2000))
     aligned = scale * np.exp(1j * draw.uniform(-1.5, 1.5, 2000))
-    for channels in (h, aligned, scale * (1 + 0.1 * h), np.abs(h.real) + 1j * np.abs(h.imag), h[:50]):
+    for channels in (
+        h,
+        aligned,
+        scale * (1 + 0.1 * h),
+        np.abs(h.real) + 1j * np.abs(h.imag),
+        h[:50],
+    ):
         check_parts("h", channels)
 
 
@@ -334,8 +402,14 @@ def test_a_single_receiver_needs_no_index(file):
 
 def test_wrong_names_of_arrays_are_refused(file):
     for names, message in (
-        ({"H": "CSI"}, "data.arrays has no array 'H'; it has: tx, rx, rx_index, frequencies, h, elements"),
-        ({"h": "CSI"}, "h: expected one array of complex numbers of (n, e, s), got 0 called 'CSI' among ['tx',"),
+        (
+            {"H": "CSI"},
+            "data.arrays has no array 'H'; it has: tx, rx, rx_index, frequencies, h, elements",
+        ),
+        (
+            {"h": "CSI"},
+            "h: expected one array of complex numbers of (n, e, s), got 0 called 'CSI' among ['tx',",
+        ),
         ({"tx": ["x", "y"]}, "tx: data.arrays has 2 names"),
     ):
         with pytest.raises(ValueError, match=re.escape(message)):
@@ -354,7 +428,10 @@ def test_damaged_matlab_files_are_refused(tmp_path, save):
 
 
 def test_the_reader_declares_the_phase(file):
-    assert load({"name": "csi_npz", "file": str(file), "phase": "per_link"}, RANDOM).task.phase == "per_link"
+    assert (
+        load({"name": "csi_npz", "file": str(file), "phase": "per_link"}, RANDOM).task.phase
+        == "per_link"
+    )
 
 
 def test_receivers_may_have_different_numbers_of_elements(file):
@@ -368,12 +445,18 @@ def test_receivers_may_have_different_numbers_of_elements(file):
     h[at_third, 0] = 0
     links = read(changed(file, elements=elements, h=h))
     assert [len(receiver.array) for receiver in links.receivers] == [3, 2]
-    np.testing.assert_array_equal(links.receivers[1].array.elements, elements[2, 1:].astype(np.float32))
-    np.testing.assert_array_equal(links.labels[at_third][:, :2], h[at_third][:, 1:].astype(np.complex64))
+    np.testing.assert_array_equal(
+        links.receivers[1].array.elements, elements[2, 1:].astype(np.float32)
+    )
+    np.testing.assert_array_equal(
+        links.labels[at_third][:, :2], h[at_third][:, 1:].astype(np.complex64)
+    )
     assert not links.labels[at_third][:, 2].any()
     check_data(links)
     elements[1] = np.nan
-    with pytest.raises(ValueError, match=r"elements\[1\]: expected an element of each receiver, got NaN alone"):
+    with pytest.raises(
+        ValueError, match=r"elements\[1\]: expected an element of each receiver, got NaN alone"
+    ):
         read(changed(file, elements=elements, h=h))
 
 
@@ -382,5 +465,10 @@ def test_real_and_imaginary_part_have_one_shape(tmp_path):
     channels = content.pop("h")
     parts = {"re": channels.real, "im": channels.imag[..., :1]}
     np.savez(tmp_path / "parts.npz", **content, **parts)
-    with pytest.raises(ValueError, match="real and imaginary part of h must be real and of one shape"):
-        load({"name": "csi_npz", "file": str(tmp_path / "parts.npz"), "arrays": {"h": ["re", "im"]}}, RANDOM)
+    with pytest.raises(
+        ValueError, match="real and imaginary part of h must be real and of one shape"
+    ):
+        load(
+            {"name": "csi_npz", "file": str(tmp_path / "parts.npz"), "arrays": {"h": ["re", "im"]}},
+            RANDOM,
+        )

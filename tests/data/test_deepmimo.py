@@ -1,4 +1,6 @@
-"""Scenarios of DeepMIMO v4, written here by numpy: channels by hand, written paths, phases, and defects."""
+"""Scenarios of DeepMIMO v4, written here by numpy: channels by hand, written paths, phases, and
+defects.
+"""
 
 import cmath
 import json
@@ -22,7 +24,10 @@ NAN = math.nan
 
 def params(**changes):
     sets = {f"txrx_set_{k}": {"id": k, "is_tx": k == 0, "is_rx": True} for k in (0, 1)}
-    return {"rt_params": {"frequency": CARRIER, "raytracer_name": "other"}, "txrx_sets": sets} | changes
+    return {
+        "rt_params": {"frequency": CARRIER, "raytracer_name": "other"},
+        "txrx_sets": sets,
+    } | changes
 
 
 def matrices():
@@ -68,7 +73,8 @@ def test_channels_are_the_sum_of_the_paths_by_hand(folder):
                 total = 0
                 for p in range(2 if user == 0 else 1):
                     power, phase, delay, azimuth, zenith = (
-                        content[key][user][p] for key in ("power", "phase", "delay", "aod_az", "aod_el")
+                        content[key][user][p]
+                        for key in ("power", "phase", "delay", "aod_az", "aod_el")
                     )
                     a, t = math.radians(azimuth), math.radians(zenith)
                     turn = y * math.sin(t) * math.sin(a) + z * math.cos(t)
@@ -87,7 +93,12 @@ def test_channels_are_the_sum_of_the_paths_by_hand(folder):
 def test_formats_and_sets_of_users_are_read_alike(folder):
     """A second set of users, in MATLAB's format; paths between stations are not links."""
     first = deepmimo.read(folder)
-    save(folder, matrices() | {"rx_pos": [[10.0, 0, 2], [20, 0, 2], [30, 5, 2]]}, "t000_tx000_r002", ".mat")
+    save(
+        folder,
+        matrices() | {"rx_pos": [[10.0, 0, 2], [20, 0, 2], [30, 5, 2]]},
+        "t000_tx000_r002",
+        ".mat",
+    )
     save(folder, matrices(), "t000_tx000_r000")
     both = deepmimo.read(folder)
     assert len(both.receivers) == 1
@@ -98,7 +109,9 @@ def test_formats_and_sets_of_users_are_read_alike(folder):
 
 
 def write_scenario(folder, seed=0):
-    """Twelve users in free space and their mirror images in the floor; the gains without the floor's are known."""
+    """Twelve users in free space and their mirror images in the floor; the gains without the
+    floor's are known.
+    """
     users = np.random.default_rng(seed).uniform((1, -5, 0.5), (9, 5, 2), (12, 3))
     station = np.array([0.0, 0.0, 2.5])
     images = np.stack((users, users * (1, 1, -1)), 1)
@@ -128,7 +141,9 @@ def test_written_paths_have_their_geometry(tmp_path):
     links = deepmimo.read(tmp_path, elements=[1, 1], subcarriers=1)
     np.testing.assert_allclose(links.labels[:, 0, 0], fields.sum(1), rtol=1e-3)
     strengths = 20 * np.log10(np.abs(fields.sum(1)))
-    np.testing.assert_allclose(deepmimo_rssi.read(tmp_path, bandwidth=1.0).labels, strengths, atol=1e-2)
+    np.testing.assert_allclose(
+        deepmimo_rssi.read(tmp_path, bandwidth=1.0).labels, strengths, atol=1e-2
+    )
 
 
 def test_phases_without_the_carriers_get_it(tmp_path):
@@ -145,32 +160,60 @@ def test_phases_without_the_carriers_get_it(tmp_path):
 
 def test_the_built_in_room_is_written_and_read(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        sys, "argv", ["gaigs.data", str(tmp_path / "room"), "synthetic_csi", "--deepmimo", "transmitters=20"]
+        sys,
+        "argv",
+        ["gaigs.data", str(tmp_path / "room"), "synthetic_csi", "--deepmimo", "transmitters=20"],
     )
     main()
     links = deepmimo.read(tmp_path / "room", elements=[1, 1], subcarriers=1)
     receiver = Receiver("point", links.receivers[0].pose, Array.single())
     places = links.query.transmitters
-    (expected,) = synthetic.respond_in_parts(synthetic.ROOM, places, receiver, 6.4896e9, torch.zeros(1), 2)
+    (expected,) = synthetic.respond_in_parts(
+        synthetic.ROOM, places, receiver, 6.4896e9, torch.zeros(1), 2
+    )
     torch.testing.assert_close(links.labels, expected.to(torch.complex64), rtol=1e-3, atol=1e-7)
     arrays = {
-        key: np.load(tmp_path / "room" / f"{key}_t000_tx000_r001.npz")[key] for key in ("delay", "inter_pos", "rx_pos")
+        key: np.load(tmp_path / "room" / f"{key}_t000_tx000_r001.npz")[key]
+        for key in ("delay", "inter_pos", "rx_pos")
     }
-    ends = [np.broadcast_to(end, (20, 25, 1, 3)) for end in (arrays["rx_pos"][:, None, None], synthetic.POSE.position)]
+    ends = [
+        np.broadcast_to(end, (20, 25, 1, 3))
+        for end in (arrays["rx_pos"][:, None, None], synthetic.POSE.position)
+    ]
     points = np.where(np.isnan(arrays["inter_pos"]), ends[0], arrays["inter_pos"])
     legs = np.diff(np.concatenate((ends[1], points, ends[0]), 2), axis=2)
-    np.testing.assert_allclose(np.linalg.norm(legs, axis=-1).sum(2), arrays["delay"] * speed_of_light, rtol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(legs, axis=-1).sum(2), arrays["delay"] * speed_of_light, rtol=1e-4
+    )
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"delay": np.full((3, 2), 40.0)}, r"delay\[0, 0\]: expected a delay of 0 to 1 ms in seconds, got 40"),
-        ({"aod_el": np.full((3, 2), -20.0)}, r"aod_el\[0, 0\]: expected an angle from the z axis.*got -20"),
-        ({"phase": np.zeros((3, 1))}, r"expected the shape \(3, 2\) to power_t000.* of \(3, 2\), got \(3, 1\)"),
-        ({"power": np.full((3, 2), NAN)}, "expected a path to a user in power_t000_tx000_r001.npz, got none"),
-        ({"power": 1e-9 - 0 * np.array(matrices()["power"])}, "expected gains in dB, got 1e-09 to 1e-09 for all paths"),
-        ({"power": np.full((3, 2), "x")}, "cannot parse .*power_t000.*; expected an array 'power' of real numbers"),
+        (
+            {"delay": np.full((3, 2), 40.0)},
+            r"delay\[0, 0\]: expected a delay of 0 to 1 ms in seconds, got 40",
+        ),
+        (
+            {"aod_el": np.full((3, 2), -20.0)},
+            r"aod_el\[0, 0\]: expected an angle from the z axis.*got -20",
+        ),
+        (
+            {"phase": np.zeros((3, 1))},
+            r"expected the shape \(3, 2\) to power_t000.* of \(3, 2\), got \(3, 1\)",
+        ),
+        (
+            {"power": np.full((3, 2), NAN)},
+            "expected a path to a user in power_t000_tx000_r001.npz, got none",
+        ),
+        (
+            {"power": 1e-9 - 0 * np.array(matrices()["power"])},
+            "expected gains in dB, got 1e-09 to 1e-09 for all paths",
+        ),
+        (
+            {"power": np.full((3, 2), "x")},
+            "cannot parse .*power_t000.*; expected an array 'power' of real numbers",
+        ),
         ({"rx_pos": np.full((3, 3), 5e6)}, r"rx_pos\[0, 0\]: expected positions within 1e5 m"),
     ],
 )
@@ -185,8 +228,14 @@ def test_defects_are_named(folder, changes, message):
     [
         (None, r"cannot parse .*params\.json: FileNotFoundError"),
         ("{", r"cannot parse .*params\.json: JSONDecodeError"),
-        (json.dumps({"rt_params": {}}), "KeyError: 'frequency'; expected rt_params.frequency and txrx_sets"),
-        (json.dumps(params(rt_params={"frequency": 3.5})), r"rt_params.frequency must be a carrier in Hz.*in GHz\?"),
+        (
+            json.dumps({"rt_params": {}}),
+            "KeyError: 'frequency'; expected rt_params.frequency and txrx_sets",
+        ),
+        (
+            json.dumps(params(rt_params={"frequency": 3.5})),
+            r"rt_params.frequency must be a carrier in Hz.*in GHz\?",
+        ),
     ],
 )
 def test_defects_of_the_parameters_are_named(folder, content, message):
@@ -199,7 +248,10 @@ def test_defects_of_the_parameters_are_named(folder, content, message):
 
 @pytest.mark.parametrize(
     "names",
-    [("params.mat", "BS1_BS.mat", "BS1_UE_0-1024.mat"), ("O1_60.params.mat", "O1_60.1.CIR.mat", "O1_60.1.DoA.mat")],
+    [
+        ("params.mat", "BS1_BS.mat", "BS1_UE_0-1024.mat"),
+        ("O1_60.params.mat", "O1_60.1.CIR.mat", "O1_60.1.DoA.mat"),
+    ],
 )
 def test_scenarios_of_earlier_versions_are_named(tmp_path, names):
     scene = tmp_path / "scene_0"

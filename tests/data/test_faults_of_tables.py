@@ -46,13 +46,17 @@ def wide(tmp_path):
 def stations(names=STANDS, heading="name,x,y,z", factor=1.0):
     """The text of a table of gateways."""
     rows = zip(names, STANDS.values(), strict=True)
-    return "\n".join((heading, *(",".join((name, *(str(factor * x) for x in place))) for name, place in rows)))
+    return "\n".join(
+        (heading, *(",".join((name, *(str(factor * x) for x in place))) for name, place in rows))
+    )
 
 
 # --- marks of "not heard" ---
 
 
-@pytest.mark.parametrize("marks", [(0, 60, 102, -107), (-107,), (-107, -120), (-99, 99), (20,), (0, 1), (-113, -140)])
+@pytest.mark.parametrize(
+    "marks", [(0, 60, 102, -107), (-107,), (-107, -120), (-99, 99), (20,), (0, 1), (-113, -140)]
+)
 def test_several_marks_are_found_also_where_they_are_rare(marks):
     draw = np.random.default_rng(0)
     own = np.round(draw.normal(-65, 7, (150, 5))).clip(-85, -30)
@@ -68,17 +72,29 @@ def test_levels_that_repeat_are_no_marks():
     fading = np.where((np.arange(4) == 1) & (draw.random((60, 1)) < 0.04), -107.0, own)
     once = own.copy()
     once[3, 1] = min(own.min() - 6, -105)
-    for found in (weak, fading, np.where(own == own.min(), -91, own), np.linspace(-30, 20, 60)[:, None] + 0 * own):
+    for found in (
+        weak,
+        fading,
+        np.where(own == own.min(), -91, own),
+        np.linspace(-30, 20, 60)[:, None] + 0 * own,
+    ):
         assert marks_of(found) == []
 
 
-LONG = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm\n" + "".join(f"{k}.5,1.25,1,5,0,2,{-40 - k}.5\n" for k in range(9))
+LONG = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm\n" + "".join(
+    f"{k}.5,1.25,1,5,0,2,{-40 - k}.5\n" for k in range(9)
+)
 
 
 def test_marks_of_long_tables_are_named_and_may_be_several(tmp_path):
     file = tmp_path / "room.csv"
-    file.write_text(re.sub(r"-4[1-4]\.5", "60", LONG).replace("-40.5", "0").replace("-45.5", "-107"))
-    with pytest.raises(ValueError, match=r'got \'60\' .*\n0 and 60 seem to mean "not heard": list them in data.not_h'):
+    file.write_text(
+        re.sub(r"-4[1-4]\.5", "60", LONG).replace("-40.5", "0").replace("-45.5", "-107")
+    )
+    with pytest.raises(
+        ValueError,
+        match=r'got \'60\' .*\n0 and 60 seem to mean "not heard": list them in data.not_h',
+    ):
         rssi_csv.read(file)
     links = rssi_csv.read(file, not_heard=[0, 60, -107])
     assert links.labels.tolist() == [-46.5, -47.5, -48.5]
@@ -89,7 +105,8 @@ def test_marks_of_long_tables_are_named_and_may_be_several(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("separator", "point"), [(";", ","), (";", "."), ("\t", ","), ("|", "."), (" ", "."), (" ", ",")]
+    ("separator", "point"),
+    [(";", ","), (";", "."), ("\t", ","), ("|", "."), (" ", "."), (" ", ",")],
 )
 def test_every_reader_takes_the_same_separators(tmp_path, wide, rssi_folder, separator, point):
     other = lambda text: text.replace(",", separator).replace(".", point)
@@ -132,14 +149,18 @@ def test_levels_with_their_unit_are_read(tmp_path):
 def test_several_levels_in_a_cell_are_named(wide, second):
     cells = [[f"{level:g}{second}" for level in row] for row in levels()]
     with pytest.raises(
-        ValueError, match=r"line 2: expected one level \[dBm\] a cell, got '-45.-51', several numbers, in"
+        ValueError,
+        match=r"line 2: expected one level \[dBm\] a cell, got '-45.-51', several numbers, in",
     ):
         wide(survey(cells=cells))
 
 
 def test_one_column_for_x_and_y_is_named(wide):
     with pytest.raises(ValueError, match="column pos holds several numbers: give each its column"):
-        wide("pos,apA,apB\n" + "".join(f"{x} {y},-5{k % 10},-6{k % 9}\n" for k, (x, y) in enumerate(PLACES)))
+        wide(
+            "pos,apA,apB\n"
+            + "".join(f"{x} {y},-5{k % 10},-6{k % 9}\n" for k, (x, y) in enumerate(PLACES))
+        )
 
 
 # --- forms of tables, powers ---
@@ -149,17 +170,26 @@ def test_readers_of_long_and_wide_tables_name_each_other(tmp_path, wide):
     (tmp_path / "room.csv").write_text(survey())
     with pytest.raises(ValueError, match="a gateway a column takes data=rssi_wide"):
         rssi_csv.read(tmp_path / "room.csv")
-    with pytest.raises(ValueError, match=r"line 1: a table of a reading a line, .*; take data=rssi_csv"):
+    with pytest.raises(
+        ValueError, match=r"line 1: a table of a reading a line, .*; take data=rssi_csv"
+    ):
         wide(LONG)
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-3])
 def test_powers_are_no_levels(wide, unit):
     powers = unit * 10 ** (levels() / 10)
-    with pytest.raises(ValueError, match=r"got powers in W or mW in apA, apB, apC\nwrite 10 log10\(P / 1 mW\)"):
+    with pytest.raises(
+        ValueError, match=r"got powers in W or mW in apA, apB, apC\nwrite 10 log10\(P / 1 mW\)"
+    ):
         wide(survey(cells=powers))
-    cells = [[f"{row[0]}", *map(str, power[1:])] for row, power in zip(levels(), powers, strict=True)]
-    assert "columns ignored: apB (powers in W or mW?), apC (powers" in wide(survey(cells=cells)).remarks
+    cells = [
+        [f"{row[0]}", *map(str, power[1:])] for row, power in zip(levels(), powers, strict=True)
+    ]
+    assert (
+        "columns ignored: apB (powers in W or mW?), apC (powers"
+        in wide(survey(cells=cells)).remarks
+    )
 
 
 # --- coordinates ---
@@ -182,12 +212,20 @@ def test_degrees_among_metres_are_named(wide, heading, columns, options):
 
 
 def test_degrees_of_gateways_and_arrays_are_named(wide):
-    rows = [f"{name},{x:.7f},{y:.7f},2\n" for name, (x, y) in zip(STANDS, DEGREES[::16], strict=True)]
-    with pytest.raises(ValueError, match=r"aps\.csv: expected metres, got such as \(11\.573\d*, 48"):
+    rows = [
+        f"{name},{x:.7f},{y:.7f},2\n" for name, (x, y) in zip(STANDS, DEGREES[::16], strict=True)
+    ]
+    with pytest.raises(
+        ValueError, match=r"aps\.csv: expected metres, got such as \(11\.573\d*, 48"
+    ):
         wide(survey(), "name,x,y,z\n" + "".join(rows))
     places = np.column_stack((DEGREES, np.ones(40)))
-    with pytest.raises(ValueError, match=r"transmitters: expected metres, .* look like degrees\nconvert them"):
-        gaigs.links(task="rssi", transmitters=places, receivers=places[:1] + 1e-6, labels=levels()[:, :1])
+    with pytest.raises(
+        ValueError, match=r"transmitters: expected metres, .* look like degrees\nconvert them"
+    ):
+        gaigs.links(
+            task="rssi", transmitters=places, receivers=places[:1] + 1e-6, labels=levels()[:, :1]
+        )
 
 
 @pytest.mark.parametrize("span", [0.04, 1.0, 30.0, 1000.0])
@@ -205,17 +243,23 @@ def test_metres_far_from_the_origin_are_no_degrees(wide, span):
 )
 def test_metres_among_degrees_are_named(wide, heading, columns):
     with pytest.raises(
-        ValueError, match=r"span .* and .* degrees, beyond 100 km; if they are metres, name them x and y"
+        ValueError,
+        match=r"span .* and .* degrees, beyond 100 km; if they are metres, name them x and y",
     ):
         wide(survey(heading, columns))
-    with pytest.raises(ValueError, match=r"columns x and y span 7 and 4 degrees, .* without data\.epsg"):
+    with pytest.raises(
+        ValueError, match=r"columns x and y span 7 and 4 degrees, .* without data\.epsg"
+    ):
         wide(survey(), epsg=4326)
     assert wide(survey("lon [m],lat [m]", PLACES)).frame is None
 
 
 def test_coordinates_in_feet_are_scaled_once(wide):
     pytest.importorskip("pyproj")
-    plain, named = wide(survey("x,y", FEET), epsg=2263), wide(survey("x [ft],y [ft]", FEET), epsg=2263)
+    plain, named = (
+        wide(survey("x,y", FEET), epsg=2263),
+        wide(survey("x [ft],y [ft]", FEET), epsg=2263),
+    )
     assert plain.frame == named.frame
     assert plain.query.transmitters.tolist() == named.query.transmitters.tolist()
     metres = FEET[:, ::-1] * 0.3048 + np.array([5e5, 4e6])
@@ -233,17 +277,23 @@ def test_coordinates_in_feet_are_scaled_once(wide):
 )
 def test_a_heading_against_its_system_is_refused(wide, heading, epsg, kind):
     pytest.importorskip("pyproj")
-    with pytest.raises(ValueError, match=rf"line 1: column . \[c?m\] is in units of .*{kind}.*\nmend the heading"):
+    with pytest.raises(
+        ValueError, match=rf"line 1: column . \[c?m\] is in units of .*{kind}.*\nmend the heading"
+    ):
         wide(survey(heading, FEET), epsg=epsg)
 
 
 # --- gateways ---
 
 
-@pytest.mark.parametrize("names", [("ap A", "AP_B", "ap-c"), ("APA", "ap b", "ap:C"), ("apA", "apB", "ap C")])
+@pytest.mark.parametrize(
+    "names", [("ap A", "AP_B", "ap-c"), ("APA", "ap b", "ap:C"), ("apA", "apB", "ap C")]
+)
 def test_names_are_matched_without_blanks_and_case(wide, names):
     links = wide(survey(), stations(names))
-    assert [receiver.pose.position.tolist() for receiver in links.receivers] == [[*place] for place in STANDS.values()]
+    assert [receiver.pose.position.tolist() for receiver in links.receivers] == [
+        [*place] for place in STANDS.values()
+    ]
 
 
 def test_ambiguous_and_other_names_are_not_matched(wide):
@@ -252,7 +302,8 @@ def test_ambiguous_and_other_names_are_not_matched(wide):
     remarks = wide(survey(), stations(("apA", "apB", "appC"))).remarks
     assert "gateways of aps.csv without a column: 'appC' (did you mean 'apC'?)" in remarks
     with pytest.raises(
-        ValueError, match=r"none of its gateways is a column of survey.csv: x, y, z\nthe columns are apA"
+        ValueError,
+        match=r"none of its gateways is a column of survey.csv: x, y, z\nthe columns are apA",
     ):
         wide(survey(), stations(("x", "y", "z")))
 
@@ -265,7 +316,9 @@ def test_columns_of_the_folder_layout_are_matched_alike(rssi_folder):
     after = nerf2_rssi.read(rssi_folder)
     assert [each.name for each in after.receivers] == [each.name for each in before.receivers]
     file.write_text(text.replace("attic", "atic"))
-    with pytest.raises(ValueError, match=r"column 'atic' \(did you mean 'attic'\?\) has no position in"):
+    with pytest.raises(
+        ValueError, match=r"column 'atic' \(did you mean 'attic'\?\) has no position in"
+    ):
         nerf2_rssi.read(rssi_folder)
 
 
@@ -274,7 +327,9 @@ def test_gateways_in_another_unit_are_converted_or_named(wide, unit, factor):
     heading = f"name,x [{unit}],y [{unit}],z [{unit}]"
     links = wide(survey(), stations(heading=heading, factor=factor))
     np.testing.assert_allclose(links.receivers[1].pose.position, STANDS["apB"])
-    message = f"gateways of aps.csv are probably in {unit}: name the unit in its heading, as x [{unit}]"
+    message = (
+        f"gateways of aps.csv are probably in {unit}: name the unit in its heading, as x [{unit}]"
+    )
     assert message not in links.remarks
     assert message in wide(survey(), stations(factor=factor)).remarks
 

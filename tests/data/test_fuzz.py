@@ -1,4 +1,6 @@
-"""Damaged files of every reader: the links keep the contract and their bounds, or one error names the file."""
+"""Damaged files of every reader: the links keep the contract and their bounds, or one error names
+the file.
+"""
 
 import io
 import random
@@ -51,23 +53,45 @@ def files(request, tmp_path, reader):
             read = lambda: nerf2_rssi.read(str(root))
         case "rssi_csv":
             # The last column is no reader's, and its cells have quotes.
-            rows = [f'{k}.25,{k % 3},1.1,{k % 2}.5,2.7,2.2,-{50 + k}.5,"note, {k}"' for k in range(8)]
-            (tmp_path / "room.csv").write_text("\n".join(["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm,note", *rows]))
+            rows = [
+                f'{k}.25,{k % 3},1.1,{k % 2}.5,2.7,2.2,-{50 + k}.5,"note, {k}"' for k in range(8)
+            ]
+            (tmp_path / "room.csv").write_text(
+                "\n".join(["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm,note", *rows])
+            )
             (tmp_path / "walls.csv").write_text("x,y\n0,0\n4,0\n4,3.5\n")
-            read, root = lambda: rssi_csv.read(tmp_path / "room.csv", tmp_path / "walls.csv"), tmp_path
+            read, root = (
+                lambda: rssi_csv.read(tmp_path / "room.csv", tmp_path / "walls.csv"),
+                tmp_path,
+            )
         case "rssi_wide":
-            rows = [f"{k}.25;{k % 3};-{50 + k},5;{-60 - k if k % 2 else 100};note {k}" for k in range(8)]
+            rows = [
+                f"{k}.25;{k % 3};-{50 + k},5;{-60 - k if k % 2 else 100};note {k}" for k in range(8)
+            ]
             (tmp_path / "room.csv").write_text("\n".join(["x;y;door;hall;note", *rows]))
             (tmp_path / "aps.csv").write_text("name,x,y,z\ndoor,0,0,2\nhall,4,1,2\n")
-            read, root = lambda: rssi_wide.read(tmp_path / "room.csv", str(tmp_path / "aps.csv")), tmp_path
+            read, root = (
+                lambda: rssi_wide.read(tmp_path / "room.csv", str(tmp_path / "aps.csv")),
+                tmp_path,
+            )
         case "csi_npz":
             (tmp_path / "room.npz").write_bytes(channels())
             read, root = lambda: csi_npz.read(tmp_path / "room.npz"), tmp_path
         case "deepmimo":
             draw, root = np.random.default_rng(0), tmp_path
             points, gains = draw.uniform(1, 3, (10, 4, 1, 3)), draw.normal(size=(10, 4)) * 1e-3j
-            deepmimo.write(root, 3.5e9, draw.uniform(-3, 3, (10, 3)), [(np.array([0.0, 0.0, 2.5]), gains, points)])
-            for unread in (*root.glob("aoa*"), *root.glob("inter_pos*"), root / "objects.json", root / "vertices.npz"):
+            deepmimo.write(
+                root,
+                3.5e9,
+                draw.uniform(-3, 3, (10, 3)),
+                [(np.array([0.0, 0.0, 2.5]), gains, points)],
+            )
+            for unread in (
+                *root.glob("aoa*"),
+                *root.glob("inter_pos*"),
+                root / "objects.json",
+                root / "vertices.npz",
+            ):
                 unread.unlink()
             read = lambda: deepmimo.read(root, subcarriers=4)
     return read, sorted(file for file in root.rglob("*") if file.is_file())
@@ -78,15 +102,21 @@ def change_array(content, draw):
     with np.load(io.BytesIO(content)) as stored:
         name, arrays = draw.choice(stored.files), dict(stored)
     array = arrays.pop(name)
-    value = draw.choice([np.nan, np.inf, -1, 0, 1e300, -1e300, 1e38, 1e-45, 1e20, 99999.9999, 2**63 - 1])
-    dtype = draw.choice(["f2", "f4", "f8", "g", "c8", "G", "i1", "u8", "i8", "?", "U3", "S2", "M8[s]", "V8", "O"])
+    value = draw.choice(
+        [np.nan, np.inf, -1, 0, 1e300, -1e300, 1e38, 1e-45, 1e20, 99999.9999, 2**63 - 1]
+    )
+    dtype = draw.choice(
+        ["f2", "f4", "f8", "g", "c8", "G", "i1", "u8", "i8", "?", "U3", "S2", "M8[s]", "V8", "O"]
+    )
     match draw.randrange(4):
         case 0:
             array = array.astype(complex if name == "h" else float)
             array.flat[draw.randrange(array.size)] = value
         case 1 | 2 as kind:
             with np.errstate(all="ignore"):
-                array = (array.real if dtype[0] not in "cG" else array).astype("f8" if dtype[0] in "MV" else dtype)
+                array = (array.real if dtype[0] not in "cG" else array).astype(
+                    "f8" if dtype[0] in "MV" else dtype
+                )
             array = array[draw.randrange(2) :] if kind == 1 else array.reshape(-1)
         case 3:
             return saved(arrays)
@@ -100,7 +130,11 @@ def within(values, low, high):
 def check_links(links):
     check_data(links)
     places = [links.query.transmitters, links.edges]
-    places += [place for receiver in links.receivers for place in (receiver.pose.position, receiver.array.elements)]
+    places += [
+        place
+        for receiver in links.receivers
+        for place in (receiver.pose.position, receiver.array.elements)
+    ]
     assert all(within(place, -FAR, FAR) for place in places)
     labels = links.labels[torch.arange(len(links))]
     if links.task.name == "rssi":
@@ -123,7 +157,9 @@ def outcome(read, file):
     return message
 
 
-@pytest.mark.parametrize("reader", ["nerf2_spectrum", "nerf2_rssi", "rssi_csv", "rssi_wide", "csi_npz", "deepmimo"])
+@pytest.mark.parametrize(
+    "reader", ["nerf2_spectrum", "nerf2_rssi", "rssi_csv", "rssi_wide", "csi_npz", "deepmimo"]
+)
 def test_a_damaged_file_is_read_or_named(files, reader):
     read, paths = files
     whole = check_links(read())

@@ -1,4 +1,6 @@
-"""Physics of the simulated room: free space against Friis, paths against folded legs, blockers against samples."""
+"""Physics of the simulated room: free space against Friis, paths against folded legs, blockers
+against samples.
+"""
 
 import itertools
 import math
@@ -13,13 +15,22 @@ from gaigs.core.antenna import Array, Receiver
 from gaigs.core.geometry import Grid, Pose, from_spherical
 from gaigs.core.propagation import bartlett, fresnel
 from gaigs.data.synthetic import respond_in_parts
-from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, passes, permittivity, trace
+from gaigs.data.synthetic.image_source import (
+    Box,
+    Room,
+    frequency_offsets,
+    passes,
+    permittivity,
+    trace,
+)
 
 FREQUENCY = 3e9
 WAVELENGTH = speed_of_light / FREQUENCY
 CARRIER = torch.zeros(1)
 PATCHES = Array.planar(4, 4, WAVELENGTH / 2, "cosine")
-SCATTERED = Array(torch.tensor([[0.0, 0.0, 0.0], [0.04, -0.01, 0.02], [-0.03, 0.05, -0.06], [0.11, 0.02, 0.01]]))
+SCATTERED = Array(
+    torch.tensor([[0.0, 0.0, 0.0], [0.04, -0.01, 0.02], [-0.03, 0.05, -0.06], [0.11, 0.02, 0.01]])
+)
 """No two of its elements are as far apart, nor the same way."""
 
 WALLS = ("concrete", "glass", "plasterboard", "brick", "wood", "ceiling_board")
@@ -38,7 +49,8 @@ ROOM = Room(
 )
 RECEIVER = torch.tensor([0.4, 0.5, 2.6], dtype=torch.float64)
 TRANSMITTERS = torch.tensor(
-    [[5.9, 3.1, 1.2], [1.5, 3.4, 0.4], [4.3, 0.6, 2.2], [6.3, 4.4, 0.3], [1.7, 1.6, 0.5]], dtype=torch.float64
+    [[5.9, 3.1, 1.2], [1.5, 3.4, 0.4], [4.3, 0.6, 2.2], [6.3, 4.4, 0.3], [1.7, 1.6, 0.5]],
+    dtype=torch.float64,
 )
 
 
@@ -52,7 +64,10 @@ def patches(position, angles=(0.0, 0.0, 0.0)):
 
 def places(receiver):
     """Of the elements, world frame, in float64."""
-    return receiver.pose.position.double() + receiver.array.elements.double() @ receiver.pose.rotation.double().T
+    return (
+        receiver.pose.position.double()
+        + receiver.array.elements.double() @ receiver.pose.rotation.double().T
+    )
 
 
 def fold(points, size):
@@ -60,25 +75,35 @@ def fold(points, size):
     return size - np.abs(points % (2 * size) - size)
 
 
-@pytest.mark.parametrize("array", [PATCHES, SCATTERED, Array.single()], ids=["patches", "scattered", "single"])
+@pytest.mark.parametrize(
+    "array", [PATCHES, SCATTERED, Array.single()], ids=["patches", "scattered", "single"]
+)
 def test_free_space_follows_friis(array):
     receiver = Receiver("gateway1", pose((200.0, 200.0, 200.0)), array)
     for distance in (1.0, 3.7, 25.0):
         transmitter = receiver.pose.position + torch.tensor([0.0, 0.0, distance])
         ((response,),) = respond_in_parts(HALL, transmitter[None], receiver, FREQUENCY, CARRIER, 0)
         distances = (transmitter.double() - places(receiver)).norm(dim=-1)
-        expected = WAVELENGTH / (4 * math.pi * distances) * torch.exp(-2j * math.pi * distances / WAVELENGTH)
+        expected = (
+            WAVELENGTH
+            / (4 * math.pi * distances)
+            * torch.exp(-2j * math.pi * distances / WAVELENGTH)
+        )
         torch.testing.assert_close(response[:, 0], expected, rtol=1e-6, atol=0)
 
 
 def test_patches_do_not_hear_from_behind_and_fade_as_the_cosine():
     receiver = patches((200.0, 200.0, 200.0), (0, 90, 0))
     angles = torch.tensor([0.0, 60.0, 85.0, 95.0, 180.0]).deg2rad()
-    directions = torch.stack((angles.cos(), angles.sin(), 0 * angles), -1)  # the normal points along x
+    directions = torch.stack(
+        (angles.cos(), angles.sin(), 0 * angles), -1
+    )  # the normal points along x
     transmitters = receiver.pose.position + 20 * directions
     (responses,) = respond_in_parts(HALL, transmitters, receiver, FREQUENCY, CARRIER, 0)
     responses = responses.abs().mean((1, 2))
-    torch.testing.assert_close(responses / responses[0], angles.cos().clamp(min=0).double(), atol=1e-3, rtol=0)
+    torch.testing.assert_close(
+        responses / responses[0], angles.cos().clamp(min=0).double(), atol=1e-3, rtol=0
+    )
 
 
 @pytest.mark.parametrize("angles", [(0, 0, 0), (40, 125, 20), (-100, 60, 170)])
@@ -99,7 +124,10 @@ def test_a_band_is_sampled_finely_enough_for_its_longest_path():
     assert offsets[[0, -1]].tolist() == [-250e6, 250e6]
     spacing = (offsets[1] - offsets[0]).item()
     corners = torch.tensor([[0.01, 0.01, 0.01], [6.99, 4.99, 2.99]], dtype=torch.float64)
-    longest = max((trace(ROOM, corners, c, FREQUENCY, 2).images - c).norm(dim=-1).max().item() for c in corners)
+    longest = max(
+        (trace(ROOM, corners, c, FREQUENCY, 2).images - c).norm(dim=-1).max().item()
+        for c in corners
+    )
     assert spacing < speed_of_light / longest
 
 
@@ -108,12 +136,16 @@ def test_third_order_has_every_image_once():
     found = [tuple(np.floor(image / np.array(ROOM.size)).astype(int).tolist()) for image in images]
     expected = [c for c in itertools.product(range(-3, 4), repeat=3) if sum(map(abs, c)) <= 3]
     assert sorted(found) == sorted(expected)
-    np.testing.assert_allclose(fold(images, np.array(ROOM.size)), np.tile(TRANSMITTERS[0], (63, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        fold(images, np.array(ROOM.size)), np.tile(TRANSMITTERS[0], (63, 1)), atol=1e-12
+    )
     np.testing.assert_array_equal(images[0], TRANSMITTERS[0])
 
 
 def test_gains_are_those_of_the_reflection_points():
-    """Legs folded back into the room: each ends on a wall, and each bounce has that wall's coefficient at its angle."""
+    """Legs folded back into the room: each ends on a wall, and each bounce has that wall's
+    coefficient at its angle.
+    """
     empty = Room(ROOM.size, WALLS)
     size, start = np.array(ROOM.size), RECEIVER.numpy()
     paths = trace(empty, TRANSMITTERS, RECEIVER, FREQUENCY, 2)
@@ -123,17 +155,29 @@ def test_gains_are_those_of_the_reflection_points():
             crossings = []
             for axis, steps in enumerate(cell):
                 planes = range(1, steps + 1) if steps > 0 else range(0, steps, -1)
-                crossings += [((k * size[axis] - start[axis]) / (image - start)[axis], axis) for k in planes]
-            stops = [start, *(fold(start + t * (image - start), size) for t, _ in sorted(crossings)), fold(image, size)]
+                crossings += [
+                    ((k * size[axis] - start[axis]) / (image - start)[axis], axis) for k in planes
+                ]
+            stops = [
+                start,
+                *(fold(start + t * (image - start), size) for t, _ in sorted(crossings)),
+                fold(image, size),
+            ]
             legs = [b - a for a, b in itertools.pairwise(stops)]
-            assert sum(map(np.linalg.norm, legs)) == pytest.approx(np.linalg.norm(image - start), rel=1e-12)
+            assert sum(map(np.linalg.norm, legs)) == pytest.approx(
+                np.linalg.norm(image - start), rel=1e-12
+            )
             expected = 1
-            for stop, (_, axis), before, after in zip(stops[1:], sorted(crossings), legs, legs[1:], strict=False):
+            for stop, (_, axis), before, after in zip(
+                stops[1:], sorted(crossings), legs, legs[1:], strict=False
+            ):
                 side = round(stop[axis] / size[axis])
                 assert stop[axis] == pytest.approx(side * size[axis], abs=1e-9)
                 cosine = abs(before[axis]) / np.linalg.norm(before)
                 assert cosine == pytest.approx(abs(after[axis]) / np.linalg.norm(after))
-                te, tm = fresnel(permittivity(WALLS[2 * axis + side], FREQUENCY), torch.tensor([cosine]))
+                te, tm = fresnel(
+                    permittivity(WALLS[2 * axis + side], FREQUENCY), torch.tensor([cosine])
+                )
                 expected = expected * (tm if axis == 2 else te).item()
             assert gain.item() == pytest.approx(expected, rel=1e-9)
 
@@ -156,7 +200,9 @@ def test_furniture_takes_its_loss_on_every_leg():
     assert 0.2 < (losses_db > 0).double().mean() < 0.95  # both kinds of paths are there
 
 
-@pytest.mark.parametrize("array", [PATCHES, SCATTERED, Array.single()], ids=["patches", "scattered", "single"])
+@pytest.mark.parametrize(
+    "array", [PATCHES, SCATTERED, Array.single()], ids=["patches", "scattered", "single"]
+)
 @pytest.mark.parametrize("frequency", [FREQUENCY, 1.1e9])
 def test_spectrum_is_the_mean_power_of_steered_sums(array, frequency):
     """Against the formula of the labels, element by element in the array's own frame."""
@@ -164,7 +210,9 @@ def test_spectrum_is_the_mean_power_of_steered_sums(array, frequency):
     grid = Grid.degrees((1, 37, 90), (0, 123, 359))
     spectra = bartlett(torch.from_numpy(responses), grid, array, frequency)
     x, y, z = array.elements.double().numpy().T
-    for (i, el), (j, az) in itertools.product(enumerate(np.deg2rad((1, 37, 90))), enumerate(np.deg2rad((0, 123, 359)))):
+    for (i, el), (j, az) in itertools.product(
+        enumerate(np.deg2rad((1, 37, 90))), enumerate(np.deg2rad((0, 123, 359)))
+    ):
         delay = x * np.cos(az) * np.cos(el) + y * np.sin(az) * np.cos(el) + z * np.sin(el)
         weights = np.exp(-2j * np.pi * frequency / speed_of_light * delay)
         expected = np.sqrt((np.abs(np.einsum("bnf,n->bf", responses, weights)) ** 2).mean(1))
@@ -200,16 +248,33 @@ def test_permittivity_is_that_of_the_recommendation():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"room": Room(ROOM.size, ("marzipan",) * 6)}, "unknown material 'marzipan'; there are: concrete, brick"),
-        ({"frequency": 920e6}, r"frequency must lie in 1e9\.\.40e9 Hz, where materials are tabulated, got 9\.2e\+08"),
+        (
+            {"room": Room(ROOM.size, ("marzipan",) * 6)},
+            "unknown material 'marzipan'; there are: concrete, brick",
+        ),
+        (
+            {"frequency": 920e6},
+            r"frequency must lie in 1e9\.\.40e9 Hz, where materials are tabulated, got 9\.2e\+08",
+        ),
         ({"offsets": torch.tensor([-4e9])}, "frequencies must be positive"),
         ({"order": -1}, "order must be the largest number of reflections, 0 or more, got -1"),
-        ({"transmitters": torch.tensor([[1.0, 1.0, 3.5]])}, r"inside the room of .* got \[1\.0, 1\.0, 3\.5\]"),
-        ({"transmitters": torch.tensor([[3.2, 2.7, 1.0]])}, r"outside its furniture, got \[3\.2, 2\.7, 1\.0\]"),
+        (
+            {"transmitters": torch.tensor([[1.0, 1.0, 3.5]])},
+            r"inside the room of .* got \[1\.0, 1\.0, 3\.5\]",
+        ),
+        (
+            {"transmitters": torch.tensor([[3.2, 2.7, 1.0]])},
+            r"outside its furniture, got \[3\.2, 2\.7, 1\.0\]",
+        ),
         ({"transmitters": torch.tensor([[math.nan, 1.0, 1.0]])}, "inside the room"),
     ],
 )
 def test_impossible_scenes_are_refused(change, message):
-    scene = {"room": ROOM, "transmitters": TRANSMITTERS, "receiver": patches(RECEIVER.tolist()), "frequency": FREQUENCY}
+    scene = {
+        "room": ROOM,
+        "transmitters": TRANSMITTERS,
+        "receiver": patches(RECEIVER.tolist()),
+        "frequency": FREQUENCY,
+    }
     with pytest.raises(ValueError, match=message):
         next(respond_in_parts(**scene | {"offsets": CARRIER, "order": 1} | change))

@@ -20,14 +20,25 @@ def read(folder, split=OFFICIAL, **options):
 def named(links, index=slice(None)):
     """Links as (x of the transmitter, gateway, label)."""
     names = [links.receivers[k].name for k in links.query.receivers[index].tolist()]
-    return [*zip(links.query.transmitters[index, 0].tolist(), names, links.labels[index].tolist(), strict=True)]
+    return [
+        *zip(
+            links.query.transmitters[index, 0].tolist(),
+            names,
+            links.labels[index].tolist(),
+            strict=True,
+        )
+    ]
 
 
 def test_every_reading_that_was_heard_is_a_link(rssi_folder):
     links = read(rssi_folder)
-    rows = [map(float, line.split(",")) for line in (rssi_folder / RSSI).read_text().splitlines()[1:]]
+    rows = [
+        map(float, line.split(",")) for line in (rssi_folder / RSSI).read_text().splitlines()[1:]
+    ]
     cells = [
-        (k + 0.5, *cell) for k, row in enumerate(rows) for cell in zip(("west", "east", "attic"), row, strict=True)
+        (k + 0.5, *cell)
+        for k, row in enumerate(rows)
+        for cell in zip(("west", "east", "attic"), row, strict=True)
     ]
     assert named(links) == [cell for cell in cells if cell[2] > -100]
     assert links.query.transmitters[6].tolist() == [4.5, -4, 0.25]
@@ -40,7 +51,10 @@ def test_every_reading_that_was_heard_is_a_link(rssi_folder):
     assert links.split.train.tolist() == [0, 1, 2, 3, 6, 7, 8]
     assert links.split.test.tolist() == [4, 5, 9, 10, 11]
     assert links.edges.shape == (0, 2, 3)
-    assert links.remarks == "12 readings of 6 rows at 3 gateways; 6 of -100 dBm were not heard and are left out"
+    assert (
+        links.remarks
+        == "12 readings of 6 rows at 3 gateways; 6 of -100 dBm were not heard and are left out"
+    )
     check_data(links)
 
 
@@ -75,7 +89,11 @@ def test_index_files_of_rows_and_gateways(rssi_folder, train, test):
     (rssi_folder / "train_index.txt").write_text(train)
     (rssi_folder / "test_index.txt").write_text(test)
     links = read(rssi_folder)
-    assert named(links, links.split.train) == [(0.5, "west", -50.5), (0.5, "east", -61), (5.5, "attic", -90)]
+    assert named(links, links.split.train) == [
+        (0.5, "west", -50.5),
+        (0.5, "east", -61),
+        (5.5, "attic", -90),
+    ]
     assert named(links, links.split.test) == [(2.5, "east", -65), (5.5, "west", -60)]
 
 
@@ -89,7 +107,9 @@ def test_gateways_named_by_numbers_are_never_taken_for_columns(rssi_folder):
     assert named(links, links.split.train) == [(0.5, "1", -50.5), (4.5, "010", -88)]
     assert named(links, links.split.test) == [(0.5, "2", -61)]
     (rssi_folder / "test_index.txt").write_text("0 0\n")
-    with pytest.raises(ValueError, match=r"line 1: expected a row in 0\.\.5, or a row and a gateway, got '0 0'"):
+    with pytest.raises(
+        ValueError, match=r"line 1: expected a row in 0\.\.5, or a row and a gateway, got '0 0'"
+    ):
         read(rssi_folder)
 
 
@@ -152,7 +172,9 @@ def flat(measured, configured):
 
 
 def test_measured_flat_scores_as_known(flat):
-    """The mean of each gateway and its 20 nearest readings err by 6.28 and 4.16 dB on the robot's own test run."""
+    """The mean of each gateway and its 20 nearest readings err by 6.28 and 4.16 dB on the robot's
+    own test run.
+    """
     check_data(flat)
     assert flat.split.name == "official, validation 0.1 in runs of 100, seed 0"
     assert len(flat.split.test) == 6 * 719
@@ -163,11 +185,13 @@ def test_measured_flat_scores_as_known(flat):
     for k in range(6):
         near, far = (part[flat.query.receivers[part] == k] for part in (known, test))
         labels = flat.labels[near]
-        distances, nearest = torch.cdist(flat.query.transmitters[far], flat.query.transmitters[near]).topk(
-            20, largest=False
-        )
+        distances, nearest = torch.cdist(
+            flat.query.transmitters[far], flat.query.transmitters[near]
+        ).topk(20, largest=False)
         weights = 1 / distances.clamp(min=1e-6)
-        errors["knn"].append(((weights * labels[nearest]).sum(1) / weights.sum(1) - flat.labels[far]).abs())
+        errors["knn"].append(
+            ((weights * labels[nearest]).sum(1) / weights.sum(1) - flat.labels[far]).abs()
+        )
         errors["mean"].append((labels.mean() - flat.labels[far]).abs())
     assert torch.cat(errors["mean"]).mean().item() == pytest.approx(6.28, abs=0.01)
     assert torch.cat(errors["knn"]).mean().item() == pytest.approx(4.16, abs=0.01)

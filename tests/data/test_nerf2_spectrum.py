@@ -45,8 +45,12 @@ def test_links_are_read_as_written(spectrum_folder):
     np.testing.assert_allclose(
         receiver.pose.rotation, Rotation.from_quat([0.5, -0.5, -0.5, 0.5]).as_matrix(), atol=1e-6
     )
-    assert torch.rad2deg(links.task.directions.elevations)[[0, -1]].tolist() == pytest.approx([1, 90])
-    assert torch.rad2deg(links.task.directions.azimuths)[[0, -1]].tolist() == pytest.approx([0, 359])
+    assert torch.rad2deg(links.task.directions.elevations)[[0, -1]].tolist() == pytest.approx(
+        [1, 90]
+    )
+    assert torch.rad2deg(links.task.directions.azimuths)[[0, -1]].tolist() == pytest.approx(
+        [0, 359]
+    )
     labels = links.labels[torch.tensor([4, 0, 4])]
     np.testing.assert_allclose(labels, np.stack([pixels(5), pixels(1), pixels(5)]) / 255, atol=1e-7)
     check_data(links)
@@ -84,7 +88,10 @@ def test_an_unknown_array_or_carrier_is_a_single_antenna(spectrum_folder):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"elements": [4]}, r"elements must be the array's rows and columns, such as \[4, 4\], or null, got \[4\]"),
+        (
+            {"elements": [4]},
+            r"elements must be the array's rows and columns, such as \[4, 4\], or null, got \[4\]",
+        ),
         ({"bandwidth": -1.0}, "bandwidth must be that of a band, 0 or more .*, got -1"),
         ({"frequency": 0.0}, r"frequency must be a carrier in Hz, from 10000 to 3e\+11, got 0$"),
         ({"frequency": 920}, r"got 920; in MHz\?$"),
@@ -104,8 +111,13 @@ def test_carriers_of_a_file_are_each_links_own(spectrum_folder):
     assert links.remarks == "3 carriers of freq.txt, 900 to 930 MHz"
     again = read(spectrum_folder, frequency=None)
     assert torch.equal(again.query.frequencies, links.query.frequencies)
-    extent = again.receivers[0].array.elements[:, 0].max() - again.receivers[0].array.elements[:, 0].min()
-    assert extent.item() == pytest.approx(3 * speed_of_light / 930e6 / 2), "half a wavelength of the highest"
+    extent = (
+        again.receivers[0].array.elements[:, 0].max()
+        - again.receivers[0].array.elements[:, 0].min()
+    )
+    assert extent.item() == pytest.approx(3 * speed_of_light / 930e6 / 2), (
+        "half a wavelength of the highest"
+    )
     check_data(links)
 
 
@@ -178,7 +190,10 @@ def test_written_links_read_back(links, tmp_path):
 def test_carriers_are_written_and_those_of_one_place_share_a_row(links, tmp_path):
     places = links.query.transmitters[[0, 1, 2, 0, 1]]
     carriers = torch.tensor([1e4, 868.3e6, 2.441e9, 6.4896e9, 3e11])
-    write(tmp_path / "room", changed(links, query=changed(links.query, transmitters=places, frequencies=carriers)))
+    write(
+        tmp_path / "room",
+        changed(links, query=changed(links.query, transmitters=places, frequencies=carriers)),
+    )
     again = read(tmp_path / "room", frequency=None)
     assert torch.equal(again.query.frequencies, carriers)
     assert again.rows.tolist() == [0, 1, 2, 0, 1]
@@ -186,9 +201,12 @@ def test_carriers_are_written_and_those_of_one_place_share_a_row(links, tmp_path
 
 def test_other_labels_are_not_written(links, tmp_path):
     grid = Grid.degrees(range(1, 10))
-    coarse = changed(links, task=Spectrum(grid.elevations, grid.azimuths, "none"), labels=links.labels[:, :9])
+    coarse = changed(
+        links, task=Spectrum(grid.elevations, grid.azimuths, "none"), labels=links.labels[:, :9]
+    )
     with pytest.raises(
-        ValueError, match=r"90 x 360 directions at one receiver, got labels of spectrum \(9, 360\) at 1"
+        ValueError,
+        match=r"90 x 360 directions at one receiver, got labels of spectrum \(9, 360\) at 1",
     ):
         write(tmp_path / "room", coarse)
     with pytest.raises(ValueError, match=r"got labels of rssi \(\) at 1"):
@@ -199,21 +217,28 @@ def test_other_labels_are_not_written(links, tmp_path):
 
 
 def test_measured_sample_scores_as_published(measured):
-    """The mean training spectrum and the three nearest ones score 0.67 and 0.974 on the published split."""
+    """The mean training spectrum and the three nearest ones score 0.67 and 0.974 on the published
+    split.
+    """
     root = measured("rfid-s23-200")
     links = read(root)
     train, test = links.split.train, links.split.test
     assert (len(train), len(test)) == (160, 40)
     assert {len(links), len(links.labels)} == {200}
-    np.testing.assert_array_equal(links.labels[torch.tensor([6])][0] * 255, imread(root / "spectrum" / "00007.png"))
-    labels, known = links.labels[test], links.labels[train]
-    distances, nearest = torch.cdist(links.query.transmitters[test], links.query.transmitters[train]).topk(
-        3, largest=False
+    np.testing.assert_array_equal(
+        links.labels[torch.tensor([6])][0] * 255, imread(root / "spectrum" / "00007.png")
     )
+    labels, known = links.labels[test], links.labels[train]
+    distances, nearest = torch.cdist(
+        links.query.transmitters[test], links.query.transmitters[train]
+    ).topk(3, largest=False)
     weights = 1 / distances
     guesses = torch.einsum("bk,bkij->bij", weights / weights.sum(1, keepdim=True), known[nearest])
     score = lambda predictions: np.median(
-        [structural_similarity(a.numpy(), b.numpy(), data_range=1) for a, b in zip(labels, predictions, strict=True)]
+        [
+            structural_similarity(a.numpy(), b.numpy(), data_range=1)
+            for a, b in zip(labels, predictions, strict=True)
+        ]
     )
     assert score(known.mean(0).expand(40, -1, -1)) == pytest.approx(0.67, abs=0.01)
     assert score(guesses) == pytest.approx(0.974, abs=0.002)

@@ -25,7 +25,9 @@ tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,rss_dbm
 3.5,1,1,0,0,2.5,-100.0
 4.5,1,1,0,0,2.5,-53
 """
-"""A transmitter at four places, heard at two: six readings that were heard, two of them repeated, and two not."""
+"""A transmitter at four places, heard at two: six readings that were heard, two of them repeated,
+and two not.
+"""
 
 BACK = FORTH.replace("tx_x,tx_y,tx_z,rx_x,rx_y,rx_z", "rx_x,rx_y,rx_z,tx_x,tx_y,tx_z")
 """The same, but the one that moves is the receiver."""
@@ -45,13 +47,24 @@ def file(tmp_path):
 def named(links):
     """Links as (x of the moving end, fixed end, label)."""
     names = [links.receivers[k].name for k in links.query.receivers.tolist()]
-    return [*zip(links.query.transmitters[:, 0].tolist(), names, links.labels.tolist(), strict=True)]
+    return [
+        *zip(links.query.transmitters[:, 0].tolist(), names, links.labels.tolist(), strict=True)
+    ]
 
 
-HEARD = [(1.5, 1, -40), (1.5, 2, -50.25), (2.5, 1, -41), (3.5, 1, -42), (2.5, 1, -43), (4.5, 2, -53)]
+HEARD = [
+    (1.5, 1, -40),
+    (1.5, 2, -50.25),
+    (2.5, 1, -41),
+    (3.5, 1, -42),
+    (2.5, 1, -43),
+    (4.5, 2, -53),
+]
 
 
-@pytest.mark.parametrize(("text", "end", "moving"), [(FORTH, "rx", "transmitter"), (BACK, "tx", "receiver")])
+@pytest.mark.parametrize(
+    ("text", "end", "moving"), [(FORTH, "rx", "transmitter"), (BACK, "tx", "receiver")]
+)
 def test_the_end_with_fewer_places_is_the_fixed_one(file, text, end, moving):
     file.write_text(text)
     links = read(file)
@@ -72,11 +85,18 @@ def test_the_end_with_fewer_places_is_the_fixed_one(file, text, end, moving):
 def test_the_fixed_end_can_be_chosen(file):
     links = read(file, fixed="tx")
     assert [r.name for r in links.receivers] == ["tx1", "tx2", "tx3", "tx4"]
-    assert [r.pose.position.tolist() for r in links.receivers] == [[x, 1, 1] for x in (1.5, 2.5, 3.5, 4.5)]
+    assert [r.pose.position.tolist() for r in links.receivers] == [
+        [x, 1, 1] for x in (1.5, 2.5, 3.5, 4.5)
+    ]
     assert links.query.transmitters[:2].tolist() == [[5, 0, 2], [0, 0, 2.5]]
-    assert links.remarks.startswith("6 readings of a moving receiver at 4 places of a fixed transmitter;")
+    assert links.remarks.startswith(
+        "6 readings of a moving receiver at 4 places of a fixed transmitter;"
+    )
     assert read(file, fixed="rx").remarks == read(file).remarks
-    with pytest.raises(ValueError, match="fixed must be tx or rx, or null for the end with fewer places, got 'both'"):
+    with pytest.raises(
+        ValueError,
+        match="fixed must be tx or rx, or null for the end with fewer places, got 'both'",
+    ):
         read(file, fixed="both")
     with pytest.raises(TypeError, match="'not_heard' must be a finite number or a list, got nan"):
         read(file, not_heard=math.nan)

@@ -29,7 +29,11 @@ def table(heading=("x", "y"), mark="100", separator=",", point=".", columns=None
     """The text of a survey: coordinates, then levels with a mark where nothing was heard."""
     rows = [separator.join((*heading, *before, *GATEWAYS))]
     for place, own in zip(PLACES if columns is None else columns, levels(), strict=True):
-        cells = [*map(str, place), *before, *(mark if np.isnan(level) else f"{level:g}" for level in own)]
+        cells = [
+            *map(str, place),
+            *before,
+            *(mark if np.isnan(level) else f"{level:g}" for level in own),
+        ]
         rows.append(separator.join(cell.replace(".", point) for cell in cells))
     return "\n".join(rows) + "\n"
 
@@ -84,7 +88,9 @@ def test_degrees_become_metres_of_utm(survey):
     links = survey(table(("lat", "lon"), columns=columns))
     assert links.frame.epsg == 32632
     corner = torch.tensor([links.frame.x, links.frame.y]) + links.query.transmitters[0, :2]
-    back = pyproj.Transformer.from_crs(32632, 4326, always_xy=True).transform(*corner.double().tolist())
+    back = pyproj.Transformer.from_crs(32632, 4326, always_xy=True).transform(
+        *corner.double().tolist()
+    )
     np.testing.assert_allclose(back, columns[0][::-1], atol=1e-5)
     span = links.query.transmitters.amax(0) - links.query.transmitters.amin(0)
     torch.testing.assert_close(span[:2], torch.tensor([7.0, 4.0]), atol=0.3, rtol=0)
@@ -109,9 +115,14 @@ def test_uji_indoor_loc_is_read_as_it_is(survey):
     assert [receiver.name for receiver in links.receivers] == ["WAP001", "WAP002"]
     assert links.query.transmitters[:, 2].unique().tolist() == [1, 4]
     assert links.labels[links.query.receivers == 0].tolist() == [-42 - k for k in range(40)]
-    assert links.noises.unique().tolist() == pytest.approx([(80 * 4 / 67) ** 0.5 / 2**0.5], rel=0.01)
+    assert links.noises.unique().tolist() == pytest.approx(
+        [(80 * 4 / 67) ** 0.5 / 2**0.5], rel=0.01
+    )
     assert "gateways that heard nothing are left out: WAP003" in links.remarks
-    assert "columns ignored: BUILDINGID, SPACEID, RELATIVEPOSITION, USERID, PHONEID, TIMESTAMP" in links.remarks
+    assert (
+        "columns ignored: BUILDINGID, SPACEID, RELATIVEPOSITION, USERID, PHONEID, TIMESTAMP"
+        in links.remarks
+    )
 
 
 @pytest.mark.parametrize("name", ["aps.csv", "aps.yml"])
@@ -121,13 +132,18 @@ def test_places_of_gateways_come_from_a_file_or_from_training_links(survey, tmp_
     yml = "".join(f'"{key}": [{x}, {y}, {z}]\n' for key, (x, y, z) in known.items())
     (tmp_path / name).write_text("MAC,x,y,z\n" + "\n".join(rows) if name.endswith("csv") else yml)
     links = survey(table(), gateways=str(tmp_path / name))
-    assert [receiver.pose.position.tolist() for receiver in links.receivers[:2]] == [[*p] for p in known.values()]
+    assert [receiver.pose.position.tolist() for receiver in links.receivers[:2]] == [
+        [*p] for p in known.values()
+    ]
     assert links.uncertainties.tolist() == [0, 0, float("inf")]
     split = divide(links, {"name": "random"})
     place, deviation = split.receivers[2].pose.position, split.uncertainties[2].item()
     assert (place[:2] - torch.tensor([2.0, 4.5])).norm() < 1
     assert 0 < deviation < 2
-    assert re.search(r"places of 1 receivers are estimated from the training links, .* m: 00:cd:1c \d", split.remarks)
+    assert re.search(
+        r"places of 1 receivers are estimated from the training links, .* m: 00:cd:1c \d",
+        split.remarks,
+    )
 
 
 def test_test_links_do_not_move_a_gateway(survey, tmp_path):
@@ -152,7 +168,9 @@ def test_links_that_calibrate_do_not_move_a_gateway(survey):
 
 def test_receivers_without_training_links_are_left_out(survey):
     text = table(before=("-55",)).replace("x,y,-55", "x,y,rare").splitlines()
-    links = survey("\n".join([text[0], *(line.replace(",-55,", ",,", 1) for line in text[1:-1]), text[-1]]))
+    links = survey(
+        "\n".join([text[0], *(line.replace(",-55,", ",,", 1) for line in text[1:-1]), text[-1]])
+    )
     seeds = [divide(links, {"name": "random", "seed": seed}) for seed in range(6)]
     counts = {len(links.receivers) for links in seeds}
     assert counts == {3, 4}
@@ -165,10 +183,16 @@ def test_an_estimated_place_is_as_far_off_as_it_says():
     draw = torch.Generator().manual_seed(0)
     errors, deviations = [], []
     for _ in range(20):
-        places = torch.rand(40, 3, generator=draw) * torch.tensor([20.0, 12.0, 0.0]) + torch.tensor([0, 0, 1.0])
-        truth = torch.rand(3, generator=draw) * torch.tensor([20.0, 12.0, 0.0]) + torch.tensor([0, 0, 2.5])
+        places = torch.rand(40, 3, generator=draw) * torch.tensor([20.0, 12.0, 0.0]) + torch.tensor(
+            [0, 0, 1.0]
+        )
+        truth = torch.rand(3, generator=draw) * torch.tensor([20.0, 12.0, 0.0]) + torch.tensor(
+            [0, 0, 2.5]
+        )
         apart = (places - truth).norm(dim=1)
-        place, deviation = estimate_place(places, -40 - 28 * apart.log10() + 3 * torch.randn(40, generator=draw))
+        place, deviation = estimate_place(
+            places, -40 - 28 * apart.log10() + 3 * torch.randn(40, generator=draw)
+        )
         errors.append((place - truth).norm().item())
         deviations.append(deviation)
     assert np.median(errors) < 2
@@ -196,7 +220,11 @@ def test_marks_are_found_and_levels_are_not():
 DEFECTS = [
     ("0.25,0.25,", "0.25,abc,", "line 2: expected a finite number, got 'abc' in column y"),
     ("x,y,00:cd:1a", "x,y,00:cd:1b", "line 1: expected each column once, got '00:cd:1b' 2 times"),
-    ("x,y", "a,b", "line 1: expected columns x and y, easting and northing, or longitude and latitude"),
+    (
+        "x,y",
+        "a,b",
+        "line 1: expected columns x and y, easting and northing, or longitude and latitude",
+    ),
     ("0.25,1.25,", "0.25,1.25,-515,", "line 3: expected 5 columns"),
 ]
 
@@ -212,10 +240,15 @@ def test_a_defect_is_named_with_its_place(survey, old, new, message):
 def test_one_level_out_of_bounds_is_an_error(survey):
     text = table().splitlines()
     text[4] = re.sub(r"-\d+", "-515", text[4], count=1)
-    with pytest.raises(ValueError, match=r"line 5: expected a level from -150 to 30 dBm \(100 where .* got '-515' in"):
+    with pytest.raises(
+        ValueError,
+        match=r"line 5: expected a level from -150 to 30 dBm \(100 where .* got '-515' in",
+    ):
         survey("\n".join(text))
     positive = re.sub(r"(?<=,)-", "", table())
-    with pytest.raises(ValueError, match=r"expected columns of levels .* write levels with their sign"):
+    with pytest.raises(
+        ValueError, match=r"expected columns of levels .* write levels with their sign"
+    ):
         survey(positive)
 
 
@@ -223,9 +256,15 @@ def test_places_of_gateways_in_yaml_have_the_units_of_the_table(survey, tmp_path
     (tmp_path / "aps.yml").write_text(
         "".join(f'"{key}": [{100 * x}, {100 * y}]\n' for key, (x, y, _) in GATEWAYS.items())
     )
-    links = survey(table(("x [cm]", "y [cm]"), columns=100 * PLACES), gateways=str(tmp_path / "aps.yml"), height=1.5)
+    links = survey(
+        table(("x [cm]", "y [cm]"), columns=100 * PLACES),
+        gateways=str(tmp_path / "aps.yml"),
+        height=1.5,
+    )
     expected = [[x, y, 1.5] for x, y, _ in GATEWAYS.values()]
-    torch.testing.assert_close(torch.stack([each.pose.position for each in links.receivers]), torch.tensor(expected))
+    torch.testing.assert_close(
+        torch.stack([each.pose.position for each in links.receivers]), torch.tensor(expected)
+    )
 
 
 def test_a_latitude_is_no_x(survey):

@@ -1,4 +1,6 @@
-"""Simulated rooms, built-in and traced: options out of range, seeds, and the command that writes them."""
+"""Simulated rooms, built-in and traced: options out of range, seeds, and the command that writes
+them.
+"""
 
 import sys
 
@@ -23,20 +25,40 @@ def simulate(data, **options):
 @pytest.mark.parametrize(
     ("data", "options", "message"),
     [
-        ("synthetic", {"transmitters": 1}, "transmitters must be at least 2, one to train and one to test on, got 1"),
+        (
+            "synthetic",
+            {"transmitters": 1},
+            "transmitters must be at least 2, one to train and one to test on, got 1",
+        ),
         ("synthetic", {"spectrum": "lobes"}, "spectrum must be 'band' or 'carrier', got 'lobes'"),
         ("synthetic", {"bandwidth": 0}, "bandwidth must be positive"),
-        ("synthetic", {"frequency": []}, r"frequency must be a carrier or several different ones \[Hz\], got \[\]"),
+        (
+            "synthetic",
+            {"frequency": []},
+            r"frequency must be a carrier or several different ones \[Hz\], got \[\]",
+        ),
         ("synthetic", {"frequency": [5e9, -1.0]}, "frequency must be a carrier in Hz, .* got -1$"),
         ("synthetic", {"frequency": [6e9, "5e9"]}, "frequency'.* must be a number"),
         ("synthetic", {"frequency": [5e9, 50e9]}, r"frequency must lie in 1e9\.\.40e9 Hz"),
         ("synthetic", {"order": -1}, "order must be the largest number of reflections"),
-        ("synthetic_rssi", {"noise": -1.0}, r"noise must be a standard deviation, 0 or more \[dB\], got -1"),
-        ("synthetic_rssi", {"sensitivity": 0.0}, "sensitivity must let each .* 'west' hears none of 4 at 0 dBm; lower"),
+        (
+            "synthetic_rssi",
+            {"noise": -1.0},
+            r"noise must be a standard deviation, 0 or more \[dB\], got -1",
+        ),
+        (
+            "synthetic_rssi",
+            {"sensitivity": 0.0},
+            "sensitivity must let each .* 'west' hears none of 4 at 0 dBm; lower",
+        ),
         ("synthetic_csi", {"subcarriers": 0}, "subcarriers must be at least 1, got 0"),
         ("synthetic_csi", {"bandwidth": 0.0}, r"bandwidth must be positive \[Hz\], got 0.0"),
         ("synthetic_csi", {"bandwidth": 14e9}, "must have positive, finite frequencies"),
-        ("sionna", {"room": "round"}, "room must be one of l_shape, slanted, furnished, got 'round'"),
+        (
+            "sionna",
+            {"room": "round"},
+            "room must be one of l_shape, slanted, furnished, got 'round'",
+        ),
         ("sionna", {"transmitters": 1}, "transmitters must be at least 2"),
     ],
 )
@@ -64,7 +86,9 @@ def command(monkeypatch, *arguments):
 
 def check_same(found, expected):
     torch.testing.assert_close(found.query.transmitters, expected.query.transmitters)
-    torch.testing.assert_close(found.receivers[0].pose.position, expected.receivers[0].pose.position)
+    torch.testing.assert_close(
+        found.receivers[0].pose.position, expected.receivers[0].pose.position
+    )
     assert found.query.receivers.tolist() == expected.query.receivers.tolist()
     index = torch.arange(len(expected))
     tolerance = 0.5 / 255 + 1e-6 if expected.task.name == "spectrum" else 0
@@ -77,39 +101,64 @@ def test_the_command_writes_each_label_in_its_layout(request, tmp_path, monkeypa
         request.getfixturevalue("tracer")
     options = ROOMS_OF[room]
     meshes = (
-        synthetic.wavefront_obj(synthetic.ROOM) if room == "synthetic" else wavefront_obj(ROOMS["slanted"].meshes())
+        synthetic.wavefront_obj(synthetic.ROOM)
+        if room == "synthetic"
+        else wavefront_obj(ROOMS["slanted"].meshes())
     )
     for labels in (SPECTRA, READINGS, CHANNELS):
         words = [f"{key}={value}" for key, value in {"transmitters": 5, **options}.items()]
         command(monkeypatch, tmp_path / f"room{labels}", f"{room}{labels}", *words)
         assert (tmp_path / f"room{labels}" / "geometry.obj").read_text() == meshes
     assert "room: 4 training and 1 test labels" in capsys.readouterr().out
-    simulated = [simulate(f"{room}{labels}", transmitters=5, **options) for labels in (SPECTRA, READINGS, CHANNELS)]
+    simulated = [
+        simulate(f"{room}{labels}", transmitters=5, **options)
+        for labels in (SPECTRA, READINGS, CHANNELS)
+    ]
     spectra = load({"name": "nerf2_spectrum", "root": str(tmp_path / "room")}, OFFICIAL)
     check_same(spectra, simulated[0])
-    torch.testing.assert_close(spectra.receivers[0].pose.rotation, simulated[0].receivers[0].pose.rotation)
+    torch.testing.assert_close(
+        spectra.receivers[0].pose.rotation, simulated[0].receivers[0].pose.rotation
+    )
     assert torch.equal(spectra.split.test, simulated[0].split.test)
     everything = {"name": "random", "validation": 0}
-    check_same(load({"name": "rssi_csv", "file": str(tmp_path / "room_rssi" / "room.csv")}, everything), simulated[1])
-    channels = load({"name": "csi_npz", "file": str(tmp_path / "room_csi" / "room.npz")}, everything)
+    check_same(
+        load({"name": "rssi_csv", "file": str(tmp_path / "room_rssi" / "room.csv")}, everything),
+        simulated[1],
+    )
+    channels = load(
+        {"name": "csi_npz", "file": str(tmp_path / "room_csi" / "room.npz")}, everything
+    )
     check_same(channels, simulated[2])
     places = [
-        each.receivers[0].pose.world(each.receivers[0].array.elements.float()) for each in (channels, simulated[2])
+        each.receivers[0].pose.world(each.receivers[0].array.elements.float())
+        for each in (channels, simulated[2])
     ]
     np.testing.assert_allclose(*places, atol=1e-5)
 
 
 def test_random_phases_follow_from_the_seed_on_any_machine():
     known, *others = (
-        load({"name": "synthetic_csi", "transmitters": 4, "order": 0, "phase": phase, "seed": seed}, OFFICIAL).labels
+        load(
+            {"name": "synthetic_csi", "transmitters": 4, "order": 0, "phase": phase, "seed": seed},
+            OFFICIAL,
+        ).labels
         for phase, seed in (("known", 0), ("per_link", 0), ("per_link", -1))
     )
-    assert (others[0] / known)[:3, 0, 0].angle().tolist() == pytest.approx([1.0502, 0.4209, -1.8601], abs=1e-4)
+    assert (others[0] / known)[:3, 0, 0].angle().tolist() == pytest.approx(
+        [1.0502, 0.4209, -1.8601], abs=1e-4
+    )
     assert not torch.equal(*others), "any seed that torch takes"
 
 
 def test_the_command_writes_several_carriers(tmp_path, monkeypatch, capsys):
-    command(monkeypatch, tmp_path / "room", "synthetic", "frequency=[5e9,3.1e9]", "transmitters=3", "order=0")
+    command(
+        monkeypatch,
+        tmp_path / "room",
+        "synthetic",
+        "frequency=[5e9,3.1e9]",
+        "transmitters=3",
+        "order=0",
+    )
     assert "4 training and 2 test labels" in capsys.readouterr().out
     assert (tmp_path / "room" / "freq.txt").read_text().split() == ["5", "3.1"] * 3
 
@@ -122,7 +171,9 @@ def test_the_command_writes_several_carriers(tmp_path, monkeypatch, capsys):
         ("room", ["nerf2_rssi"], "invalid choice: 'nerf2_rssi'"),
     ],
 )
-def test_the_command_refuses_and_writes_nothing(tmp_path, monkeypatch, capsys, folder, words, message):
+def test_the_command_refuses_and_writes_nothing(
+    tmp_path, monkeypatch, capsys, folder, words, message
+):
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(SystemExit) as caught:
         command(monkeypatch, tmp_path / folder, *words)

@@ -1,4 +1,6 @@
-"""Meshes of the rooms: closed, planar, free where they are said to be free, and drawn without seams."""
+"""Meshes of the rooms: closed, planar, free where they are said to be free, and drawn without
+seams.
+"""
 
 import math
 
@@ -24,7 +26,9 @@ def shell(room):
 def test_a_turned_cuboid_keeps_its_size_and_faces_outwards():
     mesh = TURNED.mesh()
     corners, middle = np.array(mesh.vertices), np.array((2.0, 2.3, 0.7))
-    assert ConvexHull(corners).volume == pytest.approx(np.prod(np.subtract(TURNED.upper, TURNED.lower)), rel=1e-5)
+    assert ConvexHull(corners).volume == pytest.approx(
+        np.prod(np.subtract(TURNED.upper, TURNED.lower)), rel=1e-5
+    )
     for a, b, c in corners[np.array(mesh.triangles())]:
         assert np.cross(b - a, c - a) @ (a - middle) > 0
     along = corners[1] - corners[0]
@@ -33,7 +37,9 @@ def test_a_turned_cuboid_keeps_its_size_and_faces_outwards():
 
 
 def test_a_cuboid_contains_the_points_of_its_hull():
-    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([4.0, 4.0, 1.5])
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [4.0, 4.0, 1.5]
+    )
     hull = Delaunay(np.array(TURNED.mesh().vertices))
     inside = hull.find_simplex(points.double().numpy()) >= 0
     assert 50 < inside.sum() < 500
@@ -44,26 +50,42 @@ def test_a_cuboid_contains_the_points_of_its_hull():
 @pytest.mark.parametrize("name", ["slanted", "furnished"])
 def test_free_places_of_a_convex_room_keep_their_distance_from_its_hull(name):
     room = ROOMS[name]
-    points = torch.rand(3000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([8.0, 6.0, 2.6]) + 0.02
-    planes = ConvexHull(np.array([corner for mesh in shell(room) for corner in mesh.vertices])).equations
+    points = (
+        torch.rand(3000, 3, generator=torch.Generator().manual_seed(0))
+        * torch.tensor([8.0, 6.0, 2.6])
+        + 0.02
+    )
+    planes = ConvexHull(
+        np.array([corner for mesh in shell(room) for corner in mesh.vertices])
+    ).equations
     upright = np.linalg.norm(planes[:, :2], axis=1) > 0.5
-    horizontal = planes[upright] / np.linalg.norm(planes[upright, :2], axis=1)[:, None]  # distances within a level
+    horizontal = (
+        planes[upright] / np.linalg.norm(planes[upright, :2], axis=1)[:, None]
+    )  # distances within a level
     depths = -(points.double().numpy() @ horizontal[:, :3].T + horizontal[:, 3]).max(1)
     clear = np.ones(len(points), dtype=bool)
     for cuboid in room.furniture:
         clear &= ~cuboid.contains(points, FURNITURE_MARGIN).numpy()
     certain = np.abs(depths - WALL_MARGIN) > 1e-4
-    np.testing.assert_array_equal(room.is_free(points).numpy()[certain], (clear & (depths > WALL_MARGIN))[certain])
+    np.testing.assert_array_equal(
+        room.is_free(points).numpy()[certain], (clear & (depths > WALL_MARGIN))[certain]
+    )
 
 
 def test_free_places_of_the_l_lie_in_it():
     room = ROOMS["l_shape"]
-    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([9.0, 7.0, 2.5])
+    points = torch.rand(4000, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [9.0, 7.0, 2.5]
+    )
     inside = Path([*room.floor, room.floor[0]]).contains_points(points[:, :2].double().numpy())
     free = room.is_free(points).numpy()
     assert (inside | ~free).all()
-    corner = torch.tensor([[3.8 - 0.2, 3.4 - 0.2, 1.0], [3.8 - 0.22, 3.4 - 0.22, 1.0], [4.2, 3.8, 1.0]])
-    assert room.is_free(corner).tolist() == [False, True, False], "the margin is a circle about the inner corner"
+    corner = torch.tensor(
+        [[3.8 - 0.2, 3.4 - 0.2, 1.0], [3.8 - 0.22, 3.4 - 0.22, 1.0], [4.2, 3.8, 1.0]]
+    )
+    assert room.is_free(corner).tolist() == [False, True, False], (
+        "the margin is a circle about the inner corner"
+    )
 
 
 @every_room
@@ -99,4 +121,6 @@ def test_the_obj_file_has_the_meshes():
     assert [*groups] == [(mesh.name.replace(" ", "_"), mesh.material) for mesh in meshes]
     for mesh, faces in zip(meshes, groups.values(), strict=True):
         for found, face in zip(faces, mesh.faces, strict=True):
-            np.testing.assert_allclose(vertices[list(found)], [mesh.vertices[k] for k in face], atol=1e-5)
+            np.testing.assert_allclose(
+                vertices[list(found)], [mesh.vertices[k] for k in face], atol=1e-5
+            )

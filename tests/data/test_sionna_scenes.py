@@ -21,8 +21,12 @@ SHAPE = (
 def write(folder, **cuboids):
     """A scene of cuboids of a material, (material, lower, upper) each."""
     for name, (material, lower, upper) in cuboids.items():
-        (folder / f"{name}.obj").write_text(wavefront_obj([Cuboid(name, material, lower, upper).mesh()]))
-    materials = "".join(MATERIAL.format(material) for material in sorted({own[0] for own in cuboids.values()}))
+        (folder / f"{name}.obj").write_text(
+            wavefront_obj([Cuboid(name, material, lower, upper).mesh()])
+        )
+    materials = "".join(
+        MATERIAL.format(material) for material in sorted({own[0] for own in cuboids.values()})
+    )
     shapes = "".join(SHAPE.format(name, own[0]) for name, own in cuboids.items())
     (folder / "room.xml").write_text(f'<scene version="2.1.0">{materials}{shapes}</scene>')
     return str(folder / "room.xml")
@@ -30,7 +34,11 @@ def write(folder, **cuboids):
 
 @pytest.fixture
 def scene(tracer, tmp_path):
-    return write(tmp_path, shell=("concrete", (0, 0, 0), (5, 4, 3)), chest=("wood", (1, 1, 0), (2.5, 2.6, 1.8)))
+    return write(
+        tmp_path,
+        shell=("concrete", (0, 0, 0), (5, 4, 3)),
+        chest=("wood", (1, 1, 0), (2.5, 2.6, 1.8)),
+    )
 
 
 def test_transmitters_stand_in_the_free_space_alone(scene):
@@ -39,17 +47,28 @@ def test_transmitters_stand_in_the_free_space_alone(scene):
     places = room.place(40, 0)
     low, high = places.new_tensor([0.1, 0.1, 0.5]), places.new_tensor([4.9, 3.9, 1.5])
     assert ((places >= low) & (places <= high)).all()
-    near = (places > places.new_tensor([0.9, 0.9, 0])) & (places < places.new_tensor([2.6, 2.7, 1.9]))
+    near = (places > places.new_tensor([0.9, 0.9, 0])) & (
+        places < places.new_tensor([2.6, 2.7, 1.9])
+    )
     assert not near.all(1).any()
-    assert [receiver.pose.position.tolist() for receiver in room.gateways] == torch.tensor(receivers).tolist()
+    assert [receiver.pose.position.tolist() for receiver in room.gateways] == torch.tensor(
+        receivers
+    ).tolist()
     assert len(room.edges) == 24
 
 
 def test_paths_are_those_over_a_plate_of_metal(tracer, tmp_path):
-    """Channels at the middle of the array's elements against the direct wave and its image in the floor."""
+    """Channels at the middle of the array's elements against the direct wave and its image in the
+    floor.
+    """
     scene = write(tmp_path, floor=("metal", (-20, -20, -0.5), (20, 20, 0)))
     links = sionna_rssi.traced_room_rssi(
-        scene=scene, receivers=[[0.0, 0.0, 2.0]], transmitters=10, heights=[0.5, 1.5], noise=0.0, sensitivity=-200.0
+        scene=scene,
+        receivers=[[0.0, 0.0, 2.0]],
+        transmitters=10,
+        heights=[0.5, 1.5],
+        noise=0.0,
+        sensitivity=-200.0,
     )
     images = links.query.transmitters.double()[:, None] * torch.tensor([[1.0, 1, 1], [1, 1, -1]])
     lengths = (images - torch.tensor([0.0, 0, 2])).norm(dim=-1).numpy()
@@ -63,7 +82,13 @@ def test_paths_are_those_over_a_plate_of_metal(tracer, tmp_path):
 def test_places_without_a_path_are_left_out(tracer, tmp_path):
     """The array looks up, away from all transmitters: nothing is heard."""
     scene = write(tmp_path, floor=("metal", (-5, -5, -0.5), (5, 5, 0)))
-    options = {"scene": scene, "receiver": [0, 0, 1.9], "facing": [0, 0, 9], "heights": [0.3, 1.0], "transmitters": 4}
+    options = {
+        "scene": scene,
+        "receiver": [0, 0, 1.9],
+        "facing": [0, 0, 9],
+        "heights": [0.3, 1.0],
+        "transmitters": 4,
+    }
     with pytest.raises(ValueError, match="paths must lead to two of 4 transmitters"):
         sionna_csi.traced_room_csi(**options, bandwidth=1e6, subcarriers=2)
 
@@ -72,7 +97,10 @@ def test_places_without_a_path_are_left_out(tracer, tmp_path):
     ("text", "message"),
     [
         ("", "cannot load .*room.xml: no element found"),
-        ("<scene version='2.1.0'></scene>", "no surfaces; expected a scene that sionna.rt.load_scene loads"),
+        (
+            "<scene version='2.1.0'></scene>",
+            "no surfaces; expected a scene that sionna.rt.load_scene loads",
+        ),
         (MATERIAL.format("kryptonite").join(("<scene version='2.1.0'>", "</scene>")), "kryptonite"),
     ],
 )
@@ -87,7 +115,10 @@ def test_damaged_scenes_are_named(scene, text, message):
     ("options", "message"),
     [
         ({"receiver": None}, r"data\.receiver must be x, y, z of each receiver"),
-        ({"receiver": [300, 300, 2500]}, "receivers must stand in the scene, whose surfaces lie from"),
+        (
+            {"receiver": [300, 300, 2500]},
+            "receivers must stand in the scene, whose surfaces lie from",
+        ),
         ({"heights": [2, 1]}, "heights must be the lowest and the highest z"),
         ({"heights": [5, 6]}, "expected free space at z from 5 to 6 m"),
         ({"scene": None}, r"data\.receiver is an option of data\.scene"),
@@ -96,7 +127,9 @@ def test_damaged_scenes_are_named(scene, text, message):
 )
 def test_unsuitable_options_of_a_scene_are_refused(scene, options, message):
     with pytest.raises(ValueError, match=message):
-        sionna.traced_room(**{"scene": scene, "receiver": [0.3, 0.3, 2.5], "transmitters": 2} | options)
+        sionna.traced_room(
+            **{"scene": scene, "receiver": [0.3, 0.3, 2.5], "transmitters": 2} | options
+        )
 
 
 def test_a_missing_scene_is_named(tracer, tmp_path):

@@ -46,15 +46,21 @@ def test_a_floor_of_metal_mirrors_the_transmitter(over_floor):
 
 
 def test_a_wall_of_metal_turns_the_vertical_field_around(tracer):
-    images, gains = strong(tracer.trace([WALL], RECEIVER, torch.tensor([[1.5, -0.5, 1.0]]), FREQUENCY))
+    images, gains = strong(
+        tracer.trace([WALL], RECEIVER, torch.tensor([[1.5, -0.5, 1.0]]), FREQUENCY)
+    )
     np.testing.assert_allclose(images, [(1.5, -0.5, 1), (1.5, 4.5, 1)], atol=1e-4)
     np.testing.assert_allclose(gains, [1, -1], atol=0.02)
 
 
 @pytest.mark.parametrize("frequency", [0.45e9, 6e9, 28e9])
 def test_a_board_transmits_as_a_slab(tracer, frequency):
-    """At normal incidence: Airy's formula for the slab, with the board's thickness of air left out of the way."""
-    images, gains = strong(tracer.trace([BOARD], RECEIVER, torch.tensor([[2.0, 0.0, 1.0]]), frequency))
+    """At normal incidence: Airy's formula for the slab, with the board's thickness of air left out
+    of the way.
+    """
+    images, gains = strong(
+        tracer.trace([BOARD], RECEIVER, torch.tensor([[2.0, 0.0, 1.0]]), frequency)
+    )
     real, c, d = image_source.MATERIALS["wood"]
     epsilon = real - 1j * c * (frequency / 1e9) ** d / (2 * math.pi * frequency * 8.8541878128e-12)
     index = np.sqrt(epsilon)
@@ -81,7 +87,9 @@ def test_without_the_weakest_paths_nearly_all_power_is_left(tracer, monkeypatch)
 
 
 def test_a_wave_bends_around_a_corner(tracer):
-    """A block of metal hides the transmitter; the shortest way leads over its edge, at the height of both."""
+    """A block of metal hides the transmitter; the shortest way leads over its edge, at the height
+    of both.
+    """
     block = Cuboid("block", "metal", (0.5, 0.5, -3.0), (3.0, 3.0, 5.0)).mesh()
     receiver, place = torch.tensor([0.0, 1.5, 1.0]), torch.tensor([[1.5, 0.0, 1.0]])
     images, gains = strong(tracer.trace([block], receiver, place, FREQUENCY))
@@ -113,19 +121,27 @@ def libraries(monkeypatch):
 
     def make(versions):
         monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
-        monkeypatch.setattr(tracing, "glob", lambda pattern: [*versions] if pattern.startswith("/usr/lib64/") else [])
+        monkeypatch.setattr(
+            tracing,
+            "glob",
+            lambda pattern: [*versions] if pattern.startswith("/usr/lib64/") else [],
+        )
         monkeypatch.setattr(tracing, "llvm_version", lambda file: versions.get(file, 0))
 
     return make
 
 
 def test_the_chosen_or_newest_llvm_is_taken_and_checked(libraries, monkeypatch):
-    libraries({"/a/libLLVM.so.18.1": 18, "/a/libLLVM.so.19.1": 19, "/b/mine.so": 17, "/b/old.so": 15})
+    libraries(
+        {"/a/libLLVM.so.18.1": 18, "/a/libLLVM.so.19.1": 19, "/b/mine.so": 17, "/b/old.so": 15}
+    )
     assert tracing.find_llvm() == "/a/libLLVM.so.19.1"
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/b/mine.so")
     assert tracing.find_llvm() == "/b/mine.so"
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/b/old.so")
-    with pytest.raises(RuntimeError, match=r"needs libLLVM 17 or later, got /b/old\.so \(15\); install it"):
+    with pytest.raises(
+        RuntimeError, match=r"needs libLLVM 17 or later, got /b/old\.so \(15\); install it"
+    ):
         tracing.find_llvm()
     libraries({})
     with pytest.raises(RuntimeError, match="needs libLLVM 17 or later, got none"):
@@ -143,7 +159,9 @@ PLACE = torch.tensor([[2.0, 1.0, 1.0]])
 
 @pytest.fixture
 def traced(monkeypatch, tmp_path):
-    """The arguments that the tracer is called with, which gives the same paths always; the cache is empty."""
+    """The arguments that the tracer is called with, which gives the same paths always; the cache is
+    empty.
+    """
     calls = []
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(tracing, "find_packages", lambda: {"sionna-rt": "2.2.0"})
@@ -192,7 +210,9 @@ def test_paths_of_a_faster_process_stay(traced, monkeypatch):
         return PATHS
 
     monkeypatch.setattr(tracing, "trace", slow)
-    assert torch.equal(cache.find_paths(ROOMS["slanted"], RECEIVER, PLACE, FREQUENCY).images, other.images)
+    assert torch.equal(
+        cache.find_paths(ROOMS["slanted"], RECEIVER, PLACE, FREQUENCY).images, other.images
+    )
 
 
 def test_a_damaged_file_is_named(traced, tmp_path):

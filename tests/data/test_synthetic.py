@@ -38,7 +38,9 @@ def test_labels_are_those_of_measured_sets(scene):
     assert labels.shape == (500, 90, 360)
     assert labels.amin((1, 2)).tolist() == [0] * 500
     assert labels.amax((1, 2)).tolist() == [1] * 500
-    assert (labels[:, -1] - labels[:, -1, :1]).abs().max() < 1e-5  # at the zenith azimuth means nothing
+    assert (
+        labels[:, -1] - labels[:, -1, :1]
+    ).abs().max() < 1e-5  # at the zenith azimuth means nothing
 
 
 def test_transmitters_stand_free_in_their_region(scene):
@@ -62,12 +64,19 @@ def test_each_place_sends_at_each_carrier():
     assert links.rows.tolist() == [k // 3 for k in range(18)]
     assert links.split.train.tolist() == list(range(15))
     assert links.split.test.tolist() == [15, 16, 17]
-    alone, lowest = (furnished_room(transmitters=6, seed=5, frequency=carrier) for carrier in (max(CARRIERS), 3.1e9))
+    alone, lowest = (
+        furnished_room(transmitters=6, seed=5, frequency=carrier)
+        for carrier in (max(CARRIERS), 3.1e9)
+    )
     assert torch.equal(links.receivers[0].array.elements, alone.receivers[0].array.elements)
     assert torch.equal(links.labels[1::3], alone.labels)
-    assert (links.labels[2::3] - lowest.labels).abs().max() > 0.1  # the array of the lowest carrier is twice as wide
+    assert (
+        links.labels[2::3] - lowest.labels
+    ).abs().max() > 0.1  # the array of the lowest carrier is twice as wide
     own = Grid.degrees(), "band", 3.1e9, 499.2e6, 2
-    assert torch.equal(links.labels[2::3], spectra(ROOM, lowest.query.transmitters, links.receivers[0], *own))
+    assert torch.equal(
+        links.labels[2::3], spectra(ROOM, lowest.query.transmitters, links.receivers[0], *own)
+    )
     check_data(links)
 
 
@@ -89,14 +98,20 @@ def test_obj_faces_lie_on_the_walls_and_face_outwards():
             found.add((face[0] // 8, axis, side))
             assert material == materials[2 * axis + side]
             np.testing.assert_allclose(corners[:, axis], (lower, upper)[side][axis])
-            assert np.linalg.norm(normal) == pytest.approx(np.prod(np.delete(np.subtract(upper, lower), axis)))
-            np.testing.assert_allclose(corners[0] + corners[2], corners[1] + corners[3])  # a rectangle's diagonals
+            assert np.linalg.norm(normal) == pytest.approx(
+                np.prod(np.delete(np.subtract(upper, lower), axis))
+            )
+            np.testing.assert_allclose(
+                corners[0] + corners[2], corners[1] + corners[3]
+            )  # a rectangle's diagonals
     assert len(found) == 6 * len(cuboids)
 
 
 def test_the_documented_room_is_simulated_and_written(tmp_path, monkeypatch):
     text = (Path(__file__).parents[2] / "docs" / "data.md").read_text(encoding="utf-8")
-    (code,) = [block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "my_room" in block]
+    (code,) = [
+        block for block in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "my_room" in block
+    ]
     monkeypatch.chdir(tmp_path)
     torch.manual_seed(0)
     exec(code, {})

@@ -1,4 +1,6 @@
-"""Channels of the built-in room: free space, the power and the spectra of the same room, and the phases' sign."""
+"""Channels of the built-in room: free space, the power and the spectra of the same room, and the
+phases' sign.
+"""
 
 import math
 
@@ -40,11 +42,17 @@ def test_the_default_channels_keep_the_contract():
 
 
 def test_spectra_of_the_channels_are_those_of_the_room():
-    """With as many subcarriers as sample the band of a spectrum, steering the channels gives that spectrum."""
+    """With as many subcarriers as sample the band of a spectrum, steering the channels gives that
+    spectrum.
+    """
     longest = 3 * math.hypot(7, 5, 3)
-    links = channels(transmitters=8, seed=3, subcarriers=math.ceil(BANDWIDTH * longest / speed_of_light) + 1)
+    links = channels(
+        transmitters=8, seed=3, subcarriers=math.ceil(BANDWIDTH * longest / speed_of_light) + 1
+    )
     spectra = load({"name": "synthetic", "transmitters": 8, "seed": 3}, OFFICIAL)
-    steered = bartlett(links.labels.to(torch.complex128), Grid.degrees(), links.receivers[0].array, CARRIER)
+    steered = bartlett(
+        links.labels.to(torch.complex128), Grid.degrees(), links.receivers[0].array, CARRIER
+    )
     assert (min_max(steered) - spectra.labels).abs().max() < 1e-5
 
 
@@ -53,7 +61,9 @@ def test_without_reflections_channels_are_friis_waves_that_furniture_dims():
     frequencies = np.linspace(CARRIER - BANDWIDTH / 2, CARRIER + BANDWIDTH / 2, 26)
     apart = distances(free)[..., None]
     waves = (
-        speed_of_light / (4 * np.pi * frequencies * apart) * np.exp(-2j * np.pi * frequencies * apart / speed_of_light)
+        speed_of_light
+        / (4 * np.pi * frequencies * apart)
+        * np.exp(-2j * np.pi * frequencies * apart / speed_of_light)
     )
     ratios = free.labels.numpy() / waves
     assert np.abs(np.angle(ratios)).max() < 1e-3
@@ -61,6 +71,10 @@ def test_without_reflections_channels_are_friis_waves_that_furniture_dims():
     rays = free.query.transmitters - receiver.pose.position
     cosines = (rays @ receiver.pose.rotation[:, 2] / rays.norm(dim=1)).numpy()
     losses_db = -20 * np.log10(np.abs(ratios) / cosines[:, None, None])
-    assert np.ptp(losses_db, axis=(1, 2)).max() < 1e-2  # for all of a link's elements and subcarriers the same
-    assert np.abs(losses_db.mean((1, 2)) - losses_db.mean((1, 2)).round()).max() < 1e-2  # furniture's are whole numbers
+    assert (
+        np.ptp(losses_db, axis=(1, 2)).max() < 1e-2
+    )  # for all of a link's elements and subcarriers the same
+    assert (
+        np.abs(losses_db.mean((1, 2)) - losses_db.mean((1, 2)).round()).max() < 1e-2
+    )  # furniture's are whole numbers
     assert 0.3 < (losses_db.mean((1, 2)) < 1e-2).mean() < 0.95

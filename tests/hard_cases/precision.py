@@ -31,7 +31,10 @@ def build_rasterizer(name):
     try:
         return registry("rasterizer").build({"name": name})
     except (ImportError, RuntimeError) as error:
-        if not any(words in str(error) for words in ("needs an OpenCL driver", "cannot build kernels", "pyopencl")):
+        if not any(
+            words in str(error)
+            for words in ("needs an OpenCL driver", "cannot build kernels", "pyopencl")
+        ):
             raise
         return None
 
@@ -44,7 +47,9 @@ def widen(part, dtype):
         return replace(part, transmitters=widen(part.transmitters, dtype))
     if isinstance(part, nn.Module):
         # Module.to would take complex buffers for real ones.
-        return (nn.Module.double if dtype == torch.float64 else nn.Module.float)(copy.deepcopy(part).eval())
+        return (nn.Module.double if dtype == torch.float64 else nn.Module.float)(
+            copy.deepcopy(part).eval()
+        )
     if isinstance(part, tuple):
         moved = [widen(entry, dtype) for entry in part]
         return type(part)(*moved) if hasattr(part, "_fields") else tuple(moved)
@@ -58,13 +63,18 @@ def flat(values):
 
 
 def require_same(ask, module, *leaves, tolerance=TOLERANCE, within=None):
-    """Values of ``ask(module, *leaves)`` in float64: float32's are the same, all are finite, gradients too.
+    """Values of ``ask(module, *leaves)`` in float64: float32's are the same, all are finite,
+    gradients too.
 
-    Values may differ by ``tolerance`` of the largest value of a tensor or of 1, or by ``within`` if that is more.
+    Values may differ by ``tolerance`` of the largest value of a tensor or of 1, or by ``within`` if
+    that is more.
     """
     answers = []
     for dtype in DTYPES:
-        part, own = widen(module, dtype), [widen(leaf.detach(), dtype).requires_grad_() for leaf in leaves]
+        part, own = (
+            widen(module, dtype),
+            [widen(leaf.detach(), dtype).requires_grad_() for leaf in leaves],
+        )
         answers.append(flat(ask(part, *own)))
         require_finite(answers[-1], [*own, *(() if part is None else part.parameters())])
     for one, two in zip(*answers, strict=True):
@@ -72,7 +82,10 @@ def require_same(ask, module, *leaves, tolerance=TOLERANCE, within=None):
         if one is None or not one.numel():
             continue
         if one.is_floating_point() or one.is_complex():
-            assert (one.dtype, two.dtype) == (widen(one, DTYPES[0]).dtype, widen(one, DTYPES[1]).dtype)
+            assert (one.dtype, two.dtype) == (
+                widen(one, DTYPES[0]).dtype,
+                widen(one, DTYPES[1]).dtype,
+            )
         largest = max(1.0, two.detach().abs().max().item())
         assert (one.to(two.dtype) - two).abs().max() <= max(tolerance * largest, within or 0)
     return answers[1]
@@ -82,11 +95,20 @@ def require_finite(values, leaves):
     """Requires finite values and finite gradients by the leaves."""
     values = [value for value in flat(values) if value is not None and value.numel()]
     assert all(value.isfinite().all() for value in values)
-    real = [torch.view_as_real(value) if value.is_complex() else value for value in values if value.requires_grad]
+    real = [
+        torch.view_as_real(value) if value.is_complex() else value
+        for value in values
+        if value.requires_grad
+    ]
     if real:
         # A weight for each entry: sums of differences that cancel would hide gradients.
         weights = [torch.arange(value.numel()).cos().to(value).view_as(value) for value in real]
         sizes = [max(1.0, value.detach().abs().max().item()) * value.numel() for value in real]
-        total = sum((value * weight).sum() / size for value, weight, size in zip(real, weights, sizes, strict=True))
-        gradients = torch.autograd.grad(total, [leaf for leaf in leaves if leaf.requires_grad], allow_unused=True)
+        total = sum(
+            (value * weight).sum() / size
+            for value, weight, size in zip(real, weights, sizes, strict=True)
+        )
+        gradients = torch.autograd.grad(
+            total, [leaf for leaf in leaves if leaf.requires_grad], allow_unused=True
+        )
         assert all(gradient is None or gradient.isfinite().all() for gradient in gradients)

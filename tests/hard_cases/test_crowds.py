@@ -11,7 +11,9 @@ from gaigs.splatting.projection import Plane, Splats
 from gaigs.splatting.rasterizer import ALPHA_MAX
 
 CROWD = 10_000
-PLANE = Plane(torch.linspace(-0.1, 0.1, 5)[None], torch.linspace(-0.1, 0.1, 4)[:, None], 2 * math.pi)
+PLANE = Plane(
+    torch.linspace(-0.1, 0.1, 5)[None], torch.linspace(-0.1, 0.1, 4)[:, None], 2 * math.pi
+)
 DRAWING = [name for name in registry("rasterizer").names() if name != "fastest"]
 """``fastest`` is one of the others."""
 
@@ -30,11 +32,19 @@ def drawn(name, dtype, opacity, attenuation, alike):
         "attenuations": torch.full((1, CROWD), attenuation, dtype=dtype),
     }
     leaves = {part: leaf.requires_grad_() for part, leaf in leaves.items()}
-    depths = torch.full((CROWD,), 2.0, dtype=dtype) if alike else torch.linspace(1, 9, CROWD, dtype=dtype).flip(0)
-    splats = Splats(leaves["means2d"], leaves["factors"], depths, torch.ones(CROWD, dtype=torch.bool))
+    depths = (
+        torch.full((CROWD,), 2.0, dtype=dtype)
+        if alike
+        else torch.linspace(1, 9, CROWD, dtype=dtype).flip(0)
+    )
+    splats = Splats(
+        leaves["means2d"], leaves["factors"], depths, torch.ones(CROWD, dtype=torch.bool)
+    )
     plane = Plane(PLANE.u.to(dtype), PLANE.v.to(dtype), PLANE.period)
     try:
-        image, left = rasterizer(splats, leaves["signal"], leaves["opacities"], leaves["attenuations"], plane)
+        image, left = rasterizer(
+            splats, leaves["signal"], leaves["opacities"], leaves["attenuations"], plane
+        )
     except TypeError:
         if dtype == torch.float32:
             raise
@@ -45,7 +55,11 @@ def drawn(name, dtype, opacity, attenuation, alike):
 @pytest.mark.parametrize("name", DRAWING)
 @pytest.mark.parametrize(
     ("dtype", "opacity", "attenuation", "alike"),
-    [(torch.float32, 1.0, 1.0, True), (torch.float32, 0.02, 1.0, False), (torch.float64, 1.0, 0.0, False)],
+    [
+        (torch.float32, 1.0, 1.0, True),
+        (torch.float32, 0.02, 1.0, False),
+        (torch.float64, 1.0, 0.0, False),
+    ],
     ids=["equal depths", "hardly opaque", "float64"],
 )
 def test_a_crowd_in_one_pixel(name, dtype, opacity, attenuation, alike):

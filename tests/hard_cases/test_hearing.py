@@ -61,7 +61,9 @@ def test_paths_at_an_array(widths, waves, n, coherence, bandwidth):
     array = Array.planar(3, 3, 0.03)
     receiver = Receiver("here", Pose(torch.zeros(3), torch.eye(3)), array)
     size = WAVES[waves]
-    amplitudes = size * torch.randn(B, N, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
+    amplitudes = size * torch.randn(
+        B, N, dtype=torch.complex64, generator=torch.Generator().manual_seed(1)
+    )
     lengths = torch.linspace(0, 50, B * N).view(B, N)
     # Number 4 stands on the array's middle, number 5 on an element, number 6 next to it.
     ahead = (1 - CENTRES.square().sum(-1, keepdim=True)).sqrt()
@@ -70,9 +72,14 @@ def test_paths_at_an_array(widths, waves, n, coherence, bandwidth):
     axes = points.norm(dim=-1)[..., None, None] * torch.diag_embed(WIDTHS[widths].expand(1, N, 3))
 
     def ask(pooling, points, axes, amplitudes, lengths, coherences):
-        carriers, offsets = lengths.new_full((B,), 5e9), lengths.new_tensor([[-1e7, 0, 1e7]]).expand(B, 3)
+        carriers, offsets = (
+            lengths.new_full((B,), 5e9),
+            lengths.new_tensor([[-1e7, 0, 1e7]]).expand(B, 3),
+        )
         band = None if bandwidth is None else lengths.new_tensor(bandwidth)
-        paths = ReceivedPaths(points, axes, amplitudes, lengths, coherences, band, receiver, carriers)
+        paths = ReceivedPaths(
+            points, axes, amplitudes, lengths, coherences, band, receiver, carriers
+        )
         fields, lags = element_fields(paths, offsets), pooling.sum_paths(paths)
         return (fields, lags) if size <= 1 else (fields / size, lags / size**2)
 

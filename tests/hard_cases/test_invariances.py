@@ -1,6 +1,7 @@
 """Invariances: a turned array, a moved world, scaled distances.
 
-Positions are multiples of an eighth of a metre, so that float32 moves them by a million metres without rounding.
+Positions are multiples of an eighth of a metre, so that float32 moves them by a million metres
+without rounding.
 """
 
 import math
@@ -58,7 +59,9 @@ def links_of(task, mirrored, shift=0.0, columns=0):
     for one in links.receivers:
         pose = turned(Pose((2 * one.pose.position).round() / 2 + shift, one.pose.rotation), columns)
         receivers.append(replace(one, pose=pose))
-    return replace(links, query=replace(links.query, transmitters=places), receivers=tuple(receivers))
+    return replace(
+        links, query=replace(links.query, transmitters=places), receivers=tuple(receivers)
+    )
 
 
 def model_of(links, overrides, dtype, state=None):
@@ -85,7 +88,9 @@ def test_spectra_of_gaigs_roll_where_the_array_turns(projection):
     links, other = links_of("spectrum", False), links_of("spectrum", False, columns=columns)
     model = model_of(links, overrides, torch.float64)
     still = answer(model, links, torch.float64)
-    rolled = answer(model_of(other, overrides, torch.float64, model.state_dict()), other, torch.float64)
+    rolled = answer(
+        model_of(other, overrides, torch.float64, model.state_dict()), other, torch.float64
+    )
     assert still.std() > 1e-3
     off = (rolled - still.roll(-columns, -1)).abs() > 1e-4 * still.abs().max()
     assert off.double().mean() < 0.01
@@ -111,19 +116,27 @@ def move_gaussians(model, shift):
 @both
 @pytest.mark.parametrize(
     ("task", "tokenizer"),
-    [*(("spectrum", name) for name in registry("tokenizer").names()), ("rssi", "multiview"), ("csi", "multiview")],
+    [
+        *(("spectrum", name) for name in registry("tokenizer").names()),
+        ("rssi", "multiview"),
+        ("csi", "multiview"),
+    ],
 )
 def test_nothing_changes_for_gaigs_where_all_is_moved(dtype, task, tokenizer):
     overrides = (*GAIGS, f"tokenizer={tokenizer}")
     links = links_of(task, False)
     model = model_of(links, overrides, torch.float32)
     move_gaussians(model, 0)
-    state = {name: part for name, part in model.state_dict().items() if name.startswith("gaussians.")}
+    state = {
+        name: part for name, part in model.state_dict().items() if name.startswith("gaussians.")
+    }
     far = links_of(task, False, FAR)
     there = model_of(far, overrides, torch.float32)
     state["gaussians.means"] = state["gaussians.means"] + FAR
     assert not there.load_state_dict(state, strict=False).unexpected_keys
-    values = [answer(widen(part, dtype), own, dtype) for part, own in ((model, links), (there, far))]
+    values = [
+        answer(widen(part, dtype), own, dtype) for part, own in ((model, links), (there, far))
+    ]
     require_close(values[1], values[0], 1e-3)
 
 
@@ -174,8 +187,13 @@ def test_mirrored_gaussians_learn_alike_wherever_the_worlds_origin_is(task):
 @pytest.mark.parametrize("scale", [2.0**-6, 2.0**10])
 def test_directions_stay_where_all_distances_are_scaled(placement, dtype, scale):
     scene = links_of("spectrum", True).scene
-    receivers = [replace(one, pose=Pose(scale * one.pose.position, one.pose.rotation)) for one in scene.receivers]
-    far = replace(scene, lower=scale * scene.lower, upper=scale * scene.upper, receivers=tuple(receivers))
+    receivers = [
+        replace(one, pose=Pose(scale * one.pose.position, one.pose.rotation))
+        for one in scene.receivers
+    ]
+    far = replace(
+        scene, lower=scale * scene.lower, upper=scale * scene.upper, receivers=tuple(receivers)
+    )
     seen = []
     for own, factor in ((scene, 1.0), (far, scale)):
         part = widen(build("placement", placement, scene=own, channels=2), dtype)
@@ -186,9 +204,13 @@ def test_directions_stay_where_all_distances_are_scaled(placement, dtype, scale)
         query = Query(places, torch.arange(4) % 2, torch.full((4,), CARRIER))
         placed = part(gaussians, query)
         stands = placed.means.expand(4, -1, -1) - own.positions(places)[query.receivers][:, None]
-        seen.append((stands.detach() / factor, None if placed.lengths is None else placed.lengths / factor))
+        seen.append(
+            (stands.detach() / factor, None if placed.lengths is None else placed.lengths / factor)
+        )
     (here, lengths), (there, longer) = seen
     require_close(there, here, {torch.float32: 2e-3, torch.float64: 1e-8}[dtype])
     if lengths is not None:
         n = lengths.shape[1] - 6  # free ones have none
-        require_close(longer[:, :n], lengths[:, :n], {torch.float32: 2e-3, torch.float64: 1e-8}[dtype])
+        require_close(
+            longer[:, :n], lengths[:, :n], {torch.float32: 2e-3, torch.float64: 1e-8}[dtype]
+        )

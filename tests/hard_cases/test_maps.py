@@ -1,4 +1,6 @@
-"""Maps of extreme Gaussians in every projection and rasterizer, against float64 of the same float32 inputs."""
+"""Maps of extreme Gaussians in every projection and rasterizer, against float64 of the same float32
+inputs.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -16,7 +18,10 @@ from gaigs.testing.rasterizer import distance_to_jumps, rasterize_densely
 VALUES, GRADIENTS = 1e-4, 5e-3
 """Tolerances of float32, of the largest value or of 1, and of the largest gradient."""
 
-GRID = Grid(torch.linspace(1, 90, 30, dtype=torch.float64).deg2rad(), torch.arange(0, 360, 9).double().deg2rad())
+GRID = Grid(
+    torch.linspace(1, 90, 30, dtype=torch.float64).deg2rad(),
+    torch.arange(0, 360, 9).double().deg2rad(),
+)
 PIXEL = math.radians(1)
 ASIDE = torch.tensor([0.7, 1.0, 0.4], dtype=torch.float64)
 """No multiple of the grid's pitch: half a turn from a pixel both images are equally near."""
@@ -55,11 +60,15 @@ def random_gaussians(n=12, seed=0):
     directions = from_spherical(uniform(0, 2 * math.pi, n), uniform(0.05, 1.5, n))
     means = ON.position + directions * uniform(1, 5, n, 1)
     quats = torch.randn(n, 4, generator=generator, dtype=torch.float64)
-    return Gaussians(means, quats, uniform(0.05, 0.5, n, 3), uniform(0.2, 0.9, n), uniform(0.2, 1, n))
+    return Gaussians(
+        means, quats, uniform(0.05, 0.5, n, 3), uniform(0.2, 0.9, n), uniform(0.2, 1, n)
+    )
 
 
 def with_scales(*scales):
-    return lambda: replace(random_gaussians(), scales=torch.tensor(scales, dtype=torch.float64).expand(12, 3))
+    return lambda: replace(
+        random_gaussians(), scales=torch.tensor(scales, dtype=torch.float64).expand(12, 3)
+    )
 
 
 def towards(azimuth, elevation, distance=2.0):
@@ -67,10 +76,14 @@ def towards(azimuth, elevation, distance=2.0):
 
     def make():
         azimuths, elevations = (
-            torch.full((12,), math.radians(angle), dtype=torch.float64) for angle in (azimuth, elevation)
+            torch.full((12,), math.radians(angle), dtype=torch.float64)
+            for angle in (azimuth, elevation)
         )
         means = ON.position + distance * from_spherical(azimuths, elevations)
-        return replace(random_gaussians(), means=means + 1e-3 * torch.linspace(-1, 1, 12).double()[:, None] * ASIDE)
+        return replace(
+            random_gaussians(),
+            means=means + 1e-3 * torch.linspace(-1, 1, 12).double()[:, None] * ASIDE,
+        )
 
     return make
 
@@ -92,12 +105,16 @@ def on_the_axis():
     """Round Gaussians exactly on the axis, where azimuth is undefined."""
     gaussians = random_gaussians()
     gaussians.scales[::2] = 0.2
-    gaussians.means[::2] = ON.position + torch.linspace(1, 4, 6)[:, None] * torch.tensor([0.0, 0, 1])
+    gaussians.means[::2] = ON.position + torch.linspace(1, 4, 6)[:, None] * torch.tensor(
+        [0.0, 0, 1]
+    )
     return gaussians
 
 
 def with_values(name, *values):
-    return lambda: replace(random_gaussians(), **{name: torch.tensor(values, dtype=torch.float64).repeat(12)[:12]})
+    return lambda: replace(
+        random_gaussians(), **{name: torch.tensor(values, dtype=torch.float64).repeat(12)[:12]}
+    )
 
 
 def far_from_the_origin():
@@ -161,25 +178,36 @@ def draw(gaussians, projection, rasterizer, dtype):
     plane = Plane(plane.u.float().to(dtype), plane.v.float().to(dtype), plane.period)
     signal = torch.arange(2 * len(means)).cos().reshape(1, -1, 2).to(dtype)
     image, left = rasterizer(splats, signal, opacities[None], attenuations[None], plane)
-    return image, left, leaves, distance_to_jumps(splats, signal, opacities[None], attenuations[None], plane)[0]
+    return (
+        image,
+        left,
+        leaves,
+        distance_to_jumps(splats, signal, opacities[None], attenuations[None], plane)[0],
+    )
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("projection", registry("projection").names())
 def test_maps_and_gradients_are_those_of_the_formula(case, projection):
     gaussians, projection = CASES[case](), build_projection(projection)
-    true, true_left, true_leaves, distances = draw(gaussians, projection, rasterize_densely, torch.float64)
+    true, true_left, true_leaves, distances = draw(
+        gaussians, projection, rasterize_densely, torch.float64
+    )
     sure = distances > 3e-3
     assert sure.double().mean() > 0.5
     differentiate((true, true_left), gaussians, sure)
-    for name, dtype in ((name, dtype) for name in DRAWING for dtype in (torch.float32, torch.float64)):
+    for name, dtype in (
+        (name, dtype) for name in DRAWING for dtype in (torch.float32, torch.float64)
+    ):
         rasterizer = build_rasterizer(name)
         if rasterizer is None or (name == "opencl" and dtype == torch.float64):
             continue
         found, left, leaves, *_ = draw(gaussians, projection, rasterizer, dtype)
         for value, truth in ((found, true), (left, true_left)):
             assert value.isfinite().all()
-            tolerance = (VALUES if dtype == torch.float32 else 1e-7) * max(1.0, truth.abs().max().item())
+            tolerance = (VALUES if dtype == torch.float32 else 1e-7) * max(
+                1.0, truth.abs().max().item()
+            )
             assert (value - truth)[..., sure].abs().max() < tolerance, (name, dtype)
         differentiate((found, left), gaussians, sure)
         assert all(leaf.grad is None or leaf.grad.isfinite().all() for leaf in leaves.values())
@@ -187,7 +215,11 @@ def test_maps_and_gradients_are_those_of_the_formula(case, projection):
             truth = true_leaves[part].grad
             if truth is not None:
                 error = (leaves[part].grad.double() - truth).abs().max().item()
-                assert error <= LOOSE.get(case, GRADIENTS) * max(truth.abs().max().item(), 1e-6), (name, dtype, part)
+                assert error <= LOOSE.get(case, GRADIENTS) * max(truth.abs().max().item(), 1e-6), (
+                    name,
+                    dtype,
+                    part,
+                )
 
 
 def differentiate(values, gaussians, sure):

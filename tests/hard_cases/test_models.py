@@ -32,13 +32,25 @@ FAR = torch.tensor([2.0**20, -(2.0**19), 2.0**18])
 def places_of(links):
     receiver, own = links.receivers[0].pose.position, links.query.transmitters
     beside, below = receiver + torch.tensor([1e-6, 0, 0]), receiver - torch.tensor([0, 0, 1e-3])
-    places = receiver, beside, below, own[0], own[0] + 1e-6, own.amin(0), own.amax(0) + 100, receiver + 99_000
+    places = (
+        receiver,
+        beside,
+        below,
+        own[0],
+        own[0] + 1e-6,
+        own.amin(0),
+        own.amax(0) + 100,
+        receiver + 99_000,
+    )
     return torch.stack(places)
 
 
 def links_of(task, carrier, shift=0.0):
     links = example_links(task, None if task == "csi" else carrier)
-    receivers = [replace(one, pose=Pose(one.pose.position + shift, one.pose.rotation)) for one in links.receivers]
+    receivers = [
+        replace(one, pose=Pose(one.pose.position + shift, one.pose.rotation))
+        for one in links.receivers
+    ]
     query = replace(links.query, transmitters=links.query.transmitters + shift)
     return replace(links, query=query, receivers=tuple(receivers))
 
@@ -62,7 +74,11 @@ def ask(model, links, places):
         query = Query(places.to(dtype), torch.arange(n) % 2, frequencies)
         batch = replace(batch, query=query)
         part = widen(model, dtype)
-        directions = None if batch.directions is None else batch.directions.thin(slice(1, 18, 6), slice(0, 36, 9))
+        directions = (
+            None
+            if batch.directions is None
+            else batch.directions.thin(slice(1, 18, 6), slice(0, 36, 9))
+        )
         prediction = part(replace(batch, directions=directions))
         require_finite([prediction.value, *prediction.penalties.values()], [*part.parameters()])
 
@@ -100,7 +116,11 @@ def test_opacities_that_a_residual_pushes_outside_stay_in_their_range(push, dtyp
     values = []
     for factor in (1, 1e4):
         torch.nn.init.constant_(model.deformation.heads["opacity"].bias, factor * push)
-        prediction = model(replace(batch, query=replace(batch.query, transmitters=batch.query.transmitters.to(dtype))))
+        prediction = model(
+            replace(
+                batch, query=replace(batch.query, transmitters=batch.query.transmitters.to(dtype))
+            )
+        )
         require_finite([prediction.value, *prediction.penalties.values()], [*model.parameters()])
         values.append(prediction.value)
     assert torch.equal(*values)

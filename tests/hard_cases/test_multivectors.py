@@ -48,7 +48,9 @@ TOKENS_OF = {
     "null vectors": light_like,
     "null vectors of 1e4": lambda algebra: 1e4 * light_like(algebra),
     "points at infinity": at_infinity,
-    "nearly at infinity": lambda algebra: at_infinity(algebra) + 1e-6 * random(B, TOKENS, C, algebra.size),
+    "nearly at infinity": lambda algebra: (
+        at_infinity(algebra) + 1e-6 * random(B, TOKENS, C, algebra.size)
+    ),
     "all alike": lambda algebra: random(1, 1, 1, algebra.size).expand(B, TOKENS, C, -1),
     "tiny": lambda algebra: 1e-20 * random(B, TOKENS, C, algebra.size),
     "denormal": lambda algebra: 1e-42 * random(B, TOKENS, C, algebra.size),
@@ -61,12 +63,18 @@ TOKENS_OF = {
 
 LAYERS = {
     "linear": (lambda algebra: EquivariantLinear(algebra, (C, 6), (S, 2)), lambda m, x, s: m(x, s)),
-    "bilinear": (lambda algebra: GeometricBilinear(algebra, C, S), lambda m, x, s: m(x, s, x.mean((-3, -2)))),
+    "bilinear": (
+        lambda algebra: GeometricBilinear(algebra, C, S),
+        lambda m, x, s: m(x, s, x.mean((-3, -2))),
+    ),
     "attention": (
         lambda algebra: GeometricAttention(algebra, C, S, 2),
         lambda m, x, s: m(*equivariant_norm(m.algebra, x, s)),
     ),
-    "block": (lambda algebra: GATrBlock(algebra, C, S, 2), lambda m, x, s: m(x, s, x.mean((-3, -2)))),
+    "block": (
+        lambda algebra: GATrBlock(algebra, C, S, 2),
+        lambda m, x, s: m(x, s, x.mean((-3, -2))),
+    ),
     "norm": (torch.nn.Identity, None),
     "gelu": (torch.nn.Identity, lambda m, x, s: gated_gelu(x, s)),
 }
@@ -81,7 +89,8 @@ def test_layers_are_finite_and_those_of_float64(algebra, layer, tokens):
     ask = ask or (lambda m, x, s: equivariant_norm(algebra, x, s))
     torch.manual_seed(0)
     x = TOKENS_OF[tokens](algebra)
-    # Squares of light-like vectors of 1e4 cancel but for float32's last digits: only finite values are required.
+    # Squares of light-like vectors of 1e4 cancel but for float32's last digits: only finite values
+    # are required.
     within = math.inf if tokens == "null vectors of 1e4" else 0
     require_same(ask, make(algebra), x, random(B, TOKENS, S), tolerance=2e-3, within=within)
 
@@ -95,7 +104,9 @@ TURNS = [0.0, 1e-12, 1e-7, 1e-4, 0.1, math.pi / 2, math.pi - 1e-7, math.pi]
 @pytest.mark.parametrize("turn", TURNS)
 @pytest.mark.parametrize("apart", [0.0, 1e-7, 1.0, 1e3])
 def test_two_mirrors_turn_by_twice_their_angle(dtype, turn, apart):
-    normals = torch.tensor([[1.0, 0, 0], [math.cos(turn), math.sin(turn), 0]], dtype=dtype).requires_grad_()
+    normals = torch.tensor(
+        [[1.0, 0, 0], [math.cos(turn), math.sin(turn), 0]], dtype=dtype
+    ).requires_grad_()
     offsets = torch.tensor([0.5, 0.5 + apart], dtype=dtype).requires_grad_()
     first, second = embed_plane(normals, offsets)
     versor = PROJECTIVE.product(second, first)

@@ -25,11 +25,14 @@ means = example_gaussians(SCENE, 20).means.detach()
 PLACES = {
     "on the receiver": receiver.expand(3, 3),
     "beside the receiver": receiver + torch.tensor([[1e-6, 0, 0], [0, 1e-4, 0], [0, 0, 1e-7]]),
-    "at corners of the box": torch.stack((SCENE.lower, SCENE.upper, (SCENE.lower + SCENE.upper) / 2)),
+    "at corners of the box": torch.stack(
+        (SCENE.lower, SCENE.upper, (SCENE.lower + SCENE.upper) / 2)
+    ),
     "all at one place": SCENE.lower.expand(3, 3) + 0.5,
     "outside": SCENE.upper + torch.tensor([[10.0, 0, 0], [0, 100, 0], [0, 0, -50]]),
     "on an anchor": means[:3],
-    "beside each other": SCENE.lower + torch.tensor([[1, 1, 1], [1 + 1e-6, 1, 1], [1, 1, 1 - 1e-6]]),
+    "beside each other": SCENE.lower
+    + torch.tensor([[1, 1, 1], [1 + 1e-6, 1, 1], [1, 1, 1 - 1e-6]]),
 }
 GAUSSIANS = {
     "about": means,
@@ -43,8 +46,13 @@ FAR = torch.tensor([2.0**20, -(2.0**19), 2.0**18])
 
 
 def moved(scene, shift):
-    receivers = [replace(one, pose=Pose(one.pose.position + shift, one.pose.rotation)) for one in scene.receivers]
-    return replace(scene, receivers=tuple(receivers), lower=scene.lower + shift, upper=scene.upper + shift)
+    receivers = [
+        replace(one, pose=Pose(one.pose.position + shift, one.pose.rotation))
+        for one in scene.receivers
+    ]
+    return replace(
+        scene, receivers=tuple(receivers), lower=scene.lower + shift, upper=scene.upper + shift
+    )
 
 
 SCENES = {
@@ -67,7 +75,9 @@ def query_at(places, scene=SCENE):
 def ask_tokens(scene, opacities):
     def ask(module, transmitters, stands):
         return module(
-            Placed(stands[None]), widen(opacities[: len(stands)], stands.dtype), query_at(transmitters, scene)
+            Placed(stands[None]),
+            widen(opacities[: len(stands)], stands.dtype),
+            query_at(transmitters, scene),
         )
 
     return ask
@@ -82,7 +92,9 @@ def test_tokens(name, places, gaussians, scene):
     shift = FAR if scene == "far from the origin" else 0
     own = SCENES[scene]
     module = build("tokenizer", name, scene=own)
-    require_same(ask_tokens(own, OPACITIES), module, PLACES[places] + shift, GAUSSIANS[gaussians] + shift)
+    require_same(
+        ask_tokens(own, OPACITIES), module, PLACES[places] + shift, GAUSSIANS[gaussians] + shift
+    )
 
 
 @every("tokenizer")
@@ -91,9 +103,13 @@ def test_tokens_of_attention_with_huge_logits_or_none(name, size):
     module = build("tokenizer", name, scene=SCENE)
     attending = [part for part in module.modules() if "Attention" in type(part).__name__]
     with torch.no_grad():
-        for parameter in [parameter for part in attending for parameter in part.project.parameters()]:
+        for parameter in [
+            parameter for part in attending for parameter in part.project.parameters()
+        ]:
             parameter.mul_(size)
-    require_same(ask_tokens(SCENE, OPACITIES), module, PLACES["at corners of the box"], means, tolerance=1e-2)
+    require_same(
+        ask_tokens(SCENE, OPACITIES), module, PLACES["at corners of the box"], means, tolerance=1e-2
+    )
 
 
 @every("deformation")
@@ -108,7 +124,9 @@ def test_residuals(name, size, n):
     module = build("deformation", name, scene=SCENE, channels=2, tokenizer_widths=widths)
 
     def ask(module, transmitters, stands, *tokens):
-        return module(Tokens(*tokens) if module.reads_tokens else None, Placed(stands), query_at(transmitters))
+        return module(
+            Tokens(*tokens) if module.reads_tokens else None, Placed(stands), query_at(transmitters)
+        )
 
     *_, attenuations = require_same(ask, module, PLACES["on the receiver"], stands, *tokens)
     if attenuations is not None and attenuations.numel():
@@ -179,9 +197,13 @@ def test_values_of_paths(name, size, alike):
             waves = torch.polar(torch.ones_like(turns), turns).expand(2, -1)
         else:
             shape = 2, *links.task.shape
-            waves = torch.polar(torch.ones(shape), torch.zeros(shape) if alike else torch.arange(40.0).view(shape))
+            waves = torch.polar(
+                torch.ones(shape), torch.zeros(shape) if alike else torch.arange(40.0).view(shape)
+            )
         query = links.query[:2]
-        ask = lambda module, received, query=query: module.read(received, widen(query, received.real.dtype))
+        ask = lambda module, received, query=query: module.read(
+            received, widen(query, received.real.dtype)
+        )
         require_same(ask, pooling, size * waves)
 
 
@@ -192,7 +214,13 @@ LABELS = {
     "denormal": lambda labels: 0 * labels + 1e-42,
     "as they are": lambda labels: labels,
 }
-VALUES = {"nothing": 0.0, "the labels": 1.0, "opposite": -1.0, "far too much": 1e4, "denormal": 1e-42}
+VALUES = {
+    "nothing": 0.0,
+    "the labels": 1.0,
+    "opposite": -1.0,
+    "far too much": 1e4,
+    "denormal": 1e-42,
+}
 
 
 @functools.cache
@@ -223,6 +251,8 @@ def test_losses(name, labels, values):
         def ask(_, values, loss=loss, batch=batch, given=given, is_beyond=is_beyond):
             real = values.real.dtype if values.is_complex() else values.dtype
             found, _ = loss(values, replace(batch, labels=widen(given, real)))
-            return found.detach() if is_beyond else found  # float32 does not reach one over such a channel
+            return (
+                found.detach() if is_beyond else found
+            )  # float32 does not reach one over such a channel
 
         require_same(ask, None, VALUES[values] * given)

@@ -37,7 +37,9 @@ def test_two_writers_of_a_file_never_meet(tmp_path):
     assert [*tmp_path.iterdir()] == [path]
 
 
-@pytest.mark.parametrize("error", [FULL, ValueError("no"), KeyboardInterrupt()], ids=["disk", "value", "ctrl-c"])
+@pytest.mark.parametrize(
+    "error", [FULL, ValueError("no"), KeyboardInterrupt()], ids=["disk", "value", "ctrl-c"]
+)
 @pytest.mark.parametrize("begun", [True, False])
 def test_where_writing_fails_all_is_as_before(error, begun, tmp_path):
     path = tmp_path / "scores.npz"
@@ -61,7 +63,9 @@ def test_a_folder_that_was_removed_is_not_made_anew(tmp_path):
             part.parent.mkdir()  # as Lightning does
             part.write_text("new")
 
-    with pytest.raises(FileNotFoundError, match=r"last\.ckpt could not be written \(No such file or directory\)"):
+    with pytest.raises(
+        FileNotFoundError, match=r"last\.ckpt could not be written \(No such file or directory\)"
+    ):
         write()
     assert not [*tmp_path.iterdir()]
 
@@ -88,8 +92,14 @@ def test_a_file_is_on_the_disk_before_it_takes_its_place(tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("error", "begins"),
     [
-        (FULL, "a file in run could not be written (No space left on device)\ncheck that its folder"),
-        (OSError(errno.ENOENT, os.strerror(errno.ENOENT), "a.csv"), "a.csv could not be read or written (No such file"),
+        (
+            FULL,
+            "a file in run could not be written (No space left on device)\ncheck that its folder",
+        ),
+        (
+            OSError(errno.ENOENT, os.strerror(errno.ENOENT), "a.csv"),
+            "a.csv could not be read or written (No such file",
+        ),
         (OSError(errno.ENOSPC, "run/best.ckpt could not"), "run/best.ckpt could not"),
         (FileNotFoundError("nowhere must be the folder of a data set"), "nowhere must be"),
     ],

@@ -32,7 +32,9 @@ def test_an_image_is_decoded_once_and_when_asked(files):
     for file in files:
         file.unlink()
     assert torch.equal(images[torch.tensor([2, 0])], first[1:])
-    with pytest.raises(ValueError, match=r"cannot parse .*1\.png: no whole PNG image \(.*\); copy it again"):
+    with pytest.raises(
+        ValueError, match=r"cannot parse .*1\.png: no whole PNG image \(.*\); copy it again"
+    ):
         images[torch.tensor([0, 1])]
 
 
@@ -48,7 +50,10 @@ def cut(size):
     ("damage", "message"),
     [
         (save(np.zeros((90, 361), np.uint8)), "of 90 x 360 pixels, got mode L of 90 x 361"),
-        (lambda file: Image.new("L", (360, 90)).save(file, format="jpeg"), "no whole PNG image (cannot identify image"),
+        (
+            lambda file: Image.new("L", (360, 90)).save(file, format="jpeg"),
+            "no whole PNG image (cannot identify image",
+        ),
         *((cut(size), "no whole PNG image (") for size in (0, 20, 40)),
     ],
 )
@@ -81,13 +86,19 @@ def test_grey_values_are_read_from_every_kind_of_png(files, image):
 def test_sixteen_bits_are_kept(files):
     fine = np.arange(90 * 360, dtype=np.uint16).reshape(SHAPE)
     Image.fromarray(fine).save(files[1])
-    np.testing.assert_allclose(GreyImages(files, SHAPE)[torch.tensor([1])][0], fine / 65535, rtol=1e-6)
+    np.testing.assert_allclose(
+        GreyImages(files, SHAPE)[torch.tensor([1])][0], fine / 65535, rtol=1e-6
+    )
 
 
 @pytest.mark.parametrize(
     ("channel", "value", "message"),
     [
-        (1, GREY[3, 5] ^ 1, "expected grey values, got the colour [{0}, {1}, {0}] in row 3, column 5"),
+        (
+            1,
+            GREY[3, 5] ^ 1,
+            "expected grey values, got the colour [{0}, {1}, {0}] in row 3, column 5",
+        ),
         (3, 254, "expected no transparent pixel, got one in row 3, column 5"),
     ],
 )
@@ -95,7 +106,9 @@ def test_colours_and_transparent_pixels_are_no_grey_values(files, channel, value
     pixels = np.stack((GREY, GREY, GREY, np.full_like(GREY, 255)), -1)
     pixels[3, 5, channel] = value
     Image.fromarray(pixels).save(files[1])
-    with pytest.raises(ValueError, match=rf"1\.png: {re.escape(message.format(GREY[3, 5], value))}"):
+    with pytest.raises(
+        ValueError, match=rf"1\.png: {re.escape(message.format(GREY[3, 5], value))}"
+    ):
         GreyImages(files, SHAPE)[torch.tensor([1])]
 
 
@@ -104,7 +117,8 @@ def test_a_colour_map_is_named(files, mode):
     ramp = np.stack((GREY, 255 - GREY, np.full_like(GREY, 80)), -1)
     Image.fromarray(ramp).convert(mode).save(files[1])
     with pytest.raises(
-        ValueError, match=r"^[^ ]*1\.png: expected grey values, got the colour .*; as of a colour map: store the"
+        ValueError,
+        match=r"^[^ ]*1\.png: expected grey values, got the colour .*; as of a colour map: store the",
     ):
         GreyImages(files, SHAPE)[torch.tensor([1])]
 

@@ -10,10 +10,14 @@ OBJ = "# a room\no floor\nv 0 0 1\nv 4 0 1\nv 4.5 2e0 1\nv 0 2 1\nusemtl glass\n
 
 
 def ply(text):
-    vertices = np.array([(0, 0, 1), (4, 0, 1), (4.5, 2, 1), (0, 2, 1)], [(axis, "f4") for axis in "xyz"])
+    vertices = np.array(
+        [(0, 0, 1), (4, 0, 1), (4.5, 2, 1), (0, 2, 1)], [(axis, "f4") for axis in "xyz"]
+    )
     faces = np.empty(2, [("vertex_indices", object)])
     faces["vertex_indices"] = [np.array([0, 1, 2], "i4"), np.array([0, 2, 3], "i4")]
-    return PlyData([PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")], text=text)
+    return PlyData(
+        [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")], text=text
+    )
 
 
 def test_an_obj_has_vertices_and_faces_by_object_and_material(tmp_path):
@@ -24,7 +28,9 @@ def test_an_obj_has_vertices_and_faces_by_object_and_material(tmp_path):
 
 
 def test_a_line_of_an_obj_goes_on_after_a_backslash(tmp_path):
-    (tmp_path / "room.OBJ").write_text(OBJ.replace("f 1/1 2/2", "f 1/1 \\\n 2/2\\").replace("0 2 1", "0 \\\n2 1"))
+    (tmp_path / "room.OBJ").write_text(
+        OBJ.replace("f 1/1 2/2", "f 1/1 \\\n 2/2\\").replace("0 2 1", "0 \\\n2 1")
+    )
     with (tmp_path / "room.OBJ").open("a") as file:
         file.write("# from C:\\rooms\\\n#\n")
     assert repr(read_obj(tmp_path / "room.OBJ")) == repr(parse_obj(OBJ.splitlines(), ""))
@@ -63,12 +69,28 @@ def test_a_wrong_line_of_an_obj_is_named(line, message):
 @pytest.mark.parametrize(
     ("before", "after", "message"),
     [
-        ("4.5 2 1", "4.5 2 nan", r"vertex 3: expected positions within 1e5 m .*, got \[4\.5, 2\.0, nan\]"),
+        (
+            "4.5 2 1",
+            "4.5 2 nan",
+            r"vertex 3: expected positions within 1e5 m .*, got \[4\.5, 2\.0, nan\]",
+        ),
         ("4.5 2 1", "1e9 2 1", "positions within 1e5 m"),
-        ("3 0 2 3", "3 0 2 4", r"face 2: expected three or more of the 4 vertices, got \(0, 2, 4\)"),
+        (
+            "3 0 2 3",
+            "3 0 2 4",
+            r"face 2: expected three or more of the 4 vertices, got \(0, 2, 4\)",
+        ),
         ("3 0 2 3", "2 0 2", "face 2: expected three"),
-        ("vertex 4", "vertex 400000000000", "cannot parse .*room.ply: .*; expected a .ply file of vertices x, y, z"),
-        ("property float z\n", "", "cannot parse .*room.ply: .*; expected a .ply file of vertices x, y, z"),
+        (
+            "vertex 4",
+            "vertex 400000000000",
+            "cannot parse .*room.ply: .*; expected a .ply file of vertices x, y, z",
+        ),
+        (
+            "property float z\n",
+            "",
+            "cannot parse .*room.ply: .*; expected a .ply file of vertices x, y, z",
+        ),
     ],
 )
 def test_a_defect_of_a_ply_is_named(tmp_path, before, after, message):

@@ -4,7 +4,9 @@ import pytest
 
 from gaigs.io.yaml import read_mapping, to_position
 
-ALIASES = "".join(f"b{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 8))  # each twice as long when written out
+ALIASES = "".join(
+    f"b{k}: &a{k} [*a{k - 1}, *a{k - 1}]\n" for k in range(1, 8)
+)  # each twice as long when written out
 
 
 @pytest.fixture
@@ -20,7 +22,8 @@ def read(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "position", ["[5, 1e-3, -.5]", "[+5, '1e-3', \"-0.5\"]", "[5.e0, 1.0E-3, -00.5]", "\n- 5\n- 0.001\n- -0.5"]
+    "position",
+    ["[5, 1e-3, -.5]", "[+5, '1e-3', \"-0.5\"]", "[5.e0, 1.0E-3, -00.5]", "\n- 5\n- 0.001\n- -0.5"],
 )
 def test_numbers_are_read_as_they_are_written(read, position):
     content = read(f"dataset: 010\neast: {position}\n")
@@ -39,13 +42,17 @@ def test_numbers_are_read_as_they_are_written(read, position):
 )  # fmt: skip
 def test_a_position_is_a_list_of_three_plain_numbers(read, position):
     value = read(f"east: {position}\n")["east"]
-    with pytest.raises(ValueError, match=r"east must be 3 finite numbers x, y, z, .* got") as caught:
+    with pytest.raises(
+        ValueError, match=r"east must be 3 finite numbers x, y, z, .* got"
+    ) as caught:
         to_position("east", value)
     assert len(str(caught.value)) < 200
 
 
 def test_a_position_too_far_for_float32_is_refused():
-    with pytest.raises(ValueError, match="east: expected positions within 1e5 m of the origin on each axis"):
+    with pytest.raises(
+        ValueError, match="east: expected positions within 1e5 m of the origin on each axis"
+    ):
         to_position("east", ["5", "-1e5", "2"])
 
 
@@ -53,13 +60,22 @@ def test_a_position_too_far_for_float32_is_refused():
     ("text", "message"),
     [
         ("- [1, 2, 3]\n", "expected each gateway's name: [x, y, z], got '- [1, 2, 3]'"),
-        ("east: " + 1000 * "[", "cannot parse FILE: maximum recursion depth exceeded; expected each gateway's"),
+        (
+            "east: " + 1000 * "[",
+            "cannot parse FILE: maximum recursion depth exceeded; expected each gateway's",
+        ),
         ("east: [[5, 1, 2]\n", "cannot parse FILE: while parsing a flow sequence"),
         ("east: !<tag:%E9> 1", "cannot parse FILE: "),
-        ("east: [!feet 5, 1, 2]", "cannot parse FILE: could not determine a constructor for the tag '!feet'"),
+        (
+            "east: [!feet 5, 1, 2]",
+            "cannot parse FILE: could not determine a constructor for the tag '!feet'",
+        ),
         ("east: &a [*a, 1, 2]", "east must be 3 finite"),
         (f"a: &a0 [5]\n{ALIASES}east: *a7", "got [[[[[[[...], [...]], "),
-        ("east: [5, 1, 2]\n---\nwest: [5, 1, 2]\n", "cannot parse FILE: expected a single document"),
+        (
+            "east: [5, 1, 2]\n---\nwest: [5, 1, 2]\n",
+            "cannot parse FILE: expected a single document",
+        ),
         ("east: [5, 1, 2]\n" * 2, "cannot parse FILE: the key 'east' is there twice"),
         ('"ea\\tst": 1', "expected a name in front of a colon, got 'ea\\tst'"),
     ],

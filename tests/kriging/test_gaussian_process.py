@@ -1,7 +1,7 @@
 """The Gaussian process against numpy, and against draws of processes with known hyperparameters.
 
-tests/model/test_baselines_by_hand.py checks its predictions and the likelihood of its hyperparameters, and
-test_scalar_process.py the process of labels of one number.
+tests/model/test_baselines_by_hand.py checks its predictions and the likelihood of its
+hyperparameters, and test_scalar_process.py the process of labels of one number.
 """
 
 from dataclasses import replace
@@ -32,7 +32,9 @@ def few_neighbours(monkeypatch):
 
 
 def make(task="rssi", count=60, carriers=()):
-    """Random labels of random places, which both receivers hear in turn; 0.7 train, 0.1 validate, 0.2 test."""
+    """Random labels of random places, which both receivers hear in turn; 0.7 train, 0.1 validate,
+    0.2 test.
+    """
     links = example_links("csi" if task == "one channel" else task)
     generator = torch.Generator().manual_seed(0)
     places = BOX * torch.rand(count, 3, generator=generator)
@@ -52,7 +54,8 @@ def make(task="rssi", count=60, carriers=()):
 def fitted(links, **options):
     """About the mean, unless options say otherwise: channels are about ``friis`` by default."""
     model = GaussianProcess(
-        links.scene, **({"trend": {"name": "mean"}} if links.task.dtype.is_complex else {}) | options
+        links.scene,
+        **({"trend": {"name": "mean"}} if links.task.dtype.is_complex else {}) | options,
     )
     model.fit(links)
     return model
@@ -65,7 +68,9 @@ def drawn(length, nugget, scale=0.0, validation=0):
     if scale:
         places = torch.cat((places, scale * links.query.frequencies.double().log()[:, None]), 1)
     covariances = np.exp(-cdist(places, places) / length) + nugget * np.eye(240)
-    labels = 0.3 * np.linalg.cholesky(covariances) @ np.random.default_rng(0).standard_normal((240, 648))
+    labels = (
+        0.3 * np.linalg.cholesky(covariances) @ np.random.default_rng(0).standard_normal((240, 648))
+    )
     return replace(
         links,
         query=replace(links.query, receivers=torch.zeros(240, dtype=torch.long)),
@@ -78,7 +83,10 @@ def drawn(length, nugget, scale=0.0, validation=0):
 def kriged(model, links, receiver, asked, nearest=None):
     """mean + k' (K + nugget)^-1 residuals in numpy, from all known links or the nearest ones."""
     index = links.known(receiver)
-    positions, labels = links.query.transmitters[index].double().numpy(), links.labels[index].numpy()
+    positions, labels = (
+        links.query.transmitters[index].double().numpy(),
+        links.labels[index].numpy(),
+    )
     mean = labels.astype(np.complex128 if np.iscomplexobj(labels) else np.float64).mean(0)
     values = []
     for place in asked.double().numpy():
@@ -115,11 +123,16 @@ def test_many_links_are_predicted_from_the_nearest(task, monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore::gaigs.core.geometry.ExtrapolationWarning")
-@pytest.mark.parametrize(("task", "trend"), [("spectrum", "mean"), ("rssi", "path_loss"), ("csi", "friis")])
+@pytest.mark.parametrize(
+    ("task", "trend"), [("spectrum", "mean"), ("rssi", "path_loss"), ("csi", "friis")]
+)
 def test_far_from_all_links_only_the_trend_is_predicted(task, trend):
     links = example_links(task)
     options = {"trend": None if task == "csi" else {"name": trend}}
-    model, plain = fitted(links, **options), registry("model").build({"name": trend}, scene=links.scene)
+    model, plain = (
+        fitted(links, **options),
+        registry("model").build({"name": trend}, scene=links.scene),
+    )
     plain.fit(links)
     far = torch.full((1, 3), 1e4)
     torch.testing.assert_close(model.predict(far), plain.predict(far), rtol=1e-5, atol=1e-5)
@@ -143,7 +156,8 @@ def test_places_measured_twice_do_not_break_the_matrices(task):
 
 
 @pytest.mark.parametrize(
-    ("length", "nugget", "scale", "validation"), [(0.5, 0.01, 0, 0), (1.0, 1.0, 0, 40), (2.0, 0.05, 3, 0)]
+    ("length", "nugget", "scale", "validation"),
+    [(0.5, 0.01, 0, 0), (1.0, 1.0, 0, 40), (2.0, 0.05, 3, 0)],
 )
 def test_hyperparameters_are_those_of_the_process(length, nugget, scale, validation):
     process = fitted(drawn(length, nugget, scale, validation)).process
@@ -156,7 +170,9 @@ def test_without_a_validation_no_copy_of_a_link_predicts_it():
     """Copies share their noise, which would pass for signal."""
     links = make("rssi", 40)
     links.query.transmitters[20:] = links.query.transmitters[:20].clone()
-    held = hold_out(links.scene, links, links.known(0), np.nan, lambda index: links.labels[index][:, None], 100)
+    held = hold_out(
+        links.scene, links, links.known(0), np.nan, lambda index: links.labels[index][:, None], 100
+    )
     around = held.around.transmitters.unflatten(0, (len(held.asked), -1))
     assert (around != held.asked.transmitters[:, None]).any(-1).all()
 
@@ -165,7 +181,9 @@ def test_a_squared_error_below_zero_by_rounding_has_a_likelihood():
     links = make("rssi", 10)
     products = torch.tensor([[[1.0, 1.1], [1.1, 1.0]]], dtype=torch.float64)
     held = HeldOut(links.query[:1], links.query[:1], products)
-    assert negative_log_likelihood(links.scene, held, torch.tensor(1.0), torch.tensor(1e-4)).isfinite()
+    assert negative_log_likelihood(
+        links.scene, held, torch.tensor(1.0), torch.tensor(1e-4)
+    ).isfinite()
 
 
 @TASKS
@@ -173,7 +191,9 @@ def test_labels_that_the_trend_explains_are_predicted_by_it(task):
     links = make(task)
     links.labels[:] = torch.full(links.task.shape, 0.5)
     model = fitted(links)
-    torch.testing.assert_close(model.predict(torch.rand(4, 3), 0), links.labels[:4], rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        model.predict(torch.rand(4, 3), 0), links.labels[:4], rtol=0, atol=1e-6
+    )
     edge = (links.scene.upper - links.scene.lower).max().item()
     assert links.scene.spacing < model.process.length < 8 * edge
 

@@ -1,4 +1,6 @@
-"""Wrong levels among the known ones, which must not move a fit; and strange ones that are a part of the room."""
+"""Wrong levels among the known ones, which must not move a fit; and strange ones that are a part of
+the room.
+"""
 
 import pytest
 import torch
@@ -11,7 +13,9 @@ from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.path_loss import PathLoss
 
 RECEIVERS = torch.tensor([[0.0, 0.0, 2.0], [12.0, 8.0, 2.0]])
-PLACES = torch.rand(80, 3, generator=torch.Generator().manual_seed(3)) * torch.tensor([12.0, 8.0, 1.0])
+PLACES = torch.rand(80, 3, generator=torch.Generator().manual_seed(3)) * torch.tensor(
+    [12.0, 8.0, 1.0]
+)
 
 
 def survey(change=None):
@@ -19,7 +23,13 @@ def survey(change=None):
     levels = -40 - 20 * torch.cdist(PLACES, RECEIVERS).log10()
     levels += 3 * torch.randn(80, 2, generator=torch.Generator().manual_seed(4))
     levels = levels if change is None else levels + change
-    return gaigs.links(task="rssi", transmitters=PLACES, receivers=RECEIVERS, labels=levels, test_rows=range(60, 80))
+    return gaigs.links(
+        task="rssi",
+        transmitters=PLACES,
+        receivers=RECEIVERS,
+        labels=levels,
+        test_rows=range(60, 80),
+    )
 
 
 def wrong(number, size):

@@ -35,19 +35,31 @@ def solved(places, fields, labels, residuals):
 
 def dense(places, asked, fields, labels, residuals):
     """Covariances of the processes with the residuals, and of the residuals."""
-    n, powers = fields.shape[1], (np.abs(residuals) ** 2).mean(1) + 1e-4 * (np.abs(labels) ** 2).mean(1)
-    each = lambda a, b: np.kron(PROCESS.deviation**2 * np.exp(-cdist(a, b) / PROCESS.length), np.eye(n))
+    n, powers = (
+        fields.shape[1],
+        (np.abs(residuals) ** 2).mean(1) + 1e-4 * (np.abs(labels) ** 2).mean(1),
+    )
+    each = lambda a, b: np.kron(
+        PROCESS.deviation**2 * np.exp(-cdist(a, b) / PROCESS.length), np.eye(n)
+    )
     matrix = block_diag(*(part.T for part in fields))
     noise = np.diag(np.repeat(PROCESS.nugget * powers, labels.shape[1]))
-    return each(asked, places) @ matrix.conj().T, matrix @ each(places, places) @ matrix.conj().T + noise
+    return each(asked, places) @ matrix.conj().T, matrix @ each(
+        places, places
+    ) @ matrix.conj().T + noise
 
 
 def test_strengths_are_the_dense_solution():
     """Of more links than one part; two of them at one place."""
-    places, asked = np.random.default_rng(0).uniform(0, 5, (70, 3)), np.random.default_rng(1).uniform(0, 5, (4, 3))
+    places, asked = (
+        np.random.default_rng(0).uniform(0, 5, (70, 3)),
+        np.random.default_rng(1).uniform(0, 5, (4, 3)),
+    )
     places[1] = places[0]
     fields, labels = draw(70, 3, 8), draw(70, 8, seed=1)
-    residuals = draw(70, 8, seed=2) * 10.0 ** np.random.default_rng(3).uniform(-3, 0, (70, 1))  # some in shadow
+    residuals = draw(70, 8, seed=2) * 10.0 ** np.random.default_rng(3).uniform(
+        -3, 0, (70, 1)
+    )  # some in shadow
     found = solved(places, fields, labels, residuals)(torch.from_numpy(asked), PROCESS)
     towards, covariances = dense(places, asked, fields, labels, residuals)
     expected = (towards @ np.linalg.solve(covariances, residuals.flatten())).reshape(4, 3)
@@ -55,7 +67,10 @@ def test_strengths_are_the_dense_solution():
 
 
 def test_variances_of_resolved_paths_are_the_dense_ones():
-    places, asked = np.random.default_rng(0).uniform(0, 5, (20, 3)), np.random.default_rng(1).uniform(0, 5, (4, 3))
+    places, asked = (
+        np.random.default_rng(0).uniform(0, 5, (20, 3)),
+        np.random.default_rng(1).uniform(0, 5, (4, 3)),
+    )
     fields = np.linalg.qr(draw(20, 8, 3))[0].swapaxes(1, 2) * np.array([2, 1, 0.3])[:, None]
     labels = draw(20, 8, seed=1)
     field = solved(places, fields, labels, labels)
@@ -87,7 +102,9 @@ def made(smooth=0.0, noise=0.0, phase="known", validation=20):
     task = Csi(4, links.task.frequencies, phase)
     split = Split("made up", *torch.arange(120).split((80, validation, 40 - validation)))
     query = Query(places, torch.zeros(120, dtype=torch.long))
-    links = replace(links, query=query, receivers=links.receivers[:1], rows=None, split=split, task=task)
+    links = replace(
+        links, query=query, receivers=links.receivers[:1], rows=None, split=split, task=task
+    )
     links = replace(links, labels=torch.zeros(120, *task.shape, dtype=torch.complex64))
     torch.manual_seed(0)
     placement = {"name": "mirrored", "order": 1, "planes": 6, "obstacles": 0}
@@ -96,16 +113,23 @@ def made(smooth=0.0, noise=0.0, phase="known", validation=20):
     labels, margins = model.predict(links.query), model.margins(links.query)
     waves = (places @ torch.randn(3, margins.shape[1], generator=generator) / 3).cos()
     labels = labels + smooth * (waves[..., None, None] * margins).sum(1)
-    labels = labels + noise * labels.abs().mean() * torch.randn(labels.shape, dtype=labels.dtype, generator=generator)
+    labels = labels + noise * labels.abs().mean() * torch.randn(
+        labels.shape, dtype=labels.dtype, generator=generator
+    )
     if phase != "known":
         labels = 1e4 ** (phase == "per_link_and_delay") * labels  # whose gain is unknown
-        labels = labels * torch.polar(torch.ones(120), 6 * torch.rand(120, generator=generator))[:, None, None]
+        labels = (
+            labels
+            * torch.polar(torch.ones(120), 6 * torch.rand(120, generator=generator))[:, None, None]
+        )
     return replace(links, labels=labels), model
 
 
 def errors(model, links):
     test = links.split.test
-    return links.task.scores(links.labels[test], model.predict(links.query[test]))["error_power"].sum()
+    return links.task.scores(links.labels[test], model.predict(links.query[test]))[
+        "error_power"
+    ].sum()
 
 
 @torch.no_grad()
@@ -114,9 +138,13 @@ def test_margins_are_largest_where_obstacles_block_a_part(passing, monkeypatch):
     links, model = made()
     clear = model.predict(links.query)
     model.placement.obstacles = torch.nn.Identity()
-    depths = lambda obstacles, folded, strengths: torch.full_like(strengths.real, -math.log(passing))
+    depths = lambda obstacles, folded, strengths: torch.full_like(
+        strengths.real, -math.log(passing)
+    )
     monkeypatch.setattr(model.placement, "_depths", depths)
-    torch.testing.assert_close(model.margins(links.query).sum(1), (passing * (1 - passing) + 0.1) * clear)
+    torch.testing.assert_close(
+        model.margins(links.query).sum(1), (passing * (1 - passing) + 0.1) * clear
+    )
 
 
 @pytest.mark.parametrize("phase", ["known", "per_link", "per_link_and_delay"])
@@ -161,7 +189,9 @@ def test_labels_are_kriged_where_paths_explain_less(caplog):
     """Of dense places whose phases no plane explains."""
     links, trend = made()
     places = links.query.transmitters / 100
-    labels = torch.polar(torch.ones(120), 30 * places.sum(1))[:, None, None] * trend.predict(links.query).mean(0)
+    labels = torch.polar(torch.ones(120), 30 * places.sum(1))[:, None, None] * trend.predict(
+        links.query
+    ).mean(0)
     links = replace(links, query=replace(links.query, transmitters=places), labels=labels)
     model = Kriging(links.scene, trend, {"name": "friis"})
     model.fit(links)

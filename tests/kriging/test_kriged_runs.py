@@ -62,7 +62,9 @@ def test_trend_and_kriging_are_reported(finished):
     assert links.task.scores(labels, values)["mae_db"].mean() < metrics["validation_score"] - 0.1
     evaluated = gaigs.evaluate(model, links, ["mean"]).models
     for name, scores in metrics["models"].items():
-        assert evaluated[name] == pytest.approx({key: scores[key] for key in evaluated[name]}, rel=1e-4)
+        assert evaluated[name] == pytest.approx(
+            {key: scores[key] for key in evaluated[name]}, rel=1e-4
+        )
 
 
 def test_the_checkpoint_holds_the_kriged_model(finished):
@@ -73,7 +75,9 @@ def test_the_checkpoint_holds_the_kriged_model(finished):
     assert metrics["checkpoint_bytes"] == (folder / "best.ckpt").stat().st_size
     with np.load(folder / "predictions.npz") as file:
         receivers = torch.from_numpy(file["receiver"])
-        found = gaigs.load(folder / "best.ckpt").predict(torch.from_numpy(file["transmitters"]), receivers)
+        found = gaigs.load(folder / "best.ckpt").predict(
+            torch.from_numpy(file["transmitters"]), receivers
+        )
         np.testing.assert_allclose(found, file["prediction"], rtol=1e-4)
 
 

@@ -34,7 +34,9 @@ class Trained(Model):
     def __init__(self, scene):
         super().__init__(scene)
         task = scene.task
-        weights = torch.randn(1, *task.shape, dtype=task.dtype, generator=torch.Generator().manual_seed(5))
+        weights = torch.randn(
+            1, *task.shape, dtype=task.dtype, generator=torch.Generator().manual_seed(5)
+        )
         self.weights = nn.Parameter(weights)
 
     def forward(self, batch):
@@ -50,7 +52,8 @@ def quick(monkeypatch):
 
 
 def make(task="rssi", count=100, carriers=(), smooth=0.0, trained=0.0, noise=0.0):
-    """Labels are a weighted sum of a smooth process over places, the trained model's values, and noise.
+    """Labels are a weighted sum of a smooth process over places, the trained model's values, and
+    noise.
 
     Both receivers hear in turn; a fifth tests, a fifth validates.
     """
@@ -63,7 +66,10 @@ def make(task="rssi", count=100, carriers=(), smooth=0.0, trained=0.0, noise=0.0
     covariances = torch.from_numpy(np.exp(-cdist(places.double(), places.double()) / 4))
     factor = torch.linalg.cholesky(covariances + 1e-9 * torch.eye(count)).to(dtype)
     order = torch.randperm(count, generator=generator)
-    parts = (part.sort().values for part in order.split([3 * count // 5, count // 5, count - 4 * (count // 5)]))
+    parts = (
+        part.sort().values
+        for part in order.split([3 * count // 5, count // 5, count - 4 * (count // 5)])
+    )
     links = replace(
         links,
         query=Query(places, torch.arange(count) % 2, frequencies),
@@ -91,12 +97,16 @@ def half(monkeypatch):
     def fixed(scene, links, residuals, most=300):
         residuals(links.split.known)
         assert (most == 1000) == (len(costs) % 6 == 5), "the last fit looks at more links"
-        costs.append(float(abs(len(costs) % 6 - 2)))  # of five candidates the third is best, and is fitted again
+        costs.append(
+            float(abs(len(costs) % 6 - 2))
+        )  # of five candidates the third is best, and is fitted again
         return PROCESS if scene.has_band else PROCESS._replace(scale=np.nan), costs[-1]
 
     def fixed_scalar(self, *readings):
         self.logarithms.copy_(torch.tensor([PROCESS.length, 0.7, 0.7 * PROCESS.nugget**0.5]).log())
-        self.choice.copy_(torch.tensor(Choice(0.5, np.inf, PROCESS.scale if self.scene.has_band else np.nan)))
+        self.choice.copy_(
+            torch.tensor(Choice(0.5, np.inf, PROCESS.scale if self.scene.has_band else np.nan))
+        )
         return 0.0  # as likely as any other
 
     costs = []
@@ -122,7 +132,9 @@ def formula(model, links, query, index):
         return np.hstack(columns)
 
     places, asked = stretched(links.query[index]), stretched(query)
-    covariances = np.exp(-cdist(places, places) / PROCESS.length) + PROCESS.nugget * np.eye(len(index))
+    covariances = np.exp(-cdist(places, places) / PROCESS.length) + PROCESS.nugget * np.eye(
+        len(index)
+    )
     weights = np.exp(-cdist(asked, places) / PROCESS.length) @ np.linalg.inv(covariances)
     return mixed(model, query).numpy() + np.tensordot(weights, residuals, 1)
 
@@ -142,7 +154,10 @@ def test_the_model_contract_holds(task, half):
 @pytest.mark.parametrize("task", ["spectrum", "rssi"])
 def test_a_trend_in_double_precision_is_kriged_too(task):
     links = make(task, smooth=1.0, trained=1.0)
-    models = [Kriging(links.scene, trend) for trend in (Trained(links.scene), Trained(links.scene).double())]
+    models = [
+        Kriging(links.scene, trend)
+        for trend in (Trained(links.scene), Trained(links.scene).double())
+    ]
     for model in models:
         model.fit(links)
     single, double = (model.predict(links.query[links.split.test]) for model in models)
@@ -159,18 +174,28 @@ def test_predictions_are_the_formula(task, carriers, half, monkeypatch):
     monkeypatch.setattr(field, "LEFT", 0.0)
     model, validation_model = kriged(links)
     expected = formula(model, links, query, own(links, links.split.known, 1))
-    np.testing.assert_allclose(model.predict(query), expected, rtol=0, atol=1e-4 if task == "rssi" else 5e-3)
+    np.testing.assert_allclose(
+        model.predict(query), expected, rtol=0, atol=1e-4 if task == "rssi" else 5e-3
+    )
     added = expected - mixed(model, query).numpy()
     errors = coarse.predict(query).numpy() - expected
-    assert (np.abs(errors) ** 2).sum() <= 3 * 5e-4 * (np.abs(added) ** 2).sum(), "few components keep nearly all"
+    assert (np.abs(errors) ** 2).sum() <= 3 * 5e-4 * (np.abs(added) ** 2).sum(), (
+        "few components keep nearly all"
+    )
     expected = formula(validation_model, links, query, own(links, links.split.train, 1))
-    np.testing.assert_allclose(validation_model.predict(query), expected, rtol=0, atol=1e-4 if task == "rssi" else 5e-3)
+    np.testing.assert_allclose(
+        validation_model.predict(query), expected, rtol=0, atol=1e-4 if task == "rssi" else 5e-3
+    )
     for stored in (coarse, model):
-        fresh = registry("model").build({"name": "kriging", "trend": {"name": "trained"}}, scene=links.scene)
+        fresh = registry("model").build(
+            {"name": "kriging", "trend": {"name": "trained"}}, scene=links.scene
+        )
         fresh.load_state_dict(stored.state_dict())
         assert torch.equal(fresh.predict(query), stored.predict(query))
         assert fresh.facts() == stored.facts()
-        assert all(buffer.is_contiguous() for buffer in stored.buffers()), "else loaded ones round products differently"
+        assert all(buffer.is_contiguous() for buffer in stored.buffers()), (
+            "else loaded ones round products differently"
+        )
     model.weight.fill_(0.25)
     parts = 0.25 * fresh.predict(query) + 0.75 * model.trend.predict(query)
     torch.testing.assert_close(model.predict(query), parts)
@@ -180,7 +205,14 @@ def test_facts_of_trend_and_kriging_are_reported(half):
     links = make("spectrum", smooth=1.0)
     model, _ = kriged(links)
     components = max(len(field.components) for field in model.fields)
-    facts = {"weight": 1.0, "trend_weight": 0.5, "length_m": 2.0, "nugget": 0.1, "links": 80, "components": components}
+    facts = {
+        "weight": 1.0,
+        "trend_weight": 0.5,
+        "length_m": 2.0,
+        "nugget": 0.1,
+        "links": 80,
+        "components": components,
+    }
     assert model.facts() == {"kriging": facts}
     assert model.primitives is None
     assert call_optional(model, "rendering", links.batch(links.split.test)) is None
@@ -215,15 +247,22 @@ def test_without_validation_links_kriging_counts_fully(half):
 @TASKS
 def test_a_trend_without_information_leaves_the_plain_process(task, monkeypatch):
     monkeypatch.setattr(field, "LEFT", 0.0)
-    links = make(task, 400 if task == "rssi" else 100, smooth=1.0, noise=0.1)  # one number says little
+    links = make(
+        task, 400 if task == "rssi" else 100, smooth=1.0, noise=0.1
+    )  # one number says little
     if task == "csi":
         links.labels[links.split.train[:2]] *= 1e3  # far too loud, and limited by both
     fallback = {"spectrum": None, "rssi": {"name": "path_loss"}, "csi": {"name": "friis"}}[task]
-    model, plain = Kriging(links.scene, Trained(links.scene), fallback), GaussianProcess(links.scene, trend=fallback)
+    model, plain = (
+        Kriging(links.scene, Trained(links.scene), fallback),
+        GaussianProcess(links.scene, trend=fallback),
+    )
     model.fit(links)
     plain.fit(links)
     assert model.weight == 1
-    assert model.trend_weight <= (0.1 if task == "rssi" else 0)  # of RSSI a mean over what is likely
+    assert model.trend_weight <= (
+        0.1 if task == "rssi" else 0
+    )  # of RSSI a mean over what is likely
     if task != "rssi":
         assert model.hyperparameters.tolist() == pytest.approx([*plain.process], nan_ok=True)
     query = links.query[links.split.test]
@@ -249,13 +288,18 @@ def test_a_trend_that_scores_worse_than_its_fallback_is_reported(task, trained, 
     links = make(task, smooth=1.0 - trained, trained=trained, noise=0.1)
     Kriging(links.scene, Trained(links.scene)).fit(links)
     said = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert [message.split(":")[0] for message in said] == ([] if trained else ["the room was not learnt"])
+    assert [message.split(":")[0] for message in said] == (
+        [] if trained else ["the room was not learnt"]
+    )
     assert trained or "falls back on kriging of mean" in said[0]
 
 
 def test_a_trend_that_was_not_learnt_is_left_out_where_scores_are_higher_without_it(monkeypatch):
     links, numbers = make("spectrum", smooth=1.0, noise=0.1), itertools.count()
-    likely = lambda *parts, **options: (fit.fit_hyperparameters(*parts, **options)[0], next(numbers))  # first the trend
+    likely = lambda *parts, **options: (
+        fit.fit_hyperparameters(*parts, **options)[0],
+        next(numbers),
+    )  # first the trend
     monkeypatch.setattr(kriging, "fit_hyperparameters", likely)
     model = Kriging(links.scene, Trained(links.scene))
     model.fit(links)
@@ -273,7 +317,9 @@ def test_links_that_the_trend_overfits_do_not_choose_the_trend_weight(monkeypatc
     class Overfitted(Trained):
         def forward(self, batch):
             values = torch.zeros(len(batch), *self.scene.task.shape)
-            same = (batch.query.transmitters[:, None] == links.query.transmitters[links.split.train]).all(-1)
+            same = (
+                batch.query.transmitters[:, None] == links.query.transmitters[links.split.train]
+            ).all(-1)
             link, which = same.nonzero().T
             values[link] = links.labels[links.split.train[which]]
             return Prediction(at_directions(values, batch, self.scene), {})
@@ -286,7 +332,9 @@ def test_links_that_the_trend_overfits_do_not_choose_the_trend_weight(monkeypatc
 def test_where_kriging_does_harm_its_weight_is_zero(half):
     links = make("spectrum", smooth=3.0, trained=1.0)
     train = links.split.train
-    links.labels[train] += 100 * torch.randn(links.labels[train].shape, generator=torch.Generator().manual_seed(3))
+    links.labels[train] += 100 * torch.randn(
+        links.labels[train].shape, generator=torch.Generator().manual_seed(3)
+    )
     model = Kriging(links.scene, Trained(links.scene))
     validation_model = model.krige(links)
     assert model.weight == validation_model.weight == 0
@@ -298,7 +346,11 @@ def test_where_kriging_does_harm_its_weight_is_zero(half):
 def test_surveys_see_the_process_of_the_predictions(kind, carriers, monkeypatch):
     monkeypatch.setattr(fit, "AROUND", 100)
     links = make("spectrum", carriers=carriers, smooth=1.0)
-    model = GaussianProcess(links.scene) if kind is GaussianProcess else Kriging(links.scene, Trained(links.scene))
+    model = (
+        GaussianProcess(links.scene)
+        if kind is GaussianProcess
+        else Kriging(links.scene, Trained(links.scene))
+    )
     model.fit(links)
     query = links.query[links.split.test]
     query = query[query.receivers == 0]
@@ -331,7 +383,9 @@ def test_components_are_the_fewest_that_leave_little_out(dtype, exact, monkeypat
     assert left(len(components)) <= 0.02 < left(len(components) - 1)
     basis, _ = np.linalg.qr(components.numpy().T.astype(complex).conj())
     over = residuals.numpy() - residuals.numpy() @ basis @ basis.conj().T
-    assert np.linalg.norm(over) ** 2 / np.linalg.norm(residuals) ** 2 == pytest.approx(left(len(components)), rel=0.02)
+    assert np.linalg.norm(over) ** 2 / np.linalg.norm(residuals) ** 2 == pytest.approx(
+        left(len(components)), rel=0.02
+    )
     monkeypatch.setattr(field, "MOST", 3)
     monkeypatch.setattr(field, "LEFT", 0.0)
     assert len(principal_components(residuals)) == 3

@@ -1,4 +1,6 @@
-"""The process of labels of one number against numpy and scipy, and against draws of processes that are known."""
+"""The process of labels of one number against numpy and scipy, and against draws of processes that
+are known.
+"""
 
 import math
 from dataclasses import replace
@@ -20,7 +22,10 @@ from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.testing import example_links
 
 BOX = torch.tensor([6.0, 4.0, 2.0])
-MATERN = {0.5: lambda x: np.exp(-x), 1.5: lambda x: (1 + math.sqrt(3) * x) * np.exp(-math.sqrt(3) * x)}
+MATERN = {
+    0.5: lambda x: np.exp(-x),
+    1.5: lambda x: (1 + math.sqrt(3) * x) * np.exp(-math.sqrt(3) * x),
+}
 
 
 @pytest.fixture(autouse=True)
@@ -29,7 +34,14 @@ def few_neighbours(monkeypatch):
 
 
 def drawn(
-    lengths=(1.0, 1.0), smoothness=0.5, signal=4.0, noise=1.0, degrees=math.inf, count=300, height=2.0, carriers=()
+    lengths=(1.0, 1.0),
+    smoothness=0.5,
+    signal=4.0,
+    noise=1.0,
+    degrees=math.inf,
+    count=300,
+    height=2.0,
+    carriers=(),
 ):
     """Levels of ``count`` places at each of two receivers; three tenths test."""
     links, rng = example_links("rssi"), np.random.default_rng(0)
@@ -37,11 +49,18 @@ def drawn(
     apart, labels = cdist(places, places), []
     for length in lengths:
         factor = np.linalg.cholesky(MATERN[smoothness](apart / length) + 1e-9 * np.eye(count))
-        scatter = rng.standard_normal(count) if math.isinf(degrees) else rng.standard_t(degrees, count)
+        scatter = (
+            rng.standard_normal(count) if math.isinf(degrees) else rng.standard_t(degrees, count)
+        )
         labels.append(-60 + signal * factor @ rng.standard_normal(count) + noise * scatter)
-    frequencies = torch.tensor(carriers)[torch.arange(2 * count) % len(carriers)] if carriers else None
+    frequencies = (
+        torch.tensor(carriers)[torch.arange(2 * count) % len(carriers)] if carriers else None
+    )
     query = Query(places.repeat(2, 1), torch.arange(2).repeat_interleave(count), frequencies)
-    parts = [part.repeat(2) for part in torch.arange(count).split((7 * count // 10, 0, count - 7 * count // 10))]
+    parts = [
+        part.repeat(2)
+        for part in torch.arange(count).split((7 * count // 10, 0, count - 7 * count // 10))
+    ]
     parts = [torch.cat((part[: len(part) // 2], part[len(part) // 2 :] + count)) for part in parts]
     values = torch.from_numpy(np.concatenate(labels)).float()
     return replace(links, query=query, labels=values, rows=None, split=Split("drawn", *parts))
@@ -65,7 +84,10 @@ def test_the_density_is_that_of_a_normal_variable_plus_noise(degrees, variance, 
     errors = np.array([0.0, 0.7, 5.0, 12.0 if math.isinf(degrees) else 40.0])
     scatter = stats.norm if math.isinf(degrees) else stats.t(degrees)
     both = lambda u, e: stats.norm.pdf(u) * scatter.pdf((e - u * variance**0.5) / noise) / noise
-    expected = [np.log(quad(both, -20, 20, args=(e,), points=[0, e / variance**0.5], limit=400)[0]) for e in errors]
+    expected = [
+        np.log(quad(both, -20, 20, args=(e,), points=[0, e / variance**0.5], limit=400)[0])
+        for e in errors
+    ]
     size = torch.ones(4, dtype=torch.float64)
     found = log_density(torch.from_numpy(errors), variance * size, noise**2 * size, degrees)
     np.testing.assert_allclose(found, expected, rtol=0, atol=2e-3)
@@ -83,21 +105,29 @@ def test_means_and_deviations_are_the_formula(smoothness, carriers, monkeypatch)
     query = replace(links.query[links.split.test], receivers=torch.ones(36, dtype=torch.long))
     asked, own = coordinates(links.scene, query, 1.0), receivers == 1
     stretch = lambda points: np.hstack((points[:, :3], 3.0 * points[:, 3:]))
-    kernel = lambda a, b: 9 * MATERN[smoothness](cdist(stretch(a.numpy()), stretch(b.numpy())) / 0.7)
+    kernel = lambda a, b: (
+        9 * MATERN[smoothness](cdist(stretch(a.numpy()), stretch(b.numpy())) / 0.7)
+    )
     noises = process.variances[own].numpy()
     solve = np.linalg.inv(kernel(places[own], places[own]) + np.diag(noises))
     towards = kernel(asked, places[own])
-    np.testing.assert_allclose(process(asked, query.receivers), towards @ solve @ values[own].numpy(), atol=1e-8)
+    np.testing.assert_allclose(
+        process(asked, query.receivers), towards @ solve @ values[own].numpy(), atol=1e-8
+    )
     # Student's t of four degrees of freedom has twice its squared scale as variance.
     expected = np.sqrt(9 - np.einsum("ij,jk,ik->i", towards, solve, towards) + 2 * 4)
     np.testing.assert_allclose(process.deviations(asked, query.receivers), expected, rtol=1e-6)
     with monkeypatch.context() as few:
         few.setattr(scalar, "MANY", 0)
-        np.testing.assert_allclose(process.deviations(asked, query.receivers), expected, rtol=0.03)  # of 42 readings 16
+        np.testing.assert_allclose(
+            process.deviations(asked, query.receivers), expected, rtol=0.03
+        )  # of 42 readings 16
     fresh = ScalarProcess(links.scene)
     fresh.load_state_dict(process.state_dict())
     assert torch.equal(fresh(asked, query.receivers), process(asked, query.receivers))
-    assert torch.equal(fresh.deviations(asked, query.receivers), process.deviations(asked, query.receivers))
+    assert torch.equal(
+        fresh.deviations(asked, query.receivers), process.deviations(asked, query.receivers)
+    )
 
 
 def test_the_gradient_is_finite_where_places_coincide():
@@ -106,12 +136,16 @@ def test_the_gradient_is_finite_where_places_coincide():
     process = ScalarProcess(links.scene)
     process.places, process.receivers, values = known(links)
     rows = torch.arange(10)
-    nearest = process._nearest(process.places[rows], process.receivers[rows], rows, torch.arange(len(values)))
+    nearest = process._nearest(
+        process.places[rows], process.receivers[rows], rows, torch.arange(len(values))
+    )
     around = process._around(process.places[rows], process.receivers[rows], nearest)
     logarithms = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
     scale = torch.ones((), dtype=torch.float64, requires_grad=True)
     between = covariances(around, logarithms.exp(), Choice(0.5, math.inf, scale))
-    parts = conditional(between, values[around.rows], torch.ones_like(around.found, dtype=torch.float64))
+    parts = conditional(
+        between, values[around.rows], torch.ones_like(around.found, dtype=torch.float64)
+    )
     sum(part.sum() for part in parts).backward()
     assert logarithms.grad.isfinite().all()
     assert scale.grad.isfinite()
@@ -122,11 +156,15 @@ def test_gradients_are_those_of_finite_differences():
     process = ScalarProcess(links.scene)
     process.places, process.receivers, values = known(links)
     rows = torch.arange(3)
-    nearest = process._nearest(process.places[rows], process.receivers[rows], rows, torch.arange(len(values)))
+    nearest = process._nearest(
+        process.places[rows], process.receivers[rows], rows, torch.arange(len(values))
+    )
     around = process._around(process.places[rows], process.receivers[rows], nearest)
 
     def both(logarithms, noises):
-        return conditional(covariances(around, logarithms.exp(), Choice(1.5)), values[around.rows], noises)
+        return conditional(
+            covariances(around, logarithms.exp(), Choice(1.5)), values[around.rows], noises
+        )
 
     point = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
     noises = torch.ones_like(around.found, dtype=torch.float64, requires_grad=True)
@@ -159,9 +197,12 @@ def test_kernel_tails_and_hyperparameters_are_those_of_the_draw(smoothness, degr
     assert facts["smoothness"] == smoothness
     assert facts["degrees_of_freedom"] == (0 if math.isinf(degrees) else 4)
     length, signal, noise = model.scalar[0].logarithms.exp().unbind(1)
-    # Within a box of few lengths, length and variance are hardly known apart, but well as this power of both.
+    # Within a box of few lengths, length and variance are hardly known apart, but well as this
+    # power of both.
     slope = lambda length, signal: signal**2 / length ** (2 * smoothness)
-    np.testing.assert_allclose(slope(length, signal), slope(2.0 if smoothness == 0.5 else 0.7, 5.0), rtol=0.6)
+    np.testing.assert_allclose(
+        slope(length, signal), slope(2.0 if smoothness == 0.5 else 0.7, 5.0), rtol=0.6
+    )
     np.testing.assert_allclose(noise, 0.7, rtol=0.6)
 
 
@@ -184,7 +225,9 @@ def test_each_receiver_has_a_noise_of_its_own():
 def test_the_trend_is_that_of_the_labels(law):
     links = drawn(signal=2.0)
     if law:
-        apart = (links.query.transmitters - links.scene.positions(links.labels)[links.query.receivers]).norm(dim=1)
+        apart = (
+            links.query.transmitters - links.scene.positions(links.labels)[links.query.receivers]
+        ).norm(dim=1)
         links.labels.add_(-40 * apart.clamp_min(0.1).log10())
     assert fitted(links).facts()["trend"] == ("path_loss" if law else "mean")
 
@@ -199,7 +242,10 @@ def test_a_few_readings_that_are_far_out_hardly_count():
     assert robust.facts()["degrees_of_freedom"] == 4
     errors = [(model.predict(query) - labels).abs().mean() for model in (plain, robust)]
     assert errors[1] < 1.3 * errors[0]
-    factors = robust.scalar[0].variances / (2 * robust.scalar[0].logarithms[robust.scalar[0].receivers, 2]).exp()
+    factors = (
+        robust.scalar[0].variances
+        / (2 * robust.scalar[0].logarithms[robust.scalar[0].receivers, 2]).exp()
+    )
     is_spoilt = torch.isin(torch.cat(robust.known), rows)
     assert factors[is_spoilt].min() > 10 * factors[~is_spoilt].median()
 
@@ -209,7 +255,9 @@ def test_intervals_of_the_process_hold_their_share():
     model, test = fitted(links), links.split.test
     query = links.query[test]
     deviations = model.scalar[0].deviations(coordinates(links.scene, query, 1.0), query.receivers)
-    within = ((model.predict(query) - links.labels[test]).abs() <= 1.645 * deviations).double().mean()
+    within = (
+        ((model.predict(query) - links.labels[test]).abs() <= 1.645 * deviations).double().mean()
+    )
     assert within == pytest.approx(0.9, abs=0.04)
 
 
@@ -220,7 +268,9 @@ def test_intervals_of_the_process_hold_their_share():
 def test_labels_that_the_trend_explains_are_predicted_by_it(level):
     links = drawn()
     links.labels.fill_(level)
-    torch.testing.assert_close(fitted(links).predict(BOX * torch.rand(4, 3), 0), torch.full((4,), level))
+    torch.testing.assert_close(
+        fitted(links).predict(BOX * torch.rand(4, 3), 0), torch.full((4,), level)
+    )
 
 
 def test_places_measured_often_are_predicted_by_the_mean_of_their_readings():
@@ -242,12 +292,18 @@ def test_a_receiver_with_hardly_a_reading_is_predicted():
 
 
 def test_levels_beside_a_dense_track_stay_those_of_a_receiver():
-    """A robot's two lanes, rows a centimetre apart: a smooth pattern along them shows no deviation of the field."""
+    """A robot's two lanes, rows a centimetre apart: a smooth pattern along them shows no deviation
+    of the field.
+    """
     along = torch.linspace(0, 4, 200).double()
-    places = torch.stack((along.repeat(2), torch.tensor([0.0, 2.0]).repeat_interleave(200), 0 * along.repeat(2)), 1)
+    places = torch.stack(
+        (along.repeat(2), torch.tensor([0.0, 2.0]).repeat_interleave(200), 0 * along.repeat(2)), 1
+    )
     waves = (10 * places[:, :1] + places[:, 1:2]).sin() - (7 * places[:, :1]).cos()
     levels = -60 + 6 * waves + torch.randn(400, 1, generator=torch.Generator().manual_seed(0))
-    links = gaigs.links(task="rssi", transmitters=places, receivers=[[9.0, 5.0, 2.0]], labels=levels, test=0.0)
+    links = gaigs.links(
+        task="rssi", transmitters=places, receivers=[[9.0, 5.0, 2.0]], labels=levels, test=0.0
+    )
     process = fitted(links).scalar[0]
     size = process.values.square().mean().sqrt()
     assert process.logarithms[0, 1].exp() < 2.5 * size

@@ -22,6 +22,8 @@ def batch(links):
 def build(links):
     def build(heads=ALL, scene=links.scene, **parts):
         torch.manual_seed(0)
-        return trained(GaussianSplatting(scene, **(PARTS | {"deformation": two_branch(heads)} | parts)))
+        return trained(
+            GaussianSplatting(scene, **(PARTS | {"deformation": two_branch(heads)} | parts))
+        )
 
     return build

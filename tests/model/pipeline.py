@@ -5,11 +5,22 @@ import torch
 EUCLIDEAN = {"gaussian_octaves": (-3, 2), "transmitter_octaves": (-2, 4), "hidden": 16, "width": 8}
 PARTS = {
     "placement": {"name": "free"},
-    "tokenizer": {"name": "multiview", "ga": {"name": "ga"}, "euclidean": {"name": "euclidean", **EUCLIDEAN}},
+    "tokenizer": {
+        "name": "multiview",
+        "ga": {"name": "ga"},
+        "euclidean": {"name": "euclidean", **EUCLIDEAN},
+    },
     "projection": {"name": "mercator"},
     "rasterizer": {"name": "torch"},
     "pooling": {"name": "spectrum", "channels": 2},
-    "gaussians": {"count": 40, "near": 2.0, "far": 5.0, "spread": 1.0, "opacity": 0.1, "signal": 1.0},
+    "gaussians": {
+        "count": 40,
+        "near": 2.0,
+        "far": 5.0,
+        "spread": 1.0,
+        "opacity": 0.1,
+        "signal": 1.0,
+    },
 }
 ALL = ["rotation", "scale", "signal", "opacity", "attenuation"]
 NONE = {"deformation": {"name": "none"}}
@@ -18,7 +29,13 @@ MEAN_POWER = {"name": "mean_power", "grid": [4, 8], "channels": 2, "floor_db": -
 
 
 def two_branch(heads):
-    return {"name": "two_branch", "width": 16, "attenuation_layers": 1, "signal_layers": 1, "heads": heads}
+    return {
+        "name": "two_branch",
+        "width": 16,
+        "attenuation_layers": 1,
+        "signal_layers": 1,
+        "heads": heads,
+    }
 
 
 def trained(model):

@@ -1,4 +1,6 @@
-"""Receivers with different numbers of elements: what a receiver lacks is 0, and changes nothing for the others."""
+"""Receivers with different numbers of elements: what a receiver lacks is 0, and changes nothing for
+the others.
+"""
 
 from dataclasses import replace
 
@@ -27,7 +29,9 @@ def links():
     fewer[:, :9] = made.labels[:, kept]
     places, carriers = made.query.transmitters.repeat(2, 1), made.query.frequencies.repeat(2)
     query = Query(places, torch.arange(2).repeat_interleave(60), carriers)
-    both = replace(made, query=query, receivers=(large, small), labels=torch.cat((made.labels, fewer)))
+    both = replace(
+        made, query=query, receivers=(large, small), labels=torch.cat((made.labels, fewer))
+    )
     return divide(replace(both, rows=made.rows.repeat(2), official=None), SPLIT)
 
 
@@ -46,7 +50,10 @@ def test_all_receivers_are_predicted_each_with_its_own_elements(links):
     model = gaigs.train("friis", links)
     places, names = links.query.transmitters[:2], [receiver.name for receiver in links.receivers]
     found = model.predict(places, interval=0.5)
-    assert {name: tuple(one.value.shape) for name, one in found.items()} == {names[0]: (2, 16, 4), "small": (2, 9, 4)}
+    assert {name: tuple(one.value.shape) for name, one in found.items()} == {
+        names[0]: (2, 16, 4),
+        "small": (2, 9, 4),
+    }
     for number, name in enumerate(names):
         query = Query(places, torch.full((2,), number), links.query.frequencies[:2])
         padded = model.predict(query)
@@ -60,7 +67,9 @@ def test_all_receivers_are_predicted_each_with_its_own_elements(links):
 
 
 def test_friis_has_the_gains_that_each_receiver_has_alone(links):
-    both, alone = (registry("model").build("friis", scene=own.scene) for own in (links, one(links, 1)))
+    both, alone = (
+        registry("model").build("friis", scene=own.scene) for own in (links, one(links, 1))
+    )
     both.fit(links)
     alone.fit(one(links, 1))
     torch.testing.assert_close(both.gains[1], alone.gains[0])
@@ -85,7 +94,8 @@ UNSEARCHED = {"name": "mirrored", "order": 0}
 
 
 @pytest.mark.parametrize(
-    "options", [{"name": "gaigs", "gaussians": {"count": 5}}, {"name": "mirrored", "placement": UNSEARCHED}]
+    "options",
+    [{"name": "gaigs", "gaussians": {"count": 5}}, {"name": "mirrored", "placement": UNSEARCHED}],
 )
 def test_trained_models_have_the_loss_of_the_elements_that_are_there(links, options):
     task = Csi(9, links.task.frequencies)
@@ -99,7 +109,9 @@ def test_trained_models_have_the_loss_of_the_elements_that_are_there(links, opti
     assert not value[:, 9:].any()
     cut = replace(batch, labels=batch.labels[:, :9])
     expected, _ = LogRelativeError(task)(other.eval()(cut).value, cut)
-    assert LogRelativeError(links.task)(value, batch)[0].item() == pytest.approx(expected.item(), rel=1e-5)
+    assert LogRelativeError(links.task)(value, batch)[0].item() == pytest.approx(
+        expected.item(), rel=1e-5
+    )
 
 
 def test_scores_of_padded_channels_are_those_of_the_elements_that_are_there(links):
@@ -110,6 +122,9 @@ def test_scores_of_padded_channels_are_those_of_the_elements_that_are_there(link
     padded[:, :9] = values
     for phase in ("known", "per_link_and_delay"):
         tasks = [Csi(count, links.task.frequencies, phase) for count in (9, 16)]
-        here, there = tasks[0].scores(small.labels, values), tasks[1].scores(links.labels[60:], padded)
+        here, there = (
+            tasks[0].scores(small.labels, values),
+            tasks[1].scores(links.labels[60:], padded),
+        )
         for name, score in here.items():
             torch.testing.assert_close(there[name], score, rtol=1e-6, atol=1e-6)

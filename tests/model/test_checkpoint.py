@@ -41,7 +41,11 @@ def folder(tmp_path_factory):
     config = gaigs.compose(*OVERRIDES)
     data = folder / "data"
     write(data, load(config["data"], config["split"]))
-    config["data"] = {"name": "nerf2_spectrum", "root": str(data), "frequency": config["data"]["frequency"]}
+    config["data"] = {
+        "name": "nerf2_spectrum",
+        "root": str(data),
+        "frequency": config["data"]["frequency"],
+    }
     runs.run(config, folder / "run")
     shutil.rmtree(data)
     return folder / "run"
@@ -69,10 +73,17 @@ torch.save(model.predict(torch.load(sys.argv[2]), 0), sys.argv[3])
     torch.save(torch.from_numpy(stored["transmitters"]), tmp_path / "transmitters.pt")
     files = [folder / "best.ckpt", tmp_path / "transmitters.pt", tmp_path / "spectra.pt"]
     environment = os.environ | {"PYTHONPATH": str(Path(gaigs.__path__[0]).parent)}
-    subprocess.run([sys.executable, "-W", "error", "-c", script, *files], check=True, cwd=tmp_path, env=environment)
+    subprocess.run(
+        [sys.executable, "-W", "error", "-c", script, *files],
+        check=True,
+        cwd=tmp_path,
+        env=environment,
+    )
     predicted = torch.load(files[-1])
     assert predicted.shape == stored["prediction"].shape
-    np.testing.assert_allclose(predicted, stored["prediction"], rtol=1e-3, atol=1e-4)  # stored in half precision
+    np.testing.assert_allclose(
+        predicted, stored["prediction"], rtol=1e-3, atol=1e-4
+    )  # stored in half precision
 
 
 def test_a_checkpoint_holds_configuration_split_scene_and_optimizer(folder, content):
@@ -82,7 +93,9 @@ def test_a_checkpoint_holds_configuration_split_scene_and_optimizer(folder, cont
     assert identity["model"] == identity["config"]["model"]
     split = identity["split"]
     assert split["name"].startswith("official, ")
-    assert sorted(torch.cat([split[part] for part in ("train", "validation", "test")]).tolist()) == list(range(20))
+    assert sorted(
+        torch.cat([split[part] for part in ("train", "validation", "test")]).tolist()
+    ) == list(range(20))
     assert identity["scene"]["task"]["normalisation"] == "min-max of each spectrum's amplitude"
     assert len(identity["scene"]["receivers"][0]["elements"]) == 16
     assert content["optimizer_states"][0]["state"]
@@ -96,7 +109,9 @@ def test_the_number_of_gaussians_is_the_checkpoints(folder, content):
 def test_many_spectra_go_to_a_file_as_the_page_shows(folder, tmp_path, monkeypatch):
     page = (Path(__file__).parents[1] / "docs/start.md").read_text()
     (code,) = [
-        block for block in re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S) if "predict_batches" in block
+        block
+        for block in re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
+        if "predict_batches" in block
     ]
     (tmp_path / "runs/room").mkdir(parents=True)
     shutil.copy(folder / "best.ckpt", tmp_path / "runs/room")
@@ -104,14 +119,18 @@ def test_many_spectra_go_to_a_file_as_the_page_shows(folder, tmp_path, monkeypat
     names = {}
     exec(code.replace("100_000", "5").replace("batch_size=16", "batch_size=2"), names)
     stored = np.load("spectra.npy", mmap_mode="r")
-    assert torch.equal(torch.tensor(stored), names["model"].predict(names["positions"], 0, batch_size=2))
+    assert torch.equal(
+        torch.tensor(stored), names["model"].predict(names["positions"], 0, batch_size=2)
+    )
 
 
 def test_missing_files_and_other_types_are_refused(tmp_path):
     for path in (None, 3, b"best.ckpt"):
         with pytest.raises(TypeError):
             gaigs.load(path)
-    with pytest.raises(FileNotFoundError, match=r"no checkpoint at .*; a run writes best\.ckpt and last"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no checkpoint at .*; a run writes best\.ckpt and last"
+    ):
         gaigs.load(tmp_path / "best.ckpt")
 
 
@@ -177,7 +196,9 @@ def test_a_file_with_another_content_is_refused(defect, content, tmp_path, monke
     with pytest.raises((ValueError, ImportError), match=rf"best\.ckpt.*{message}") as error:
         gaigs.load(tmp_path / "best.ckpt")
     assert str(error.value).count("\n") <= 1
-    assert "weights_only" not in "".join(traceback.format_exception(error.value)), "torch advises to run its code"
+    assert "weights_only" not in "".join(traceback.format_exception(error.value)), (
+        "torch advises to run its code"
+    )
     assert isinstance(error.value, ImportError) == (message == "ZeroDivisionError")
     for name in [name for name in sys.modules if name.partition(".")[0] == "plugins"]:
         del sys.modules[name]
@@ -226,7 +247,9 @@ def flipped(data, draw, first=0):
     return data[:place] + bytes([data[place] ^ 1 << draw.randrange(8)]) + data[place + 1 :]
 
 
-@pytest.mark.parametrize("change", [flipped, lambda data, draw: flipped(data, draw, len(data) - 200)])
+@pytest.mark.parametrize(
+    "change", [flipped, lambda data, draw: flipped(data, draw, len(data) - 200)]
+)
 def test_any_change_of_a_file_is_found(change, folder, tmp_path):
     data, draw = (folder / "best.ckpt").read_bytes(), random.Random(0)
     for _ in range(8):
@@ -235,7 +258,9 @@ def test_any_change_of_a_file_is_found(change, folder, tmp_path):
             checkpoint.read(tmp_path / "best.ckpt")
 
 
-@pytest.mark.parametrize("error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")])
+@pytest.mark.parametrize(
+    "error", [MemoryError(), RuntimeError("DefaultCPUAllocator: can't allocate memory")]
+)
 def test_a_lack_of_memory_is_not_called_a_damaged_file(error, folder, monkeypatch):
     """The advice to take another file would lose a good one."""
 
@@ -267,7 +292,9 @@ def test_a_full_disk_leaves_the_checkpoint_that_was_there(folder, content, tmp_p
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(torch, "save", fill)
-    with pytest.raises(OSError, match=r"best\.ckpt could not be written \(No space left on device\)\ncheck") as error:
+    with pytest.raises(
+        OSError, match=r"best\.ckpt could not be written \(No space left on device\)\ncheck"
+    ) as error:
         checkpoint.write(content, path)
     assert error.value.errno == errno.ENOSPC
     assert path.read_bytes() == before

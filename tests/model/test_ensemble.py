@@ -52,7 +52,9 @@ def test_an_ensemble_is_stored_whole_and_a_finished_one_is_not_trained_again(lin
     loaded = gaigs.load(folder / "best.ckpt")
     assert isinstance(loaded, Ensemble)
     place = [1.0, 2.0, 1.5]
-    for own, other in zip(model.predict(place, interval=0.5), loaded.predict(place, interval=0.5), strict=True):
+    for own, other in zip(
+        model.predict(place, interval=0.5), loaded.predict(place, interval=0.5), strict=True
+    ):
         torch.testing.assert_close(own, other)
     again = gaigs.train("gaigs", links, ensemble=3, seed=4, folder=folder, **FEW)
     torch.testing.assert_close(again.predict(place), model.predict(place))
@@ -66,7 +68,9 @@ def test_channels_deviate_by_the_size_of_their_complex_difference():
     for one in friis:
         one.fit(links)
     ensemble = Ensemble(links.scene, friis)
-    ensemble.members[1].forward = lambda batch: type(friis[0](batch))(1j * friis[0](batch).value, {})
+    ensemble.members[1].forward = lambda batch: type(friis[0](batch))(
+        1j * friis[0](batch).value, {}
+    )
     batch = links.batch(links.split.test[:3])
     power = friis[0](batch).value.abs().square().mean((1, 2))
     torch.testing.assert_close(ensemble.deviations(batch), (power / 5).sqrt())
@@ -86,10 +90,21 @@ def test_kriging_has_the_ensemble_as_its_trend(tmp_path, monkeypatch):
 def test_an_ensemble_has_a_member_and_one_process_and_is_not_trained_again(links):
     with pytest.raises(ValueError, match="ensemble must be at least 1"):
         gaigs.train("gaigs", links, ensemble=0, **FEW)
-    with pytest.raises(ValueError, match=r"an ensemble trains in one process; set trainer\.devices=1"):
+    with pytest.raises(
+        ValueError, match=r"an ensemble trains in one process; set trainer\.devices=1"
+    ):
         gaigs.train("gaigs", links, "trainer.devices=2", "trainer.strategy=ddp", ensemble=2, **FEW)
-    with pytest.raises(ValueError, match=r"max_time limits a run of one process; of several set trainer\.max_time"):
-        gaigs.train("gaigs", links, "trainer.devices=2", "trainer.strategy=ddp", max_time="00:00:10:00", **FEW)
+    with pytest.raises(
+        ValueError, match=r"max_time limits a run of one process; of several set trainer\.max_time"
+    ):
+        gaigs.train(
+            "gaigs",
+            links,
+            "trainer.devices=2",
+            "trainer.strategy=ddp",
+            max_time="00:00:10:00",
+            **FEW,
+        )
     model = Ensemble(links.scene, [GaussianSplatting(links.scene, gaussians={"count": 20})])
     with pytest.raises(ValueError, match=r"train one of its models, members\[0\]"):
         gaigs.train(model, links, **FEW)
@@ -97,13 +112,17 @@ def test_an_ensemble_has_a_member_and_one_process_and_is_not_trained_again(links
 
 def test_all_members_are_rendered():
     links = gaigs.links("synthetic", transmitters=10, order=0)
-    model = Ensemble(links.scene, [GaussianSplatting(links.scene, gaussians={"count": 20}) for _ in range(3)])
+    model = Ensemble(
+        links.scene, [GaussianSplatting(links.scene, gaussians={"count": 20}) for _ in range(3)]
+    )
     assert len(model.rendering(links.batch(links.split.test[:1]))()) == 3
 
 
 def test_deviations_do_not_depend_on_the_asked_directions():
     links = gaigs.links("synthetic", transmitters=30, order=0)
-    model = Ensemble(links.scene, [GaussianSplatting(links.scene, gaussians={"count": 20}) for _ in range(2)])
+    model = Ensemble(
+        links.scene, [GaussianSplatting(links.scene, gaussians={"count": 20}) for _ in range(2)]
+    )
     batch = links.batch(links.split.test[:2])
     few = gaigs.Grid.degrees([30], [40])
     expected = model.deviations(batch)

@@ -1,4 +1,6 @@
-"""Friis' formula against the simulator in an empty room, in both conventions of time, and with random phases."""
+"""Friis' formula against the simulator in an empty room, in both conventions of time, and with
+random phases.
+"""
 
 import math
 from dataclasses import replace
@@ -27,11 +29,17 @@ POSES = (
 
 def empty_room(pattern="isotropic"):
     """Channels at two turned arrays, by the image-source method; the last ten links test."""
-    places = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 4.0, 2.0]) + 0.4
+    places = (
+        torch.rand(60, 3, generator=torch.Generator().manual_seed(0))
+        * torch.tensor([6.0, 4.0, 2.0])
+        + 0.4
+    )
     array = Array.planar(2, 3, 0.023, pattern)
     receivers = tuple(Receiver(f"gateway{i}", pose, array) for i, pose in enumerate(POSES))
     heard_by = torch.arange(60) % 2
-    each = torch.stack([next(respond_in_parts(EMPTY, places, one, CARRIER, OFFSETS, 0)) for one in receivers])
+    each = torch.stack(
+        [next(respond_in_parts(EMPTY, places, one, CARRIER, OFFSETS, 0)) for one in receivers]
+    )
     return Links(
         query=Query(places, heard_by),
         receivers=receivers,
@@ -49,13 +57,20 @@ def fitted(links):
 
 def relative_error(found, labels):
     """The largest of all links."""
-    return ((found - labels).abs().square().sum((1, 2)) / labels.abs().square().sum((1, 2))).sqrt().max().item()
+    return (
+        ((found - labels).abs().square().sum((1, 2)) / labels.abs().square().sum((1, 2)))
+        .sqrt()
+        .max()
+        .item()
+    )
 
 
 @pytest.mark.parametrize(("pattern", "conjugated"), [("isotropic", False), ("cosine", True)])
 def test_an_empty_rooms_channels_are_its_formula(pattern, conjugated):
     links = empty_room(pattern)
-    links = replace(links, labels=links.labels.conj().resolve_conj() if conjugated else links.labels)
+    links = replace(
+        links, labels=links.labels.conj().resolve_conj() if conjugated else links.labels
+    )
     # A transmitter behind the array is not heard.
     heard = links.labels.abs().amax((1, 2)) > 0
     assert heard.all() == (pattern == "isotropic")
@@ -72,14 +87,18 @@ def test_an_empty_rooms_channels_are_its_formula(pattern, conjugated):
 def test_with_random_phases_there_is_no_gain():
     links = empty_room()
     phases = 2 * math.pi * torch.rand(60, 1, 1, generator=torch.Generator().manual_seed(1))
-    model = fitted(replace(links, labels=links.labels * torch.polar(torch.ones_like(phases), phases)))
+    model = fitted(
+        replace(links, labels=links.labels * torch.polar(torch.ones_like(phases), phases))
+    )
     assert model.sign == -1
     assert not model.gains.any()
 
 
 def test_an_array_that_faces_away_hears_nothing():
     links = empty_room("cosine")
-    away = Pose(torch.tensor([3.0, 2.0, 0.1]), torch.diag(torch.tensor([1.0, -1.0, -1.0])))  # down, below all
+    away = Pose(
+        torch.tensor([3.0, 2.0, 0.1]), torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    )  # down, below all
     labels = torch.randn(links.labels.shape, dtype=torch.complex64)
     receivers = links.receivers[0], replace(links.receivers[1], pose=away)
     links = replace(links, receivers=receivers, labels=labels)
@@ -90,5 +109,7 @@ def test_an_array_that_faces_away_hears_nothing():
 
 @pytest.mark.parametrize("task", ["spectrum", "rssi"])
 def test_labels_that_are_no_channels_are_refused(task):
-    with pytest.raises(ValueError, match=f"model 'friis' gives complex channels, not labels of task '{task}'"):
+    with pytest.raises(
+        ValueError, match=f"model 'friis' gives complex channels, not labels of task '{task}'"
+    ):
         Friis(example_links(task).scene)

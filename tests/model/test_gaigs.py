@@ -22,7 +22,9 @@ def excite(model, query):
     """Residuals of the Gaussians at their places."""
     gaussians = model.gaussians
     placed = Placed(gaussians.means.detach()[None])
-    return model.deformation(model.tokenizer(placed, gaussians.opacities.detach(), query), placed, query)
+    return model.deformation(
+        model.tokenizer(placed, gaussians.opacities.detach(), query), placed, query
+    )
 
 
 def test_the_pipeline_equals_the_papers_step_by_step(build, batch, links):
@@ -31,7 +33,9 @@ def test_the_pipeline_equals_the_papers_step_by_step(build, batch, links):
     residuals = excite(model, batch.query)
     quats = torch.nn.functional.normalize(gaussians.quats) + residuals.delta_quats
     axes = semi_axes(quats, gaussians.log_scales.exp() + residuals.delta_scales)
-    signal = 0.28209479 * (gaussians.signal + residuals.delta_signal)[..., 0]  # times the constant spherical harmonic
+    signal = (
+        0.28209479 * (gaussians.signal + residuals.delta_signal)[..., 0]
+    )  # times the constant spherical harmonic
     opacities = (gaussians.opacity_logits.sigmoid() + residuals.delta_opacities).clamp(0, 1)
     splats = model.projection.project(gaussians.means, axes, pose)
     plane = model.projection.plane(links.task.directions)
@@ -46,12 +50,18 @@ def test_the_pipeline_equals_the_papers_step_by_step(build, batch, links):
 @pytest.mark.parametrize("heads", [["signal", "opacity"], None])
 def test_the_model_contract_holds(task, heads):
     deformation = two_branch(heads) if heads else {"name": "none"}
-    pooling = {"spectrum": PARTS["pooling"], "rssi": SOFTMAX, "csi": {"name": "element_sum", "grid": [6, 12]}}[task]
+    pooling = {
+        "spectrum": PARTS["pooling"],
+        "rssi": SOFTMAX,
+        "csi": {"name": "element_sum", "grid": [6, 12]},
+    }[task]
     trend = {"rssi": {"name": "path_loss"}, "csi": {"name": "friis"}}.get(task)
 
     def build(scene):
         torch.manual_seed(0)
-        return GaussianSplatting(scene, **(PARTS | {"deformation": deformation, "pooling": pooling, "trend": trend}))
+        return GaussianSplatting(
+            scene, **(PARTS | {"deformation": deformation, "pooling": pooling, "trend": trend})
+        )
 
     check_model(build, example_links(task))
 
@@ -69,7 +79,9 @@ def test_harmonics_are_of_the_direction_in_which_a_transmitter_sees_a_gaussian(b
     x, y, z = (seen / seen.norm(dim=-1, keepdim=True)).nan_to_num().movedim(-1, 0)
     dc, *bands = gaussians.signal.detach().clone().unbind(-1)
     # 3 ** 0.5 is the first degree's factor over that of the constant harmonic.
-    sent = dc + 3**0.5 * sum(part[..., None] * band for part, band in zip((-y, z, -x), bands, strict=True))
+    sent = dc + 3**0.5 * sum(
+        part[..., None] * band for part, band in zip((-y, z, -x), bands, strict=True)
+    )
     gaussians.degree = 0
     for row, own in enumerate(sent):
         with torch.no_grad():
@@ -80,7 +92,11 @@ def test_harmonics_are_of_the_direction_in_which_a_transmitter_sees_a_gaussian(b
 
 def test_gaussians_beside_a_placements_own_send_alike(build):
     placement = {"name": "mirrored", "planes": 6, "order": 1, "obstacles": 0}
-    parts = {"name": "mirrored", "placement": placement, "gaussians": PARTS["gaussians"] | {"degree": 2}}
+    parts = {
+        "name": "mirrored",
+        "placement": placement,
+        "gaussians": PARTS["gaussians"] | {"degree": 2},
+    }
     with pytest.raises(ValueError, match=r"placement 'mirrored' needs gaussians\.degree=0, got 2"):
         registry("model").build(PARTS | NONE | parts, scene=example_links().scene)
 
@@ -93,7 +109,9 @@ def test_where_gaussians_stand_is_learnt_from_the_image_alone(build, batch):
     assert all(parameter.grad is None for parameter in model.gaussians.parameters())
 
 
-@pytest.mark.parametrize("heads", [[], ["signal"], ["opacity"], ["attenuation"], ["rotation"], ["signal", "opacity"]])
+@pytest.mark.parametrize(
+    "heads", [[], ["signal"], ["opacity"], ["attenuation"], ["rotation"], ["signal", "opacity"]]
+)
 def test_without_some_heads_it_predicts_and_trains(build, batch, heads):
     model = build(heads)
     value, penalties = model(batch)
@@ -120,7 +138,11 @@ def test_without_deformation_there_is_no_tokenizer(build, batch):
 
 def test_only_deformed_gaussians_need_a_footprint_for_each_transmitter(build, batch):
     drawn = []
-    for heads, sets in ((["signal", "opacity", "attenuation"], 1), (["rotation"], 3), (["scale"], 3)):
+    for heads, sets in (
+        (["signal", "opacity", "attenuation"], 1),
+        (["rotation"], 3),
+        (["scale"], 3),
+    ):
         model = build(heads)
         watch(model, drawn)
         model(batch)
@@ -158,7 +180,11 @@ class SeesReceivers(nn.Module):
     def forward(self, placed, opacities, query):
         self.rows.append(len(query))
         nothing = placed.means.new_zeros(placed.means.shape[1], 0)
-        return Tokens(query.receivers[:, None].to(placed.means), nothing, placed.means.new_zeros(len(query), 0))
+        return Tokens(
+            query.receivers[:, None].to(placed.means),
+            nothing,
+            placed.means.new_zeros(len(query), 0),
+        )
 
 
 @pytest.fixture
@@ -185,7 +211,9 @@ def test_gaussians_that_move_are_rendered_for_each_query(build, links, strangers
 
 
 def test_gaussians_that_move_train_and_are_timed(build, links, strangers):
-    model = build(["signal"], placement={"name": "drift"}, tokenizer=PARTS["tokenizer"]["euclidean"])
+    model = build(
+        ["signal"], placement={"name": "drift"}, tokenizer=PARTS["tokenizer"]["euclidean"]
+    )
     batch = links.batch(torch.tensor([0, 1, 2, 3]))
     model(batch).value.square().mean().backward()
     assert model.gaussians.means.grad.any()
@@ -194,14 +222,18 @@ def test_gaussians_that_move_train_and_are_timed(build, links, strangers):
 
 
 def test_a_tokenizer_that_sees_receivers_has_a_row_for_each_link(build, links, strangers):
-    links.query.transmitters[1::2] = links.query.transmitters[::2].clone()  # both receivers hear the same places
+    links.query.transmitters[1::2] = links.query.transmitters[
+        ::2
+    ].clone()  # both receivers hear the same places
     model = build(["signal"], tokenizer={"name": "sees_receivers"})
     value = model(links.batch(torch.tensor([0, 1, 2, 3, 1]))).value
     assert model.tokenizer.rows == [4]
     # One hears the same from everywhere, as these tokens know of nothing else.
     torch.testing.assert_close(value[0], value[2], rtol=0, atol=1e-5)
     for i, one in zip((0, 1), value, strict=False):
-        torch.testing.assert_close(one, model(links.batch(torch.tensor([i]))).value[0], rtol=0, atol=1e-5)
+        torch.testing.assert_close(
+            one, model(links.batch(torch.tensor([i]))).value[0], rtol=0, atol=1e-5
+        )
     # And the token tells the receivers apart, not only their view.
     changed = links.batch(torch.tensor([1]))
     model.tokenizer.forward = lambda placed, opacities, query: Tokens(
@@ -229,7 +261,9 @@ def readings():
 def rssi(readings):
     torch.manual_seed(0)
     options = PARTS | {"pooling": SOFTMAX, "trend": {"name": "path_loss"}}
-    model = GaussianSplatting(readings.scene, **options, deformation=two_branch(["signal", "opacity"]))
+    model = GaussianSplatting(
+        readings.scene, **options, deformation=two_branch(["signal", "opacity"])
+    )
     model.fit(readings)
     return model
 
@@ -262,7 +296,11 @@ def test_the_map_is_that_of_the_whole_sphere(rssi, readings):
 @pytest.mark.parametrize("pooling", [SOFTMAX, MEAN_POWER], ids=["softmax_attention", "mean_power"])
 def test_the_training_starts_from_the_trend(readings, pooling):
     torch.manual_seed(3)
-    options = PARTS | {"pooling": pooling, "trend": {"name": "mean"}, "deformation": two_branch(["signal"])}
+    options = PARTS | {
+        "pooling": pooling,
+        "trend": {"name": "mean"},
+        "deformation": two_branch(["signal"]),
+    }
     model = GaussianSplatting(readings.scene, **options)
     assert model.predicts_untrained
     model.fit(readings)
@@ -277,7 +315,9 @@ def test_the_training_starts_from_the_trend(readings, pooling):
 
 def test_a_place_is_mapped_once_for_all_who_hear_it(rssi, readings):
     asked = []
-    rssi.deformation.register_forward_pre_hook(lambda _, arguments: asked.append(len(arguments[0].transmitters)))
+    rssi.deformation.register_forward_pre_hook(
+        lambda _, arguments: asked.append(len(arguments[0].transmitters))
+    )
     rssi(readings.batch(torch.arange(13)))
     assert asked == [6]
 
@@ -288,7 +328,10 @@ def test_a_place_is_mapped_once_for_all_who_hear_it(rssi, readings):
 def test_channels_are_the_trend_and_the_waves_of_the_map():
     links = example_links("csi")
     torch.manual_seed(0)
-    options = PARTS | {"pooling": {"name": "element_sum", "grid": [6, 12]}, "trend": {"name": "friis"}}
+    options = PARTS | {
+        "pooling": {"name": "element_sum", "grid": [6, 12]},
+        "trend": {"name": "friis"},
+    }
     model = trained(GaussianSplatting(links.scene, **options, deformation=two_branch(["signal"])))
     model.fit(links)
     assert model.level == 0  # waves have no level
@@ -308,11 +351,18 @@ def test_channels_are_the_trend_and_the_waves_of_the_map():
 
 
 def test_a_pooling_for_other_labels_is_refused(build, readings):
-    with pytest.raises(ValueError, match=r"'softmax_attention' gives \(\), not labels of task 'spectrum', \(18, 36\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"'softmax_attention' gives \(\), not labels of task 'spectrum', \(18, 36\)",
+    ):
         build(pooling=SOFTMAX)
-    with pytest.raises(ValueError, match="labels of task 'rssi' have no directions; take the task's own pooling"):
+    with pytest.raises(
+        ValueError, match="labels of task 'rssi' have no directions; take the task's own pooling"
+    ):
         build(scene=readings.scene)
-    with pytest.raises(ValueError, match="'element_sum' gives complex channels, not labels of task 'spectrum'"):
+    with pytest.raises(
+        ValueError, match="'element_sum' gives complex channels, not labels of task 'spectrum'"
+    ):
         build(pooling={"name": "element_sum", "grid": [4, 8]})
 
 

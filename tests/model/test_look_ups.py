@@ -24,13 +24,17 @@ def links(request):
     return replace(links, query=replace(links.query, transmitters=places), rows=None)
 
 
-BOTH = pytest.mark.parametrize("build", [Mean, lambda scene: KNearestNeighbours(scene, 3)], ids=["mean", "knn"])
+BOTH = pytest.mark.parametrize(
+    "build", [Mean, lambda scene: KNearestNeighbours(scene, 3)], ids=["mean", "knn"]
+)
 
 
 @pytest.mark.parametrize("shift", [0.0, 2e3])
 @pytest.mark.parametrize("power", [1.0, 2.0, 100.0])
 def test_where_a_training_link_stands_its_label_comes_back(links, shift, power):
-    links = replace(links, query=replace(links.query, transmitters=links.query.transmitters + shift))
+    links = replace(
+        links, query=replace(links.query, transmitters=links.query.transmitters + shift)
+    )
     model = KNearestNeighbours(links.scene, 3, power)
     model.fit(links)
     predictions = model.predict(links.query.transmitters[:4:2], 0)
@@ -38,13 +42,16 @@ def test_where_a_training_link_stands_its_label_comes_back(links, shift, power):
 
 
 def test_distances_far_from_the_origin_are_exact():
-    """torch's matrix product for more than 25 places rounds, and gives copies of a place different distances."""
+    """torch's matrix product for more than 25 places rounds, and gives copies of a place different
+    distances.
+    """
     a, b = 1e5 + 0.01 * torch.rand(2, 40, 3, dtype=torch.float64)
     torch.testing.assert_close(distances(a, b), (a[:, None] - b).norm(dim=-1), rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize(
-    ("name", "task"), [("mean", "spectrum"), ("knn", "rssi"), ("path_loss", "rssi"), ("friis", "csi")]
+    ("name", "task"),
+    [("mean", "spectrum"), ("knn", "rssi"), ("path_loss", "rssi"), ("friis", "csi")],
 )
 def test_known_links_are_needed_at_each_receiver(name, task):
     links = example_links(task)
@@ -52,26 +59,38 @@ def test_known_links_are_needed_at_each_receiver(name, task):
     if name != "knn":
         assert model.predict(torch.rand(3, 3)).isnan().all(), "no numbers before the fit"
     links.query.receivers[:20] = 0  # the other is heard in the test alone
-    with pytest.raises(ValueError, match="split 'example' has no known links of gateway1; choose another split"):
+    with pytest.raises(
+        ValueError, match="split 'example' has no known links of gateway1; choose another split"
+    ):
         model.fit(links)
 
 
-@pytest.mark.parametrize(("k", "power"), [(0, 2.0), (-2, 2.0), (3, -1.0), (3, float("inf")), (3, float("nan"))])
+@pytest.mark.parametrize(
+    ("k", "power"), [(0, 2.0), (-2, 2.0), (3, -1.0), (3, float("inf")), (3, float("nan"))]
+)
 def test_a_neighbourhood_out_of_range_is_refused(k, power):
-    with pytest.raises(ValueError, match=r"model\.(k must be at least 1 or|power must be 0 or more, and finite)"):
+    with pytest.raises(
+        ValueError, match=r"model\.(k must be at least 1 or|power must be 0 or more, and finite)"
+    ):
         KNearestNeighbours(example_links().scene, k, power)
 
 
 def test_the_number_of_neighbours_follows_from_held_out_groups():
-    """Readings of one run are equal, and those of others pure noise: within runs one neighbour would do."""
+    """Readings of one run are equal, and those of others pure noise: within runs one neighbour
+    would do.
+    """
     links = gaigs.links("synthetic_rssi", transmitters=200)
     query = replace(links.query, receivers=torch.zeros_like(links.query.receivers))
     group = torch.arange(len(links)) // 20
-    places = torch.stack((group.float(), torch.arange(len(links)) % 20 / 1e3, torch.zeros(len(links))), 1)
+    places = torch.stack(
+        (group.float(), torch.arange(len(links)) % 20 / 1e3, torch.zeros(len(links))), 1
+    )
     labels = torch.randn(len(links), generator=torch.Generator().manual_seed(0))[group]
     split = Split("runs", *torch.arange(len(links)).split((600, 100, len(links) - 700)), group)
     query = replace(query, transmitters=places)
-    links = replace(links, query=query, labels=labels, split=split, receivers=links.receivers[:1], rows=None)
+    links = replace(
+        links, query=query, labels=labels, split=split, receivers=links.receivers[:1], rows=None
+    )
     chosen = []
     for each in (links, replace(links, split=replace(split, groups=None))):
         model = KNearestNeighbours(links.scene, None)
@@ -88,7 +107,9 @@ def test_all_receivers_answer_unless_one_is_named(receivers):
         task="rssi",
         transmitters=[[1.0, 1.0, 1.0], [2.0, 1.0, 1.0], [1.0, 2.0, 1.0], [2.0, 2.0, 1.0]],
         receivers=[[0.0, 0.0, 2.0], [3.0, 3.0, 2.0]][:receivers],
-        labels=torch.tensor([[-40.0, -50.0], [-45.0, -55.0], [-50.0, -60.0], [-47.0, -58.0]])[:, :receivers],
+        labels=torch.tensor([[-40.0, -50.0], [-45.0, -55.0], [-50.0, -60.0], [-47.0, -58.0]])[
+            :, :receivers
+        ],
         test_rows=[3],
     )
     model = KNearestNeighbours(links.scene, 2)
@@ -98,7 +119,9 @@ def test_all_receivers_answer_unless_one_is_named(receivers):
         found = model.predict(places, batch_size=1)
     assert found.shape == (3, receivers)
     assert model.predict(places[0]).shape == (receivers,)
-    assert [part.shape for part in model.predict_batches(places[:2], batch_size=receivers)] == [(1, receivers)] * 2
+    assert [part.shape for part in model.predict_batches(places[:2], batch_size=receivers)] == [
+        (1, receivers)
+    ] * 2
     for number in range(receivers):
         assert torch.equal(found[:2, number], model.predict(places[:2], f"rx{number}"))
         assert torch.equal(found[:, number], model.predict(Query(places, torch.full((3,), number))))
@@ -113,7 +136,9 @@ def test_each_direction_gets_the_nearest_row_and_column(build):
     model = build(links.scene)
     model.fit(links)
     whole, grid = model.predict(torch.zeros(2, 3), 0), links.task.directions
-    elevations, azimuths = torch.tensor([[6, 7, 60, 90, 0.0], [4, 356, -11, 724.9, 125.1]]).deg2rad()
+    elevations, azimuths = torch.tensor(
+        [[6, 7, 60, 90, 0.0], [4, 356, -11, 724.9, 125.1]]
+    ).deg2rad()
     assert not torch.isin(elevations, grid.elevations).any()
     found = model.predict(torch.zeros(2, 3), 0, directions=Rays(elevations, azimuths))
     assert torch.equal(found, whole[:, [0, 1, 11, 17, 0], [0, 0, 35, 0, 13]])
@@ -143,7 +168,9 @@ def test_images_of_eight_bits_are_stored_in_bytes(most, dtype):
 def several_carriers(label, seed=0, places=60, carriers=(1e9, 1.5e9, 2.2e9, 3.3e9)):
     """RSSI at one receiver from random places at each carrier; the last tenth of the places tests."""
     links = example_links("rssi")
-    positions = torch.rand(places, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor([6.0, 4.0, 2.0])
+    positions = torch.rand(places, 3, generator=torch.Generator().manual_seed(seed)) * torch.tensor(
+        [6.0, 4.0, 2.0]
+    )
     rows = torch.arange(places).repeat_interleave(len(carriers))
     frequencies = torch.tensor(carriers).repeat(places)
     cut = len(carriers) * (places * 9 // 10)
@@ -161,7 +188,9 @@ def several_carriers(label, seed=0, places=60, carriers=(1e9, 1.5e9, 2.2e9, 3.3e
 def test_a_carrier_that_matters_is_kept_apart_from_others():
     waves = lambda places, phase: 10 * torch.sin(places[:, 0] + phase)
     alike = several_carriers(lambda places, logs: waves(places, 0))
-    apart = several_carriers(lambda places, logs: waves(places, 3 * (logs * 1e3).round()))  # another phase at each
+    apart = several_carriers(
+        lambda places, logs: waves(places, 3 * (logs * 1e3).round())
+    )  # another phase at each
     models = [KNearestNeighbours(links.scene, 3) for links in (alike, apart)]
     for model, links in zip(models, (alike, apart), strict=True):
         model.fit(links)
@@ -188,14 +217,21 @@ def test_distances_count_place_and_log_frequency():
 
 def test_places_measured_twice_do_not_predict_themselves():
     """Were a link's copy not left out with it, k = 1 would be exact with every scale."""
-    links = several_carriers(lambda places, logs: 10 * torch.sin(places[:, 0] + 3 * (logs * 1e3).round()))
+    links = several_carriers(
+        lambda places, logs: 10 * torch.sin(places[:, 0] + 3 * (logs * 1e3).round())
+    )
     n = len(links)
     double = replace(
         links,
         query=links.query[torch.arange(2 * n) % n],
         labels=links.labels.repeat(2),
         rows=None,
-        split=Split("twice", torch.cat((links.split.train, links.split.train + n)), torch.arange(0), links.split.test),
+        split=Split(
+            "twice",
+            torch.cat((links.split.train, links.split.train + n)),
+            torch.arange(0),
+            links.split.test,
+        ),
     )
     models = [KNearestNeighbours(part.scene, 1) for part in (links, double)]
     for model, part in zip(models, (links, double), strict=True):

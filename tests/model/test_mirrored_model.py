@@ -48,7 +48,10 @@ def walled(model):
     with torch.no_grad():
         for wall, material in enumerate(EMPTY.walls):
             axis, side = divmod(wall, 2)
-            normal, offset = torch.eye(3)[axis] * (1 if side else -1), EMPTY.size[axis] if side else 0.0
+            normal, offset = (
+                torch.eye(3)[axis] * (1 if side else -1),
+                EMPTY.size[axis] if side else 0.0,
+            )
             placement.place(wall, torch.tensor([*normal, offset]))
             epsilon = permittivity(material, CARRIER)
             placement.log_permittivities[wall] = math.log(epsilon.real - 1)
@@ -62,11 +65,15 @@ def walled(model):
 def links_of(labels, task, receiver, bandwidth=None):
     count = len(labels)
     return Links(
-        query=Query(place(count, 0), torch.zeros(count, dtype=torch.long), torch.full((count,), CARRIER)),
+        query=Query(
+            place(count, 0), torch.zeros(count, dtype=torch.long), torch.full((count,), CARRIER)
+        ),
         receivers=(receiver,),
         labels=labels,
         task=task,
-        split=Split("most", torch.arange(count - 2), torch.arange(0), torch.arange(count - 2, count)),
+        split=Split(
+            "most", torch.arange(count - 2), torch.arange(0), torch.arange(count - 2, count)
+        ),
         bandwidth=bandwidth,
     )
 
@@ -82,7 +89,9 @@ def room_spectra(spectrum, count=12):
     return links_of(labels, task, receiver, BANDWIDTH if spectrum == "band" else 0.0)
 
 
-@pytest.mark.parametrize(("spectrum", "powers", "waves"), [("band", 0.03, 0.004), ("carrier", 0.08, 0.005)])
+@pytest.mark.parametrize(
+    ("spectrum", "powers", "waves"), [("band", 0.03, 0.004), ("carrier", 0.08, 0.005)]
+)
 def test_with_the_rooms_walls_it_predicts_the_labels(spectrum, powers, waves):
     """Powers lack interference; phases lack the waves' curvature over the array alone."""
     links = room_spectra(spectrum)
@@ -101,12 +110,16 @@ BENT = Array(torch.tensor([[0, 0, 0], [0.02, -0.01, 0.03], [-0.3, 0.2, 0.1], [0.
 """An array that lies in no plane, over half a metre wide."""
 
 
-@pytest.mark.parametrize("array", [Array.planar(2, 2, speed_of_light / CARRIER / 2), BENT], ids=["planar", "bent"])
+@pytest.mark.parametrize(
+    "array", [Array.planar(2, 2, speed_of_light / CARRIER / 2), BENT], ids=["planar", "bent"]
+)
 def test_with_the_rooms_walls_it_predicts_channels(array):
     """Also 100 MHz away, at subcarriers that no label had."""
     receiver = Receiver("gateway1", POSE, array)
     both = FREQUENCIES, FREQUENCIES[1:] + 1e8
-    labels = [simulated(place(12, 0), receiver, part - CARRIER, 2).to(torch.complex64) for part in both]
+    labels = [
+        simulated(place(12, 0), receiver, part - CARRIER, 2).to(torch.complex64) for part in both
+    ]
     links = links_of(labels[0], Csi(4, FREQUENCIES), receiver)
     model = walled(build(links, pooling="path_csi"))
     model.placement.enable_phases(speed_of_light / CARRIER)
@@ -118,9 +131,13 @@ def test_with_the_rooms_walls_it_predicts_channels(array):
 
 
 @pytest.mark.parametrize("conjugated", [False, True])
-@pytest.mark.parametrize("array", [Array.planar(2, 2, 0.02, "cosine"), BENT], ids=["planar", "bent"])
+@pytest.mark.parametrize(
+    "array", [Array.planar(2, 2, 0.02, "cosine"), BENT], ids=["planar", "bent"]
+)
 def test_channels_start_from_free_space(array, conjugated):
-    """Those of few numbers, as ``friis`` has it: gain and phase of each of two receivers, in either time convention."""
+    """Those of few numbers, as ``friis`` has it: gain and phase of each of two receivers, in either
+    time convention.
+    """
     poses = POSE, replace(POSE, position=torch.tensor([4.0, 3.0, 2.0]))
     receivers = tuple(Receiver(f"gateway{k}", pose, array) for k, pose in enumerate(poses))
     offsets, places, gains = FREQUENCIES[:1] - CARRIER, place(60, 0), (3e-3j, 50.0 - 20j)
@@ -138,14 +155,18 @@ def test_channels_start_from_free_space(array, conjugated):
     model.fit(links)
     free_space = Friis(links.scene)
     split = links.split
-    free_space.fit(replace(links, split=Split("train", split.train, split.validation[:0], split.validation)))
+    free_space.fit(
+        replace(links, split=Split("train", split.train, split.validation[:0], split.validation))
+    )
     assert model.predicts_untrained
     with torch.no_grad():
         found, expected = (part(links.batch(split.test)).value for part in (model, free_space))
     torch.testing.assert_close(found, expected, rtol=0, atol=1e-3 * expected.abs().max().item())
     model.placement.enable_reflections()
     with torch.no_grad():
-        assert (model(links.batch(split.test)).value - expected).abs().max() > 0.1 * expected.abs().max()
+        assert (
+            model(links.batch(split.test)).value - expected
+        ).abs().max() > 0.1 * expected.abs().max()
 
 
 def test_channels_of_order_0_need_no_planes():
@@ -196,7 +217,9 @@ def test_levels_need_no_carrier():
     other.load_state_dict(model.state_dict())
     index = torch.arange(6)
     torch.testing.assert_close(model(unknown.batch(index)).value, other(known.batch(index)).value)
-    check_model(lambda scene: build(replace(unknown, receivers=scene.receivers), pooling=pooling), unknown)
+    check_model(
+        lambda scene: build(replace(unknown, receivers=scene.receivers), pooling=pooling), unknown
+    )
 
 
 def test_paths_to_several_gateways_are_summed_at_once():
@@ -229,10 +252,22 @@ def test_gradients_reach_all_that_paths_have():
 @pytest.mark.parametrize(
     ("parts", "message"),
     [
-        ({"projection": "mercator"}, "'path_spectrum' takes paths, and no map is projected or rasterized\nleave out"),
-        ({"pooling": "spectrum"}, "'spectrum' takes a map, which needs a projection and a rasterizer\nset proj"),
-        ({"pooling": "path_rssi"}, r"'path_rssi' gives \(\), not labels of task 'spectrum', \(18, 36\);"),
-        ({"placement": {"name": "free"}}, r"takes placement=mirrored, got free; take \+experiment=mirrored"),
+        (
+            {"projection": "mercator"},
+            "'path_spectrum' takes paths, and no map is projected or rasterized\nleave out",
+        ),
+        (
+            {"pooling": "spectrum"},
+            "'spectrum' takes a map, which needs a projection and a rasterizer\nset proj",
+        ),
+        (
+            {"pooling": "path_rssi"},
+            r"'path_rssi' gives \(\), not labels of task 'spectrum', \(18, 36\);",
+        ),
+        (
+            {"placement": {"name": "free"}},
+            r"takes placement=mirrored, got free; take \+experiment=mirrored",
+        ),
     ],
 )
 def test_parts_that_do_not_go_together_are_refused(parts, message):
@@ -242,7 +277,9 @@ def test_parts_that_do_not_go_together_are_refused(parts, message):
 
 def test_mirrored_gaussians_are_refused_under_the_papers_name():
     links = example_links("spectrum", 5e9)
-    with pytest.raises(ValueError, match=r"placement 'mirrored' makes another predictor; set model=mirrored"):
+    with pytest.raises(
+        ValueError, match=r"placement 'mirrored' makes another predictor; set model=mirrored"
+    ):
         GaussianSplatting(links.scene, **OPTIONS)
 
 
@@ -250,7 +287,10 @@ def test_mirrored_gaussians_are_refused_under_the_papers_name():
 def test_half_precision_is_refused(dtype):
     links = room_spectra("band", 4)
     model, batch = build(links), links.batch(links.split.train)
-    with torch.autocast("cpu", torch.bfloat16), pytest.raises(ValueError, match=r"set trainer\.precision to 32-true"):
+    with (
+        torch.autocast("cpu", torch.bfloat16),
+        pytest.raises(ValueError, match=r"set trainer\.precision to 32-true"),
+    ):
         model(batch)
     with pytest.raises(ValueError, match=r"set trainer\.precision to 32-true"):
         model.to(dtype)(batch)
@@ -261,9 +301,14 @@ def test_half_precision_is_refused(dtype):
 
 @torch.no_grad()
 def test_phases_come_with_planes_that_move():
-    receiver, offsets = Receiver("gateway1", POSE), torch.linspace(-BANDWIDTH / 2, BANDWIDTH / 2, 51).double()
+    receiver, offsets = (
+        Receiver("gateway1", POSE),
+        torch.linspace(-BANDWIDTH / 2, BANDWIDTH / 2, 51).double(),
+    )
     rss = rss_dbm(simulated(place(12, 0), receiver, offsets, 1)).float()
-    links = links_of(rss - 20 * math.log10(speed_of_light / CARRIER / (4 * math.pi)), Rssi(), receiver)
+    links = links_of(
+        rss - 20 * math.log10(speed_of_light / CARRIER / (4 * math.pi)), Rssi(), receiver
+    )
     pooling = {"name": "path_rssi", "floor_db": -100.0}
     model = walled(build(links, placement=MIRRORED | {"order": 1}, pooling=pooling))
     placement, batch = model.placement, links.batch(torch.arange(12))
@@ -287,7 +332,9 @@ def test_tilted_plane_is_turned_square_to_the_others():
     model, batch = walled(build(links)), links.batch(torch.arange(24))
     planes = model.placement.origin
     right = planes.clone()
-    planes[0, :3] = torch.nn.functional.normalize(planes[0, :3] + torch.tensor([0.0, 0.06, 0.04]), dim=0)
+    planes[0, :3] = torch.nn.functional.normalize(
+        planes[0, :3] + torch.tensor([0.0, 0.06, 0.04]), dim=0
+    )
     planes[0, 3] += 0.05
     search.move_planes(model, batch, wavelength, 0.0)
     torch.testing.assert_close(planes, right, rtol=0, atol=wavelength / 20)
@@ -332,7 +379,9 @@ def test_fixed_planes_do_not_move_and_unknown_carriers_have_no_phases():
     torch.testing.assert_close(model.placement.offsets, before)
     links = example_links("rssi")
     pooling = {"name": "path_rssi", "floor_db": -60.0}
-    line = build(links, pooling=pooling).revise(2, links.batch(torch.arange(4)), None, lambda batch: 1.0)
+    line = build(links, pooling=pooling).revise(
+        2, links.batch(torch.arange(4)), None, lambda batch: 1.0
+    )
     assert line == "frequencies are unknown, so powers add to the end"
 
 
@@ -341,7 +390,11 @@ def test_a_loaded_model_exports_its_planes(tmp_path):
     model = build(links)
     model.load_state_dict(walled(build(links)).state_dict())
     model.export(tmp_path)
-    vertices = [line.split()[1:] for line in (tmp_path / "planes.obj").read_text().splitlines() if line[:2] == "v "]
+    vertices = [
+        line.split()[1:]
+        for line in (tmp_path / "planes.obj").read_text().splitlines()
+        if line[:2] == "v "
+    ]
     vertices = torch.tensor([[float(value) for value in vertex] for vertex in vertices])
     assert torch.allclose(vertices.amin(0), torch.zeros(3), atol=1e-3)
     assert torch.allclose(vertices.amax(0), torch.tensor(EMPTY.size), atol=1e-3)

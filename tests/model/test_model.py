@@ -1,4 +1,6 @@
-"""Prediction, common to all models, of the splatting pipeline: directions, chunks, batches, carriers, warnings."""
+"""Prediction, common to all models, of the splatting pipeline: directions, chunks, batches,
+carriers, warnings.
+"""
 
 from dataclasses import replace
 
@@ -22,8 +24,13 @@ def test_some_directions_get_the_values_of_all(build, batch, projection):
     model, grid = build(projection={"name": projection}), batch.directions
     whole = model(batch).value
     assert torch.equal(model(Batch(batch.query)).value, whole)  # the label's own
-    close(model(replace(batch, directions=grid.thin(slice(1, None, 3), slice(2, None, 4)))).value, whole[:, 1::3, 2::4])
-    chosen = torch.randperm(grid.shape[0] * grid.shape[1], generator=torch.Generator().manual_seed(0))[:200]
+    close(
+        model(replace(batch, directions=grid.thin(slice(1, None, 3), slice(2, None, 4)))).value,
+        whole[:, 1::3, 2::4],
+    )
+    chosen = torch.randperm(
+        grid.shape[0] * grid.shape[1], generator=torch.Generator().manual_seed(0)
+    )[:200]
     value = model(replace(batch, directions=grid.flatten()[chosen])).value
     close(value, whole.flatten(1)[:, chosen])
     assert (value[:, :-1] - value[:, 1:]).abs().max() > 0.1  # the map is not constant
@@ -50,7 +57,9 @@ def test_evaluation_in_chunks_equals_the_whole(build, batch, chunk):
     drawn = []
     watch(model, drawn)
     found = model.evaluate(batch)
-    pairs = [len(arguments[1]) * arguments[4].shape[0] * arguments[4].shape[1] for arguments in drawn]
+    pairs = [
+        len(arguments[1]) * arguments[4].shape[0] * arguments[4].shape[1] for arguments in drawn
+    ]
     assert max(pairs) <= max(chunk, 1)
     close(found, whole)
     assert not found.requires_grad
@@ -67,7 +76,10 @@ def test_predict_takes_points_grids_and_receivers_of_any_kind(build):
     close(model.predict(points[1, 2], 1), each[1, 5])
     receivers = torch.tensor([0, 1, 1, 0, 1, 0])
     close(model.predict(points.flatten(0, 1), receivers), each[receivers, torch.arange(6)])
-    close(model.predict(Query(points.flatten(0, 1), receivers), batch_size=4), each[receivers, torch.arange(6)])
+    close(
+        model.predict(Query(points.flatten(0, 1), receivers), batch_size=4),
+        each[receivers, torch.arange(6)],
+    )
 
 
 @pytest.mark.parametrize("method", ["predict", "predict_batches"])
@@ -94,7 +106,9 @@ def test_batches_are_the_prediction_in_parts(build, links, monkeypatch):
     whole = model.predict(places, receivers, batch_size=5)
     close(whole, model.predict(places, receivers, batch_size=100))
     evaluate, asked = model.evaluate, []
-    monkeypatch.setattr(model, "evaluate", lambda batch: asked.append(len(batch)) or evaluate(batch))
+    monkeypatch.setattr(
+        model, "evaluate", lambda batch: asked.append(len(batch)) or evaluate(batch)
+    )
     parts = model.predict_batches(places, receivers, batch_size=5)
     assert asked == []
     first = next(parts)
@@ -120,7 +134,10 @@ def test_gaussians_that_become_nan_are_not_hidden(build, links):
 @pytest.mark.parametrize("method", ["predict", "predict_batches"])
 def test_far_positions_are_predicted_with_a_warning(build, method):
     message = r"^2 of 3 positions are up to 1\.71e\+05 m outside .* is 7\.04 m across: nothing was measured near there$"
-    ask, places = getattr(build(), method), [[9.9e4, -9.9e4, 9.9e4], [1.0, 2.0, 1.0], [-9.9e4, 0.0, 0.0]]
+    ask, places = (
+        getattr(build(), method),
+        [[9.9e4, -9.9e4, 9.9e4], [1.0, 2.0, 1.0], [-9.9e4, 0.0, 0.0]],
+    )
     with pytest.warns(ExtrapolationWarning, match=message):
         values = ask(places)
     assert torch.cat([*values]).isfinite().all()
@@ -131,7 +148,9 @@ def test_positions_within_the_extent_give_no_warning(build):
     model.predict(model.scene.upper + torch.tensor([0.99 * model.scene.extent, 0.0, 0.0]))
     with pytest.warns(ExtrapolationWarning, match="1 of 1 positions"):
         model.predict(model.scene.upper + torch.tensor([1.01 * model.scene.extent, 0.0, 0.0]))
-    assert model.predict(Query(torch.full((1, 3), 9e4), torch.tensor([0]))).isfinite().all()  # of a query no warning
+    assert (
+        model.predict(Query(torch.full((1, 3), 9e4), torch.tensor([0]))).isfinite().all()
+    )  # of a query no warning
 
 
 @pytest.fixture
@@ -148,7 +167,10 @@ def test_carriers_change_predictions(build, band, tokenizer):
     place = band.query.transmitters[:1]
     low, high = (model.predict(place, frequency=frequency) for frequency in (1e9, 4e9))
     assert (low - high).abs().max() > 1e-4
-    close(model.predict(place.expand(2, 3), frequency=torch.tensor([1e9, 4e9])), torch.cat((low, high)))
+    close(
+        model.predict(place.expand(2, 3), frequency=torch.tensor([1e9, 4e9])),
+        torch.cat((low, high)),
+    )
     query = Query(place, torch.tensor([0]), torch.tensor([60e9]))
     assert model.predict(query).isfinite().all()  # of a query no warning
 
@@ -168,6 +190,12 @@ def test_a_band_is_left_with_a_warning(build, band):
         assert torch.cat([*values]).isfinite().all()
     for frequency in (1e9, 1e9 * (1 - 5e-7), 3e9, 4e9, 4e9 * (1 + 5e-7)):
         assert model.predict(place, frequency=frequency).isfinite().all()
-    for frequency, shown in ((1e9 * (1 - 2e-6), "9.99998e"), (4e9 * (1 + 2e-6), "4.000008e"), (60e9, "6e")):
-        with pytest.warns(ExtrapolationWarning, match=f"^1 of 1 positions are asked at {shown}[^ ]* Hz, outside"):
+    for frequency, shown in (
+        (1e9 * (1 - 2e-6), "9.99998e"),
+        (4e9 * (1 + 2e-6), "4.000008e"),
+        (60e9, "6e"),
+    ):
+        with pytest.warns(
+            ExtrapolationWarning, match=f"^1 of 1 positions are asked at {shown}[^ ]* Hz, outside"
+        ):
             model.predict(place, frequency=frequency)

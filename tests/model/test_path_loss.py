@@ -31,21 +31,30 @@ def make(transmitters, labels, heard_by=None, task=None):
         heard_by = torch.arange(2).repeat_interleave(n // 2)
     return Links(
         query=Query(transmitters, heard_by),
-        receivers=tuple(Receiver(f"gateway{i}", Pose(position, torch.eye(3))) for i, position in enumerate(GATEWAYS)),
+        receivers=tuple(
+            Receiver(f"gateway{i}", Pose(position, torch.eye(3)))
+            for i, position in enumerate(GATEWAYS)
+        ),
         labels=labels.float(),
         task=task or Rssi(),
-        split=Split("made up", torch.arange(n - 6), torch.arange(n - 6, n - 3), torch.arange(n - 3, n)),
+        split=Split(
+            "made up", torch.arange(n - 6), torch.arange(n - 6, n - 3), torch.arange(n - 3, n)
+        ),
     )
 
 
 def law(transmitters, receiver, level, exponent):
-    distances = np.linalg.norm(transmitters.double().numpy() - GATEWAYS[receiver].double().numpy(), axis=-1)
+    distances = np.linalg.norm(
+        transmitters.double().numpy() - GATEWAYS[receiver].double().numpy(), axis=-1
+    )
     return torch.tensor(level - 10 * exponent * np.log10(distances))
 
 
 @pytest.fixture
 def places():
-    return torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 4.0, 2.0])
+    return torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [6.0, 4.0, 2.0]
+    )
 
 
 def fitted(links):
@@ -59,13 +68,21 @@ def fitted(links):
 def test_level_and_exponent_of_the_law_are_recovered(places, shift, task, monkeypatch):
     monkeypatch.setattr(__name__ + ".GATEWAYS", GATEWAYS + shift)
     places = places + shift
-    model = fitted(make(places, torch.cat((law(places[:30], 0, -40, 2.7), law(places[30:], 1, -52, -0.7))), task=task))
+    model = fitted(
+        make(
+            places,
+            torch.cat((law(places[:30], 0, -40, 2.7), law(places[30:], 1, -52, -0.7))),
+            task=task,
+        )
+    )
     assert model.levels.tolist() == pytest.approx([-40, -52], abs=1e-3)
     assert model.exponents.tolist() == pytest.approx([2.7, -0.7], abs=1e-3)
     asked = shift + torch.tensor([[3.0, 2.0, 1.0], [60.0, 2.0, 1.0]])
     for receiver, (level, exponent) in enumerate([(-40, 2.7), (-52, -0.7)]):
         predicted = model.predict(asked, receiver)
-        torch.testing.assert_close(predicted, law(asked, receiver, level, exponent).float(), rtol=0, atol=1e-2)
+        torch.testing.assert_close(
+            predicted, law(asked, receiver, level, exponent).float(), rtol=0, atol=1e-2
+        )
 
 
 @pytest.mark.filterwarnings("ignore::gaigs.core.geometry.ExtrapolationWarning")
@@ -87,25 +104,36 @@ def test_one_link_is_enough(places):
     index = torch.ones(60, dtype=torch.long)
     index[4] = 0
     model = fitted(make(places, law(places, 1, -52, 1.6), index))
-    assert model.predict(places[4:5], 0).item() == pytest.approx(law(places[4], 1, -52, 1.6).item(), abs=1e-3)
+    assert model.predict(places[4:5], 0).item() == pytest.approx(
+        law(places[4], 1, -52, 1.6).item(), abs=1e-3
+    )
     assert model.exponents.tolist() == pytest.approx([1.6, 1.6], abs=1e-4)
 
 
 def test_slopes_of_few_readings_are_drawn_towards_the_mean():
-    own, weights = torch.tensor([2.9, 3.1, 3.0, -4.0], dtype=torch.float64), torch.tensor([9e4, 9e4, 9e4, 2.0]).double()
+    own, weights = (
+        torch.tensor([2.9, 3.1, 3.0, -4.0], dtype=torch.float64),
+        torch.tensor([9e4, 9e4, 9e4, 2.0]).double(),
+    )
     *many, few = shrunk(own, weights, torch.tensor(16.0).double()).tolist()
     assert many == pytest.approx([2.9, 3.1, 3.0], abs=0.01)
     assert few == pytest.approx(3.0, abs=0.1)
-    torch.testing.assert_close(shrunk(own, weights, torch.tensor(0.0).double()), own)  # no noise explains the scatter
+    torch.testing.assert_close(
+        shrunk(own, weights, torch.tensor(0.0).double()), own
+    )  # no noise explains the scatter
     assert shrunk(own, 0 * weights, torch.tensor(1.0)).tolist() == [2, 2, 2, 2]  # free space
     # The variance of DerSimonian and Laird, by hand: squares 2, chance 1, both weights 1.
-    found = shrunk(torch.tensor([1.0, 3.0]).double(), torch.ones(2).double(), torch.tensor(1.0).double())
+    found = shrunk(
+        torch.tensor([1.0, 3.0]).double(), torch.ones(2).double(), torch.tensor(1.0).double()
+    )
     assert found.tolist() == pytest.approx([1.5, 2.5])
 
 
 def test_slopes_of_two_readings_each_are_one():
     slopes, weights = torch.tensor([-1.0, 5.0]), torch.tensor([1.0, 3.0])
-    torch.testing.assert_close(shrunk(slopes, weights, torch.tensor(torch.nan)), torch.tensor([3.5, 3.5]))
+    torch.testing.assert_close(
+        shrunk(slopes, weights, torch.tensor(torch.nan)), torch.tensor([3.5, 3.5])
+    )
 
 
 def test_lines_through_two_readings_leave_no_noise_to_estimate(places):
@@ -120,5 +148,7 @@ def test_lines_through_two_readings_leave_no_noise_to_estimate(places):
 
 @pytest.mark.parametrize("task", ["spectrum", "csi"])
 def test_more_than_a_real_number_is_refused(task):
-    with pytest.raises(ValueError, match=f"predicts one real number a link, not labels of task '{task}'"):
+    with pytest.raises(
+        ValueError, match=f"predicts one real number a link, not labels of task '{task}'"
+    ):
         PathLoss(example_links(task).scene)

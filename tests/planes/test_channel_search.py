@@ -30,7 +30,10 @@ def reflection(permittivity, thickness, cosines, level):
     """Of a slab between air, as a wave of vertical polarisation meets it."""
     root = np.sqrt(permittivity - 1 + cosines**2)
     turns = np.exp(-4j * np.pi * thickness * FREQUENCIES / speed_of_light * root)
-    te, tm = (cosines - root) / (cosines + root), (permittivity * cosines - root) / (permittivity * cosines + root)
+    te, tm = (
+        (cosines - root) / (cosines + root),
+        (permittivity * cosines - root) / (permittivity * cosines + root),
+    )
     te, tm = (r * (1 - turns) / (1 - r**2 * turns) for r in (te, tm))
     return (1 - level) * te + level * tm
 
@@ -44,16 +47,23 @@ def channels(places, elements, planes):
         images = places - 2 * (places @ normal - offset)[:, None] * normal
         ways = images - elements.mean(0)
         cosines = np.abs(ways @ normal) / np.linalg.norm(ways, axis=1)
-        found = found + reflection(*slab, cosines[:, None, None], normal[2] ** 2) * waves(apart(images))
+        found = found + reflection(*slab, cosines[:, None, None], normal[2] ** 2) * waves(
+            apart(images)
+        )
     return found
 
 
 def room(moved=0.0, receivers=1, count=60, walls=PLANES):
     """Links in a room that is moved along all axes [m], and its planes."""
-    places = np.float32(np.random.default_rng(0).uniform((0.3, 0.3, 0.5), (5.5, 4.5, 2.2), (count, 3)) + moved)
+    places = np.float32(
+        np.random.default_rng(0).uniform((0.3, 0.3, 0.5), (5.5, 4.5, 2.2), (count, 3)) + moved
+    )
     walls = walls.copy()
     walls[:, 3] += moved * walls[:, :3].sum(1)
-    poses = [Pose.from_xyzw(tuple(moved + x for x in at), (0, 0, 0, 1)) for at in ((1.0, 0.6, 2.4), (4.8, 3.9, 1.1))]
+    poses = [
+        Pose.from_xyzw(tuple(moved + x for x in at), (0, 0, 0, 1))
+        for at in ((1.0, 0.6, 2.4), (4.8, 3.9, 1.1))
+    ]
     whole = Array.planar(2, 2, 0.027)
     arrays, labels = (whole, Array(whole.elements[:3])), []
     for pose, array in zip(poses, arrays, strict=True):
@@ -84,7 +94,9 @@ def turned(labels):
 
 def partly_silent(labels):
     """With a link that is silent in a part of the band."""
-    return torch.where((torch.arange(len(labels)) == 7)[:, None, None] & (torch.arange(16) >= 5), 0, labels)
+    return torch.where(
+        (torch.arange(len(labels)) == 7)[:, None, None] & (torch.arange(16) >= 5), 0, labels
+    )
 
 
 CASES = {
@@ -109,7 +121,10 @@ def test_planes_are_found(case):
     for wall in walls:
         cosines = planes[:, :3] @ wall[:3]
         number = cosines.abs().argmax()
-        heights = (plane[:3] @ middle - plane[3] for plane in (planes[number] * cosines[number].sgn(), wall))
+        heights = (
+            plane[:3] @ middle - plane[3]
+            for plane in (planes[number] * cosines[number].sgn(), wall)
+        )
         assert torch.linalg.cross(planes[number, :3], wall[:3]).norm() < 0.01
         assert abs(next(heights) - next(heights)) < 0.005
 
@@ -135,7 +150,9 @@ def test_no_plane_is_found_in_free_space(monkeypatch):
 @pytest.mark.parametrize("count", [1, 60])
 def test_no_plane_is_found_in_noise(count):
     links, _ = room(count=count)
-    noise = torch.randn(links.labels.shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(2))
+    noise = torch.randn(
+        links.labels.shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(2)
+    )
     planes, _ = search(replace(links, labels=noise)).run()
     assert len(planes) == 0
 
@@ -177,7 +194,9 @@ def test_a_plane_that_a_false_one_moved_returns(monkeypatch):
 
 def test_the_only_plane_may_be_false():
     own = search(room(walls=PLANES[:0])[0])
-    planes, slabs = own.without_false(torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double(), torch.zeros(1, 3).double())
+    planes, slabs = own.without_false(
+        torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double(), torch.zeros(1, 3).double()
+    )
     assert len(planes) == len(slabs) == 0
 
 
@@ -185,7 +204,9 @@ def test_tilted_plane_is_turned_square():
     links, walls = room(walls=np.array([[1.0, 0, 0, -0.4], [0, 1.0, 0, -0.7]]))
     tilted, level = torch.tensor([[0.99, -0.13, 0.05, -0.2], [0, 0, 1.0, 3.1]]).double()
     own = search(links)
-    turned = own.squared(seen_from(torch.stack((tilted / tilted[:3].norm(), walls[1], level)), own.middle), 0)
+    turned = own.squared(
+        seen_from(torch.stack((tilted / tilted[:3].norm(), walls[1], level)), own.middle), 0
+    )
     true = seen_from(walls[0], own.middle)
     assert any((plane[0] - true).abs().max() < 0.03 for plane in turned)
 
@@ -202,7 +223,9 @@ WALL, PARALLEL, FLOOR = [1.0, 0, 0, -0.4], [1.0, 0, 0, 6.3], [0, 0, 1.0, -0.2]
 
 @pytest.mark.usefixtures("unchecked")
 def test_walls_along_axes_show_where_channels_have_few_numbers():
-    """One element and 8 subcarriers: free strengths at each place explain these channels by many planes."""
+    """One element and 8 subcarriers: free strengths at each place explain these channels by many
+    planes.
+    """
     walls = np.array([[1.0, 0, 0, -0.1], [0, 1.0, 0, 0.1]])
     links, _ = room(count=200, walls=walls)
     planes, _ = search(few(links)).run()
@@ -212,7 +235,9 @@ def test_walls_along_axes_show_where_channels_have_few_numbers():
 
 def test_links_that_are_partly_silent_or_repeated_show_no_wall():
     links, walls = room(count=120, walls=np.array([WALL]))
-    noise = torch.randn(120, 4, 16, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
+    noise = torch.randn(
+        120, 4, 16, dtype=torch.complex64, generator=torch.Generator().manual_seed(0)
+    )
     labels = links.labels + 0.1 * links.labels.abs().mean() * noise
     for link in range(0, 120, 5):
         labels[link, :, torch.arange(16) != link % 16] = 0
@@ -227,7 +252,9 @@ def test_links_that_are_partly_silent_or_repeated_show_no_wall():
 def test_drawn_walls_that_phases_do_not_show_stay():
     links, walls = room(count=120, walls=np.array([WALL]))
     links = few(links)
-    noise = torch.randn(links.labels.shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(1))
+    noise = torch.randn(
+        links.labels.shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(1)
+    )
     own = search(replace(links, labels=links.labels + 0.1 * links.labels.abs().mean() * noise))
     drawn = torch.cat((walls, torch.tensor([[0, 1.0, 0, 5.2], PARALLEL]).double()))
     own.order, own.most, own.start = 2, 3, seen_from(drawn, own.middle)
@@ -245,12 +272,16 @@ def test_walls_find_the_right_lobe():
 
 @pytest.mark.parametrize("error", [0.0, 0.15])
 def test_walls_of_a_drawing_stand_where_phases_agree(error, monkeypatch):
-    """Free strengths may move walls away that are drawn where they stand, or not move those that are drawn beside."""
+    """Free strengths may move walls away that are drawn where they stand, or not move those that
+    are drawn beside.
+    """
     links, walls = room(walls=np.array([WALL, FLOOR]))
     own = search(few(links))
     own.start = seen_from(walls, own.middle) + torch.tensor([0, 0, 0, error])
     monkeypatch.setattr(own, "find", lambda start: start)
-    monkeypatch.setattr(own, "refine", lambda planes, *options: planes + torch.tensor([0, 0, 0, 0.3]))
+    monkeypatch.setattr(
+        own, "refine", lambda planes, *options: planes + torch.tensor([0, 0, 0, 0.3])
+    )
     monkeypatch.setattr(own, "resolve", channel_search.half_spaces)
     planes, _ = own.run()
     torch.testing.assert_close(planes, walls, rtol=0, atol=5e-3)
@@ -268,7 +299,8 @@ def test_room_grows_by_planes_along_its_axes(walls):
 
 
 @pytest.mark.parametrize(
-    ("walls", "known", "tilt"), [([WALL, FLOOR], 0, 0.4), ([WALL, FLOOR], 1, 0.4), ([FLOOR], 0, 1.2)]
+    ("walls", "known", "tilt"),
+    [([WALL, FLOOR], 0, 0.4), ([WALL, FLOOR], 1, 0.4), ([FLOOR], 0, 1.2)],
 )
 def test_planes_along_axes_replace_a_tilted_one(walls, known, tilt, monkeypatch):
     """As free strengths of an array that tells no heights apart may find it."""
@@ -276,13 +308,19 @@ def test_planes_along_axes_replace_a_tilted_one(walls, known, tilt, monkeypatch)
     own = search(links)
     own.start = seen_from(walls[:known], own.middle)
     tilted = torch.tensor([[math.cos(tilt), 0, math.sin(tilt), -0.4]]).double()
-    monkeypatch.setattr(own, "find", lambda start: torch.cat((start, seen_from(tilted, own.middle))))
+    monkeypatch.setattr(
+        own, "find", lambda start: torch.cat((start, seen_from(tilted, own.middle)))
+    )
     monkeypatch.setattr(own, "refine", lambda planes, *options: planes)
-    monkeypatch.setattr(own, "resolve", lambda planes: (planes, channel_search.SLABS[: len(planes)]))
+    monkeypatch.setattr(
+        own, "resolve", lambda planes: (planes, channel_search.SLABS[: len(planes)])
+    )
     monkeypatch.setattr(own, "without_false", lambda *room: room)
     planes, _ = own.run()
     order = planes[:, 2].abs().argsort()
-    torch.testing.assert_close(planes[order] * planes[order].sum(1, keepdim=True).sign(), walls, rtol=0, atol=0.01)
+    torch.testing.assert_close(
+        planes[order] * planes[order].sum(1, keepdim=True).sign(), walls, rtol=0, atol=0.01
+    )
 
 
 # --- strengths ---
@@ -321,7 +359,9 @@ def test_walls_are_tried_beside_planes_amid_the_places(monkeypatch):
     own, normal = search(links), torch.tensor([[1.0, 0, 0]]).double()
     wall = float(own.points[:, 0].max()) + 0.3
     peaks = torch.tensor([[-1.5, 1.0], [0.0, 0.9], [1.5, 0.8], [wall, 0.5]]).double()
-    share = lambda _, __, grid: (peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()).sum(-1)
+    share = lambda _, __, grid: (
+        peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()
+    ).sum(-1)
     monkeypatch.setattr(own, "added_shares", share)
     walls, amid = own.along(torch.zeros(0, 4).double(), torch.zeros(0, 3).double(), normal, 0.1)
     assert [plane[3].item() for plane in walls] == pytest.approx([wall], abs=0.03)
@@ -330,7 +370,8 @@ def test_walls_are_tried_beside_planes_amid_the_places(monkeypatch):
 
 @pytest.mark.parametrize("few", [0, 1000])
 def test_an_image_counts_by_what_it_adds_to_known_paths(few, monkeypatch):
-    """Least squares with and without the image, of two receivers with different arrays and some of the places each.
+    """Least squares with and without the image, of two receivers with different arrays and some of
+    the places each.
 
     Known paths have complex strengths, or real ones with the phase of the direct path.
     """
@@ -350,12 +391,19 @@ def test_an_image_counts_by_what_it_adds_to_known_paths(few, monkeypatch):
         heights = places @ normals.mT - tried[:, 3]
         outside = heights * (normals @ part.position.double() - tried[:, 3]) > 0
         images = places[:, None] - 2 * heights[..., None] * normals
-        known, images = part.reflected(*known_room, own.sequences(planes[:1])).to(torch.complex128), waves(images)
+        known, images = (
+            part.reflected(*known_room, own.sequences(planes[:1])).to(torch.complex128),
+            waves(images),
+        )
         known = stacked(known.numpy())
         both = (images,) if few == 0 else (images, 1j * images)
         images = np.stack([stacked(wave) for wave in both], 2)
-        for row, channel in enumerate(stacked((part.flat * turn.conj()).to(torch.complex128).numpy())):
-            fitted = lambda columns, channel=channel: columns.T @ np.linalg.lstsq(columns.T, channel, rcond=1e-4)[0]
+        for row, channel in enumerate(
+            stacked((part.flat * turn.conj()).to(torch.complex128).numpy())
+        ):
+            fitted = lambda columns, channel=channel: (
+                columns.T @ np.linalg.lstsq(columns.T, channel, rcond=1e-4)[0]
+            )
             left = lambda columns, channel=channel: np.linalg.norm(channel - fitted(columns)) ** 2  # noqa: B023
             after = [left(np.concatenate((known[row], wave))) for wave in images[row]]
             expected.append((1 - np.array(after) / left(known[row])) * outside[row].numpy())
@@ -365,7 +413,9 @@ def test_an_image_counts_by_what_it_adds_to_known_paths(few, monkeypatch):
 
 @pytest.mark.parametrize("phases", [False, True])
 def test_cost_is_what_neighbours_do_not_predict(phases, monkeypatch):
-    """Non-negative least squares over the eight nearest places that are a wavelength away, by numpy; and a price."""
+    """Non-negative least squares over the eight nearest places that are a wavelength away, by
+    numpy; and a price.
+    """
     monkeypatch.setattr(channel_search, "RIDGE", 1e-7)
     links, planes = room(walls=np.array([WALL]), receivers=2, count=61)
     if phases:
@@ -386,7 +436,9 @@ def test_cost_is_what_neighbours_do_not_predict(phases, monkeypatch):
                 (waves[near] / size[..., None]).swapaxes(0, 1).reshape(2, -1),
                 (channels[near] / size).ravel(),
             )
-            strengths, _ = nnls(np.concatenate((columns.real, columns.imag), 1).T, np.r_[right.real, right.imag])
+            strengths, _ = nnls(
+                np.concatenate((columns.real, columns.imag), 1).T, np.r_[right.real, right.imag]
+            )
             predicted = strengths @ waves[k]
             if phases:
                 own_channel = own_channel * np.exp(1j * np.angle(np.vdot(own_channel, predicted)))
@@ -401,5 +453,8 @@ def test_neighbours_may_be_silent_at_the_subcarriers_that_count(monkeypatch):
     links, planes = room(walls=np.array([WALL]))
     links.labels[:, :, ::2] = 0
     own = search(links)
-    wall, none = (own.cost(channel_search.half_spaces(seen_from(some, own.middle))) for some in (planes, planes[:0]))
+    wall, none = (
+        own.cost(channel_search.half_spaces(seen_from(some, own.middle)))
+        for some in (planes, planes[:0])
+    )
     assert wall == pytest.approx(none + channel_search.PRICE, abs=1e-6)

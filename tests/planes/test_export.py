@@ -27,7 +27,9 @@ def links():
         Receiver(name, Pose(torch.tensor(place), torch.eye(3)))
         for name, place in {"low": [0.2, 0.2, 0.3], "high": [5.7, 3.6, 2.8]}.items()
     )
-    split = Split("random", torch.arange(50), torch.zeros(0, dtype=torch.long), torch.arange(50, 80))
+    split = Split(
+        "random", torch.arange(50), torch.zeros(0, dtype=torch.long), torch.arange(50, 80)
+    )
     query = Query(places.repeat_interleave(2, 0), torch.arange(80) % 2)
     return Links(query, receivers, torch.zeros(80), Rssi(), split=split)
 
@@ -35,7 +37,9 @@ def links():
 @pytest.fixture
 def build(links):
     def build(planes=6, order=2, obstacles=0):
-        """A placement whose first six planes are the room's faces; every second normal points inwards."""
+        """A placement whose first six planes are the room's faces; every second normal points
+        inwards.
+        """
         torch.manual_seed(0)
         placement = Mirrored(links.scene, 2, planes, order, obstacles)
         with torch.no_grad():
@@ -71,7 +75,9 @@ def test_planes_face_outwards_with_their_loss_and_paths(links, build):
     placement = build()
     with torch.no_grad():
         placement.plane_gains[1] = -0.3
-    planes = {plane["number"]: plane for plane in room_export.facts(placement, training(links))["planes"]}
+    planes = {
+        plane["number"]: plane for plane in room_export.facts(placement, training(links))["planes"]
+    }
     assert planes.keys() == set(range(6))
     root = np.sqrt(PERMITTIVITY)
     loss = -20 * np.log10(abs((root - 1) / (root + 1)))
@@ -79,7 +85,9 @@ def test_planes_face_outwards_with_their_loss_and_paths(links, build):
         axis = np.eye(3)[k % 3]
         np.testing.assert_allclose(plane["normal"], axis if k < 3 else -axis, atol=1e-4)
         assert plane["offset_m"] == pytest.approx(SIZE[k] if k < 3 else 0, abs=1e-4)
-        assert plane["loss_db"] == pytest.approx(loss + (20 * np.log10(np.e) * 0.3 if k == 1 else 0), abs=0.02)
+        assert plane["loss_db"] == pytest.approx(
+            loss + (20 * np.log10(np.e) * 0.3 if k == 1 else 0), abs=0.02
+        )
         assert plane["paths"] == 1 + 5 + 5  # alone, before each other one, behind each
     shares = [plane["share"] for plane in planes.values()]
     assert shares == sorted(shares, reverse=True)
@@ -93,7 +101,8 @@ def test_shares_are_those_of_image_sources(links, build):
     direct, mirrored = [], []
     root = lambda cosine: np.sqrt(PERMITTIVITY - (1 - cosine**2))
     for place, receiver in zip(
-        *(part.numpy() for part in (training(links).transmitters, training(links).receivers)), strict=True
+        *(part.numpy() for part in (training(links).transmitters, training(links).receivers)),
+        strict=True,
     ):
         heard = links.receivers[receiver].pose.position.numpy()
         image = place * (-1, 1, 1) + (2 * SIZE[0], 0, 0)
@@ -115,7 +124,9 @@ def test_a_loss_is_that_where_the_plane_reflects_best(links, build):
     with torch.no_grad():
         placement.middles[6] = torch.tensor(middle) - placement.middle
         placement.log_extents[6] = torch.tensor(np.log(extents))
-    planes = {plane["number"]: plane for plane in room_export.facts(placement, training(links))["planes"]}
+    planes = {
+        plane["number"]: plane for plane in room_export.facts(placement, training(links))["planes"]
+    }
     u, v = np.array([0.8, 0, -0.6]), np.array([0, 1.0, 0])
     steps = np.linspace(-4, 4, 801)
     points = 2.0 * np.array([0.6, 0, 0.8]) + steps[:, None, None] * u + steps[:, None] * v
@@ -127,13 +138,17 @@ def test_a_loss_is_that_where_the_plane_reflects_best(links, build):
 def test_walls_close_to_a_box(links, build):
     placement = build()
     planes = room_export.outlines(placement, room_export.trace_paths(placement, training(links)))
-    assert [plane.share for plane in planes] == sorted((plane.share for plane in planes), reverse=True)
+    assert [plane.share for plane in planes] == sorted(
+        (plane.share for plane in planes), reverse=True
+    )
     ends = Counter()
     for plane in planes:
         area = SIZE.prod() / SIZE[plane.number % 3]
         np.testing.assert_allclose(newell(plane.corners), area * plane.normal, atol=1e-3)
         corners = [tuple(corner) for corner in plane.corners.round(3)]
-        ends.update(frozenset(edge) for edge in zip(corners, corners[1:] + corners[:1], strict=True))
+        ends.update(
+            frozenset(edge) for edge in zip(corners, corners[1:] + corners[:1], strict=True)
+        )
     assert len(ends) == 12
     assert set(ends.values()) == {2}  # each edge belongs to two walls
 
@@ -155,7 +170,9 @@ def test_a_plane_within_the_room_spans_its_bounces(links, build):
     placement = add(build(planes=7), [0.6, 0.8, 0.0], 3.2)
     found = room_export.trace_paths(placement, training(links))
     (plane,) = (plane for plane in room_export.outlines(placement, found) if plane.number == 6)
-    np.testing.assert_allclose(plane.normal, [-0.6, -0.8, 0], atol=1e-6)  # away from the room's middle
+    np.testing.assert_allclose(
+        plane.normal, [-0.6, -0.8, 0], atol=1e-6
+    )  # away from the room's middle
     np.testing.assert_allclose(plane.corners @ plane.normal, -3.2, atol=1e-4)
     assert (plane.corners >= -1e-4).all()
     assert (plane.corners <= SIZE + 1e-4).all()
@@ -167,7 +184,9 @@ def test_a_plane_within_the_room_spans_its_bounces(links, build):
         assert drawn.max() > np.quantile(met, 0.9)
     assert newell(plane.corners) @ plane.normal > 0
     walls = [other for other in room_export.outlines(placement, found) if other.number != 6]
-    assert sum(np.linalg.norm(newell(wall.corners)) for wall in walls) == pytest.approx(2 * (24 + 18 + 12), abs=0.01)
+    assert sum(np.linalg.norm(newell(wall.corners)) for wall in walls) == pytest.approx(
+        2 * (24 + 18 + 12), abs=0.01
+    )
 
 
 def test_a_window_ends_a_wall(links, build):
@@ -186,7 +205,9 @@ def test_a_plane_far_off_is_left_out(links, build):
     with torch.no_grad():
         placement.plane_gains[6] = -5
     found = room_export.trace_paths(placement, training(links))
-    assert 6 in [plane["number"] for plane in room_export.facts(placement, training(links))["planes"]]
+    assert 6 in [
+        plane["number"] for plane in room_export.facts(placement, training(links))["planes"]
+    ]
     assert {plane.number for plane in room_export.outlines(placement, found)} == set(range(6))
 
 
@@ -204,7 +225,9 @@ def test_paths_are_as_long_as_to_their_images(links, build):
         np.testing.assert_allclose(path.points[0], first.transmitters[0])
         length = np.linalg.norm(np.diff(path.points, axis=0), axis=1).sum()
         assert np.abs(lengths - length).min() < 1e-4
-        for before, bounce, after in zip(path.points, path.points[1:], path.points[2:], strict=False):
+        for before, bounce, after in zip(
+            path.points, path.points[1:], path.points[2:], strict=False
+        ):
             (axis,) = np.nonzero(np.minimum(abs(bounce), abs(bounce - SIZE)) < 1e-4)[0]
             come, gone = (part / np.linalg.norm(part) for part in (bounce - before, after - bounce))
             come[axis] *= -1
@@ -265,7 +288,9 @@ def test_obstacles_are_written_as_splats(links, build, tmp_path):
     vertices = file["vertex"]
     columns = lambda *names: torch.from_numpy(np.stack([vertices[name] for name in names], -1))
     torch.testing.assert_close(columns("x", "y", "z"), blobs.centres.data + placement.middle)
-    axes = semi_axes(columns("rot_0", "rot_1", "rot_2", "rot_3"), columns("scale_0", "scale_1", "scale_2").exp())
+    axes = semi_axes(
+        columns("rot_0", "rot_1", "rot_2", "rot_3"), columns("scale_0", "scale_1", "scale_2").exp()
+    )
     torch.testing.assert_close(axes @ axes.mT, torch.diag_embed(blobs.widths.data.square()))
     logits = columns("opacity")[:, 0]
     depths = np.exp([-12.0, -1.0, 0.5, 5.0]) * np.sqrt(2 * np.pi) * 0.2

@@ -1,4 +1,6 @@
-"""The search for planes in spectra: in spectra of a room with known walls, and against sums by hand."""
+"""The search for planes in spectra: in spectra of a room with known walls, and against sums by
+hand.
+"""
 
 import itertools
 from dataclasses import replace
@@ -30,12 +32,19 @@ def search():
     links = example_links("spectrum")
     pose = Pose.from_xyzw([0.5, 1.0, 1.5], [0.0, 0.0, 0.0, 1.0])
     receiver = Receiver("array", pose, Array.planar(4, 4, pitch=0.0625))
-    places = torch.tensor([6.0, 4.0, 2.0]) * torch.rand(150, 3, generator=torch.Generator().manual_seed(0))
+    places = torch.tensor([6.0, 4.0, 2.0]) * torch.rand(
+        150, 3, generator=torch.Generator().manual_seed(0)
+    )
     query = Query(places, torch.zeros(150, dtype=torch.long), torch.full((150,), 2.4e9))
     split = Split("made up", *torch.arange(150).split((150, 0, 0)))
-    links = replace(links, query=query, receivers=(receiver,), labels=torch.ones(150, 2), rows=None, split=split)
+    links = replace(
+        links, query=query, receivers=(receiver,), labels=torch.ones(150, 2), rows=None, split=split
+    )
     count = len(receiver.array.lags[0])
-    ones = lambda labels, query: (torch.ones(len(labels), count, dtype=torch.complex128), torch.zeros(len(labels)))
+    ones = lambda labels, query: (
+        torch.ones(len(labels), count, dtype=torch.complex128),
+        torch.zeros(len(labels)),
+    )
     made = LagSearch(links, query.frequencies, ones, 2)
     own = made.receivers[0]
     lags = own.sums(*own.paths(seen_from(WALLS, made.middle), all_sequences(3, 2)), 0.0)
@@ -63,10 +72,16 @@ def test_a_search_whose_time_is_up_leaves_planes_near_their_start(search):
 
 
 def test_an_unknown_band_is_a_carrier_where_waves_of_all_planes_interfere(search):
-    """Six walls, which all start in wrong places: hardly any move of one alone shows that paths interfere."""
-    walls = torch.cat((WALLS, torch.tensor([(-1.0, 0, 0, 0.2), (0, -1.0, 0, -4.6), (0, 0, -1.0, -2.9)])))
+    """Six walls, which all start in wrong places: hardly any move of one alone shows that paths
+    interfere.
+    """
+    walls = torch.cat(
+        (WALLS, torch.tensor([(-1.0, 0, 0, 0.2), (0, -1.0, 0, -4.6), (0, 0, -1.0, -2.9)]))
+    )
     own = search.receivers[0]
-    lags = own.sums(*own.paths(seen_from(walls.double(), search.middle).float(), all_sequences(6, 2)), 0.0)
+    lags = own.sums(
+        *own.paths(seen_from(walls.double(), search.middle).float(), all_sequences(6, 2)), 0.0
+    )
     search.receivers = [replace(own, lags=lags)]
     off = torch.tensor([0.3, -0.3, 0.25, 0.35, -0.4, 0.3])
     found = search.run(walls + off[:, None] * torch.tensor([0.0, 0, 0, 1]), None, 6)
@@ -90,7 +105,9 @@ def test_a_plane_stays_where_nothing_shows_it(search):
     noise = torch.randn(lags.shape, dtype=lags.dtype, generator=torch.Generator().manual_seed(0))
     search.receivers = [replace(own, lags=lags + 0.3 * lags.abs() * noise)]
     far, count = torch.tensor([[0.0, 0.0, 1.0, 40.0]]), len(own.places)
-    assert search.moved(Found(far, torch.ones(count, 2).bool(), torch.zeros(count)), 0).planes is far
+    assert (
+        search.moved(Found(far, torch.ones(count, 2).bool(), torch.zeros(count)), 0).planes is far
+    )
 
 
 @pytest.mark.parametrize(
@@ -127,8 +144,14 @@ def test_the_covariances_are_the_sums_of_waves_over_the_band(search, bandwidth):
     fields, _, lengths = (part.numpy() for part in own.paths(WALLS, all_sequences(3, 1)))
     found = own.sums(*own.paths(WALLS, all_sequences(3, 1)), bandwidth).numpy()
     position, rotation = own.pose.position.numpy(), own.pose.rotation.numpy()
-    places, elements, frequency = own.places.double().numpy(), own.array.elements.double().numpy(), own.frequency
-    images = np.stack([places, *(places - 2 * ((places @ n) - d)[:, None] * n for *n, d in _rows())], 1)
+    places, elements, frequency = (
+        own.places.double().numpy(),
+        own.array.elements.double().numpy(),
+        own.frequency,
+    )
+    images = np.stack(
+        [places, *(places - 2 * ((places @ n) - d)[:, None] * n for *n, d in _rows())], 1
+    )
     ways = (images - position) @ rotation
     distances = np.linalg.norm(ways, axis=-1)
     np.testing.assert_allclose(lengths, distances, rtol=1e-6)
@@ -168,7 +191,9 @@ def test_spectra_give_back_the_covariances_of_their_elements():
     links = replace(links, task=task, receivers=(receiver, receiver))
     pooling = MirroredSplatting(links.scene).pooling
     elements = links.receivers[0].array
-    waves = torch.randn(5, 3, len(elements), dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    waves = torch.randn(
+        5, 3, len(elements), dtype=torch.complex128, generator=torch.Generator().manual_seed(0)
+    )
     covariances = (waves.mT @ waves.conj()).flatten(1)
     _, pairs, counts = elements.lags
     lags = covariances.new_zeros(5, len(counts)).index_add(1, pairs, covariances) / counts
@@ -176,9 +201,13 @@ def test_spectra_give_back_the_covariances_of_their_elements():
     labels = pooling.beamformer(lags.to(torch.complex64), query)
     found, left = pooling.beamformer.lags(labels, query)
     assert left.max() < 1e-6
-    assert pooling.beamformer.lags(labels.flip(1), query)[1].min() > 0.01, "no spectra of this array"
+    assert pooling.beamformer.lags(labels.flip(1), query)[1].min() > 0.01, (
+        "no spectra of this array"
+    )
     half = len(counts) // 2
-    torch.testing.assert_close(found / found[:, half, None], lags / lags[:, half, None], rtol=0, atol=1e-3)
+    torch.testing.assert_close(
+        found / found[:, half, None], lags / lags[:, half, None], rtol=0, atol=1e-3
+    )
     assert not pooling.beamformer.lags(torch.zeros(5, *links.task.shape), query)[0].any()
 
 
@@ -191,4 +220,6 @@ def test_a_periodogram_sums_the_waves_at_moved_and_turned_planes():
     every = torch.cat((-turns[1:].flip(0), turns))
     for i, j, k in itertools.product(range(5), range(5), range(5)):
         phases = rates.double() @ torch.stack((moves[i], every[j], every[k])).double()
-        assert tile[i, j, k].item() == pytest.approx((heard * torch.exp(1j * phases)).real.sum().item(), abs=1e-4)
+        assert tile[i, j, k].item() == pytest.approx(
+            (heard * torch.exp(1j * phases)).real.sum().item(), abs=1e-4
+        )

@@ -37,7 +37,9 @@ def levels(places, position):
             cosines = np.abs((image - position) @ normal) / lengths
             wave = (
                 wave
-                + fresnel(MATERIAL, torch.tensor(cosines))[0].numpy() * np.exp(-1j * wavenumber * lengths) / lengths
+                + fresnel(MATERIAL, torch.tensor(cosines))[0].numpy()
+                * np.exp(-1j * wavenumber * lengths)
+                / lengths
             )
         powers = powers + np.abs(wave) ** 2
     return 10 * np.log10(powers)
@@ -55,16 +57,24 @@ def room(bandwidth, noise=1.0, is_silent=False, seed=0):
     labels = torch.from_numpy(
         np.concatenate([levels(places, position) + 7 * k for k, position in enumerate(positions)])
     )
-    labels = (0 if is_silent else labels) + noise * torch.randn(2 * PLACES, dtype=torch.float64, generator=generator)
+    labels = (0 if is_silent else labels) + noise * torch.randn(
+        2 * PLACES, dtype=torch.float64, generator=generator
+    )
     rows = torch.arange(2).repeat_interleave(PLACES)
     query = Query(places.repeat(2, 1), rows, torch.full((2 * PLACES,), CARRIER))
     split = Split("made up", *torch.arange(2 * PLACES).split((2 * PLACES, 0, 0)))
-    links = replace(example_links("rssi"), query=query, receivers=receivers, labels=labels.float(), rows=None)
+    links = replace(
+        example_links("rssi"), query=query, receivers=receivers, labels=labels.float(), rows=None
+    )
     links = replace(links, split=split, bandwidth=bandwidth)
-    start = WALLS + torch.tensor([(0.0, 0.02, 0.01, 0.15), (0.02, 0.0, -0.01, -0.1), (0.0, 0.01, 0.0, 0.12)])
+    start = WALLS + torch.tensor(
+        [(0.0, 0.02, 0.01, 0.15), (0.02, 0.0, -0.01, -0.1), (0.0, 0.01, 0.0, 0.12)]
+    )
     start[:, :3] = functional.normalize(start[:, :3], dim=1)
     torch.manual_seed(0)
-    placement = MirroredSplatting(links.scene, placement={"name": "mirrored", "obstacles": 0}).placement
+    placement = MirroredSplatting(
+        links.scene, placement={"name": "mirrored", "obstacles": 0}
+    ).placement
     for k, plane in enumerate(start):
         placement.place(k, plane)
     placement.kept.copy_(placement.sequences_of(torch.arange(3)))
@@ -76,7 +86,9 @@ def room(bandwidth, noise=1.0, is_silent=False, seed=0):
 
 def planes(placement):
     normals = placement.normals[:3]
-    return torch.cat((normals, (placement.offsets[:3] + normals @ placement.middle)[:, None]), 1).detach()
+    return torch.cat(
+        (normals, (placement.offsets[:3] + normals @ placement.middle)[:, None]), 1
+    ).detach()
 
 
 @pytest.mark.parametrize("bandwidth", [BANDWIDTH, None])

@@ -20,7 +20,9 @@ def placement():
     scene = gaigs.links("synthetic_csi", transmitters=10, order=0).scene
     placement = Mirrored(scene, 2, obstacles=0)
     with torch.no_grad():
-        placement.log_extents.fill_(10.0)  # planes without edges, near which they would reflect less
+        placement.log_extents.fill_(
+            10.0
+        )  # planes without edges, near which they would reflect less
     return placement
 
 
@@ -42,7 +44,9 @@ def test_a_plane_has_the_material_it_is_made_of(placement):
 
 
 def test_gains_of_planes_and_paths_count_as_material(placement):
-    """Glass as a weaker dielectric with gains: a learnt permittivity alone would be called plasterboard."""
+    """Glass as a weaker dielectric with gains: a learnt permittivity alone would be called
+    plasterboard.
+    """
     paint(placement, 0, complex(2.73, -0.1))
     reflected = lambda value: abs((1 - value**0.5) / (1 + value**0.5))
     gain = math.log(reflected(permittivity("glass", FREQUENCY)) / reflected(complex(2.73, -0.1)))

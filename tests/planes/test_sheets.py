@@ -17,7 +17,9 @@ CORNERS = np.zeros(3), np.array([7.0, 5.0, 3.0])
 def placement_of(obstacles):
     """Free space in the built-in room, with obstacles at places from its middle."""
     torch.manual_seed(0)
-    placement = Mirrored(gaigs.links("synthetic_csi", transmitters=10, order=0).scene, 2, obstacles=0, order=0)
+    placement = Mirrored(
+        gaigs.links("synthetic_csi", transmitters=10, order=0).scene, 2, obstacles=0, order=0
+    )
     placement.kept.fill_(True)
     if obstacles:
         placement.obstacles = Obstacles(len(obstacles), -placement.middle, placement.middle)
@@ -39,17 +41,24 @@ def test_crossings_of_a_ball(monkeypatch):
     levels = 2 * (-2 * (steps**2 + starts[:, 1:].square().sum(1)[:, None])).exp()
     along = torch.tensor([[4.0, 0, 0]]).double().expand(3, 3)
     matter = sheets.sample(placement.obstacles, -np.ones(3), np.ones(3))
-    found = sheets.cross(placement.obstacles, matter, 1.0, sheets.Legs(starts, along, torch.arange(3), levels))
+    found = sheets.cross(
+        placement.obstacles, matter, 1.0, sheets.Legs(starts, along, torch.arange(3), levels)
+    )
     assert found.paths.tolist() == [0, 0, 1, 1]
     assert found.surfaces.tolist() == [0] * 4
-    torch.testing.assert_close(found.cosines, torch.tensor([1, 1, 0.75**0.5, 0.75**0.5]).double(), atol=2e-3, rtol=0)
+    torch.testing.assert_close(
+        found.cosines, torch.tensor([1, 1, 0.75**0.5, 0.75**0.5]).double(), atol=2e-3, rtol=0
+    )
     vertices, _ = matter.surface(1.0, 1)
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), radius, atol=2e-3)
 
 
 def test_losses_of_a_sheet():
     crossings = sheets.Crossings(
-        torch.tensor([0.5, 0.5]), torch.tensor([0.0, 1.0]), torch.tensor([0, 1]), torch.tensor([0, 0])
+        torch.tensor([0.5, 0.5]),
+        torch.tensor([0.0, 1.0]),
+        torch.tensor([0, 1]),
+        torch.tensor([0, 0]),
     )
     losses = crossings.losses(torch.tensor([2.0]), 3)
     torch.testing.assert_close(losses, torch.tensor([math.log(3.0), math.log(1.5), 0.0]))
@@ -66,7 +75,8 @@ def test_sheets_dim_paths_as_two_unlike_obstacles_do(monkeypatch):
     found, rest = sheets.fit_sheets(placement, query, *CORNERS)
     at = [sheet.vertices.mean(0)[0] - float(placement.middle[0]) for sheet in found]
     thin, dense = (
-        sum(sheet.loss_db for sheet, x in zip(found, at, strict=True) if abs(x - y) < 0.2) for y in (-1, 1.5)
+        sum(sheet.loss_db for sheet, x in zip(found, at, strict=True) if abs(x - y) < 0.2)
+        for y in (-1, 1.5)
     )
     # Through the middle they lose 6.5 and 26 dB on each side.
     assert 2 < thin < 7

@@ -58,9 +58,13 @@ def links_of(task, carriers=()):
 
 
 def run(folder, monkeypatch, *overrides):
-    """A short training on the built-in room: its configuration, its metrics, and the model of its checkpoint."""
+    """A short training on the built-in room: its configuration, its metrics, and the model of its
+    checkpoint.
+    """
     monkeypatch.setattr(runs, "radio_map", Mock())
-    few = [] if any(word.startswith("data.root=") for word in overrides) else ["data.transmitters=30"]
+    few = (
+        [] if any(word.startswith("data.root=") for word in overrides) else ["data.transmitters=30"]
+    )
     config = composed(*overrides, *few, *RUN)
     with repository():
         return config, runs.run(config, folder), gaigs.load(folder / "best.ckpt")

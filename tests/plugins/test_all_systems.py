@@ -54,7 +54,9 @@ def make(name, scene, task="spectrum", **options):
     return build("model", configured(name, task)["model"] | options, scene=scene)
 
 
-@pytest.mark.parametrize(("name", "task"), [(name, task) for name in SMALL for task in TASKS.get(name, DATA)])
+@pytest.mark.parametrize(
+    ("name", "task"), [(name, task) for name in SMALL for task in TASKS.get(name, DATA)]
+)
 def test_systems_keep_the_contract_of_models(name, task):
     check_model(lambda scene: make(name, scene, task), links_of(task))
 
@@ -73,14 +75,24 @@ def test_systems_keep_the_contract_at_several_carriers(name):
 def chosen(name):
     """Loss of spectra, levels and channels."""
     levels = {"dcgan": "absolute", "gsrf": "gsrf"}.get(name, "squared")
-    spectra = {"fire": "squared", "nerf2": "squared", "nerf_apt": "squared", "dcgan": "absolute", "gsrf": "gsrf"}
-    return dict(zip(DATA, (spectra.get(name, "l1_ssim"), levels, "log_relative_error"), strict=True))
+    spectra = {
+        "fire": "squared",
+        "nerf2": "squared",
+        "nerf_apt": "squared",
+        "dcgan": "absolute",
+        "gsrf": "gsrf",
+    }
+    return dict(
+        zip(DATA, (spectra.get(name, "l1_ssim"), levels, "log_relative_error"), strict=True)
+    )
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_a_run_stores_the_model_that_it_scores(name, tmp_path, monkeypatch):
     tasks = TASKS.get(name, DATA)
-    assert {task: configured(name, task)["loss"]["name"] for task in tasks} == {t: chosen(name)[t] for t in tasks}
+    assert {task: configured(name, task)["loss"]["name"] for task in tasks} == {
+        t: chosen(name)[t] for t in tasks
+    }
     task = tasks[0] if name in TASKS else ("spectrum", "rssi", "csi")[len(name) % 3]
     thin = {"spectrum": ["training.thinning.stride=8"]}.get(task, [])
     words = (f"data={DATA[task]}", f"model={name}", *SMALL[name].split(), *thin)
@@ -89,10 +101,14 @@ def test_a_run_stores_the_model_that_it_scores(name, tmp_path, monkeypatch):
     assert [*metrics["models"]] == [name, "mean"]
     with np.load(tmp_path / "predictions.npz") as stored:
         query = Query(torch.tensor(stored["transmitters"]), torch.tensor(stored["receiver"]))
-        frequencies = model.scene.frequencies[:1].expand(len(query)) if len(model.scene.frequencies) else None
+        frequencies = (
+            model.scene.frequencies[:1].expand(len(query)) if len(model.scene.frequencies) else None
+        )
         again = model.predict(replace(query, frequencies=frequencies)).numpy()
         scale = 255 if stored["prediction"].dtype == np.uint8 else 1
-        np.testing.assert_allclose(stored["prediction"] / scale, again, rtol=1e-3, atol=1e-3 if scale == 1 else 1)
+        np.testing.assert_allclose(
+            stored["prediction"] / scale, again, rtol=1e-3, atol=1e-3 if scale == 1 else 1
+        )
 
 
 @pytest.mark.parametrize(
@@ -112,7 +128,9 @@ def test_a_run_stores_the_model_that_it_scores(name, tmp_path, monkeypatch):
         ("wrf_gs_plus", "amplitude_phase", "spectrum"),
     ],
 )
-def test_splatting_systems_keep_their_networks_for_every_task(name, deformation, own, words, pooling):
+def test_splatting_systems_keep_their_networks_for_every_task(
+    name, deformation, own, words, pooling
+):
     config = composed(f"model={name}", *words)["model"]
     assert (config["name"], config["deformation"]["name"]) == (name, deformation)
     assert config["pooling"]["name"] == (pooling or own)
@@ -123,7 +141,14 @@ def test_splatting_systems_keep_their_networks_for_every_task(name, deformation,
 LEAST = {
     "nerf2": {"samples": 2, "octaves": 0, "width": 2, "layers": 2},
     "nerf_apt": {"octaves": 0},
-    "newrf": {"arrivals": 1, "samples": 2, "octaves": 0, "view_octaves": 0, "width": 1, "layers": 1},
+    "newrf": {
+        "arrivals": 1,
+        "samples": 2,
+        "octaves": 0,
+        "view_octaves": 0,
+        "width": 1,
+        "layers": 1,
+    },
     "ngrf": {"count": 1, "width": 1, "layers": 1},
     "fire": {"latent": 1},
     "dcgan": {"width": 1, "noise": 1},
@@ -135,10 +160,14 @@ LEAST = {
 }
 
 
-@pytest.mark.parametrize(("name", "option"), [(name, option) for name in LEAST for option in LEAST[name]])
+@pytest.mark.parametrize(
+    ("name", "option"), [(name, option) for name in LEAST for option in LEAST[name]]
+)
 def test_sizes_below_the_least_are_refused(name, option):
     least, task = LEAST[name][option], TASKS.get(name, ["spectrum"])[0]
-    with pytest.raises(ValueError, match=rf"model\.{option} must be (of )?at least {least}.*, got {least - 1}"):
+    with pytest.raises(
+        ValueError, match=rf"model\.{option} must be (of )?at least {least}.*, got {least - 1}"
+    ):
         make(name, links_of(task).scene, task, **{option: least - 1})
 
 
@@ -149,23 +178,43 @@ def test_sizes_below_the_least_are_refused(name, option):
 )
 def test_sizes_of_deformations_below_the_least_are_refused(name, option, least):
     deformation = configured(name, "spectrum")["deformation"] | {option: least - 1}
-    with pytest.raises(ValueError, match=rf"deformation\.{option} must be at least {least}, got {least - 1}"):
-        build("deformation", deformation, scene=links_of("spectrum").scene, channels=2, tokenizer_widths=(0, 3, 3))
+    with pytest.raises(
+        ValueError, match=rf"deformation\.{option} must be at least {least}, got {least - 1}"
+    ):
+        build(
+            "deformation",
+            deformation,
+            scene=links_of("spectrum").scene,
+            channels=2,
+            tokenizer_widths=(0, 3, 3),
+        )
 
 
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
         ("nerf2", {"far": 0.0}, r"model.far must be positive \[m\] or null, got 0"),
-        ("nerf2", {"frequency": -1.0}, r"model\.frequency must be a carrier in Hz, from 10000 to 3e\+11, got -1"),
+        (
+            "nerf2",
+            {"frequency": -1.0},
+            r"model\.frequency must be a carrier in Hz, from 10000 to 3e\+11, got -1",
+        ),
         ("nerf2", {"octaves": 200}, "model.octaves must be at least 0 and at most 30, got 200"),
         ("nerf_apt", {"samples": 6}, r"multiples of 4, of at least 2 rows, got 6 and \[3, 8\]"),
         ("nerf_apt", {"rays": [3, 10]}, r"multiples of 4, of at least 2 rows, got 4 and \[3, 10\]"),
         ("nerf_apt", {"rays": [1, 8]}, r"multiples of 4, of at least 2 rows, got 4 and \[1, 8\]"),
         ("nerf_apt", {"rays": [8]}, r"model.rays must be \[rows, columns\], got \[8\]"),
-        ("nerf_apt", {"widths": [4, 4]}, r"model.widths must be three numbers of at least 2, got \[4, 4\]"),
+        (
+            "nerf_apt",
+            {"widths": [4, 4]},
+            r"model.widths must be three numbers of at least 2, got \[4, 4\]",
+        ),
         ("nerf_apt", {"widths": [1, 4, 4]}, "three numbers of at least 2"),
-        ("mlp", {"octaves": [2, 1]}, r"model\.octaves must be \[lowest, highest\] within -30..30, got \[2, 1\]"),
+        (
+            "mlp",
+            {"octaves": [2, 1]},
+            r"model\.octaves must be \[lowest, highest\] within -30..30, got \[2, 1\]",
+        ),
         ("mlp", {"pixel": 0.0}, r"model\.pixel must be above 0 and at most 90 \[deg\], got 0\.0"),
         ("mlp", {"widths": []}, r"model\.widths must be of at least 1, got \[\]"),
         ("mlp", {"dropout": 1.0}, r"model\.dropout must be in \[0, 1\), got 1\.0"),
@@ -174,17 +223,41 @@ def test_sizes_of_deformations_below_the_least_are_refused(name, option, least):
         ("ngrf", {"scale": 0.0}, "model.scale must be more than 0 and at most 1e6, got 0"),
         ("gsrf", {"count": 1}, "a point for each of the 2 receivers"),
         ("gsrf", {"margin": 0.0}, "model.margin must be positive"),
-        ("gsrf", {"pooling": {"name": "spectrum", "channels": 1}}, "pooling 'spectrum' takes 1 real channel"),
+        (
+            "gsrf",
+            {"pooling": {"name": "spectrum", "channels": 1}},
+            "pooling 'spectrum' takes 1 real channel",
+        ),
         ("gsrf", {"pooling": None}, "no pooling for labels of task 'spectrum'; use another model"),
-        ("swift_wrf", {"octaves": [2, 1]}, r"model\.octaves must be \[lowest, highest\] within -30..30, got \[2, 1\]"),
-        ("array_response", {"rows": 1, "columns": 1}, "at least 2 elements, got model.rows=1, model.columns=1"),
+        (
+            "swift_wrf",
+            {"octaves": [2, 1]},
+            r"model\.octaves must be \[lowest, highest\] within -30..30, got \[2, 1\]",
+        ),
+        (
+            "array_response",
+            {"rows": 1, "columns": 1},
+            "at least 2 elements, got model.rows=1, model.columns=1",
+        ),
         ("array_response", {"pitch": 0.0}, r"model\.pitch must be positive \[wavelengths\], got 0"),
-        ("array_response", {"octaves": [2, 1]}, r"\[lowest, highest\] within -30..30, got \[2, 1\]"),
+        (
+            "array_response",
+            {"octaves": [2, 1]},
+            r"\[lowest, highest\] within -30..30, got \[2, 1\]",
+        ),
         ("rf_3dgs", {"first_stage": 0.0}, r"model\.first_stage must lie between 0 and 1"),
         ("rf_3dgs", {"first_stage": 1.0}, r"model\.first_stage must lie between 0 and 1"),
-        ("ray_tracing", {"room": "nerf2_spectrum"}, "must know the room: one of built_in, l_shape, slanted, furnished"),
+        (
+            "ray_tracing",
+            {"room": "nerf2_spectrum"},
+            "must know the room: one of built_in, l_shape, slanted, furnished",
+        ),
         ("ray_tracing", {"depth": 0}, r"model\.depth must be in 1\.\.8, got 0"),
-        ("ray_tracing", {"frequency": -1.0}, r"model\.frequency must be a carrier in Hz, from 10000 to 3e\+11, got -1"),
+        (
+            "ray_tracing",
+            {"frequency": -1.0},
+            r"model\.frequency must be a carrier in Hz, from 10000 to 3e\+11, got -1",
+        ),
     ],
 )
 def test_options_out_of_range_are_refused(name, options, message):
@@ -199,7 +272,9 @@ def of_task(task):
 
 def seen_in(elevations):
     scene = of_task("spectrum")
-    return replace(scene, task=Spectrum(torch.tensor(elevations), scene.task.directions.azimuths, "none"))
+    return replace(
+        scene, task=Spectrum(torch.tensor(elevations), scene.task.directions.azimuths, "none")
+    )
 
 
 @pytest.mark.parametrize(

@@ -65,7 +65,9 @@ def test_at_a_pitch_of_one_wavelength_lobes_repeat(build):
     # cos az cos el is 1/2 and -1/2 there: one period of the pattern, 1 / pitch, apart.
     scene = seen_in(Grid.degrees([60, 1, 90], [0, 90, 180]))
     fields = torch.randn(16, dtype=torch.complex64, generator=torch.Generator().manual_seed(0))
-    spectra = [answering(build(scene, pitch=p), fields).predict(SOMEWHERE[:1], 0)[0] for p in (1.0, 0.5)]
+    spectra = [
+        answering(build(scene, pitch=p), fields).predict(SOMEWHERE[:1], 0)[0] for p in (1.0, 0.5)
+    ]
     apart = [abs(float(spectrum[0, 0] - spectrum[0, 2])) for spectrum in spectra]
     assert apart[0] < 1e-5 < 0.1 < apart[1]
 
@@ -74,10 +76,14 @@ def test_the_gradient_is_that_of_the_plain_formula(build):
     model = build().double()
     grid = GRID.to(torch.float64)
     batch = Batch(Query(SOMEWHERE.double(), torch.tensor([1, 1])), grid)
-    weights = torch.randn(2, *grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    weights = torch.randn(
+        2, *grid.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
 
     outputs = []
-    hook = model.network.register_forward_hook(lambda module, inputs, output: outputs.append(output))
+    hook = model.network.register_forward_hook(
+        lambda module, inputs, output: outputs.append(output)
+    )
     value = model(batch).value
     hook.remove()
     (found,) = torch.autograd.grad((value * weights).sum(), outputs[0])
@@ -88,7 +94,9 @@ def test_the_gradient_is_that_of_the_plain_formula(build):
     steps = torch.arange(4, dtype=torch.float64) - 1.5
     along_x = torch.exp(-1j * math.pi * steps[:, None, None] * azimuths.cos() * elevations.cos())
     along_y = torch.exp(-1j * math.pi * steps[:, None, None] * azimuths.sin() * elevations.cos())
-    plain = min_max(torch.einsum("bij,iac,jac->bac", fields.unflatten(1, (4, 4)), along_x, along_y).abs())
+    plain = min_max(
+        torch.einsum("bij,iac,jac->bac", fields.unflatten(1, (4, 4)), along_x, along_y).abs()
+    )
     (expected,) = torch.autograd.grad((plain * weights).sum(), again)
     torch.testing.assert_close(value, plain, rtol=0, atol=1e-6)
     torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-5 * float(expected.abs().max()))
@@ -103,13 +111,18 @@ def test_any_directions_get_the_arrays_answer(build):
     torch.testing.assert_close(rays, whole.flatten()[chosen], rtol=0, atol=1e-5)
     (unasked,) = model(Batch(query)).value
     assert torch.equal(unasked, whole)
-    # Between pixels, and below the horizon, where a planar array sees the mirror image of the half above.
+    # Between pixels, and below the horizon, where a planar array sees the mirror image of the half
+    # above.
     elevations, azimuths = torch.tensor([0.3, -0.3, 1.0]), torch.tensor([0.123, 0.123, 4.0])
     (between,) = model(Batch(query, Rays(elevations, azimuths))).value
     steps = torch.cartesian_prod(torch.arange(4) - 1.5, torch.arange(4) - 1.5)
     cosines = torch.stack((azimuths.cos() * elevations.cos(), azimuths.sin() * elevations.cos()))
-    amplitudes = lambda cosines: (fields[:, None] * torch.exp(-1j * math.pi * (steps @ cosines))).sum(0).abs()
+    amplitudes = lambda cosines: (
+        (fields[:, None] * torch.exp(-1j * math.pi * (steps @ cosines))).sum(0).abs()
+    )
     pixels = GRID.flatten().vectors()[:, :2].T
     low, high = amplitudes(pixels).aminmax()
-    torch.testing.assert_close(between, (amplitudes(cosines) - low) / (high - low), rtol=0, atol=1e-4)
+    torch.testing.assert_close(
+        between, (amplitudes(cosines) - low) / (high - low), rtol=0, atol=1e-4
+    )
     assert between[0] == between[1]

@@ -1,4 +1,6 @@
-"""GSRF: its rendering against a plain float64 transcription, its harmonics against scipy's; how Gaussians start."""
+"""GSRF: its rendering against a plain float64 transcription, its harmonics against scipy's; how
+Gaussians start.
+"""
 
 import math
 from dataclasses import replace
@@ -43,7 +45,9 @@ def as_trained(model):
     with torch.no_grad():
         for name, size in {"log_scales": 0.5, "opacity_logits": 4.0, "phases": 2.0}.items():
             parameter = getattr(gaussians, name)
-            parameter.add_(size * torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
+            parameter.add_(
+                size * torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+            )
     return model
 
 
@@ -62,7 +66,10 @@ def test_its_loss_refuses_channels():
 
 
 def test_its_pooling_keeps_the_contract_of_poolings():
-    check_pooling(lambda scene: build("pooling", {"name": "mean_amplitude", "grid": [3, 8]}), example_links("rssi"))
+    check_pooling(
+        lambda scene: build("pooling", {"name": "mean_amplitude", "grid": [3, 8]}),
+        example_links("rssi"),
+    )
 
 
 # --- the series ---
@@ -137,7 +144,9 @@ def test_the_rendering_equation_is_the_published_one(task, degree):
     model = as_trained(model_of(task, degree=degree))
     gaussians, place = model.gaussians, torch.tensor([[2.0, 1.5, 0.7]], dtype=torch.float64)
     generator = torch.Generator().manual_seed(2)
-    angles = torch.rand(2, 9, generator=generator, dtype=torch.float64) * torch.tensor([[math.tau], [1.5]])
+    angles = torch.rand(2, 9, generator=generator, dtype=torch.float64) * torch.tensor(
+        [[math.tau], [1.5]]
+    )
     rays = from_spherical(*angles)
     radiance = gaussians.radiance(place)
     expected = transcribed_radiance(gaussians, place[0].numpy(), degree)
@@ -153,11 +162,17 @@ def test_the_rendering_equation_is_the_published_one(task, degree):
 @torch.no_grad()
 def test_a_spectrum_is_the_magnitude_of_the_map():
     model = as_trained(model_of())
-    elevations, azimuths = torch.tensor([0.2, 1.1, 0.9]).double(), torch.tensor([0.1, 3.0, 6.1]).double()
+    elevations, azimuths = (
+        torch.tensor([0.2, 1.1, 0.9]).double(),
+        torch.tensor([0.1, 3.0, 6.1]).double(),
+    )
     query = Query(torch.tensor([[2.0, 1.5, 0.7]]).double(), torch.tensor([1]))
     (value,) = model(Batch(query, Rays(elevations, azimuths))).value
     radiance = transcribed_radiance(model.gaussians, query.transmitters[0].numpy(), 3)
-    rays, pose = from_spherical(azimuths, elevations).numpy(), LINKS.receivers[1].pose.to(elevations)
+    rays, pose = (
+        from_spherical(azimuths, elevations).numpy(),
+        LINKS.receivers[1].pose.to(elevations),
+    )
     expected = np.abs(transcribed_map(model.gaussians, radiance, pose, rays, 0.307)[0])
     np.testing.assert_allclose(value.numpy(), expected, rtol=0, atol=1e-10)
 
@@ -239,9 +254,13 @@ def test_the_count_bounds_a_grid_of_unknown_or_short_wavelengths(frequencies):
 def test_all_of_the_grid_that_labels_show_is_there_and_nothing_else():
     model = model_of(count=400)
     grid, low = cubic_grid(LINKS.scene, 400, 1.85, 0.25), LINKS.task.directions.elevations[0]
-    is_seen = torch.stack([to_spherical(r.pose.local(grid))[1] >= low for r in LINKS.receivers]).any(0)
+    is_seen = torch.stack(
+        [to_spherical(r.pose.local(grid))[1] >= low for r in LINKS.receivers]
+    ).any(0)
     assert 0 < len(model.gaussians) == is_seen.sum() < len(grid)
-    assert len(model_of("rssi", count=400).gaussians) == len(cubic_grid(LINKS.scene, 400, 1.85, 0.25))
+    assert len(model_of("rssi", count=400).gaussians) == len(
+        cubic_grid(LINKS.scene, 400, 1.85, 0.25)
+    )
 
 
 def test_density_control_keeps_each_phase_with_its_gaussian():
@@ -268,23 +287,34 @@ def test_spectra_have_the_three_published_terms():
     fourier = torch.fft.fft2(errors.double(), norm="ortho").abs().square().mean().float()
     torch.testing.assert_close(terms["fourier"], fourier)
     torch.testing.assert_close(terms["l1"], errors.abs().mean())
-    windows = [part.unfold(1, 11, 1).unfold(2, 11, 1).flatten(3).double() for part in (values, batch.labels)]
+    windows = [
+        part.unfold(1, 11, 1).unfold(2, 11, 1).flatten(3).double()
+        for part in (values, batch.labels)
+    ]
     (mx, vx), (my, vy) = ((part.mean(-1), part.var(-1)) for part in windows)
     covariance = ((windows[0] - mx[..., None]) * (windows[1] - my[..., None])).sum(-1) / 120
-    similarity = (2 * mx * my + 1e-4) * (2 * covariance + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+    similarity = (
+        (2 * mx * my + 1e-4) * (2 * covariance + 9e-4) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))
+    )
     torch.testing.assert_close(terms["ssim"], 1 - similarity.mean().float(), rtol=0, atol=1e-5)
-    torch.testing.assert_close(loss, 0.44 * terms["l1"] + 0.37 * terms["ssim"] + 0.19 * terms["fourier"])
+    torch.testing.assert_close(
+        loss, 0.44 * terms["l1"] + 0.37 * terms["ssim"] + 0.19 * terms["fourier"]
+    )
 
 
 def test_levels_have_the_squared_error_of_amplitudes():
     links = example_links("rssi")
     batch = links.batch(torch.arange(4))
-    loss, _ = build("loss", {"name": "gsrf"}, task=links.task)(batch.labels + torch.tensor([10.0, 0, -10, 0]), batch)
+    loss, _ = build("loss", {"name": "gsrf"}, task=links.task)(
+        batch.labels + torch.tensor([10.0, 0, -10, 0]), batch
+    )
     torch.testing.assert_close(loss, torch.tensor(0.005))
 
 
 def test_single_directions_have_no_window():
     batch = LINKS.batch(torch.arange(2))
-    rays = replace(batch, directions=batch.directions.flatten()[:5], labels=batch.labels.flatten(1)[:, :5])
+    rays = replace(
+        batch, directions=batch.directions.flatten()[:5], labels=batch.labels.flatten(1)[:, :5]
+    )
     with pytest.raises(ValueError, match="'gsrf' needs rows and columns"):
         build("loss", {"name": "gsrf"}, task=LINKS.task)(rays.labels, rays)

@@ -1,4 +1,6 @@
-"""NeRF²: its sums along rays against float64 transcriptions of the published equations; networks, tasks, refusals."""
+"""NeRF²: its sums along rays against float64 transcriptions of the published equations; networks,
+tasks, refusals.
+"""
 
 import cmath
 import functools
@@ -17,7 +19,14 @@ from gaigs.core.geometry import Grid, Rays
 from gaigs.core.query import Batch
 from gaigs.testing import example_links
 
-SMALL = ("model=nerf2", "model.samples=4", "model.rays=[2,4]", "model.octaves=2", "model.width=8", "model.layers=3")
+SMALL = (
+    "model=nerf2",
+    "model.samples=4",
+    "model.rays=[2,4]",
+    "model.octaves=2",
+    "model.width=8",
+    "model.layers=3",
+)
 LIGHT = 299792458.0
 TASKS = ("spectrum", "rssi", "csi")
 
@@ -55,7 +64,9 @@ def given(package, scene, links, rays, seed=0, **changes):
     random = lambda *shape: torch.rand(*shape, generator=generator)
     along, sent = (rays, 7), (links, rays, 7, model.reading.channels)
     # Up to opaque within a step, and many turns.
-    model.samples = package.Samples(20 * random(*along), 40 * random(*along), random(*sent), 7 * random(*sent))
+    model.samples = package.Samples(
+        20 * random(*along), 40 * random(*along), random(*sent), 7 * random(*sent)
+    )
     return model, asked
 
 
@@ -79,8 +90,13 @@ def test_spectra_are_the_published_sum(package, seed):
     links = example_links()
     batch = Batch(links.query[torch.tensor([0, 2, 4])], Rays(torch.rand(5), 6 * torch.rand(5)))
     model, _ = given(package, links.scene, 3, 5, seed)
-    expected = [[abs(along(model.samples, b, r, 0, lambda t: 0.025 / t)) for r in range(5)] for b in range(3)]
-    torch.testing.assert_close(model(batch).value.double(), torch.tensor(expected).double(), rtol=1e-4, atol=1e-6)
+    expected = [
+        [abs(along(model.samples, b, r, 0, lambda t: 0.025 / t)) for r in range(5)]
+        for b in range(3)
+    ]
+    torch.testing.assert_close(
+        model(batch).value.double(), torch.tensor(expected).double(), rtol=1e-4, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -110,13 +126,20 @@ def test_channels_are_the_sum_at_each_element(package, sign):
         distance = (query.transmitters[b] - receiver.pose.position).double().norm().item()
         for c, frequency in enumerate(links.task.frequencies.tolist()):
             k = 2 * math.pi * frequency / LIGHT
-            sums = [along(model.samples, b, r, c, lambda t, k=k: cmath.exp(1j * k * t)) for r in range(8)]
+            sums = [
+                along(model.samples, b, r, c, lambda t, k=k: cmath.exp(1j * k * t))
+                for r in range(8)
+            ]
             direct = cmath.exp(1j * sign * k * distance) / (2 * k * distance)
             for e in range(4):
-                steered = (cmath.exp(-1j * k * (elements[e] @ views[r]).item()) * sums[r] for r in range(8))
+                steered = (
+                    cmath.exp(-1j * k * (elements[e] @ views[r]).item()) * sums[r] for r in range(8)
+                )
                 total = sum(steered)
                 expected[b, e, c] = direct * (total if (sign or 1) > 0 else total.conjugate())
-    torch.testing.assert_close(model(Batch(query)).value, expected.to(torch.complex64), rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        model(Batch(query)).value, expected.to(torch.complex64), rtol=0, atol=1e-5
+    )
 
 
 def test_samples_stand_in_the_middles_of_steps_along_the_rays(package):
@@ -131,7 +154,9 @@ def test_samples_stand_in_the_middles_of_steps_along_the_rays(package):
         torch.testing.assert_close(asked.views[r], view)
         for i in range(7):
             place = pose.position + 0.5 * (i + 0.5) * view
-            torch.testing.assert_close(asked.points[r, i] + (links.scene.lower + links.scene.upper) / 2, place)
+            torch.testing.assert_close(
+                asked.points[r, i] + (links.scene.lower + links.scene.upper) / 2, place
+            )
 
 
 def test_rays_end_at_the_farthest_corner(package):
@@ -151,7 +176,11 @@ def test_gradients_are_finite_where_nothing_is_sent(package):
             for parameter in model.send[-1].parameters():
                 parameter.zero_()
         model(links.batch(torch.arange(4))).value.abs().square().sum().backward()
-        assert all(parameter.grad.isfinite().all() for parameter in model.parameters() if parameter.grad is not None)
+        assert all(
+            parameter.grad.isfinite().all()
+            for parameter in model.parameters()
+            if parameter.grad is not None
+        )
 
 
 # --- the networks ---
@@ -162,10 +191,16 @@ def test_the_networks_are_the_published_ones(package):
     model = make(scene, octaves=3, width=6, layers=8).double()
     query = example_links().query[:2]
     query = replace(query, transmitters=query.transmitters.double())
-    points, views = torch.randn(4, 5, 3).double(), nn.functional.normalize(torch.randn(4, 3).double(), dim=-1)
+    points, views = (
+        torch.randn(4, 5, 3).double(),
+        nn.functional.normalize(torch.randn(4, 3).double(), dim=-1),
+    )
 
     def encode(x):
-        waves = [[f(2**k * x[..., a]) for a in range(3) for k in range(3)] for f in (torch.sin, torch.cos)]
+        waves = [
+            [f(2**k * x[..., a]) for a in range(3) for k in range(3)]
+            for f in (torch.sin, torch.cos)
+        ]
         return torch.cat((x, *(torch.stack(each, -1) for each in waves)), -1)
 
     found = model.sample(query, points, views)
@@ -178,7 +213,9 @@ def test_the_networks_are_the_published_ones(package):
     torch.testing.assert_close(found.turns, 2 * math.pi / (1 + torch.exp(-p)))
     for b in range(2):
         tx = encode(query.transmitters[b] - (scene.lower + scene.upper).double() / 2)
-        joint = torch.cat((model.feature(h), encode(views)[:, None].expand(-1, 5, -1), tx.expand(4, 5, -1)), -1)
+        joint = torch.cat(
+            (model.feature(h), encode(views)[:, None].expand(-1, 5, -1), tx.expand(4, 5, -1)), -1
+        )
         s, phi = model.send(torch.relu(model.join(joint))).unbind(-1)
         torch.testing.assert_close(found.amplitudes[b, ..., 0], torch.where(s > 0, s, -0.01 * s))
         torch.testing.assert_close(found.phases[b, ..., 0], 2 * math.pi / (1 + torch.exp(-phi)))
@@ -187,7 +224,12 @@ def test_the_networks_are_the_published_ones(package):
 def test_published_sizes():
     model = make(example_links().scene, octaves=10, width=256, layers=8)
     count = lambda *sizes: sum(a * b + b for a, b in pairwise(sizes))
-    first = count(63, 256, 256, 256, 256) + count(63 + 256, 256, 256, 256, 256) + count(256, 2) + count(256, 256)
+    first = (
+        count(63, 256, 256, 256, 256)
+        + count(63 + 256, 256, 256, 256, 256)
+        + count(256, 2)
+        + count(256, 256)
+    )
     second = count(256 + 63 + 63, 256, 128, 2)
     assert sum(parameter.numel() for parameter in model.parameters()) == first + second
 
@@ -204,7 +246,9 @@ def test_it_starts_at_the_mean_amplitude(task):
     batch = links.batch(links.split.train)  # 16 of them, as many as it looks at
     amplitudes = lambda values: model.reading.amplitudes(values, batch.query).mean()
     with torch.no_grad():
-        torch.testing.assert_close(amplitudes(model(batch).value), amplitudes(batch.labels), rtol=0.1, atol=0)
+        torch.testing.assert_close(
+            amplitudes(model(batch).value), amplitudes(batch.labels), rtol=0.1, atol=0
+        )
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -1,4 +1,6 @@
-"""NeRF-APT: its U-Net against plain convolutions, its grid of rays, its tasks and refusals; and that it finds NeRF²."""
+"""NeRF-APT: its U-Net against plain convolutions, its grid of rays, its tasks and refusals; and
+that it finds NeRF².
+"""
 
 import functools
 import itertools
@@ -18,7 +20,13 @@ from gaigs.core.query import Batch
 from gaigs.core.task.spectrum import Spectrum
 from gaigs.testing import example_links
 
-SMALL = ("model=nerf_apt", "model.samples=4", "model.rays=[3,8]", "model.octaves=2", "model.widths=[2,3,4]")
+SMALL = (
+    "model=nerf_apt",
+    "model.samples=4",
+    "model.rays=[3,8]",
+    "model.octaves=2",
+    "model.widths=[2,3,4]",
+)
 LINKS = example_links()
 
 
@@ -41,14 +49,18 @@ def package():
 
 
 def convolved(image, weight, bias):
-    """3 x 3 over (rays, samples), place by place: rays close a circle, beyond the samples there is nothing."""
+    """3 x 3 over (rays, samples), place by place: rays close a circle, beyond the samples there is
+    nothing.
+    """
     _, rays, samples = image.shape
     result = np.zeros((len(weight), rays, samples))
     for out, r, i in itertools.product(range(len(weight)), range(rays), range(samples)):
         result[out, r, i] = bias[out]
         for dr, di in itertools.product((-1, 0, 1), repeat=2):
             if 0 <= i + di < samples:
-                result[out, r, i] += weight[out, :, dr + 1, di + 1] @ image[:, (r + dr) % rays, i + di]
+                result[out, r, i] += (
+                    weight[out, :, dr + 1, di + 1] @ image[:, (r + dr) % rays, i + di]
+                )
     return result
 
 
@@ -64,7 +76,10 @@ def test_the_parts_of_the_u_net_are_the_published_ones(package):
     unet = sys.modules["gaigs_nerf_apt.unet"]
     image = torch.randn(2, 4, 8, 4, dtype=torch.float64)
     pyramid = unet.Pyramid(4).double()
-    whole, quarters = image.mean((2, 3), keepdim=True), image.unflatten(3, (2, 2)).unflatten(2, (2, 4)).mean((3, 5))
+    whole, quarters = (
+        image.mean((2, 3), keepdim=True),
+        image.unflatten(3, (2, 2)).unflatten(2, (2, 4)).mean((3, 5)),
+    )
     levels = [
         nn.functional.interpolate(level(means), (8, 4), mode="bilinear")
         for level, means in zip(pyramid.levels, (whole, quarters), strict=True)
@@ -73,7 +88,9 @@ def test_the_parts_of_the_u_net_are_the_published_ones(package):
     torch.testing.assert_close(pyramid(image), expected)
     gate, asked = unet.Gate(4).double().eval(), torch.randn(2, 4, 8, 4, dtype=torch.float64)
     weights = gate.weigh[1](torch.relu(gate.ask(asked) + gate.offer(image)))
-    weights = 1 / (1 + torch.exp(-weights / math.sqrt(1 + 1e-5)))  # of an untrained batch normalisation
+    weights = 1 / (
+        1 + torch.exp(-weights / math.sqrt(1 + 1e-5))
+    )  # of an untrained batch normalisation
     torch.testing.assert_close(gate(asked, image), image * weights)
 
 
@@ -107,7 +124,9 @@ def test_published_sizes():
 
     def count(inputs, outputs):
         down = double(inputs, 64) + double(64, 128) + double(128, 256) + pyramid
-        back = up(256, 128) + gate(128) + double(256, 128) + up(128, 64) + gate(64) + double(128, 64)
+        back = (
+            up(256, 128) + gate(128) + double(256, 128) + up(128, 64) + gate(64) + double(128, 64)
+        )
         return down + back + 64 * outputs + outputs
 
     expected = count(63, 66) + count(64 + 63, 2) + 63 * 64
@@ -122,7 +141,9 @@ def test_images_are_the_rays_of_one_elevation(package):
     images = package.as_images(values, 3)
     assert images.shape == (3, 2, 8, 4)
     assert torch.equal(images[1, :, 5, 2], values[1 * 8 + 5, 2])
-    assert torch.equal(package.as_samples(torch.cat((images, -images)), 3), torch.stack((values, -values)))
+    assert torch.equal(
+        package.as_samples(torch.cat((images, -images)), 3), torch.stack((values, -values))
+    )
 
 
 def test_the_grid_spans_the_labels_directions(package):
@@ -149,7 +170,9 @@ def test_spectra_are_interpolated_from_the_grid(package):
 
 def test_directions_beyond_the_labels_get_the_nearest_ones():
     model = make().eval()
-    values = lambda degrees: model.predict(LINKS.query.transmitters[:1], directions=Grid.degrees([degrees], [10, 100]))
+    values = lambda degrees: model.predict(
+        LINKS.query.transmitters[:1], directions=Grid.degrees([degrees], [10, 100])
+    )
     torch.testing.assert_close(values(-20), values(4))
     torch.testing.assert_close(values(90), values(89))
 

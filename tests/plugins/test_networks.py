@@ -1,4 +1,6 @@
-"""The networks: formulas against plain loops in float64, contracts, refusals, and a short run of each on each task."""
+"""The networks: formulas against plain loops in float64, contracts, refusals, and a short run of
+each on each task.
+"""
 
 import functools
 import math
@@ -76,7 +78,9 @@ def numbers(module):
 
 def numbers_of_links(model, count=3):
     width = model.question.width
-    return torch.randn(count, width, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    return torch.randn(
+        count, width, dtype=torch.float64, generator=torch.Generator().manual_seed(2)
+    )
 
 
 # --- contracts ---
@@ -119,11 +123,16 @@ def moved(scene, by=0.0, factor=1.0):
 
 def test_places_are_relative_to_the_box():
     scene, places = LINKS["rssi"].scene, LINKS["rssi"].query.transmitters
-    ask = lambda scene, places: build("mlp", scene).question(Query(places, torch.zeros(len(places), dtype=torch.long)))
+    ask = lambda scene, places: build("mlp", scene).question(
+        Query(places, torch.zeros(len(places), dtype=torch.long))
+    )
     answer = ask(scene, places)
     torch.testing.assert_close(ask(moved(scene, by=7.0), places + 7), answer, rtol=0, atol=1e-4)
-    # The coordinates themselves keep their meaning in a larger box, their waves stay those of the same octaves.
-    torch.testing.assert_close(ask(moved(scene, factor=3.0), 3 * places)[:, :3], answer[:, :3], rtol=0, atol=1e-5)
+    # The coordinates themselves keep their meaning in a larger box, their waves stay those of the
+    # same octaves.
+    torch.testing.assert_close(
+        ask(moved(scene, factor=3.0), 3 * places)[:, :3], answer[:, :3], rtol=0, atol=1e-5
+    )
     middle, half = ((scene.lower + s * scene.upper).double().numpy() / 2 for s in (1, -1))
     x = places.double().numpy() - middle
     phases = (x[:, :, None] * 2 * math.pi * 2.0 ** np.arange(-2, 1)).reshape(len(x), -1)
@@ -150,7 +159,9 @@ def test_receivers_and_carriers_are_inputs():
 
 
 def free_space_scale(links):
-    """The amplitude of free space at the median link, times the median link's strength over it, by receiver."""
+    """The amplitude of free space at the median link, times the median link's strength over it, by
+    receiver.
+    """
     train = links.split.train
     heard, labels = links.query.receivers[train].numpy(), links.labels[train].numpy()
     stands = np.stack([receiver.pose.position.numpy() for receiver in links.receivers])
@@ -188,11 +199,17 @@ def test_an_image_with_all_pixels_is_the_label(task):
     images = label.own_images(batch.labels, batch.directions)
     shapes = {"spectrum": (1, 18, 36), "rssi": (1, 1, 1), "csi": (2, 4, 5)}
     assert images.shape == (5, *shapes[task]) == (5, *label.shape)
-    torch.testing.assert_close(label.images(batch.labels, batch.directions), images, rtol=0, atol=1e-5)
-    torch.testing.assert_close(label.values(images, batch.directions), batch.labels, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        label.images(batch.labels, batch.directions), images, rtol=0, atol=1e-5
+    )
+    torch.testing.assert_close(
+        label.values(images, batch.directions), batch.labels, rtol=1e-4, atol=1e-5
+    )
 
 
-@pytest.mark.parametrize(("pixel", "shape"), [(5.0, (18, 36)), (10.0, (9, 36)), (19.0, (6, 36)), (20.0, (5, 18))])
+@pytest.mark.parametrize(
+    ("pixel", "shape"), [(5.0, (18, 36)), (10.0, (9, 36)), (19.0, (6, 36)), (20.0, (5, 18))]
+)
 def test_pixels_are_at_most_as_large_as_the_option(pixel, shape):
     assert build("mlp", LINKS["spectrum"].scene, pixel=pixel).label.shape == (1, *shape)
 
@@ -201,12 +218,18 @@ def test_between_pixels_spectra_are_linear_and_azimuths_go_round():
     label = build("mlp", LINKS["spectrum"].scene).label.double()
     generator = torch.Generator().manual_seed(0)
     image = torch.randn(1, *label.shape, dtype=torch.float64, generator=generator)
-    elevations, azimuths = (angles.double().numpy() for angles in (label.grid.elevations, label.grid.azimuths))
+    elevations, azimuths = (
+        angles.double().numpy() for angles in (label.grid.elevations, label.grid.azimuths)
+    )
     asked = LINKS["spectrum"].task.directions.flatten().to(torch.float64)
     asked.azimuths += 0.1
     found = label.values(image, asked)[0].numpy()
-    for value, elevation, azimuth in zip(found, asked.elevations.numpy(), asked.azimuths.numpy(), strict=True):
-        row = [np.interp(azimuth, azimuths, pixels, period=2 * np.pi) for pixels in image[0, 0].numpy()]
+    for value, elevation, azimuth in zip(
+        found, asked.elevations.numpy(), asked.azimuths.numpy(), strict=True
+    ):
+        row = [
+            np.interp(azimuth, azimuths, pixels, period=2 * np.pi) for pixels in image[0, 0].numpy()
+        ]
         assert value == pytest.approx(np.interp(elevation, elevations, row), abs=1e-9)
 
 
@@ -219,7 +242,9 @@ def test_labels_of_single_directions_make_no_image():
             "fire": lambda model=model: model(rays),
             "dcgan": lambda model=model: model.discriminate(rays, rays.labels),
         }
-        with pytest.raises(ValueError, match=r"needs rows and columns, .* set training\.thinning\.rays=null"):
+        with pytest.raises(
+            ValueError, match=r"needs rows and columns, .* set training\.thinning\.rays=null"
+        ):
             looks[name]()
 
 
@@ -232,7 +257,9 @@ def leaky(x, slope=0.01):
 
 def normalised(x, part):
     """By running statistics."""
-    return (x - part["running_mean"]) / np.sqrt(part["running_var"] + 1e-5) * part["weight"] + part["bias"]
+    return (x - part["running_mean"]) / np.sqrt(part["running_var"] + 1e-5) * part["weight"] + part[
+        "bias"
+    ]
 
 
 def test_the_mlp_is_the_formula():
@@ -296,13 +323,19 @@ def test_the_latent_code_is_penalised_by_its_divergence(task):
     seen = torch.cat((model.label.own_images(batch.labels, batch.directions).flatten(1), given), 1)
     mean, log_variance = model.posterior(model.encoder(seen)).chunk(2, 1)
     posterior = torch.distributions.Normal(mean, (log_variance / 2).exp())
-    kl = torch.distributions.kl_divergence(posterior, torch.distributions.Normal(0.0, 1.0)).sum(1).mean()
+    kl = (
+        torch.distributions.kl_divergence(posterior, torch.distributions.Normal(0.0, 1.0))
+        .sum(1)
+        .mean()
+    )
     unit = 1.0 if task == "csi" else links.labels[links.split.train].var(correction=0)
     expected = unit * kl / math.prod(model.label.shape)
     torch.testing.assert_close(penalties["kl"], expected, rtol=1e-4, atol=1e-7)
     torch.manual_seed(5)
     images = model.decoder(torch.cat((posterior.rsample(), given), 1))
-    torch.testing.assert_close(value, model.label.values(images, batch.directions), rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(
+        value, model.label.values(images, batch.directions), rtol=1e-4, atol=1e-4
+    )
 
 
 def test_fire_sees_thinned_labels_as_whole_ones():
@@ -322,7 +355,10 @@ def transposed_by_loops(x, weight, bias, stride, padding):
     whole = np.zeros((len(x), outs, *sizes))
     for r in range(rows):
         for c in range(columns):
-            at = (slice(r * stride[0], r * stride[0] + height), slice(c * stride[1], c * stride[1] + width))
+            at = (
+                slice(r * stride[0], r * stride[0] + height),
+                slice(c * stride[1], c * stride[1] + width),
+            )
             whole[:, :, at[0], at[1]] += np.einsum("bi,iohw->bohw", x[:, :, r, c], weight)
     cut = (slice(padding[0], sizes[0] - padding[0]), slice(padding[1], sizes[1] - padding[1]))
     return whole[:, :, cut[0], cut[1]] + bias[None, :, None, None]
@@ -345,20 +381,26 @@ def test_the_generator_is_four_transposed_convolutions(task):
     widths = [16, 8, 4, 2, channels]
     assert [layer.in_channels for layer in blocks[1::2]] == widths[:-1]
     assert x.shape[1:] == {"spectrum": (1, 8, 32), "rssi": (1, 1, 1), "csi": (2, 4, 8)}[task]
-    np.testing.assert_allclose(model.draw(given).detach(), x[..., :rows, :columns], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(
+        model.draw(given).detach(), x[..., :rows, :columns], rtol=1e-9, atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_discriminator_looks_at_label_and_link(task):
     model = fitted("dcgan", task).eval()
     batch = LINKS[task].batch(torch.arange(6))
-    judge = lambda labels, query=batch.query: model.discriminate(replace(batch, query=query), labels)
+    judge = lambda labels, query=batch.query: model.discriminate(
+        replace(batch, query=query), labels
+    )
     own = judge(batch.labels)
     assert own.shape == (6,)
     assert (own - judge(batch.labels.flip(0))).abs().max() > 1e-6
     other = Query(batch.query.transmitters + 1, batch.query.receivers)
     assert (own - judge(batch.labels, other)).abs().max() > 1e-6
-    torch.testing.assert_close(own[2:3], model.discriminate(LINKS[task].batch(torch.tensor([2])), batch.labels[2:3]))
+    torch.testing.assert_close(
+        own[2:3], model.discriminate(LINKS[task].batch(torch.tensor([2])), batch.labels[2:3])
+    )
     groups = model.parameter_groups()
     gradients = torch.autograd.grad(own.square().sum(), groups["discriminator"])
     assert all(gradient.isfinite().all() for gradient in gradients)
@@ -379,7 +421,9 @@ def test_dropout_and_noise_are_for_the_training_alone(name, dropout):
 def test_the_discriminator_takes_labels_however_thin(stride):
     links = LINKS["spectrum"]
     model = fitted("dcgan", "spectrum", pixel=1.0)
-    thin = links.task.thinning(stride=stride)(links.batch(torch.arange(4)), torch.Generator().manual_seed(0))
+    thin = links.task.thinning(stride=stride)(
+        links.batch(torch.arange(4)), torch.Generator().manual_seed(0)
+    )
     assert model.discriminate(thin, thin.labels).isfinite().all()
 
 
@@ -387,7 +431,9 @@ def test_the_discriminator_takes_labels_however_thin(stride):
 
 
 class Forger(Model):
-    """A level with noise on it, from the transmitter's place, and a discriminator that sees level and place."""
+    """A level with noise on it, from the transmitter's place, and a discriminator that sees level
+    and place.
+    """
 
     trained_by = "adversarial"
     learning_rates: Mapping[str, float] = {"network": 0.02, "discriminator": 0.05}
@@ -398,11 +444,16 @@ class Forger(Model):
         self.network, self.judge = torch.nn.Linear(3, 1), torch.nn.Linear(2, 1)
 
     def parameter_groups(self):
-        return {"network": [*self.network.parameters()], "discriminator": [*self.judge.parameters()]}
+        return {
+            "network": [*self.network.parameters()],
+            "discriminator": [*self.judge.parameters()],
+        }
 
     def forward(self, batch):
         value = self.network(batch.query.transmitters)[:, 0]
-        noise = 0.01 * torch.randn(value.shape) if self.training else 0.0  # of the global generator, which is kept
+        noise = (
+            0.01 * torch.randn(value.shape) if self.training else 0.0
+        )  # of the global generator, which is kept
         return Prediction(value + noise, {"gain": value.square().mean()})
 
     def discriminate(self, batch, values):
@@ -424,13 +475,22 @@ ADVERSARIAL = {
 def adversarial(model=Forger, **options):
     torch.manual_seed(0)
     links = LINKS["rssi"]
-    context = {"model": model(links.scene), "loss": Absolute(links.task), "identity": {"who": "the check"}, "seed": 0}
+    context = {
+        "model": model(links.scene),
+        "loss": Absolute(links.task),
+        "identity": {"who": "the check"},
+        "seed": 0,
+    }
     return registry("training").build(ADVERSARIAL | options, **context)
 
 
 def test_adversarial_training_keeps_the_contract_of_trainings():
-    """Both learn, a step of both is one step, and a stopped training goes on as if it had never stopped."""
-    check_training(functools.partial(registry("training").build, ADVERSARIAL), Forger, LINKS["rssi"])
+    """Both learn, a step of both is one step, and a stopped training goes on as if it had never
+    stopped.
+    """
+    check_training(
+        functools.partial(registry("training").build, ADVERSARIAL), Forger, LINKS["rssi"]
+    )
 
 
 def test_a_step_is_goodfellows_with_the_gradient_of_its_own_player_alone(tmp_path):
@@ -440,12 +500,18 @@ def test_a_step_is_goodfellows_with_the_gradient_of_its_own_player_alone(tmp_pat
     class Referee(Callback):
         def on_train_batch_start(self, trainer, module, batch, _):
             self.random = torch.random.get_rng_state()
-            self.before = {name: parameter.detach().clone() for name, parameter in forger.named_parameters()}
-            self.rates = [group["lr"] for optimizer in trainer.optimizers for group in optimizer.param_groups]
+            self.before = {
+                name: parameter.detach().clone() for name, parameter in forger.named_parameters()
+            }
+            self.rates = [
+                group["lr"] for optimizer in trainer.optimizers for group in optimizer.param_groups
+            ]
 
         def on_train_batch_end(self, trainer, module, outputs, batch, _):
             factor = 0.1 ** ((trainer.global_step - 1) / 3)
-            assert self.rates == pytest.approx([0.02 * factor, 0.05 * factor]), "both follow the schedule"
+            assert self.rates == pytest.approx([0.02 * factor, 0.05 * factor]), (
+                "both follow the schedule"
+            )
             leaves = {name: value.clone().requires_grad_() for name, value in self.before.items()}
             torch.random.set_rng_state(self.random)
             value, penalties = torch.func.functional_call(forger, leaves, (batch,))
@@ -454,11 +520,16 @@ def test_a_step_is_goodfellows_with_the_gradient_of_its_own_player_alone(tmp_pat
                 return (torch.stack((x, batch.query.transmitters[:, 0]), 1) @ weight.T + bias)[:, 0]
 
             judge = [leaves["judge.weight"], leaves["judge.bias"]]
-            real, fake = logits(batch.labels, *judge).sigmoid(), logits(value.detach(), *judge).sigmoid()
+            real, fake = (
+                logits(batch.labels, *judge).sigmoid(),
+                logits(value.detach(), *judge).sigmoid(),
+            )
             judged = -(real.log().mean() + (1 - fake).log().mean())
             steps = zip(judge, torch.autograd.grad(judged, judge), strict=True)
             moved = [(x - self.rates[1] * g).detach() for x, g in steps]
-            torch.testing.assert_close([forger.judge.weight.detach(), forger.judge.bias.detach()], moved)
+            torch.testing.assert_close(
+                [forger.judge.weight.detach(), forger.judge.bias.detach()], moved
+            )
             deceit = -logits(value, *moved).sigmoid().log().mean()
             loss = (value - batch.labels).abs().mean() + 0.5 * deceit + 0.5 * penalties["gain"]
             assert outputs["loss"].item() == pytest.approx(loss.item(), rel=1e-5)
@@ -474,16 +545,27 @@ def test_a_step_is_goodfellows_with_the_gradient_of_its_own_player_alone(tmp_pat
         check_val_every_n_epoch=None, num_sanity_val_steps=0,
         logger=CSVLogger(tmp_path, "log"),
     )  # fmt: skip
-    trainer.fit(module, Batches(links, links.split.train, 4, 0, 3), InOrder(links, links.split.validation, 4))
+    trainer.fit(
+        module,
+        Batches(links, links.split.train, 4, 0, 3),
+        InOrder(links, links.split.validation, 4),
+    )
     assert counted == [1, 2, 3]
     curves = read_curves(list(tmp_path.glob("log/*/metrics.csv")))
-    assert all(len({*curves[f"train/{name}"][1].tolist()}) == 3 for name in ("discriminator", "deceit", "mae"))
+    assert all(
+        len({*curves[f"train/{name}"][1].tolist()}) == 3
+        for name in ("discriminator", "deceit", "mae")
+    )
 
 
 @pytest.mark.parametrize(
     ("model", "options", "message"),
     [
-        (type("Plain", (Forger,), {"trained_by": "descent"}), {}, "is trained by 'descent'; set training=descent"),
+        (
+            type("Plain", (Forger,), {"trained_by": "descent"}),
+            {},
+            "is trained by 'descent'; set training=descent",
+        ),
         (Unjudged, {}, "adversarial training needs a model with a parameter group 'discriminator'"),
         (Forger, {"weight": -1.0}, r"training\.weight must be at least 0, got -1\.0"),
     ],
@@ -493,9 +575,13 @@ def test_adversarial_training_refuses(model, options, message):
         adversarial(model, **options)
 
 
-@pytest.mark.parametrize(("processes", "scaler", "message"), [(2, None, "one process"), (1, "a scaler", "not scale")])
+@pytest.mark.parametrize(
+    ("processes", "scaler", "message"), [(2, None, "one process"), (1, "a scaler", "not scale")]
+)
 def test_adversarial_training_takes_one_process_and_unscaled_gradients(processes, scaler, message):
     module = adversarial()
-    module._trainer = SimpleNamespace(world_size=processes, precision_plugin=SimpleNamespace(scaler=scaler))
+    module._trainer = SimpleNamespace(
+        world_size=processes, precision_plugin=SimpleNamespace(scaler=scaler)
+    )
     with pytest.raises(ValueError, match=f"adversarial training .*{message}"):
         module.on_fit_start()

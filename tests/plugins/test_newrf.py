@@ -1,4 +1,6 @@
-"""NeWRF: its sum against a float64 transcription of the published equation, the arrivals it finds, and its refusals."""
+"""NeWRF: its sum against a float64 transcription of the published equation, the arrivals it finds,
+and its refusals.
+"""
 
 import cmath
 import functools
@@ -20,7 +22,14 @@ from gaigs.data.synthetic import respond_in_parts
 from gaigs.data.synthetic.image_source import Room
 from gaigs.testing import example_links
 
-SMALL = ("model=newrf", "model.arrivals=3", "model.samples=4", "model.octaves=2", "model.width=8", "model.layers=5")
+SMALL = (
+    "model=newrf",
+    "model.arrivals=3",
+    "model.samples=4",
+    "model.octaves=2",
+    "model.width=8",
+    "model.layers=5",
+)
 LIGHT = 299792458.0
 LINKS = example_links("csi")
 
@@ -48,7 +57,10 @@ def test_channels_are_the_published_sum(package, sign):
     generator = torch.Generator().manual_seed(sign + 1)
     random = lambda *shape: torch.rand(*shape, generator=generator)
     fields = torch.complex(2 * random(2, 3, 6, 4) - 1, 2 * random(2, 3, 6, 4) - 1)
-    depths, frequencies = 3 * random(2, 3, 6) ** 3, torch.tensor([2.4e9, 2.41e9, 2.45e9], dtype=torch.float64)
+    depths, frequencies = (
+        3 * random(2, 3, 6) ** 3,
+        torch.tensor([2.4e9, 2.41e9, 2.45e9], dtype=torch.float64),
+    )
     depths[0, :, -1] = torch.inf
     distances = random(2, 3, 6).double().add(0.1).cumsum(-1)
     expected = torch.zeros(2, 4, 3, dtype=torch.complex128)
@@ -62,7 +74,9 @@ def test_channels_are_the_published_sum(package, sign):
                 expected[b, e, s] += fields[b, k, i, e].item() * loss * alpha * passed * way
                 passed *= 1 - alpha
     found = package.render(fields, depths, distances, frequencies, sign)
-    torch.testing.assert_close(found, expected.to(torch.complex64), rtol=0, atol=1e-4 * expected.abs().max().item())
+    torch.testing.assert_close(
+        found, expected.to(torch.complex64), rtol=0, atol=1e-4 * expected.abs().max().item()
+    )
 
 
 def test_opaque_and_empty_samples_have_finite_gradients(package):
@@ -86,7 +100,9 @@ def test_samples_lie_evenly_from_the_antenna_to_where_waves_arrive_from(package)
     ((places, views),) = seen
     for b, k, i in itertools.product(range(2), range(3), range(4)):
         way = model.origins[1, k] - query.transmitters[b]
-        place = query.transmitters[b] + way * (i + 1) / 4 - (LINKS.scene.lower + LINKS.scene.upper) / 2
+        place = (
+            query.transmitters[b] + way * (i + 1) / 4 - (LINKS.scene.lower + LINKS.scene.upper) / 2
+        )
         torch.testing.assert_close(places[b, k, i, :3], place, rtol=0, atol=1e-5)
         torch.testing.assert_close(views[b, k, i, :3], way / way.norm(), rtol=0, atol=1e-5)
 
@@ -109,15 +125,24 @@ def test_the_field_is_the_published_network(package):
         place, view = places[i].numpy(), views[i].numpy()
         hidden = place
         for layer in range(6):
-            hidden = apply(f"layers.{layer}", np.concatenate((place, hidden)) if layer == 4 else hidden).clip(0)
+            hidden = apply(
+                f"layers.{layer}", np.concatenate((place, hidden)) if layer == 4 else hidden
+            ).clip(0)
         out = np.tanh(apply("send.2", apply("send.0", np.concatenate((hidden, view))).clip(0)))
-        np.testing.assert_allclose(densities[i].item(), np.log1p(np.exp(apply("density", hidden)[0])))
+        np.testing.assert_allclose(
+            densities[i].item(), np.log1p(np.exp(apply("density", hidden)[0]))
+        )
         np.testing.assert_allclose(sent[i].detach().numpy(), out[:2] + 1j * out[2:])
 
 
 def test_published_sizes():
     options = composed("data=synthetic_csi", "model=newrf")["model"]
-    assert (options["width"], options["layers"], options["octaves"], options["view_octaves"]) == (128, 6, 10, 4)
+    assert (options["width"], options["layers"], options["octaves"], options["view_octaves"]) == (
+        128,
+        6,
+        10,
+        4,
+    )
     field = build("model", options | {"samples": 2, "arrivals": 1}, scene=LINKS.scene).fields[0]
     inputs = [63, 128, 128, 128, 63 + 128, 128]
     network = sum(128 * (size + 1) for size in inputs) + 129
@@ -132,13 +157,19 @@ POSE = Pose.from_xyzw((1.5, 1.0, 1.2), (0, 0, 0, 1))
 
 
 def room_links(count, sign=-1, strength=1.0):
-    """Channels at two elements in a box of metal, single reflections alone; the receiver is well within the room."""
+    """Channels at two elements in a box of metal, single reflections alone; the receiver is well
+    within the room.
+    """
     generator = torch.Generator().manual_seed(0)
-    places = torch.tensor([1.0, 1.0, 0.5]) + torch.rand(count, 3, generator=generator) * torch.tensor([4.0, 3.0, 2.0])
+    places = torch.tensor([1.0, 1.0, 0.5]) + torch.rand(
+        count, 3, generator=generator
+    ) * torch.tensor([4.0, 3.0, 2.0])
     array, carrier = Array.planar(1, 2, 0.03), 5e9
     offsets = torch.linspace(-5e8, 5e8, 41, dtype=torch.float64)
     receiver = Receiver("middle", POSE, array)
-    channels = strength * torch.cat([*respond_in_parts(ROOM, places, receiver, carrier, offsets, 1)])
+    channels = strength * torch.cat(
+        [*respond_in_parts(ROOM, places, receiver, carrier, offsets, 1)]
+    )
     channels = channels.conj() if sign > 0 else channels
     links = replace(
         LINKS,
@@ -149,7 +180,9 @@ def room_links(count, sign=-1, strength=1.0):
         rows=None,
     )
     parts = torch.arange(count).split((count - 8, 4, 4))
-    return replace(links, split=replace(links.split, train=parts[0], validation=parts[1], test=parts[2]))
+    return replace(
+        links, split=replace(links.split, train=parts[0], validation=parts[1], test=parts[2])
+    )
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -158,7 +191,15 @@ def test_arrivals_are_the_receiver_and_its_images_in_the_walls(sign):
     model = make(links.scene, arrivals=7)
     model.fit(links)
     (x, y, z), (a, b, c) = POSE.position.tolist(), ROOM.size
-    images = [[x, y, z], [-x, y, z], [2 * a - x, y, z], [x, -y, z], [x, 2 * b - y, z], [x, y, -z], [x, y, 2 * c - z]]
+    images = [
+        [x, y, z],
+        [-x, y, z],
+        [2 * a - x, y, z],
+        [x, -y, z],
+        [x, 2 * b - y, z],
+        [x, y, -z],
+        [x, y, 2 * c - z],
+    ]
     found = model.origins[0]
     torch.testing.assert_close(found[0], POSE.position)
     apart = torch.cdist(torch.tensor(images), found).amin(1)

@@ -20,7 +20,9 @@ SMALL = ("model=ngrf", "model.count=3", "model.width=8", "model.layers=2")
 
 
 def make(**changes):
-    return build("model", composed("data=synthetic_csi", *SMALL)["model"] | changes, scene=LINKS.scene)
+    return build(
+        "model", composed("data=synthetic_csi", *SMALL)["model"] | changes, scene=LINKS.scene
+    )
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
@@ -29,7 +31,9 @@ def test_channels_are_the_sum_over_the_gaussians_of_the_receiver(sign):
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for parameter in model.parameters():
-            parameter.add_(0.3 * torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
+            parameter.add_(
+                0.3 * torch.randn(parameter.shape, generator=generator, dtype=torch.float64)
+            )
     model.sign.fill_(sign)
     model.gains.copy_(torch.tensor([2.0 + 1.0j, -0.5j]))
     query = LINKS.query[torch.tensor([0, 1, 2])]
@@ -52,7 +56,9 @@ def test_channels_are_the_sum_over_the_gaussians_of_the_receiver(sign):
         loss = math.log1p(math.exp(attenuation - 5)) * offset.norm().item()
         source = weight * complex(*model.strengths[r, i].tolist()) * complex(model.gains[r])
         source *= 2 / (1 + math.exp(-amplitude)) * cmath.exp(1j * phase - loss)
-        for (e, element), (s, f) in itertools.product(enumerate(receiver.array.elements), enumerate(frequencies)):
+        for (e, element), (s, f) in itertools.product(
+            enumerate(receiver.array.elements), enumerate(frequencies)
+        ):
             place = mean + turn @ (receiver.pose.rotation.double() @ element.double())
             length = (query.transmitters[b] - place).norm().item()
             cycles = (middle * length + (f - middle) * offset.norm().item()) / LIGHT
@@ -80,6 +86,9 @@ def test_gradients_are_finite_on_a_gaussian_and_beyond_all_hearing(attenuation):
     with torch.no_grad():
         model.network[-1].bias[2] = attenuation
     place = LINKS.receivers[0].pose.position
-    query = Query(torch.stack((place, place + place.new_tensor([1.0, 0, 0]), place + 1e3)), torch.zeros(3).long())
+    query = Query(
+        torch.stack((place, place + place.new_tensor([1.0, 0, 0]), place + 1e3)),
+        torch.zeros(3).long(),
+    )
     model(Batch(query)).value.abs().sum().backward()
     assert all(parameter.grad.isfinite().all() for parameter in model.parameters())

@@ -1,4 +1,6 @@
-"""Ray tracing as a model: its fields against Sionna RT's and a plain transcription, its rooms, its calibration."""
+"""Ray tracing as a model: its fields against Sionna RT's and a plain transcription, its rooms, its
+calibration.
+"""
 
 import functools
 import importlib
@@ -122,14 +124,23 @@ def test_gains_are_those_of_a_field_that_is_followed_from_point_to_point(tracer,
         way = way - 2 * (way @ normal) * normal if kind == "reflected" else way
     points.append(points[-1] + rng.uniform(0.5, 3) * way)
     names = rng.permutation(sorted(MATERIALS))[:3]
-    epsilons, thicknesses = rng.uniform(1.5, 8, 3) - 1j * rng.uniform(0.01, 2, 3), rng.uniform(0.005, 0.2, 3)
+    epsilons, thicknesses = (
+        rng.uniform(1.5, 8, 3) - 1j * rng.uniform(0.01, 2, 3),
+        rng.uniform(0.005, 0.2, 3),
+    )
 
     sheets = []
     for k, (point, normal) in enumerate(zip(points[1:-1], normals, strict=True)):
         along = unit(np.cross(normal, rng.normal(size=3)))
-        corners = [point + u * along + v * np.cross(normal, along) for u, v in ((-1, -1), (1, -1), (0, 2))]
-        sheets.append(f"o sheet{k}\nusemtl {names[k]}\n" + "".join("v {} {} {}\n".format(*c) for c in corners))
-    text = "".join(f"{sheet}f {3 * k + 1} {3 * k + 2} {3 * k + 3}\n" for k, sheet in enumerate(sheets))
+        corners = [
+            point + u * along + v * np.cross(normal, along) for u, v in ((-1, -1), (1, -1), (0, 2))
+        ]
+        sheets.append(
+            f"o sheet{k}\nusemtl {names[k]}\n" + "".join("v {} {} {}\n".format(*c) for c in corners)
+        )
+    text = "".join(
+        f"{sheet}f {3 * k + 1} {3 * k + 2} {3 * k + 3}\n" for k, sheet in enumerate(sheets)
+    )
     known = {str(name): str(name) for name in names}
     own = tracing.Tracer(text, known, points[-1][None], CARRIER, 3, 100)
     types = np.array([[{"reflected": 1, "passed": 4}[kind] for kind in kinds]])
@@ -139,7 +150,9 @@ def test_gains_are_those_of_a_field_that_is_followed_from_point_to_point(tracer,
     )  # fmt: skip
     order = [sorted(names).index(name) for name in names]
     media = fields.Slabs(
-        torch.from_numpy(epsilons[np.argsort(order)]), torch.from_numpy(thicknesses[np.argsort(order)]), CARRIER
+        torch.from_numpy(epsilons[np.argsort(order)]),
+        torch.from_numpy(thicknesses[np.argsort(order)]),
+        CARRIER,
     )
     paths = fields.padded([traced], torch.from_numpy(points[-1]))
     (gain,) = fields.gains(paths, media)[0].tolist()
@@ -154,8 +167,13 @@ def test_fields_are_those_of_sionna(tracer, monkeypatch):
     tracing, fields, rooms = module("tracer"), module("fields"), module("rooms")
     room = ROOMS["slanted"]
     known = rooms.known_materials(room.meshes(), {})
-    receiver, places = room.pose().position, [(3.6, 2.9, 0.8), (1.5, 3.2, 0.7)]  # the first behind a screen of glass
-    own = tracing.Tracer(wavefront_obj(room.meshes()), known, receiver[None].double().numpy(), CARRIER, 2, 2000)
+    receiver, places = (
+        room.pose().position,
+        [(3.6, 2.9, 0.8), (1.5, 3.2, 0.7)],
+    )  # the first behind a screen of glass
+    own = tracing.Tracer(
+        wavefront_obj(room.meshes()), known, receiver[None].double().numpy(), CARRIER, 2, 2000
+    )
     heard, follow = [], own._paths
     monkeypatch.setattr(own, "_paths", lambda *given: heard.append(given) or follow(*given))
     links = [link for (link,) in own._trace(places)]
@@ -163,10 +181,14 @@ def test_fields_are_those_of_sionna(tracer, monkeypatch):
     paths = fields.padded(links, receiver)
     real, c, d = np.array([MATERIALS[known[name]] for name in sorted(known)]).T
     epsilons = real - 1j * c * (CARRIER / 1e9) ** d / (2 * math.pi * CARRIER * epsilon_0)
-    thicknesses = torch.tensor([THICKNESS[known[name]] for name in sorted(known)], dtype=torch.float64)
+    thicknesses = torch.tensor(
+        [THICKNESS[known[name]] for name in sorted(known)], dtype=torch.float64
+    )
     found = fields.gains(paths, fields.Slabs(torch.from_numpy(epsilons), thicknesses, CARRIER))
     lengths = (paths.images - receiver).norm(dim=-1)
-    arrived = (found * speed_of_light / CARRIER / (4 * math.pi * lengths))[paths.strengths != 0].numpy()
+    arrived = (found * speed_of_light / CARRIER / (4 * math.pi * lengths))[
+        paths.strengths != 0
+    ].numpy()
     assert (types == 1).any()
     assert (types == 4).any()
     assert (types == 8).any(), "diffracted ones are among them"
@@ -174,8 +196,13 @@ def test_fields_are_those_of_sionna(tracer, monkeypatch):
 
 
 def test_the_ray_tracers_own_labels_come_back(tracer):
-    """Spectra of a room that Sionna RT simulated, from other places at a time and the other end of each path."""
-    links = load({"name": "sionna", "room": "slanted", "transmitters": 10}, {"name": "official", "validation": 0})
+    """Spectra of a room that Sionna RT simulated, from other places at a time and the other end of
+    each path.
+    """
+    links = load(
+        {"name": "sionna", "room": "slanted", "transmitters": 10},
+        {"name": "official", "validation": 0},
+    )
     model = build(links.scene, calibrate=False, room="slanted", depth=3, rays=5000)
     model.fit(links)
     scores = links.task.scores(links.labels, model.predict(links.query))["ssim"]
@@ -201,7 +228,11 @@ def test_a_checkpoint_needs_neither_the_mesh_nor_the_data(tracer, hall, tmp_path
     twin = build(Scene.from_state(links.scene.state()), mesh=str(file))
     twin.load_state_dict(model.state_dict())
     assert torch.equal(twin.predict(links.query), model.predict(links.query))
-    assert twin.facts()["materials"].keys() == model.facts()["materials"].keys() == {*WALLS.values(), "metal"}
+    assert (
+        twin.facts()["materials"].keys()
+        == model.facts()["materials"].keys()
+        == {*WALLS.values(), "metal"}
+    )
 
 
 def test_places_of_the_data_are_traced_once_and_few_others_are_kept(tracer, hall, monkeypatch):
@@ -272,10 +303,19 @@ def test_readings_of_an_unknown_band_add_powers(tracer, hall):
     for row in range(4):
         receiver = int(links.query.receivers[row])
         position = links.receivers[receiver].pose.position
-        paths = fields.padded(model._tracer(CARRIER).find(links.query.transmitters[row : row + 1], receiver), position)
+        paths = fields.padded(
+            model._tracer(CARRIER).find(links.query.transmitters[row : row + 1], receiver), position
+        )
         lengths = (paths.images - position).norm(dim=-1)
-        fields_of = fields.gains(paths, model.slabs(CARRIER)).abs() * speed_of_light / CARRIER / (4 * math.pi * lengths)
-        assert found[row].item() == pytest.approx(10 * math.log10(fields_of.square().sum().item()), abs=1e-3)
+        fields_of = (
+            fields.gains(paths, model.slabs(CARRIER)).abs()
+            * speed_of_light
+            / CARRIER
+            / (4 * math.pi * lengths)
+        )
+        assert found[row].item() == pytest.approx(
+            10 * math.log10(fields_of.square().sum().item()), abs=1e-3
+        )
 
 
 def test_where_no_path_leads_a_reading_is_low_and_finite(tracer, hall):
@@ -301,7 +341,10 @@ def test_descent_finds_what_the_walls_are_made_of(tracer, hall, task):
         model.log_permittivities.zero_()
         model.log_conductivities.zero_()
     batch = Batch(links.query, links.task.directions)
-    optimizer, errors = torch.optim.Adam([model.log_permittivities, model.log_conductivities], lr=0.02), []
+    optimizer, errors = (
+        torch.optim.Adam([model.log_permittivities, model.log_conductivities], lr=0.02),
+        [],
+    )
     for _ in range(60):
         error = (model(batch).value - links.labels).abs().square().mean()
         optimizer.zero_grad()
@@ -322,11 +365,17 @@ def test_descent_finds_what_the_walls_are_made_of(tracer, hall, task):
 def test_the_built_in_room_is_the_simulated_one():
     rooms = module("rooms")
     meshes = rooms.find_meshes("synthetic_rssi", None)
-    lines = lambda segments: {tuple(sorted(tuple(round(x, 4) for x in end) for end in line)) for line in segments}
+    lines = lambda segments: {
+        tuple(sorted(tuple(round(x, 4) for x in end) for end in line)) for line in segments
+    }
     shell = [mesh for mesh in meshes if mesh.name == "room"]
     furniture = [mesh for mesh in meshes if mesh.name != "room"]
     assert lines(edges(furniture).tolist()) < lines(synthetic.edges(synthetic.ROOM).tolist())
-    assert sorted((mesh.material, len(mesh.faces)) for mesh in shell) == [("brick", 1), ("concrete", 4), ("glass", 1)]
+    assert sorted((mesh.material, len(mesh.faces)) for mesh in shell) == [
+        ("brick", 1),
+        ("concrete", 4),
+        ("glass", 1),
+    ]
     known = rooms.known_materials(meshes, {})
     assert {box.name for box in synthetic.ROOM.furniture} < known.keys()
     assert known["refrigerator"] == "metal"
@@ -347,15 +396,35 @@ def scene(material, shape):
     ("name", "text", "message"),
     [
         ("room.obj", "v 0 0", "line 1: expected numbers x y z, got 'v 0 0'"),
-        ("room.obj", "v 0 0 0\nf 1 2 3", "line 2: expected a face of three vertices or more of the 1 before it"),
-        ("room.obj", "v 0 0 nan\nv 0 1 0\nv 1 0 0\nf 1 2 3", "line 1: expected numbers x y z, got 'v 0 0 nan'"),
+        (
+            "room.obj",
+            "v 0 0 0\nf 1 2 3",
+            "line 2: expected a face of three vertices or more of the 1 before it",
+        ),
+        (
+            "room.obj",
+            "v 0 0 nan\nv 0 1 0\nv 1 0 0\nf 1 2 3",
+            "line 1: expected numbers x y z, got 'v 0 0 nan'",
+        ),
         ("room.obj", "v 0 0 0", "must hold surfaces, and holds none"),
         ("room.stl", "solid", r"model\.mesh must be a file \.obj, \.ply, \.xml, got .*room\.stl"),
         ("room.ply", "no mesh", r"expected a \.ply file of vertices"),
         ("room.xml", "no mesh", "must be a scene that Sionna RT"),
-        ("room.xml", scene("wood", LEAF.format("rectangle", "")), "shape '.*', must be a mesh of type ply or obj"),
-        ("room.xml", scene("gold", LEAF.format("rectangle", "")), "must be a scene that Sionna RT reads, .*gold"),
-        ("room.xml", scene("wood", "<shape>"), "must be a scene that Sionna RT reads, and is not: "),
+        (
+            "room.xml",
+            scene("wood", LEAF.format("rectangle", "")),
+            "shape '.*', must be a mesh of type ply or obj",
+        ),
+        (
+            "room.xml",
+            scene("gold", LEAF.format("rectangle", "")),
+            "must be a scene that Sionna RT reads, .*gold",
+        ),
+        (
+            "room.xml",
+            scene("wood", "<shape>"),
+            "must be a scene that Sionna RT reads, and is not: ",
+        ),
         ("room.xml", scene("wood", FAR), "shape .*: expected positions"),
     ],
 )
@@ -392,8 +461,12 @@ def test_files_of_all_kinds_hold_the_same_room(tracer, hall, tmp_path):
     expected = rooms.find_meshes("none", str(hall))
     shapes = []
     for k, mesh in enumerate(expected):
-        corners = np.array([tuple(corner) for corner in mesh.vertices], dtype=[(axis, "f4") for axis in "xyz"])
-        faces = np.array([(face,) for face in mesh.triangles()], dtype=[("vertex_indices", "i4", (3,))])
+        corners = np.array(
+            [tuple(corner) for corner in mesh.vertices], dtype=[(axis, "f4") for axis in "xyz"]
+        )
+        faces = np.array(
+            [(face,) for face in mesh.triangles()], dtype=[("vertex_indices", "i4", (3,))]
+        )
         elements = [PlyElement.describe(corners, "vertex"), PlyElement.describe(faces, "face")]
         PlyData(elements).write(tmp_path / f"{k}.ply")
         (found,) = rooms.find_meshes("none", str(tmp_path / f"{k}.ply"))
@@ -408,7 +481,9 @@ def test_files_of_all_kinds_hold_the_same_room(tracer, hall, tmp_path):
     (tmp_path / "hall.xml").write_text(f'<scene version="2.1.0">{"".join(shapes)}</scene>')
     found = rooms.find_meshes("none", str(tmp_path / "hall.xml"))
     assert len(found) == len(expected)
-    lines = lambda meshes: sorted(sorted(map(tuple, line)) for line in edges(meshes).round(decimals=4).tolist())
+    lines = lambda meshes: sorted(
+        sorted(map(tuple, line)) for line in edges(meshes).round(decimals=4).tolist()
+    )
     assert lines(found) == lines(expected)
     chosen = {f"mat{k}": "wood" for k in range(len(expected))}
     assert rooms.known_materials(found, {name: chosen[name] for name in chosen}) == chosen
@@ -465,8 +540,13 @@ def test_a_run_stores_the_materials(tracer, tmp_path):
     with repository():
         metrics = runs.run(config, tmp_path / "run")
         model = gaigs.load(tmp_path / "run/best.ckpt")
-    assert metrics["models"]["ray_tracing"]["snr_db_median"] > metrics["models"]["mean"]["snr_db_median"] + 1
+    assert (
+        metrics["models"]["ray_tracing"]["snr_db_median"]
+        > metrics["models"]["mean"]["snr_db_median"] + 1
+    )
     assert metrics["materials"].keys() == set(model.known)
     assert metrics["num_parameters"] == 2 * len(model.known) + 2
     with np.load(tmp_path / "run/predictions.npz") as kept:
-        np.testing.assert_allclose(model.predict(kept["transmitters"], 0), kept["prediction"], atol=1e-7)
+        np.testing.assert_allclose(
+            model.predict(kept["transmitters"], 0), kept["prediction"], atol=1e-7
+        )

@@ -1,4 +1,6 @@
-"""RF-3DGS: its two stages, the rooms that it reads, and its rendering against a plain float64 transcription."""
+"""RF-3DGS: its two stages, the rooms that it reads, and its rendering against a plain float64
+transcription.
+"""
 
 import math
 
@@ -57,7 +59,12 @@ def write(tmp_path):
 @pytest.mark.parametrize("degree", [0, 3])
 def test_it_keeps_the_contract_of_models(degree):
     gaussians = composed(*SMALL)["model"]["gaussians"] | {"degree": degree}
-    check_model(lambda scene: build("model", composed(*SMALL)["model"] | {"gaussians": gaussians}, scene=scene), LINKS)
+    check_model(
+        lambda scene: build(
+            "model", composed(*SMALL)["model"] | {"gaussians": gaussians}, scene=scene
+        ),
+        LINKS,
+    )
 
 
 def test_with_a_file_too(write):
@@ -71,7 +78,9 @@ def test_with_a_file_too(write):
 
 def test_it_trains_in_two_stages_and_comes_back_from_its_checkpoint(tmp_path, monkeypatch):
     options = "data.transmitters=30", "model.first_stage=0.5"
-    config, metrics, model = run(tmp_path, monkeypatch, *SMALL, *options, "trainer.val_check_interval=4")
+    config, metrics, model = run(
+        tmp_path, monkeypatch, *SMALL, *options, "trainer.val_check_interval=4"
+    )
     assert config["pooling"] == {"name": "spectrum", "channels": 1}
     assert (metrics["stage"], metrics["geometry"]) == (2, "training spectra")
     assert model.stage == 2
@@ -80,7 +89,10 @@ def test_it_trains_in_two_stages_and_comes_back_from_its_checkpoint(tmp_path, mo
     assert model.gaussians.signal[..., 1:].abs().amin() > 0
     # The geometry is that in which the first stage ended.
     last = torch.load(tmp_path / "last.ckpt", weights_only=True)["state_dict"]
-    assert all(torch.equal(last[f"model.gaussians.{name}"], getattr(model.gaussians, name)) for name in FROZEN)
+    assert all(
+        torch.equal(last[f"model.gaussians.{name}"], getattr(model.gaussians, name))
+        for name in FROZEN
+    )
 
 
 def test_density_control_ends_with_the_first_stage(tmp_path, monkeypatch):
@@ -105,7 +117,10 @@ def test_at_first_all_transmitters_excite_the_same():
 
 def test_then_the_geometry_is_frozen_and_the_signal_begins_anew():
     model = model_of()
-    before = {name: getattr(model.gaussians, name).detach().clone() for name in (*FROZEN, "opacity_logits")}
+    before = {
+        name: getattr(model.gaussians, name).detach().clone()
+        for name in (*FROZEN, "opacity_logits")
+    }
     message = model.revise(0, None, None, None)
     assert message == "geometry of 40 Gaussians frozen; harmonics of degree 3 from here on"
     assert all(torch.equal(getattr(model.gaussians, name), old) for name, old in before.items())
@@ -138,12 +153,16 @@ def test_the_rendering_equation_is_splattings_with_harmonics_towards_the_transmi
     query.transmitters = query.transmitters.double()
     signal = np.zeros((2, 40, 1))
     for b, place in enumerate(query.transmitters.numpy()):
-        for i, (mean, own) in enumerate(zip(gaussians.means.numpy(), gaussians.signal[:, 0].numpy(), strict=True)):
+        for i, (mean, own) in enumerate(
+            zip(gaussians.means.numpy(), gaussians.signal[:, 0].numpy(), strict=True)
+        ):
             x, y, z = (mean - place) / np.linalg.norm(mean - place)
             for n in range(4):
                 for m in range(-n, n + 1):
                     wave = sph_harm_y(n, abs(m), math.acos(z), math.atan2(y, x))
-                    term = wave.real if m == 0 else math.sqrt(2) * (wave.real if m > 0 else wave.imag)
+                    term = (
+                        wave.real if m == 0 else math.sqrt(2) * (wave.real if m > 0 else wave.imag)
+                    )
                     signal[b, i] += own[n**2 + n + m] * term
     axes = semi_axes(gaussians.quats, gaussians.scales)[None]
     splats = model.projection.project(gaussians.means, axes, LINKS.receivers[1].pose)
@@ -160,10 +179,14 @@ def test_the_rendering_equation_is_splattings_with_harmonics_towards_the_transmi
 @pytest.mark.parametrize("heading", [[], ["x,y,z"]])
 def test_points_of_a_table(write, heading):
     corners = [[x, y, z] for x in (0, 3) for y in (0, 4) for z in (0, 2)]
-    found = read_geometry(write("room.csv", [*heading, *(",".join(map(str, row)) for row in corners)]), 100)
+    found = read_geometry(
+        write("room.csv", [*heading, *(",".join(map(str, row)) for row in corners)]), 100
+    )
     assert sorted(found.means.tolist()) == corners
     # The three nearest of each corner are 2 m, 3 m and the diagonal of both away.
-    torch.testing.assert_close(found.log_scales.exp(), torch.full((8, 3), math.sqrt((4 + 9 + 13) / 3)))
+    torch.testing.assert_close(
+        found.log_scales.exp(), torch.full((8, 3), math.sqrt((4 + 9 + 13) / 3))
+    )
     assert found.opacity_logits is None
 
 
@@ -179,7 +202,8 @@ def test_points_that_are_there_twice_have_a_width(write):
 
 
 @pytest.mark.parametrize(
-    "faces", [["f 1 2 3 4"], ["f 1/1/1 2/2/2 3/3/3", "f -4 -2 -1"], ["f 1//1 2//1 3//1 4//1  # the floor"]]
+    "faces",
+    [["f 1 2 3 4"], ["f 1/1/1 2/2/2 3/3/3", "f -4 -2 -1"], ["f 1//1 2//1 3//1 4//1  # the floor"]],
 )
 def test_a_mesh_is_sampled_evenly(write, faces):
     torch.manual_seed(0)
@@ -198,12 +222,16 @@ def test_a_mesh_without_faces_is_its_points(write):
 
 @pytest.mark.parametrize("key", ["vertex_indices", "vertex_index", None])
 def test_a_ply_of_points_or_of_a_mesh(tmp_path, key):
-    vertices = np.array([(0, 0, 1), (4, 0, 1), (4, 2, 1), (0, 2, 1)], [(axis, "f4") for axis in "xyz"])
+    vertices = np.array(
+        [(0, 0, 1), (4, 0, 1), (4, 2, 1), (0, 2, 1)], [(axis, "f4") for axis in "xyz"]
+    )
     elements = [PlyElement.describe(vertices, "vertex")]
     if key:
         faces = np.empty(1, [(key, object)])
         faces[key][0] = np.array([0, 1, 2, 3], "i4")
-        elements.append(PlyElement.describe(faces, "face", val_types={key: "i4"}, len_types={key: "u1"}))
+        elements.append(
+            PlyElement.describe(faces, "face", val_types={key: "i4"}, len_types={key: "u1"})
+        )
     PlyData(elements).write(str(tmp_path / "room.ply"))
     means = read_geometry(tmp_path / "room.ply", 30).means
     assert len(means) == (30 if key else 4)
@@ -219,7 +247,9 @@ def test_splats_keep_their_shapes(tmp_path):
         splats.log_scales.copy_(splats.means)
     splats.save_ply(tmp_path / "photographs.ply")
     model = model_of(geometry=str(tmp_path / "photographs.ply"))
-    nearest = torch.from_numpy(cKDTree(splats.means.detach()).query(model.gaussians.means.detach())[1])
+    nearest = torch.from_numpy(
+        cKDTree(splats.means.detach()).query(model.gaussians.means.detach())[1]
+    )
     assert nearest.sort().values.tolist() == [*range(40)]
     for name in ("means", "quats", "log_scales", "opacity_logits"):
         assert torch.equal(getattr(model.gaussians, name), getattr(splats, name)[nearest]), name
@@ -243,7 +273,9 @@ def test_several_processes(monkeypatch):
     model = model_of()
     monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
-    with pytest.raises(ValueError, match=r"which one process can do, not 2; set trainer\.devices=1"):
+    with pytest.raises(
+        ValueError, match=r"which one process can do, not 2; set trainer\.devices=1"
+    ):
         model.train()(LINKS.batch(torch.arange(2)))
     assert model.eval().predict([[1.0, 1.0, 1.0]]).isfinite().all()
 
@@ -254,7 +286,11 @@ def test_several_processes(monkeypatch):
         ("room.stl", [""], r"must be a .csv, .obj or .ply, got room.stl"),
         ("room.csv", ["x,y,z"], r"room\.csv: no positions below the header"),
         ("room.csv", ["0,0,0", "1,1,1", "2,2,2"], "at least 4 Gaussians, got 3"),
-        ("room.csv", ["0,0,0", "1,nan,1"], "line 2: expected a finite number, got 'nan' in column y"),
+        (
+            "room.csv",
+            ["0,0,0", "1,nan,1"],
+            "line 2: expected a finite number, got 'nan' in column y",
+        ),
         ("room.obj", ["v 0 0 wall"], "line 1: expected numbers x y z, got 'v 0 0 wall'"),
         ("room.obj", [*SQUARE, "f 1 2 9"], "a face of three vertices or more of the 4 before it"),
         ("room.obj", [*SQUARE, "f 1 1 1"], "at least 4 Gaussians, got 0"),
@@ -267,5 +303,7 @@ def test_files_that_hold_no_room(write, name, lines, message):
 
 
 def test_a_file_that_is_not_there(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no geometry at .*room\.ply; set model\.geometry to"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no geometry at .*room\.ply; set model\.geometry to"
+    ):
         model_of(geometry=str(tmp_path / "room.ply"))

@@ -41,8 +41,12 @@ def added_up(gaussians, directions):
     grid = directions.flatten()
     pixel = np.eye(2) * SCENE.task.directions.pitch**2 / 12
     spectra = []
-    for means, factors, amplitudes in zip(*(part.detach().double().numpy() for part in gaussians), strict=True):
-        for azimuth, elevation in zip(grid.azimuths.double().numpy(), grid.elevations.double().numpy(), strict=True):
+    for means, factors, amplitudes in zip(
+        *(part.detach().double().numpy() for part in gaussians), strict=True
+    ):
+        for azimuth, elevation in zip(
+            grid.azimuths.double().numpy(), grid.elevations.double().numpy(), strict=True
+        ):
             value = 0.0
             for mean, (p, q, r), amplitude in zip(means, factors, amplitudes, strict=True):
                 factor = np.array([[p, 0], [q, r]])
@@ -65,7 +69,10 @@ def test_the_value_is_the_plain_sum(model):
 
 
 def test_azimuth_wraps(model):
-    grid, gaussians = Grid.degrees(range(4, 90, 17), range(0, 360, 30)), model.deform(LINKS.query[SOME])
+    grid, gaussians = (
+        Grid.degrees(range(4, 90, 17), range(0, 360, 30)),
+        model.deform(LINKS.query[SOME]),
+    )
     turned = gaussians._replace(means=gaussians.means - torch.tensor([6 * math.pi, 0.0]))
     add_up = sys.modules[type(model).__module__].add_up
     here, there = (add_up(each, grid, model.pixel_variance) for each in (gaussians, turned))
@@ -94,16 +101,24 @@ def features(x, frequencies):
 def test_the_network_moves_stretches_and_weighs_each_receivers_own_gaussians(model):
     query = LINKS.query[SOME]
     found = model.deform(query)
-    values = {name: parameter.detach().double().numpy() for name, parameter in model.named_parameters()}
+    values = {
+        name: parameter.detach().double().numpy() for name, parameter in model.named_parameters()
+    }
     linear = lambda name, x: values[f"{name}.weight"] @ x + values[f"{name}.bias"]
     middle = ((SCENE.lower + SCENE.upper) / 2).double().numpy()
-    for k, (place, receiver) in enumerate(zip(query.transmitters.double().numpy(), query.receivers, strict=True)):
+    for k, (place, receiver) in enumerate(
+        zip(query.transmitters.double().numpy(), query.receivers, strict=True)
+    ):
         sends = features(place - middle, model.frequencies.double().numpy())
         link = np.concatenate((np.eye(2)[receiver], sends))
         for i in range(0, 40, 7):
             mean = values["means"][receiver, i]
             h = values["first.links.weight"] @ link
-            h = h + values["first.gaussians.weight"] @ features(mean, 2.0 ** np.arange(5)) + values["first.bias"]
+            h = (
+                h
+                + values["first.gaussians.weight"] @ features(mean, 2.0 ** np.arange(5))
+                + values["first.bias"]
+            )
             for layer in range(2):
                 h = linear(f"rest.{layer}", np.maximum(h, 0))
             h = np.maximum(h, 0)
@@ -116,7 +131,10 @@ def test_the_network_moves_stretches_and_weighs_each_receivers_own_gaussians(mod
 
 def test_gaussians_start_undeformed_over_the_labels_directions_and_meet():
     model = make(count=200)
-    here, there = model.deform(Query(SCENE.lower[None], torch.tensor([0]))), model.deform(LINKS.query[:1])
+    here, there = (
+        model.deform(Query(SCENE.lower[None], torch.tensor([0]))),
+        model.deform(LINKS.query[:1]),
+    )
     assert torch.equal(here.means, there.means)
     assert torch.equal(here.factors, there.factors)
     assert (here.amplitudes - there.amplitudes).abs().max() > 1e-3

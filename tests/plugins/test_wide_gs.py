@@ -28,9 +28,13 @@ def test_both_networks_see_the_carrier(links):
     with torch.no_grad():
         for head in model.deformation.heads.values():
             head.weight.normal_()
-    query = Query(links.query.transmitters[:1].expand(3, 3), torch.zeros(3, dtype=torch.long), CARRIERS)
+    query = Query(
+        links.query.transmitters[:1].expand(3, 3), torch.zeros(3, dtype=torch.long), CARRIERS
+    )
     placed = Placed(model.gaussians.means.detach()[None])
-    residuals = model.deformation(model.tokenizer(placed, model.gaussians.opacities, query), placed, query)
+    residuals = model.deformation(
+        model.tokenizer(placed, model.gaussians.opacities, query), placed, query
+    )
     for part in (residuals.attenuations, residuals.delta_signal):
         for i, j in ((0, 1), (1, 2)):
             assert (part[i] - part[j]).abs().max() > 1e-3
@@ -38,11 +42,15 @@ def test_both_networks_see_the_carrier(links):
 
 
 def test_a_run_on_a_folder_with_the_carrier_of_each_link(tmp_path, monkeypatch):
-    room = composed("data=synthetic", "data.transmitters=15", "data.order=1", "data.frequency=[2.4e9,5.0e9]")
+    room = composed(
+        "data=synthetic", "data.transmitters=15", "data.order=1", "data.frequency=[2.4e9,5.0e9]"
+    )
     with repository():
         write(tmp_path / "room", load(room["data"], room["split"]))
     overrides = (f"data.root={tmp_path / 'room'}", "training.thinning.stride=8")
-    _, metrics, loaded = run(tmp_path / "run", monkeypatch, *SMALL, "data=nerf2_spectrum", *overrides)
+    _, metrics, loaded = run(
+        tmp_path / "run", monkeypatch, *SMALL, "data=nerf2_spectrum", *overrides
+    )
     assert "2 carriers of freq.txt, 2400 to 5000 MHz" in metrics["data"]
     assert metrics["models"].keys() == {"wide_gs", "mean"}
     assert loaded.scene.frequencies.tolist() == pytest.approx([2.4e9, 5.0e9])

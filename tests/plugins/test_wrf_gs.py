@@ -41,7 +41,9 @@ def test_its_parts_keep_theirs():
     check_deformation(functools.partial(build, "deformation", config["deformation"]), LINKS.scene)
     check_tokenizer(build("tokenizer", config["tokenizer"], scene=LINKS.scene), LINKS.scene)
     for channels in (1, 2):
-        make = lambda scene, channels=channels: build("pooling", config["pooling"] | {"channels": channels})
+        make = lambda scene, channels=channels: build(
+            "pooling", config["pooling"] | {"channels": channels}
+        )
         check_pooling(make, LINKS)
 
 
@@ -56,7 +58,9 @@ def features(x, octaves):
 
 def transcribed(network, tokens, placed, query):
     """NeRF²'s two networks, pair by pair, in numpy: signal (b, n, c), attenuations (b, n)."""
-    values = {name: parameter.detach().double().numpy() for name, parameter in network.named_parameters()}
+    values = {
+        name: parameter.detach().double().numpy() for name, parameter in network.named_parameters()
+    }
     linear = lambda name, x: values[f"{name}.weight"] @ x + values[f"{name}.bias"]
     relu = lambda x: np.maximum(x, 0)
     positions = [receiver.pose.position.double().numpy() for receiver in network.scene.receivers]
@@ -67,7 +71,11 @@ def transcribed(network, tokens, placed, query):
             h = relu(values["first.gaussians.weight"] @ u + values["first.bias"])
             for k in range(3):
                 h = relu(linear(f"before.{k}", h))
-            h = values["again.gaussians.weight"] @ u + values["again.hidden.weight"] @ h + values["again.bias"]
+            h = (
+                values["again.gaussians.weight"] @ u
+                + values["again.hidden.weight"] @ h
+                + values["again.bias"]
+            )
             h = relu(h)
             for k in range(3):
                 h = relu(linear(f"behind.{k}", h))
@@ -105,7 +113,9 @@ def test_matter_is_the_same_for_all_and_the_signal_depends_on_the_view(model):
     places = LINKS.query.transmitters[:1].expand(2, 3)
     query = Query(places, torch.tensor([0, 1]))
     placed = Placed(model.gaussians.means.detach()[None])
-    residuals = model.deformation(model.tokenizer(placed, model.gaussians.opacities, query), placed, query)
+    residuals = model.deformation(
+        model.tokenizer(placed, model.gaussians.opacities, query), placed, query
+    )
     assert torch.equal(residuals.attenuations[0], residuals.attenuations[1])
     assert (residuals.delta_signal[0] - residuals.delta_signal[1]).abs().max() > 0.01
 
@@ -113,7 +123,9 @@ def test_matter_is_the_same_for_all_and_the_signal_depends_on_the_view(model):
 def test_it_starts_nearly_transparent():
     model = build("model", composed(*SMALL)["model"], scene=LINKS.scene)
     placed, query = Placed(model.gaussians.means.detach()[None]), LINKS.query[:3]
-    residuals = model.deformation(model.tokenizer(placed, model.gaussians.opacities, query), placed, query)
+    residuals = model.deformation(
+        model.tokenizer(placed, model.gaussians.opacities, query), placed, query
+    )
     torch.testing.assert_close(residuals.attenuations, torch.full((3, 40), INITIAL_ATTENUATION))
 
 
@@ -130,10 +142,16 @@ def test_a_gaussian_on_the_receiver_has_finite_gradients(model):
 
 
 def test_its_rendering_is_the_dense_reference(model):
-    gaussians, pose, query = model.gaussians, LINKS.receivers[0].pose, LINKS.query[torch.tensor([0, 2, 4])]
+    gaussians, pose, query = (
+        model.gaussians,
+        LINKS.receivers[0].pose,
+        LINKS.query[torch.tensor([0, 2, 4])],
+    )
     placed = Placed(gaussians.means.detach()[None])
     tokens = model.tokenizer(placed, gaussians.opacities.detach(), query)
-    signal, attenuations = map(torch.from_numpy, transcribed(model.deformation, tokens, placed, query))
+    signal, attenuations = map(
+        torch.from_numpy, transcribed(model.deformation, tokens, placed, query)
+    )
     with torch.no_grad():
         axes = semi_axes(normalize(gaussians.quats), gaussians.log_scales.exp())[None]
         splats = model.projection.project(gaussians.means, axes, pose)
@@ -160,7 +178,9 @@ def test_spectra_are_clamped_to_the_range_of_labels():
 def test_a_map_that_is_silent_everywhere_is_led_back():
     pooling = build("pooling", {"name": "clamped", "channels": 1})
     image = torch.tensor([-0.5, -0.5, 0.25, 3.0, 3.0]).expand(1, 1, 1, 5).clone().requires_grad_()
-    pooling(image, LINKS.query[:1]).backward(torch.tensor([-1.0, 1.0, 1.0, 1.0, -1.0]).expand(1, 1, 5))
+    pooling(image, LINKS.query[:1]).backward(
+        torch.tensor([-1.0, 1.0, 1.0, 1.0, -1.0]).expand(1, 1, 5)
+    )
     assert image.grad.flatten().tolist() == [-1, 0, 1, 1, 0]
 
 

@@ -52,7 +52,9 @@ def test_its_parts_keep_theirs():
 
 def transcribed(network, tokens, channels):
     """Rotation, scale and signal of each pair, in numpy."""
-    values = {name: parameter.detach().double().numpy() for name, parameter in network.named_parameters()}
+    values = {
+        name: parameter.detach().double().numpy() for name, parameter in network.named_parameters()
+    }
     linear = lambda name, x: values[f"{name}.weight"] @ x + values[f"{name}.bias"]
     relu = lambda x: np.maximum(x, 0)
     mixed = lambda name, transmitter, gaussian: (
@@ -79,14 +81,18 @@ def transcribed(network, tokens, channels):
 @pytest.mark.parametrize("channels", [1, 2, 6])
 def test_the_network_has_eight_layers_and_heads_of_shape_and_wave(channels):
     widths = 0, 5, 4
-    network = build("deformation", composed(*SMALL)["deformation"], channels=channels, tokenizer_widths=widths)
+    network = build(
+        "deformation", composed(*SMALL)["deformation"], channels=channels, tokenizer_widths=widths
+    )
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(0.1 * torch.randn(parameter.shape))
     tokens = build("tokenizer", composed(*SMALL)["tokenizer"], scene=LINKS.scene)(
         Placed(torch.rand(1, 7, 3)), torch.rand(7), LINKS.query[:3]
     )
-    tokens = tokens._replace(gaussians=tokens.gaussians[:, :5], transmitters=tokens.transmitters[:, :4])
+    tokens = tokens._replace(
+        gaussians=tokens.gaussians[:, :5], transmitters=tokens.transmitters[:, :4]
+    )
     residuals = network(tokens, Placed(torch.rand(1, 7, 3)), LINKS.query[:3])
     quats, scales, signal = transcribed(network, tokens, channels)
     np.testing.assert_allclose(residuals.delta_quats.detach(), quats, atol=1e-6)
@@ -109,7 +115,9 @@ def test_shapes_start_as_they_are_and_signals_differ_from_the_first_step_on():
 
 def test_its_rendering_is_the_dense_reference(model):
     gaussians, tokens = model.gaussians, ask(model)[0]
-    quats, scales, signal = map(torch.from_numpy, transcribed(model.deformation, tokens, channels=2))
+    quats, scales, signal = map(
+        torch.from_numpy, transcribed(model.deformation, tokens, channels=2)
+    )
     with torch.no_grad():
         axes = semi_axes(normalize(gaussians.quats) + quats, gaussians.log_scales.exp() + scales)
         splats = model.projection.project(gaussians.means.double(), axes, LINKS.receivers[0].pose)

@@ -26,6 +26,12 @@ quaternions = tensors(st.floats(-1, 1, width=32), 4)
 @st.composite
 def normals(draw):
     """Unit vectors, the poles and the seam among them."""
-    azimuth = draw(st.sampled_from([0.0, math.pi / 2, math.pi, -math.pi]) | st.floats(-math.pi, math.pi))
-    elevation = draw(st.sampled_from([0.0, math.pi / 2, -math.pi / 2]) | st.floats(-math.pi / 2, math.pi / 2))
-    return from_spherical(*(torch.tensor(angle, dtype=torch.float64) for angle in (azimuth, elevation)))
+    azimuth = draw(
+        st.sampled_from([0.0, math.pi / 2, math.pi, -math.pi]) | st.floats(-math.pi, math.pi)
+    )
+    elevation = draw(
+        st.sampled_from([0.0, math.pi / 2, -math.pi / 2]) | st.floats(-math.pi / 2, math.pi / 2)
+    )
+    return from_spherical(
+        *(torch.tensor(angle, dtype=torch.float64) for angle in (azimuth, elevation))
+    )

@@ -40,7 +40,9 @@ def test_unit_quaternions_are_of_length_1_and_turn_alike(quat, length, dtype):
         assert (quaternions_to_rotations(unit) - torch.eye(3)).abs().max() == 0
         return
     assert abs(unit.norm().item() - 1) < BOUND[dtype]
-    assert (quaternions_to_rotations(unit) - quaternions_to_rotations(quat)).abs().max() < 8 * BOUND[dtype]
+    assert (
+        quaternions_to_rotations(unit) - quaternions_to_rotations(quat)
+    ).abs().max() < 8 * BOUND[dtype]
 
 
 @given(quaternions, tensors(st.floats(2.0**-20, 1e3, width=32), 3))
@@ -59,7 +61,9 @@ def test_angles_lead_back_to_the_point(direction, distance):
     azimuth, elevation, length = to_spherical(point)
     assert abs(azimuth.item()) <= math.pi
     assert abs(elevation.item()) <= math.pi / 2
-    torch.testing.assert_close(length * from_spherical(azimuth, elevation), point, rtol=0, atol=1e-9 * distance)
+    torch.testing.assert_close(
+        length * from_spherical(azimuth, elevation), point, rtol=0, atol=1e-9 * distance
+    )
 
 
 @given(normals(), coordinates, points)
@@ -68,4 +72,6 @@ def test_a_reflection_undoes_itself_and_is_the_sandwich_with_the_plane(normal, o
     once = reflect(point, normal, offset)
     torch.testing.assert_close(reflect(once, normal, offset), point, rtol=0, atol=1e-10)
     versor = embed_plane(normal, offset)
-    torch.testing.assert_close(extract_point(PROJECTIVE.sandwich(versor, embed_point(point))), once, rtol=0, atol=1e-9)
+    torch.testing.assert_close(
+        extract_point(PROJECTIVE.sandwich(versor, embed_point(point))), once, rtol=0, atol=1e-9
+    )

@@ -21,7 +21,11 @@ OPTIONS |= {"sparse": {"train": st.integers(1, 300)}, "official": {"length": st.
 def make(count, seed, is_ordered, size):
     """Links to one receiver in rows of one to three, in the order of measurement or not."""
     generator = torch.Generator().manual_seed(seed)
-    rows = torch.arange(count) if is_ordered else torch.randint(0, count, (count,), generator=generator)
+    rows = (
+        torch.arange(count)
+        if is_ordered
+        else torch.randint(0, count, (count,), generator=generator)
+    )
     where = size * torch.rand(count, 3, generator=generator)[rows]
     return Links(
         query=Query(where, torch.zeros(count, dtype=torch.long)),
@@ -33,7 +37,9 @@ def make(count, seed, is_ordered, size):
     )
 
 
-shapes = st.tuples(st.integers(1, 120), seeds, st.booleans(), st.sampled_from([0.0, 1e-3, 3.0, 1e4]))
+shapes = st.tuples(
+    st.integers(1, 120), seeds, st.booleans(), st.sampled_from([0.0, 1e-3, 3.0, 1e4])
+)
 
 
 @pytest.mark.parametrize("name", registry("split").names())
@@ -41,7 +47,9 @@ shapes = st.tuples(st.integers(1, 120), seeds, st.booleans(), st.sampled_from([0
 def test_parts_are_disjoint_cover_and_repeat(name, shape, data, test, validation, seed):
     links = make(*shape)
     options = {key: data.draw(strategy) for key, strategy in OPTIONS.get(name, {}).items()}
-    options |= {"validation": validation, "seed": seed} | ({} if name == "official" else {"test": test})
+    options |= {"validation": validation, "seed": seed} | (
+        {} if name == "official" else {"test": test}
+    )
     build = lambda: registry("split").build({"name": name} | options, links=links)
     try:
         split = build()

@@ -19,7 +19,9 @@ def write_run(folder, overrides, models=None, task="spectrum", log="", **facts):
     (folder / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump(overrides))
     (folder / "gaigs.log").write_text(log)
     if models is not None:
-        (folder / "metrics.json").write_text(json.dumps(FACTS | {"task": task, "models": models} | facts))
+        (folder / "metrics.json").write_text(
+            json.dumps(FACTS | {"task": task, "models": models} | facts)
+        )
     return folder
 
 

@@ -34,15 +34,26 @@ What that lets expect on split made:
 
 def test_the_page(tmp_path):
     page = write(tmp_path, Rssi(), CELLS, ROWS, "made", ["a remark"])
-    assert (tmp_path / "agreement.md").read_text() == page == MARKDOWN.replace("distance\nof", "distance of")
+    assert (
+        (tmp_path / "agreement.md").read_text()
+        == page
+        == MARKDOWN.replace("distance\nof", "distance of")
+    )
     assert (tmp_path / "agreement.png").is_file()
 
 
 def test_the_figure_has_a_line_for_each_separation():
     drawn = figure("|difference| [dB]", CELLS)
     (ax,) = drawn.axes
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("distance of the places [m]", "|difference| [dB] of two labels")
-    assert [tick.get_text() for tick in ax.get_xticklabels()] == ["same place", "under 0.01", "0.01 to 0.02"]
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (
+        "distance of the places [m]",
+        "|difference| [dB] of two labels",
+    )
+    assert [tick.get_text() for tick in ax.get_xticklabels()] == [
+        "same place",
+        "under 0.01",
+        "0.01 to 0.02",
+    ]
     lines = {entry.get_label(): entry.lines[0] for entry in ax.containers}
     assert [*lines] == ["within 3", "4 to 30", "over 30"]
     assert lines["within 3"].get_ydata().tolist() == [5.0, 1.25]

@@ -14,7 +14,11 @@ from gaigs.report.runs import read_runs
 
 def write_variant(folder, variant, score=None, seed=0, task="spectrum", log="", **overrides):
     """A run of a variant, or one that has logged something and has no result."""
-    typed = [*(f"{key}={value}" for key, value in overrides.items()), f"+variant={variant}", f"seed={seed}"]
+    typed = [
+        *(f"{key}={value}" for key, value in overrides.items()),
+        f"+variant={variant}",
+        f"seed={seed}",
+    ]
     name = next(iter(registry("task").get(task).metrics()))
     models = None if score is None else {"gaigs": {name: score}, "mean": {name: 0.5}}
     write_run(folder / ",".join(typed), typed, models, task, log, seed=seed)
@@ -29,7 +33,9 @@ def found(folder):
 
 
 def test_an_interval_of_three_gains_by_hand():
-    """Mean 2, sample deviation 1; t of two degrees of freedom is 4.302653, and 4.302653 / sqrt(3) is 2.484138."""
+    """Mean 2, sample deviation 1; t of two degrees of freedom is 4.302653, and 4.302653 / sqrt(3)
+    is 2.484138.
+    """
     assert interval([1.0, 2.0, 3.0]) == pytest.approx((2 - 2.484138, 2 + 2.484138), abs=1e-5)
 
 
@@ -71,7 +77,9 @@ def test_the_verdict_on_a_claim_follows_from_paired_seeds(task, paper, other, wo
 @pytest.fixture
 def sweep(tmp_path):
     """Two variants with three seeds and one that has lost a seed, one alone, one that failed."""
-    for seed, (both, alone, few) in enumerate([(0.90, 0.60, 0.901), (0.91, 0.62, 0.899), (0.92, 0.61, None)]):
+    for seed, (both, alone, few) in enumerate(
+        [(0.90, 0.60, 0.901), (0.91, 0.62, 0.899), (0.92, 0.61, None)]
+    ):
         write_variant(tmp_path, "paper", both, seed)
         write_variant(tmp_path, "ga", alone, seed)
         write_variant(tmp_path, "anchors_4", few, seed, log="gaigs: the disk is full")
@@ -84,7 +92,10 @@ def test_the_table(sweep):
     *_, table = report(sweep).renderables
     first, *notes = (sweep / "claims.md").read_text().split("\n\n")
     lines = first.splitlines()
-    assert lines[0] == "| claim | compared | score | published gain | with | without | ours | seeds | says |"
+    assert (
+        lines[0]
+        == "| claim | compared | score | published gain | with | without | ours | seeds | says |"
+    )
     assert lines[2:] == [
         "| both tokenizers beat geometric algebra alone | paper, ga | median SSIM | none | 0.910 | 0.610 | "
         "+0.300 (+0.275, +0.325) | 3 | confirmed |",
@@ -92,7 +103,10 @@ def test_the_table(sweep):
         "not seen |",
     ]
     assert "95%" in notes[0]
-    assert '- 16 anchors beat 4: section "Multi-view Tokenizer", anchors stand for the scene\n' in notes[1]
+    assert (
+        '- 16 anchors beat 4: section "Multi-view Tokenizer", anchors stand for the scene\n'
+        in notes[1]
+    )
     assert "- without a result: +variant=anchors_4,seed=2: the disk is full\n" in notes[1]
     assert "- without a result: +variant=blocks_4,seed=0: the disk is full\n" in notes[1]
     assert table.title == "Claims of the paper"
@@ -104,8 +118,12 @@ def test_seeds_of_one_setting_are_joined_and_settings_kept_apart(tmp_path):
         for data, gap in (("room", 0.1), ("rfid", -0.1)):
             part = tmp_path / f"{data}{seed // 2}"  # the last seed came later, elsewhere
             write_variant(part, "paper", 0.8 + 0.01 * seed, seed, data=data)
-            write_variant(part, "ga", 0.8 - gap, seed, data=data, threads=1 + seed)  # which changes no result
-    write_variant(tmp_path / "run twice", "paper", 0.1, 0, data="room")  # the one first by name counts
+            write_variant(
+                part, "ga", 0.8 - gap, seed, data=data, threads=1 + seed
+            )  # which changes no result
+    write_variant(
+        tmp_path / "run twice", "paper", 0.1, 0, data="room"
+    )  # the one first by name counts
     rows = compare(read_runs(tmp_path), read_claims())
     assert {row["setting"]: (row["says"], row["seeds"]) for row in rows} == {
         "data=rfid": ("contradicted", 3),
@@ -153,16 +171,19 @@ PARTS = {"tokenizer", "deformation", "projection", "pooling"}
 @pytest.mark.parametrize(("experiment", "task"), [("claims", "spectrum"), ("claims_rssi", "rssi")])
 def test_variants_differ_from_the_paper_in_one_thing(experiment, task):
     """By their files; the last one is composed, too."""
-    params = yaml.safe_load((conf_dir() / "experiment" / f"{experiment}.yaml").read_text())["hydra"]["sweeper"][
-        "params"
-    ]
+    params = yaml.safe_load((conf_dir() / "experiment" / f"{experiment}.yaml").read_text())[
+        "hydra"
+    ]["sweeper"]["params"]
     first, *names = "".join(params["+variant"].split()).split(",")
     assert first == "paper"
     for name in names:
         content = yaml.safe_load((conf_dir() / "variant" / f"{name}.yaml").read_text())
         base, *others = content.pop("defaults")
         overridden = [
-            key.removeprefix("override /") for entry in (base, *others) if isinstance(entry, dict) for key in entry
+            key.removeprefix("override /")
+            for entry in (base, *others)
+            if isinstance(entry, dict)
+            for key in entry
         ]
         assert (base == "paper") != (name == "static"), "static Gaussians have no heads"
         assert len([*content, *overridden]) == 1, name
@@ -170,7 +191,10 @@ def test_variants_differ_from_the_paper_in_one_thing(experiment, task):
         if "heads" in content.get("deformation", {}):
             assert len(content["deformation"]["heads"]) == 4
     with initialize_config_dir(str(conf_dir()), version_base="1.3"):
-        paper, config = (compose("config", [f"+variant={name}", f"+experiment={experiment}"]) for name in (first, name))
+        paper, config = (
+            compose("config", [f"+variant={name}", f"+experiment={experiment}"])
+            for name in (first, name)
+        )
     assert paper.task.name == task
     assert len(paper.deformation.heads) == 5
     assert len([key for key in paper if config[key] != paper[key] and key in PARTS]) == 1

@@ -31,7 +31,9 @@ def lines(ax):
 def draw(function, labels, predictions, frequencies, snr=None, names=None):
     count = len(labels)
     snr = np.zeros(count) if snr is None else snr
-    return function(Examples(labels, predictions, snr, names or [f"row {i}" for i in range(count)]), frequencies)
+    return function(
+        Examples(labels, predictions, snr, names or [f"row {i}" for i in range(count)]), frequencies
+    )
 
 
 def test_magnitude_and_phase_are_those_of_the_strongest_element(rng):
@@ -40,7 +42,14 @@ def test_magnitude_and_phase_are_those_of_the_strongest_element(rng):
     labels[1, 0] *= 4
     predictions[0, 1] *= 100  # which the label's own strength decides, not the prediction's
     frequencies = 2.4e9 + 1e6 * np.arange(40)
-    figure = draw(magnitudes_and_phases, labels, predictions, frequencies, np.array([-2.5, 20.0]), ["worst", "best"])
+    figure = draw(
+        magnitudes_and_phases,
+        labels,
+        predictions,
+        frequencies,
+        np.array([-2.5, 20.0]),
+        ["worst", "best"],
+    )
     assert [ax.get_title() for ax in figure.axes[::2]] == [
         "worst, SNR -2.5 dB, element 3 of 3",
         "best, SNR 20.0 dB, element 1 of 3",
@@ -55,7 +64,8 @@ def test_magnitude_and_phase_are_those_of_the_strongest_element(rng):
             drawn = np.isfinite(x)
             np.testing.assert_allclose(x[drawn], frequencies / 1e9)
             np.testing.assert_allclose(
-                np.exp(1j * np.deg2rad(y[drawn])), channel[row, element] / abs(channel[row, element])
+                np.exp(1j * np.deg2rad(y[drawn])),
+                channel[row, element] / abs(channel[row, element]),
             )
         assert (magnitude.get_ylabel(), phase.get_ylabel()) == ("|h| [dB]", "phase [deg]")
     assert [ax.get_xlabel() for ax in figure.axes] == ["", "", "frequency [GHz]", "frequency [GHz]"]
@@ -78,11 +88,14 @@ def test_frequencies_may_come_in_any_order(rng):
     label, prediction = random(rng, 1, 1, 64), random(rng, 1, 1, 64)
     for function in (magnitudes_and_phases, impulse_responses):
         sorted_, shuffled = (
-            draw(function, label[..., index], prediction[..., index], EVEN[index]) for index in (np.arange(64), order)
+            draw(function, label[..., index], prediction[..., index], EVEN[index])
+            for index in (np.arange(64), order)
         )
         for ax, other in zip(sorted_.axes, shuffled.axes, strict=True):
             for name in ("measured", "predicted"):
-                np.testing.assert_allclose(lines(ax)[name].get_xydata(), lines(other)[name].get_xydata(), atol=1e-6)
+                np.testing.assert_allclose(
+                    lines(ax)[name].get_xydata(), lines(other)[name].get_xydata(), atol=1e-6
+                )
 
 
 def test_a_prediction_of_nothing_is_drawn_as_nothing(rng):
@@ -105,14 +118,18 @@ def test_deep_fades_do_not_squeeze_the_rest(rng):
     assert measured.max() - 60 - 5 < low < measured.max() - 60 + 5
 
 
-@pytest.mark.parametrize("frequencies", [EVEN, GAP, EVEN[:5], 2.4e9 + 7e7 * np.random.default_rng(1).random(90)])
+@pytest.mark.parametrize(
+    "frequencies", [EVEN, GAP, EVEN[:5], 2.4e9 + 7e7 * np.random.default_rng(1).random(90)]
+)
 @pytest.mark.parametrize("delay", [0.0, 0.13e-6, 0.5e-6])
 def test_a_path_peaks_at_its_delay_and_height(frequencies, delay):
     label, prediction = path(frequencies, 0.3e-6), path(frequencies, delay, 0.1)
     (ax,) = draw(impulse_responses, label, prediction, frequencies).axes
     x, y = lines(ax)["predicted"].get_data()
     near = abs(x - 1e9 * delay) < 400
-    assert x[near][y[near].argmax()] == pytest.approx(1e9 * delay, abs=2)  # ns, of 15 or more that the band resolves
+    assert x[near][y[near].argmax()] == pytest.approx(
+        1e9 * delay, abs=2
+    )  # ns, of 15 or more that the band resolves
     assert y.max() == pytest.approx(-20, abs=0.1)
     x, y = lines(ax)["measured"].get_data()
     assert (x[y.argmax()], y.max()) == (pytest.approx(300, abs=2), 0)
@@ -129,7 +146,11 @@ def test_evenly_spaced_subcarriers_give_the_inverse_fourier_transform(rng):
     assert -1000 / 32 < x[0] < 0
     window = np.hanning(66)[1:-1]
     truth = [
-        np.abs(np.fft.ifft(window * channel * np.exp(2j * np.pi * (EVEN - EVEN[0]) * 1e-9 * x[0]), count))
+        np.abs(
+            np.fft.ifft(
+                window * channel * np.exp(2j * np.pi * (EVEN - EVEN[0]) * 1e-9 * x[0]), count
+            )
+        )
         for channel in (label, prediction)
     ]
     np.testing.assert_allclose(10 ** (measured / 20), truth[0] / truth[0].max(), atol=1e-9)

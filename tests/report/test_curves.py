@@ -20,7 +20,11 @@ def rng():
 @pytest.mark.parametrize(
     ("texts", "steps", "values"),
     [
-        (["step,a\n1,0.5\n2,0.25\n3,0.1", "", "step,a\n3,0.125\n"], [1, 2, 3], [0.5, 0.25, 0.125]),  # a cut row
+        (
+            ["step,a\n1,0.5\n2,0.25\n3,0.1", "", "step,a\n3,0.125\n"],
+            [1, 2, 3],
+            [0.5, 0.25, 0.125],
+        ),  # a cut row
         (
             ["step,a\n99,60\n149,90\n199,120\n", "step,a\n139,130\n189,160\n"],
             [99, 139, 189],
@@ -61,11 +65,15 @@ def test_cdf_is_the_empirical_one(rng):
 
 def write_losses(path, steps=30):
     with open(path, "w", newline="") as file:
-        writer = csv.DictWriter(file, ["epoch", "step", "train/loss", "train/l1", "validation/ssim"])
+        writer = csv.DictWriter(
+            file, ["epoch", "step", "train/loss", "train/l1", "validation/ssim"]
+        )
         writer.writeheader()
         for step in range(steps):
             loss = 1 / (step + 1)
-            writer.writerow({"epoch": step // 10, "step": step, "train/loss": loss, "train/l1": loss / 2})
+            writer.writerow(
+                {"epoch": step // 10, "step": step, "train/loss": loss, "train/l1": loss / 2}
+            )
             if step % 10 == 9:
                 writer.writerow({"epoch": step // 10, "step": step, "validation/ssim": step / 100})
 
@@ -77,13 +85,21 @@ def test_curves_leave_out_the_gaps_of_the_log(tmp_path):
     np.testing.assert_array_equal(curves["validation/ssim"], [[9, 19, 29], [0.09, 0.19, 0.29]])
     train, validation = loss_curves(curves).axes
     assert set(lines(train)) == {"loss", "l1"}
-    np.testing.assert_allclose(lines(train)["loss"].get_xydata(), [(k, 1 / (k + 1)) for k in range(30)])
+    np.testing.assert_allclose(
+        lines(train)["loss"].get_xydata(), [(k, 1 / (k + 1)) for k in range(30)]
+    )
     np.testing.assert_allclose(lines(validation)["ssim"].get_xdata(), [9, 19, 29])
 
 
 def test_penalties_have_an_axis_of_their_own():
     steps = np.arange(9.0)
-    figure = loss_curves({"train/l1": (steps, steps), "train/loss": (steps, steps), "penalty/opacity": (steps, steps)})
+    figure = loss_curves(
+        {
+            "train/l1": (steps, steps),
+            "train/loss": (steps, steps),
+            "penalty/opacity": (steps, steps),
+        }
+    )
     assert [[*lines(ax)] for ax in figure.axes] == [["loss", "l1"], ["opacity"]]
 
 
@@ -106,14 +122,18 @@ def test_a_system_has_one_look_in_all_figures(rng):
     assert steps == [found[name][0] for name in scores]
     two = [((1.0, 2.0), (0.5, 0.6))] * 2
     curves = learning_curves(
-        dict(zip(("mirrored Gaussians", "GAI-GS"), two, strict=True)), {"knn": 0.7}, Metric("SSIM", True)
+        dict(zip(("mirrored Gaussians", "GAI-GS"), two, strict=True)),
+        {"knn": 0.7},
+        Metric("SSIM", True),
     )
     assert [line.get_color() for line in curves.axes[0].lines] == [
         found[name][0] for name in ("mirrored", "gaigs", "knn")
     ]
     times = {"inference": np.array([1.0, 2.0, 3.0])}
     models = ["mirrored", "gaigs", "mirrored"]
-    (ax,) = speed_against_error(["a", "b", "c"], np.ones(3), times, "SSIM", {"knn official": 0.8}, models).axes
+    (ax,) = speed_against_error(
+        ["a", "b", "c"], np.ones(3), times, "SSIM", {"knn official": 0.8}, models
+    ).axes
     assert [line.get_color() for line in ax.lines] == [found[name][0] for name in (*models, "knn")]
 
 
@@ -122,19 +142,25 @@ def test_many_steps_are_smoothed_in_place():
     (ax,) = loss_curves({"train/loss": (steps, 5 + steps)}).axes
     x, y = lines(ax)["loss"].get_data()
     assert len(x) < 1000
-    np.testing.assert_allclose(y, 5 + x, atol=0.5)  # a straight line stays where it is, to half a step
+    np.testing.assert_allclose(
+        y, 5 + x, atol=0.5
+    )  # a straight line stays where it is, to half a step
 
 
 def test_a_diverged_loss_still_makes_a_figure():
     steps = np.arange(9.0)
-    figure = loss_curves({"train/loss": (steps, np.full(9, np.nan)), "train/l1": (steps, np.zeros(9))})
+    figure = loss_curves(
+        {"train/loss": (steps, np.full(9, np.nan)), "train/l1": (steps, np.zeros(9))}
+    )
     figure.draw_without_rendering()
 
 
 @pytest.mark.parametrize(("longest", "scale"), [(20.0, "linear"), (500.0, "log")])
 def test_speed_against_error(longest, scale):
     times = {"inference": np.array([np.nan, 5, longest])}
-    figure = speed_against_error(["a", "b", "c"], np.array([0.7, 0.8, 0.9]), times, "median SSIM", {"knn": 0.85})
+    figure = speed_against_error(
+        ["a", "b", "c"], np.array([0.7, 0.8, 0.9]), times, "median SSIM", {"knn": 0.85}
+    )
     figure.draw_without_rendering()
     (ax,) = figure.axes
     points = {line.get_label(): line for line in ax.lines}

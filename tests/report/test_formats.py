@@ -24,6 +24,8 @@ def test_figures_have_the_formats_of_the_context(pixels, tmp_path, given):
 @pytest.mark.parametrize("given", ["jpg", [], ["png", "jpg"]])
 def test_unknown_formats_are_refused_before_the_run(tmp_path, given):
     configuration = gaigs.compose("model=knn") | {"figures": {"format": given}}
-    with pytest.raises(ValueError, match=r"figures\.format must be one or several of png, pdf, svg, got "):
+    with pytest.raises(
+        ValueError, match=r"figures\.format must be one or several of png, pdf, svg, got "
+    ):
         gaigs.run(configuration, tmp_path / "run")
     assert not (tmp_path / "run").exists()

@@ -21,7 +21,10 @@ def scores(gaigs, mean=0.6, knn=0.95):
 
 def errors(gaigs, knn=4.158, path_loss=4.974):
     means = {"gaigs": gaigs, "knn": knn, "path_loss": path_loss}
-    return {name: {"mae_db": e, "median_ae_db": 0.8 * e, "rmse_db": 1.3 * e} for name, e in means.items()}
+    return {
+        name: {"mae_db": e, "median_ae_db": 0.8 * e, "rmse_db": 1.3 * e}
+        for name, e in means.items()
+    }
 
 
 # --- one row a run ---
@@ -46,7 +49,10 @@ def test_names_of_runs_are_no_formulas_and_no_markup(tmp_path):
     for name in ("@[bold]one", "@two[/red]"):
         write_run(tmp_path / name, [], scores(0.9))
     text = "\n".join(terminal(report(tmp_path)))
-    assert [row["run"] for row in read(tmp_path / "ablation.csv")][:2] == ["'@[bold]one", "'@two[/red]"]
+    assert [row["run"] for row in read(tmp_path / "ablation.csv")][:2] == [
+        "'@[bold]one",
+        "'@two[/red]",
+    ]
     assert "@[bold]one" in text
     assert "@two[/red]" in text
 
@@ -55,8 +61,16 @@ def test_unfinished_runs_stay_and_baselines_come_once(tmp_path):
     common = ["+experiment=spectrum", "data=rfid"]
     write_run(tmp_path / "0", [*common, "tokenizer=ga", "seed=1"], scores(0.91), seed=1)
     write_run(tmp_path / "1", [*common, "tokenizer=multiview", "seed=1"])
-    write_run(tmp_path / "10", [*common, "tokenizer=ga", "seed=2"], scores(0.87, knn=0.95 + 1e-9), seed=2)
-    write_run(tmp_path / "2", [*common, "tokenizer=euclidean", "seed=1"], scores(0.81), seed=1, num_gaussians=None)
+    write_run(
+        tmp_path / "10", [*common, "tokenizer=ga", "seed=2"], scores(0.87, knn=0.95 + 1e-9), seed=2
+    )
+    write_run(
+        tmp_path / "2",
+        [*common, "tokenizer=euclidean", "seed=1"],
+        scores(0.81),
+        seed=1,
+        num_gaussians=None,
+    )
     table, seeds = report(tmp_path).renderables
     rows = read(tmp_path / "ablation.csv")
     assert list(rows[0])[:5] == ["run", "status", "model", "tokenizer", "seed"]
@@ -71,9 +85,16 @@ def test_unfinished_runs_stay_and_baselines_come_once(tmp_path):
     ]
     assert [row["ssim_median"] for row in rows[:4]] == ["0.91", "", "0.81", "0.87"]
     assert [row["num_gaussians"] for row in rows[:4]] == ["0", "", "", "0"]
-    assert (rows[0]["train_seconds"], rows[0]["inference_ms"], rows[0]["num_parameters"]) == ("180.0", "17.25", "1234")
+    assert (rows[0]["train_seconds"], rows[0]["inference_ms"], rows[0]["num_parameters"]) == (
+        "180.0",
+        "17.25",
+        "1234",
+    )
     assert (table.row_count, seeds.row_count) == (6, 1)
-    assert table.caption == "experiment=spectrum, data=rfid, split=official, device=cpu; all columns in ablation.md"
+    assert (
+        table.caption
+        == "experiment=spectrum, data=rfid, split=official, device=cpu; all columns in ablation.md"
+    )
     markdown = (tmp_path / "ablation.md").read_text().splitlines()
     assert len({line.count("|") for line in markdown[:8]}) == 1
     assert markdown[3].startswith("| 1 | unfinished |  | multiview | 1 |")
@@ -83,8 +104,12 @@ def test_unfinished_runs_stay_and_baselines_come_once(tmp_path):
 def test_runs_of_rssi(tmp_path):
     common = ["+experiment=rssi", "data=nerf2_rssi"]
     at = {"g": errors(3.0)}
-    write_run(tmp_path / "0", [*common, "pooling=softmax_attention"], errors(3.859), "rssi", receivers=at)
-    write_run(tmp_path / "1", [*common, "pooling=mean_power"], errors(4.021), "rssi", inference_ms=None)
+    write_run(
+        tmp_path / "0", [*common, "pooling=softmax_attention"], errors(3.859), "rssi", receivers=at
+    )
+    write_run(
+        tmp_path / "1", [*common, "pooling=mean_power"], errors(4.021), "rssi", inference_ms=None
+    )
     write_run(tmp_path / "2", [*common, "pooling=broken"], task="rssi")
     printed = "\n".join(terminal(report(tmp_path)))
     rows = read(tmp_path / "ablation.csv")
@@ -112,7 +137,10 @@ def test_runs_without_a_result_have_rows(tmp_path):
     (table,) = report(tmp_path).renderables
     assert table.row_count == 2
     rows = read(tmp_path / "ablation.csv")
-    assert [(row["status"], row["tokenizer"]) for row in rows] == [("unfinished", "[a]"), ("unfinished", "[b]")]
+    assert [(row["status"], row["tokenizer"]) for row in rows] == [
+        ("unfinished", "[a]"),
+        ("unfinished", "[b]"),
+    ]
     assert "- without a result: 0: the disk is full\n" in (tmp_path / "ablation.md").read_text()
 
 
@@ -120,7 +148,13 @@ def test_runs_without_a_result_have_rows(tmp_path):
 
 
 def test_spread_over_seeds(tmp_path):
-    medians = {("8", "1"): 0.90, ("8", "2"): 0.84, ("8", "3"): 0.87, ("16", "1"): 0.95, ("16", "2"): 0.93}
+    medians = {
+        ("8", "1"): 0.90,
+        ("8", "2"): 0.84,
+        ("8", "3"): 0.87,
+        ("16", "1"): 0.95,
+        ("16", "2"): 0.93,
+    }
     for (width, seed), median in medians.items():
         overrides = ["data=rfid", f"width={width}", f"seed={seed}"]
         write_run(tmp_path / f"{width}-{seed}", overrides, scores(median), seed=int(seed))
@@ -137,9 +171,18 @@ def test_spread_over_seeds(tmp_path):
         assert float(row["ssim_median_least"]) == min(values)
         assert float(row["mae_least"]) == pytest.approx(1 - max(values))
     assert all(row["ssim_median_sd"] == "" for row in rows if row["status"] != "seeds")
-    assert [column.header for column in seeds.columns] == ["model", "width", "runs", "median\nSSIM", "MAE"]
+    assert [column.header for column in seeds.columns] == [
+        "model",
+        "width",
+        "runs",
+        "median\nSSIM",
+        "MAE",
+    ]
     page = (tmp_path / "ablation.md").read_text()
-    assert "| seeds | gaigs | 8 | 3 | 0.870 ± 0.030, least 0.840 | 0.130 ± 0.030, least 0.100 |\n" in page
+    assert (
+        "| seeds | gaigs | 8 | 3 | 0.870 ± 0.030, least 0.840 | 0.130 ± 0.030, least 0.100 |\n"
+        in page
+    )
     printed = "\n".join(terminal(tables))
     assert "0.940 ± 0.014" in printed
     assert "least 0.930" in printed
@@ -165,7 +208,10 @@ def test_runs_of_one_seed_have_no_spread_and_a_default_seed_counts(tmp_path):
 def test_runs_of_two_tasks_make_no_table(tmp_path):
     write_run(tmp_path / "a", ["data=rfid"], scores(0.9))
     write_run(tmp_path / "b", ["data=ble"], errors(3.9), "rssi")
-    with pytest.raises(ValueError, match="must be of one task, got spectrum in a, rssi in b; pass a folder with runs"):
+    with pytest.raises(
+        ValueError,
+        match="must be of one task, got spectrum in a, rssi in b; pass a folder with runs",
+    ):
         report(tmp_path)
     assert not (tmp_path / "ablation.csv").exists()
 
@@ -184,13 +230,21 @@ METRICS = FACTS | {"task": "spectrum", "models": scores(0.9)}
         (json.dumps(METRICS)[:-20], "JSONDecodeError: Expecting"),
         ("[1, 2]", "TypeError"),
         (json.dumps(FACTS), "KeyError: 'task'"),
-        (json.dumps(METRICS | {"models": {"mean": {"ssim_median": None}}}), "'ssim_median' must be a number, got None"),
-        (json.dumps(METRICS | {"task": "spectra"}), r"unknown task 'spectra' \(did you mean 'spectrum'\?\)"),
+        (
+            json.dumps(METRICS | {"models": {"mean": {"ssim_median": None}}}),
+            "'ssim_median' must be a number, got None",
+        ),
+        (
+            json.dumps(METRICS | {"task": "spectra"}),
+            r"unknown task 'spectra' \(did you mean 'spectrum'\?\)",
+        ),
     ],
 )
 def test_a_damaged_file_of_metrics_is_named(content, message, tmp_path):
     (tmp_path / "metrics.json").write_text(content)
-    with pytest.raises(ValueError, match=rf"cannot read .*metrics\.json \(.*{message}.*\)\nmove it elsewhere"):
+    with pytest.raises(
+        ValueError, match=rf"cannot read .*metrics\.json \(.*{message}.*\)\nmove it elsewhere"
+    ):
         read_metrics(tmp_path / "metrics.json")
 
 
@@ -206,9 +260,13 @@ def test_overrides_of_a_refused_start_are_not_shown_as_the_runs(tmp_path):
     run = write_run(tmp_path / "0", ["seed=2"], scores(0.9))
     (run / "config.yaml").write_text("seed: 1\n")  # of the run's metrics
     (run / ".hydra" / "config.yaml").write_text("seed: 2\n")
-    with pytest.raises(ValueError, match="holds a run of another configuration than the one last started there"):
+    with pytest.raises(
+        ValueError, match="holds a run of another configuration than the one last started there"
+    ):
         report(tmp_path)
-    (run / ".hydra" / "config.yaml").write_text("seed: 1\nsave_every: 5\n")  # which changes no result
+    (run / ".hydra" / "config.yaml").write_text(
+        "seed: 1\nsave_every: 5\n"
+    )  # which changes no result
     assert len(read_runs(tmp_path)) == 1
 
 
@@ -219,11 +277,23 @@ def write_configured(folder, overrides, config, own):
 
 def configured(seed, tokenizer="ga", deformation="two_branch", **others):
     parts = {"tokenizer": {"name": tokenizer}, "deformation": {"name": deformation}}
-    return {"seed": seed, "model": {"name": "gaigs", **parts}, **parts, "split": {"name": "official"}} | others
+    return {
+        "seed": seed,
+        "model": {"name": "gaigs", **parts},
+        **parts,
+        "split": {"name": "official"},
+    } | others
 
 
 def test_the_configuration_counts_where_overrides_were_changed(tmp_path):
-    words = ["tokenizer=ga", "split=official_runs", "+experiment=spectrum", "rate=1e-3", "name='a b'", "list=[1,2]"]
+    words = [
+        "tokenizer=ga",
+        "split=official_runs",
+        "+experiment=spectrum",
+        "rate=1e-3",
+        "name='a b'",
+        "list=[1,2]",
+    ]
     others = {"rate": 0.001, "name": "a b", "list": [1, 2]}
     write_configured(tmp_path / "0", [*words, "seed=0"], configured(0, **others), 0.9)
     write_configured(tmp_path / "1", [*words, "seed=0"], configured(1, "euclidean", **others), 0.7)
@@ -238,13 +308,18 @@ def test_the_configuration_counts_where_overrides_were_changed(tmp_path):
 
 
 def test_runs_whose_overrides_were_cut_are_told_apart(tmp_path):
-    for seed, tokenizer, words in ((0, "ga", ["seed=0"]), (1, "ga", ["seed=1"]), (2, "euclidean", ["seed=2"])):
+    for seed, tokenizer, words in (
+        (0, "ga", ["seed=0"]),
+        (1, "ga", ["seed=1"]),
+        (2, "euclidean", ["seed=2"]),
+    ):
         write_configured(tmp_path / str(seed), words, configured(seed, tokenizer), 0.9)
     assert [run.overrides["tokenizer"] for run in read_runs(tmp_path)] == ["ga", "ga", "euclidean"]
     assert [run.doubts for run in read_runs(tmp_path)][:2] == [(), ()]
     report(tmp_path)
     assert (
-        "2: .hydra/overrides.yaml has no tokenizer, and config.yaml euclidean" in (tmp_path / "ablation.md").read_text()
+        "2: .hydra/overrides.yaml has no tokenizer, and config.yaml euclidean"
+        in (tmp_path / "ablation.md").read_text()
     )
     (group,) = [row for row in read(tmp_path / "ablation.csv") if row["status"] == "seeds"]
     assert (group["tokenizer"], group["runs"]) == ("ga", "2")
@@ -273,12 +348,21 @@ def test_command_line(tmp_path, monkeypatch, capsys):
 
 
 def test_models_may_vary_and_a_run_without_its_kriging_is_no_baseline(tmp_path):
-    kriged = {"gaigs": scores(0.9)["gaigs"], "gaigs_trend": {"ssim_median": 0.8, "mae": 0.2}} | scores(0.9)
+    kriged = {
+        "gaigs": scores(0.9)["gaigs"],
+        "gaigs_trend": {"ssim_median": 0.8, "mae": 0.2},
+    } | scores(0.9)
     write_run(tmp_path / "0", ["model=gaigs_small"], kriged)
     write_run(tmp_path / "1", ["model=mlp"], {"mlp": scores(0.8)["gaigs"]})
     write_run(tmp_path / "2", ["model=fire"])
     report(tmp_path)
-    assert [row["model"] for row in read(tmp_path / "ablation.csv")] == ["gaigs_small", "mlp", "fire", "mean", "knn"]
+    assert [row["model"] for row in read(tmp_path / "ablation.csv")] == [
+        "gaigs_small",
+        "mlp",
+        "fire",
+        "mean",
+        "knn",
+    ]
 
 
 def test_runs_lie_at_any_depth_and_are_named_by_their_folders(tmp_path):
@@ -286,6 +370,11 @@ def test_runs_lie_at_any_depth_and_are_named_by_their_folders(tmp_path):
     write_run(tmp_path / "first/width=8,seed=10", ["width=8", "seed=10"], scores(0.9))
     write_run(tmp_path / "first/width=8,seed=2", ["width=8", "seed=2"], scores(0.89))
     write_run(tmp_path / "second/deeper/²", ["width=4", "seed=2"], scores(0.88))
-    names = ["first/width=8,seed=2", "first/width=8,seed=10", "first/width=16,seed=2", "second/deeper/²"]
+    names = [
+        "first/width=8,seed=2",
+        "first/width=8,seed=10",
+        "first/width=16,seed=2",
+        "second/deeper/²",
+    ]
     assert [run.name for run in read_runs(tmp_path)] == names
     assert [run.name for run in read_runs(tmp_path / "second" / "deeper" / "²")] == ["."]

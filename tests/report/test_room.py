@@ -26,11 +26,18 @@ def rng():
 def links(train, test=None, receivers=None, rotation=None, edges=None):
     """One training and one test link; a receiver with a rotation is an array."""
     places = torch.as_tensor(np.stack((train, train if test is None else test))).float()
-    turn, array = (np.eye(3), Array.single()) if rotation is None else (rotation, Array.planar(1, 2, 0.1))
-    place, turn = (torch.as_tensor(part).float() for part in (train if receivers is None else receivers, turn))
+    turn, array = (
+        (np.eye(3), Array.single()) if rotation is None else (rotation, Array.planar(1, 2, 0.1))
+    )
+    place, turn = (
+        torch.as_tensor(part).float() for part in (train if receivers is None else receivers, turn)
+    )
     split = Split("made", torch.tensor([0]), torch.zeros(0, dtype=torch.long), torch.tensor([1]))
     edges = torch.zeros(0, 2, 3) if edges is None else torch.tensor(edges)
-    query, receiver = Query(places, torch.zeros(2, dtype=torch.long)), Receiver("one", Pose(place, turn), array)
+    query, receiver = (
+        Query(places, torch.zeros(2, dtype=torch.long)),
+        Receiver("one", Pose(place, turn), array),
+    )
     return Links(query, (receiver,), torch.zeros(2), Rssi(), split=split, edges=edges)
 
 
@@ -55,21 +62,27 @@ def test_gaussians_are_ellipses_of_one_standard_deviation():
     order = strengths.argsort()
     for ax, view in zip(figure.axes, ([0, 1], [0, 2]), strict=False):
         (ellipses,) = (artist for artist in ax.collections if isinstance(artist, EllipseCollection))
-        np.testing.assert_allclose(ellipses.get_array(), strengths[order], rtol=1e-6)  # the strongest last, so on top
+        np.testing.assert_allclose(
+            ellipses.get_array(), strengths[order], rtol=1e-6
+        )  # the strongest last, so on top
         np.testing.assert_allclose(ellipses.get_offsets(), means[order][:, view])
         for k, index in enumerate(order):
             angle = np.deg2rad(ellipses.get_angles()[k])
             major = ellipses.get_widths()[k] / 2 * np.array([np.cos(angle), np.sin(angle)])
             minor = ellipses.get_heights()[k] / 2 * np.array([-np.sin(angle), np.cos(angle)])
             flat = sigma[index][view][:, view].numpy()
-            np.testing.assert_allclose(np.outer(major, major) + np.outer(minor, minor), flat, atol=1e-5)
+            np.testing.assert_allclose(
+                np.outer(major, major) + np.outer(minor, minor), flat, atol=1e-5
+            )
 
 
 def test_room_shows_the_strongest_gaussians_and_keeps_everyone_in_sight(rng):
     strengths = torch.from_numpy(rng.permutation(650)).float()
     many = gaussians(strengths, torch.Generator().manual_seed(0))
     edges = [[[-7.0, 0, 0], [-7.0, 1, 0]]]
-    plan, side, bar = room(links([4.0, 0, 0], [0, -5.0, 0], [0, 0, 6.0], np.eye(3), edges), many).axes
+    plan, side, bar = room(
+        links([4.0, 0, 0], [0, -5.0, 0], [0, 0, 6.0], np.eye(3), edges), many
+    ).axes
     ellipses = next(artist for artist in plan.collections if isinstance(artist, EllipseCollection))
     assert ellipses.get_array().min() == pytest.approx(50)
     assert bar.get_ylabel() == "|signal| × opacity, 600 strongest of 650 Gaussians"
@@ -123,7 +136,11 @@ def labels(ax):
 def test_planes_are_drawn_edge_on_and_as_wide_as_they_are_strong(walls):
     plan, side = room(links(POINT), learnt=LearntRoom(walls, None, [])).axes
     assert labels(plan) == {"0: 40 %", "1: 10 %", "3: 5 %", "4: 2 %"}
-    assert labels(side) == {"0: 40 %", "2: 8 %", "3: 5 %"}  # y points at the reader; the floor carries nothing
+    assert labels(side) == {
+        "0: 40 %",
+        "2: 8 %",
+        "3: 5 %",
+    }  # y points at the reader; the floor carries nothing
     for ax, up in ((plan, 1), (side, 2)):
         outlines = drawn(ax, PolyCollection)
         widths = outlines.get_linewidths()
@@ -138,13 +155,17 @@ def test_planes_are_drawn_edge_on_and_as_wide_as_they_are_strong(walls):
 def test_an_oblique_plane_is_seen_in_both_views():
     corners = np.array([(0.0, 4, 0), (6, 4, 0), (6, 1, 3), (0, 1, 3)])
     plane = LearntPlane(7, corners, np.array([0, 1, 1]) / np.sqrt(2), 0.3)
-    for ax, view in zip(room(links(POINT), learnt=LearntRoom([plane], None, [])).axes, ([0, 1], [0, 2]), strict=True):
+    for ax, view in zip(
+        room(links(POINT), learnt=LearntRoom([plane], None, [])).axes, ([0, 1], [0, 2]), strict=True
+    ):
         (path,) = drawn(ax, PolyCollection).get_paths()
         np.testing.assert_array_equal(path.vertices[:4], corners[:, view])
 
 
 def test_labels_of_planes_keep_clear_of_each_other(walls):
-    close = [plane._replace(number=plane.number + 6, corners=1.01 * plane.corners) for plane in walls]
+    close = [
+        plane._replace(number=plane.number + 6, corners=1.01 * plane.corners) for plane in walls
+    ]
     doubled = [*walls, *close]
     figure = room(links(POINT), learnt=LearntRoom(doubled, None, []))
     canvas = FigureCanvasAgg(figure)
@@ -157,13 +178,17 @@ def test_labels_of_planes_keep_clear_of_each_other(walls):
 
 
 def test_obstacles_are_shown_by_what_they_take_along_the_line_of_sight(walls, rng):
-    matter = Matter(rng.uniform(1, 3, (3, 3)), rng.uniform(0.2, 0.6, (3, 3)), np.array([5.0, 10.0, 20.0]))
+    matter = Matter(
+        rng.uniform(1, 3, (3, 3)), rng.uniform(0.2, 0.6, (3, 3)), np.array([5.0, 10.0, 20.0])
+    )
     figure = room(links(POINT), learnt=LearntRoom(walls, matter, []))
     plan, side, bar = figure.axes
     assert bar.get_ylabel() == "loss by obstacles along the line of sight [dB]"
 
     def density(point):
-        return (matter.densities * np.exp(-(((point - matter.centres) / matter.widths) ** 2).sum(1) / 2)).sum()
+        return (
+            matter.densities * np.exp(-(((point - matter.centres) / matter.widths) ** 2).sum(1) / 2)
+        ).sum()
 
     for ax, up, along in ((plan, 1, 2), (side, 2, 1)):
         (image,) = ax.images
@@ -193,7 +218,9 @@ def test_paths_are_drawn_from_end_to_end_the_strongest_on_top(walls):
         LearntPath(np.stack((ends[0], [2.0, 4, 1.5], [6.0, 3.5, 1.9], ends[1])), -24.0),
     ]
     edges = [[[-7.0, 0, 0], [-7.0, 1, 0]]]
-    plan, side, bar = paths(links(POINT, receivers=ends[1], edges=edges), LearntRoom(walls, None, routes)).axes
+    plan, side, bar = paths(
+        links(POINT, receivers=ends[1], edges=edges), LearntRoom(walls, None, routes)
+    ).axes
     assert plan.get_title() == "The 3 strongest paths of a transmitter at (1.00, 1.00, 1.00) m"
     assert bar.get_ylabel() == "power over that of the strongest path [dB]"
     assert plan.get_xlim()[0] < -7
@@ -213,7 +240,9 @@ def test_paths_are_drawn_from_end_to_end_the_strongest_on_top(walls):
 def test_walls_have_a_place_in_the_legend_if_there_are_any():
     words = lambda edges: [
         text.get_text()
-        for text in room(links(POINT, receivers=np.array([5.0, 4, 2]), edges=edges)).legends[0].get_texts()
+        for text in room(links(POINT, receivers=np.array([5.0, 4, 2]), edges=edges))
+        .legends[0]
+        .get_texts()
     ]
     assert "walls and furniture" in words([[[0.0, 0, 0], [1, 0, 0]]])
     assert "walls and furniture" not in words(np.zeros((0, 2, 3)))
@@ -222,7 +251,10 @@ def test_walls_have_a_place_in_the_legend_if_there_are_any():
 def test_a_single_path_has_a_scale_of_its_own():
     route = LearntPath(np.array([[1.0, 1, 1], [2, 2, 2]]), 0.0)
     figure = paths(links(POINT), LearntRoom([], None, [route]))
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["receivers", "transmitter"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == [
+        "receivers",
+        "transmitter",
+    ]
     plan, *_ = figure.axes
     folded = [artist for artist in plan.collections if isinstance(artist, LineCollection)][-1]
     assert folded.get_clim() == (-10, 0)

@@ -76,7 +76,9 @@ def spectrum_links():
     generator = torch.Generator().manual_seed(1)
     query = Query(torch.rand(12, 3, generator=generator), torch.zeros(12, dtype=torch.long))
     pose = Pose.from_xyzw([3.0, 0, 1], [0.0, 0, 0, 1])
-    split = Split("runs of 4", torch.arange(8), torch.tensor([], dtype=torch.long), torch.arange(8, 12))
+    split = Split(
+        "runs of 4", torch.arange(8), torch.tensor([], dtype=torch.long), torch.arange(8, 12)
+    )
     task = Spectrum(GRID.elevations, GRID.azimuths, "min-max")
     labels = torch.rand(12, *task.shape, generator=generator)
     return Links(query, (Receiver("array", pose),), labels, task, split=split)
@@ -87,25 +89,44 @@ def write_losses(path, steps=30):
     with open(path, "w", newline="") as file:
         writer = csv.DictWriter(file, ["epoch", "step", "train/loss", "validation/ssim"])
         writer.writeheader()
-        writer.writerows({"epoch": 0, "step": k, "train/loss": 1 / (k + 1), "validation/ssim": k} for k in range(steps))
+        writer.writerows(
+            {"epoch": 0, "step": k, "train/loss": 1 / (k + 1), "validation/ssim": k}
+            for k in range(steps)
+        )
 
 
 def test_a_run_is_drawn_into_its_folder(pixels, spectrum_links, tmp_path, rng):
     test = spectrum_links.split.test
     labels = spectrum_links.labels[test].numpy().astype(np.float16)
     ssim = {f"ssim_{model}": rng.random(4) for model in ("gaigs", "mean", "knn")}
-    np.savez(tmp_path / "predictions.npz", labels=labels, prediction=labels[::-1], link=test, **ssim)
+    np.savez(
+        tmp_path / "predictions.npz", labels=labels, prediction=labels[::-1], link=test, **ssim
+    )
     write_losses(tmp_path / "log" / "version_0" / "metrics.csv")
     torch.manual_seed(0)
     start = {"count": 30, "near": 0.5, "far": 3, "spread": 1, "opacity": 0.5, "signal": 0.1}
-    model = Untrained(spectrum_links.scene, Gaussians(spectrum_links.scene, zone=(0.1, 1.5), channels=2, **start))
-    assert written(tmp_path, spectrum_links, model) == {"room", "loss", "spectra", "spectra_polar", "ssim_cdf"}
+    model = Untrained(
+        spectrum_links.scene, Gaussians(spectrum_links.scene, zone=(0.1, 1.5), channels=2, **start)
+    )
+    assert written(tmp_path, spectrum_links, model) == {
+        "room",
+        "loss",
+        "spectra",
+        "spectra_polar",
+        "ssim_cdf",
+    }
 
 
 def test_examples_are_at_their_percentiles_of_the_own_model(spectrum_links, tmp_path, rng, spy):
     labels = rng.random((41, 9, 24)).astype(np.float16)
     own = rng.permutation(np.linspace(0, 0.8, 41))
-    np.savez(tmp_path / "predictions.npz", labels=labels, prediction=1 - labels, ssim_gaigs=own, ssim_knn=own[::-1])
+    np.savez(
+        tmp_path / "predictions.npz",
+        labels=labels,
+        prediction=1 - labels,
+        ssim_gaigs=own,
+        ssim_knn=own[::-1],
+    )
     shown = spy(spectrum, "spectra")
     figures_of(Spectrum).of_run(spectrum_links.task, tmp_path, spectrum_links)
     drawn_labels, drawn_predictions, ssim, names = shown[0][0][0]
@@ -118,7 +139,12 @@ def test_examples_are_at_their_percentiles_of_the_own_model(spectrum_links, tmp_
 
 def test_the_learnt_room_is_drawn(spectrum_links, tmp_path, spy):
     labels = spectrum_links.labels[spectrum_links.split.test].numpy().astype(np.float16)
-    np.savez(tmp_path / "predictions.npz", labels=labels[:1], prediction=labels[:1], ssim_mirrored=np.ones(1))
+    np.savez(
+        tmp_path / "predictions.npz",
+        labels=labels[:1],
+        prediction=labels[:1],
+        ssim_mirrored=np.ones(1),
+    )
     seen, folded = spy(run_figures, "room"), spy(run_figures, "paths")
     learnt = LearntRoom([], None, [LearntPath(np.array([[1.0, 1, 1], [3, 0, 1]]), 0.0)])
     model = Untrained(spectrum_links.scene, room=learnt)
@@ -126,13 +152,17 @@ def test_the_learnt_room_is_drawn(spectrum_links, tmp_path, spy):
     assert names == {"room", "paths", "spectra", "spectra_polar", "ssim_cdf"}
     assert seen[0][0] == (spectrum_links, None, learnt)
     assert folded[0][0] == (spectrum_links, learnt)
-    model = Untrained(spectrum_links.scene, room=learnt._replace(paths=[]))  # of a transmitter that nobody hears
+    model = Untrained(
+        spectrum_links.scene, room=learnt._replace(paths=[])
+    )  # of a transmitter that nobody hears
     assert "paths" not in {file.stem for file in write_figures(tmp_path, spectrum_links, model)}
 
 
 def test_figures_that_have_no_time_are_named(spectrum_links, tmp_path, monkeypatch):
     labels = spectrum_links.labels[spectrum_links.split.test].numpy().astype(np.float16)
-    np.savez(tmp_path / "predictions.npz", labels=labels[:1], prediction=labels[:1], ssim_mean=np.ones(1))
+    np.savez(
+        tmp_path / "predictions.npz", labels=labels[:1], prediction=labels[:1], ssim_mean=np.ones(1)
+    )
     monkeypatch.setattr(stages, "is_up", iter([False, True]).__next__)
     with stages.watched() as watch:
         files = write_figures(tmp_path, spectrum_links, Untrained(spectrum_links.scene))
@@ -149,10 +179,14 @@ def rssi_run(tmp_path):
     receivers = tuple(Receiver(f"g{i}", pose) for i, pose in enumerate(poses))
     query = Query(torch.rand(160, 3) * torch.tensor([8.0, 4, 1]), torch.arange(160) % count)
     labels = torch.linspace(-80, -50, 160)
-    split = Split("random", torch.arange(80), torch.zeros(0, dtype=torch.long), torch.arange(80, 160))
+    split = Split(
+        "random", torch.arange(80), torch.zeros(0, dtype=torch.long), torch.arange(80, 160)
+    )
     links = Links(query, receivers, labels, Rssi(), split=split)
     test = split.test.numpy()
-    errors = {name: rng.normal(0, scale, 80) for name, scale in (("gaigs", 2), ("mean", 6), ("knn", 3))}
+    errors = {
+        name: rng.normal(0, scale, 80) for name, scale in (("gaigs", 2), ("mean", 6), ("knn", 3))
+    }
     np.savez(
         tmp_path / "predictions.npz",
         link=test,
@@ -163,14 +197,20 @@ def rssi_run(tmp_path):
         **{f"error_{name}": error for name, error in errors.items()},
     )
     names = tuple(receiver.name for receiver in receivers)
-    maps = RadioMap(rng.uniform(-80, -50, (count, 9, 17)), 0.5 * np.arange(17), 0.5 * np.arange(9), 0.5, names)
+    maps = RadioMap(
+        rng.uniform(-80, -50, (count, 9, 17)), 0.5 * np.arange(17), 0.5 * np.arange(9), 0.5, names
+    )
     maps.save(tmp_path / "radio_map.npz")
     return links, tmp_path, errors
 
 
 def test_an_rssi_run_is_drawn_into_its_folder(pixels, rssi_run, spy):
     links, folder, errors = rssi_run
-    distributed, mapped, seen = spy(scalar, "cdf"), spy(scalar, "radio_maps"), spy(run_figures, "room")
+    distributed, mapped, seen = (
+        spy(scalar, "cdf"),
+        spy(scalar, "radio_maps"),
+        spy(run_figures, "room"),
+    )
     paged = ("predicted_against_measured", "radio_map")
     assert written(folder, links) == {"room", "error_cdf", *paged, *(f"{name}_2" for name in paged)}
     (absolute, *_), drawn = distributed[0]
@@ -198,7 +238,9 @@ def test_a_run_of_channels_is_drawn(pixels, tmp_path, rng, spy, subcarriers):
     frequencies = 2.4e9 + 1e6 * torch.arange(subcarriers, dtype=torch.float64)
     task = Csi(4, frequencies)
     pose, array = Pose.from_xyzw([3.0, 0, 1], [0.0, 0, 0, 1]), Array.planar(2, 2, 0.06)
-    split = Split("official", torch.arange(8), torch.tensor([], dtype=torch.long), torch.arange(8, 29))
+    split = Split(
+        "official", torch.arange(8), torch.tensor([], dtype=torch.long), torch.arange(8, 29)
+    )
     query = Query(torch.rand(29, 3), torch.zeros(29, dtype=torch.long))
     labels = torch.randn(29, *task.shape, dtype=torch.complex64)
     links = Links(query, (Receiver("array", pose, array),), labels, task, split=split)
@@ -206,7 +248,10 @@ def test_a_run_of_channels_is_drawn(pixels, tmp_path, rng, spy, subcarriers):
     test = labels[split.test].numpy()
     stored = {"snr_db_gaigs": own, "snr_db_knn": own[::-1]}
     for name, error in (("gaigs", 2.0), ("gaigs_trend", 1.0), ("knn", 3.0), ("mean", 4.0)):
-        stored |= {f"error_power_{name}": np.full(21, error), f"label_power_{name}": np.full(21, 20.0)}
+        stored |= {
+            f"error_power_{name}": np.full(21, error),
+            f"label_power_{name}": np.full(21, 20.0),
+        }
     np.savez(tmp_path / "predictions.npz", labels=test, prediction=1j * test, **stored)
     errors, shown = spy(csi, "error_against_power"), spy(csi, "magnitudes_and_phases")
     responses = {"impulse_response"} if subcarriers > 1 else set()

@@ -48,14 +48,21 @@ def test_few_readings_are_dots_and_many_are_counted():
     )
     (few,), (many,) = draw(2 * scalar.FEW), draw(2 * scalar.FEW + 1)
     assert len(few.axes) == 2, "no bar of colours"
-    np.testing.assert_array_equal(few.axes[1].lines[0].get_xydata(), np.stack((labels, labels + 1), 1)[1:-1:2])
+    np.testing.assert_array_equal(
+        few.axes[1].lines[0].get_xydata(), np.stack((labels, labels + 1), 1)[1:-1:2]
+    )
     assert counts(many.axes[0])[1].sum() == scalar.FEW + 1
 
 
 def test_readings_are_counted_where_they_were_measured_and_predicted(counted):
-    labels, predictions = np.array([-61.0, -61, -70, -50, -43]), np.array([-55.0, -55.5, -70, -50.5, -44])
+    labels, predictions = (
+        np.array([-61.0, -61, -70, -50, -43]),
+        np.array([-55.0, -55.5, -70, -50.5, -44]),
+    )
     receiver = np.array([1, 1, 1, 2, 2])
-    (figure,) = predicted_against_measured(labels, predictions, receiver, ["silent", "hall", "[attic]"], Rssi())
+    (figure,) = predicted_against_measured(
+        labels, predictions, receiver, ["silent", "hall", "[attic]"], Rssi()
+    )
     hall, attic = panels(figure)
     assert hall.get_title() == "hall, MAE 3.83 dB"  # (6 + 5.5 + 0) / 3
     assert attic.get_title() == "[attic], MAE 0.75 dB"
@@ -71,7 +78,9 @@ def test_readings_are_counted_where_they_were_measured_and_predicted(counted):
 
 def test_many_receivers_take_several_figures():
     labels = np.linspace(-80, -50, 80)
-    drawn = predicted_against_measured(labels, labels, np.arange(80) % 8, [f"g{i}" for i in range(8)], Rssi())
+    drawn = predicted_against_measured(
+        labels, labels, np.arange(80) % 8, [f"g{i}" for i in range(8)], Rssi()
+    )
     assert [len(panels(figure)) for figure in drawn] == [6, 2]
     assert panels(drawn[1])[0].get_title().startswith("g6,")
 
@@ -82,7 +91,9 @@ def test_cells_and_margins_follow_from_the_data_in_other_units(counted, scale):
     labels = scale * rng.gamma(2, 30, 3000)
     predictions = labels + scale * rng.normal(0, 10, 3000)
     predictions[0] = 1e9 * scale
-    (figure,) = predicted_against_measured(labels, predictions, np.zeros(3000, int), ["hall"], NANOSECONDS)
+    (figure,) = predicted_against_measured(
+        labels, predictions, np.zeros(3000, int), ["hall"], NANOSECONDS
+    )
     (ax,) = panels(figure)
     edges, count = counts(ax)
     assert count.sum() == 3000
@@ -92,14 +103,19 @@ def test_cells_and_margins_follow_from_the_data_in_other_units(counted, scale):
     digit = cell / 10 ** np.floor(np.log10(cell * 1.001))
     assert digit == pytest.approx(1) or digit == pytest.approx(2) or digit == pytest.approx(5)
     assert edges[-1] <= labels.max() + (20 + 2) * cell
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("measured delay spread [ns]", "predicted delay spread [ns]")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == (
+        "measured delay spread [ns]",
+        "predicted delay spread [ns]",
+    )
     written = float(ax.get_title().removeprefix("hall, MAE ").removesuffix(" ns"))
     assert written == pytest.approx(np.abs(predictions - labels).mean(), rel=6e-3)
     assert f"in {cell:g} ns × {cell:g} ns" in figure.axes[-1].get_ylabel()
 
 
 @pytest.mark.parametrize("task", [NANOSECONDS, Rssi()])
-@pytest.mark.parametrize("labels", [np.full(4, 7.0), np.zeros(4), np.arange(11) / 10, -60 - 2.0 * np.arange(4)])
+@pytest.mark.parametrize(
+    "labels", [np.full(4, 7.0), np.zeros(4), np.arange(11) / 10, -60 - 2.0 * np.arange(4)]
+)
 def test_every_reading_is_inside(counted, labels, task):
     (figure,) = predicted_against_measured(labels, labels, np.zeros(len(labels), int), ["a"], task)
     (ax,) = panels(figure)
@@ -110,20 +126,31 @@ def test_every_reading_is_inside(counted, labels, task):
 # --- radio maps ---
 
 WALLS = np.array(
-    [[[0.0, 0, 0], [6, 0, 0]], [[6.0, 0, 0], [6, 3, 0]], [[6.0, 0, 0], [6, 0, 2]], [[1.0, 1, 1], [9, 9, 1]]]
+    [
+        [[0.0, 0, 0], [6, 0, 0]],
+        [[6.0, 0, 0], [6, 3, 0]],
+        [[6.0, 0, 0], [6, 0, 2]],
+        [[1.0, 1, 1], [9, 9, 1]],
+    ]
 )
 
 
 def maps(count, x=None, y=None, seed=3, scale=1.0, **words):
     x, y = 0.5 * np.arange(-1, 12) if x is None else x, 0.5 * np.arange(-1, 7) if y is None else y
-    values = scale * np.random.default_rng(seed).uniform(-80, -50, (count, len(y), len(x))).astype(np.float32)
+    values = scale * np.random.default_rng(seed).uniform(-80, -50, (count, len(y), len(x))).astype(
+        np.float32
+    )
     return RadioMap(values, x, y, 1.25, tuple(f"g{i}" for i in range(count)), **words)
 
 
 def draw(radio_map, readings=None, edges=WALLS, gateways=None, task=None):
     names = radio_map.receivers
     readings = {name: np.array([[1.0, 2, -60]]) for name in names} if readings is None else readings
-    gateways = {name: np.array([i, 0.5, 2.0]) for i, name in enumerate(names)} if gateways is None else gateways
+    gateways = (
+        {name: np.array([i, 0.5, 2.0]) for i, name in enumerate(names)}
+        if gateways is None
+        else gateways
+    )
     return radio_maps(radio_map, gateways, readings, edges, task or Rssi())
 
 
@@ -161,7 +188,10 @@ def test_walls_on_the_floor_are_drawn_and_in_sight():
     (figure,) = draw(maps(1, x=0.5 * np.arange(4)))
     (ax,) = panels(figure)
     (lines,) = (artist for artist in ax.collections if type(artist) is LineCollection)
-    assert [segment.tolist() for segment in lines.get_segments()] == [[[0, 0], [6, 0]], [[6, 0], [6, 3]]]
+    assert [segment.tolist() for segment in lines.get_segments()] == [
+        [[0, 0], [6, 0]],
+        [[6, 0], [6, 3]],
+    ]
     assert ax.get_xlim()[1] > 6
     draw(maps(1), edges=np.zeros((0, 2, 3)))
 
@@ -180,7 +210,9 @@ def test_levels_have_lines_every_ten_decibels_and_the_scale_ends_on_fives():
     slope = maps(1)
     slope.values[0] = -77 + 3 * slope.x  # -78.5 to -60.5 dBm along x
     (figure,) = draw(slope)
-    (contours,) = (artist for artist in panels(figure)[0].collections if isinstance(artist, QuadContourSet))
+    (contours,) = (
+        artist for artist in panels(figure)[0].collections if isinstance(artist, QuadContourSet)
+    )
     assert contours.levels.tolist() == [-70]
     assert figure.get_suptitle().endswith("at z = 1.25 m, a line every 10 dB")
     assert panels(figure)[0].images[0].get_clim() == (-80, -55)
@@ -189,7 +221,9 @@ def test_levels_have_lines_every_ten_decibels_and_the_scale_ends_on_fives():
 
 @pytest.mark.parametrize("scale", [-1e-6, -1.0, -1e5])
 def test_lines_and_colours_follow_from_the_data_in_other_units(scale):
-    drawn = maps(1, scale=scale, quantity="delay spread", unit="ns", frequency=2.45e9)  # 50 to 80 times the scale
+    drawn = maps(
+        1, scale=scale, quantity="delay spread", unit="ns", frequency=2.45e9
+    )  # 50 to 80 times the scale
     (figure,) = draw(drawn, {"g0": np.array([[1.0, 2, -60 * scale]])}, task=NANOSECONDS)
     (ax,) = panels(figure)
     (contours,) = (artist for artist in ax.collections if isinstance(artist, QuadContourSet))
@@ -217,7 +251,9 @@ def test_a_wild_map_has_no_endless_lines():
     wild = maps(1)
     wild.values[0, 2, 2] = 1e9
     (figure,) = draw(wild)
-    (contours,) = (artist for artist in panels(figure)[0].collections if isinstance(artist, QuadContourSet))
+    (contours,) = (
+        artist for artist in panels(figure)[0].collections if isinstance(artist, QuadContourSet)
+    )
     assert len(contours.levels) < 40
 
 
@@ -226,18 +262,27 @@ def test_no_panel_is_lost_and_the_lowest_tell_their_metres(count):
     figures = draw(maps(count))
     for figure in figures:
         figure.draw_without_rendering()  # which places the panels
-    assert [ax.get_title() for figure in figures for ax in panels(figure)] == [f"g{i}" for i in range(count)]
+    assert [ax.get_title() for figure in figures for ax in panels(figure)] == [
+        f"g{i}" for i in range(count)
+    ]
     for figure in figures:
         assert figure.get_figwidth() < 7.2
         assert figure.get_figheight() < 9
         for ax in panels(figure):
-            below = [other for other in panels(figure) if other.get_position().y1 < ax.get_position().y0]
+            below = [
+                other for other in panels(figure) if other.get_position().y1 < ax.get_position().y0
+            ]
             same = [o for o in below if abs(o.get_position().x0 - ax.get_position().x0) < 1e-3]
-            assert ax.xaxis.get_tick_params()["labelbottom"] == (ax.get_xlabel() == "x [m]") == (not same)
+            assert (
+                ax.xaxis.get_tick_params()["labelbottom"]
+                == (ax.get_xlabel() == "x [m]")
+                == (not same)
+            )
 
 
 @pytest.mark.parametrize(
-    ("span", "most", "step"), [(40, 40, 1), (41, 40, 2), (81, 40, 5), (201, 40, 10), (3e-9, 10, 5e-10), (7e8, 7, 1e8)]
+    ("span", "most", "step"),
+    [(40, 40, 1), (41, 40, 2), (81, 40, 5), (201, 40, 10), (3e-9, 10, 5e-10), (7e8, 7, 1e8)],
 )
 def test_steps_are_round(span, most, step):
     assert round_step(span, most) == pytest.approx(step)
@@ -260,7 +305,9 @@ def test_a_run_draws_the_receivers_with_most_readings(tmp_path):
     arrays = {"transmitters": places, "receiver": receiver, "labels": labels, "prediction": labels}
     np.savez(tmp_path / "predictions.npz", **arrays, error_knn=labels)
     maps(20).save(tmp_path / "radio_map.npz")
-    links = replace(links, receivers=receivers, split=Split("random", *torch.zeros(3, 0, dtype=torch.long)))
+    links = replace(
+        links, receivers=receivers, split=Split("random", *torch.zeros(3, 0, dtype=torch.long))
+    )
     drawn = scalar.ScalarFigures().of_run(Rssi(), tmp_path, links)
     names = "radio_map", "predicted_against_measured"
     assert {*drawn} == {"error_cdf", *(f"{name}{page}" for name in names for page in ("", "_2"))}

@@ -25,23 +25,43 @@ GRID = np.deg2rad(np.arange(1, 12)), np.deg2rad(np.arange(14))
 
 
 def scores(median):
-    return dict(zip(SCORES, (median, median - 0.01, median - 0.1, median + 0.01, 1 - median), strict=True))
+    return dict(
+        zip(SCORES, (median, median - 0.01, median - 0.1, median + 0.01, 1 - median), strict=True)
+    )
 
 
-def write_system(folder, model, median=None, seed=0, log="", drawn=True, overrides=(), shift=0.0, knn=0.9, **facts):
-    """A run of a spectrum's system with its predictions, or one that has logged something and has no result."""
+def write_system(
+    folder,
+    model,
+    median=None,
+    seed=0,
+    log="",
+    drawn=True,
+    overrides=(),
+    shift=0.0,
+    knn=0.9,
+    **facts,
+):
+    """A run of a spectrum's system with its predictions, or one that has logged something and has
+    no result.
+    """
     own = folder / ",".join([f"model={model}", *overrides, f"seed={seed}"])
     typed = ["data=room", f"model={model}", *overrides, f"seed={seed}"]
     if median is None:
         return write_run(own, typed, log=log)
-    models = {model: scores(median), "mean": scores(0.6)} | ({"knn": scores(knn)} if model != "knn" else {})
+    models = {model: scores(median), "mean": scores(0.6)} | (
+        {"knn": scores(knn)} if model != "knn" else {}
+    )
     facts = {"seed": seed, "validation": {name: scores(0.5) for name in models}} | facts
     write_run(own, typed, models, **facts)
     if drawn:
         rng = np.random.default_rng(seed)
         spectra = rng.random((5, 11, 14)) + shift
         content = {"labels": spectra, "prediction": spectra + 0.1 * rng.random(spectra.shape)}
-        content |= {f"ssim_{name}": value["ssim_median"] + 0.01 * np.arange(5) for name, value in models.items()}
+        content |= {
+            f"ssim_{name}": value["ssim_median"] + 0.01 * np.arange(5)
+            for name, value in models.items()
+        }
         np.savez(own / "predictions.npz", elevations=GRID[0], azimuths=GRID[1], **content)
     return own
 
@@ -64,7 +84,9 @@ def rows_of(folder):
 
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory):
-    """Two systems with two seeds, one of a stranger, one that failed and one at work; figures noted, not written."""
+    """Two systems with two seeds, one of a stranger, one that failed and one at work; figures
+    noted, not written.
+    """
     folder, noted = tmp_path_factory.mktemp("sweep"), {}
     write_system(folder, "yagi", 0.99)
     write_system(folder, "gaigs", 0.94, num_gaussians=300, render_ms=3.5)
@@ -83,7 +105,9 @@ def sweep(tmp_path_factory):
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(SpectrumFigures, "of_systems", spy)
-        patch.setattr(systems, "learning_curves", lambda *given: noted.update(curves=given) or Figure())
+        patch.setattr(
+            systems, "learning_curves", lambda *given: noted.update(curves=given) or Figure()
+        )
         patch.setattr(Figure, "savefig", lambda self, file, **_: file.touch())
         *_, noted["table"] = report(folder).renderables
     return folder, noted
@@ -96,7 +120,9 @@ def test_published_figures_and_costs_stand_beside_ours(sweep):
     assert column("published median SSIM, RFID") == ["0.78", "0.91", "", "", ""]
     assert column("published training [min], A100") == ["", "203.0", "", "", ""]
     assert column("model") == ["nerf2", "gaigs", "yagi", "mean", "knn"]
-    assert [float(median) for median in column("median SSIM")] == pytest.approx([0.82, 0.95, 0.99, 0.6, 0.9])
+    assert [float(median) for median in column("median SSIM")] == pytest.approx(
+        [0.82, 0.95, 0.99, 0.6, 0.9]
+    )
     assert float(rows["NeRF²"]["median SSIM, sd"]) == pytest.approx(np.std([0.81, 0.83], ddof=1))
     assert rows["yagi"]["median SSIM, sd"] == ""
     assert column("training [s]") == ["190.0", "180.0", "180.0", "", ""], "with its kriging"
@@ -108,7 +134,9 @@ def test_published_figures_and_costs_stand_beside_ours(sweep):
 def test_the_page_of_systems(sweep):
     folder, _ = sweep
     scored, cost, notes = (folder / "systems.md").read_text().split("\n\n")
-    assert scored.splitlines()[0].startswith("| system | published median SSIM, RFID | median SSIM | mean SSIM |")
+    assert scored.splitlines()[0].startswith(
+        "| system | published median SSIM, RFID | median SSIM | mean SSIM |"
+    )
     assert scored.splitlines()[2].startswith("| NeRF² | 0.780 | 0.820 ± 0.014 |")
     assert scored.splitlines()[4].startswith("| yagi |  | **0.990** |")
     assert scored.count("**") == 2 * len(SCORES)
@@ -130,7 +158,10 @@ def test_the_terminal_has_the_brief_columns_and_what_failed(sweep):
     folder, noted = sweep
     table = noted["table"]
     assert table.title == "Systems"
-    assert table.caption == "MLP: unfinished\nFIRE: model 'fire' gives levels; take another\nall columns in systems.md"
+    assert (
+        table.caption
+        == "MLP: unfinished\nFIRE: model 'fire' gives levels; take another\nall columns in systems.md"
+    )
     heads = [column.header.replace("\\", "") for column in table.columns]
     assert heads[:4] == ["system", "published\nmedian\nSSIM,\nRFID", "median\nSSIM", "MAE"]
     assert heads[4:] == ["training\n[s]", "inference\n[ms]", "parameters"]
@@ -169,7 +200,10 @@ def test_all_systems_that_print_as_the_best_are_bold(tmp_path):
         write_system(tmp_path, model, score)
     report(tmp_path)
     lines = (tmp_path / "systems.md").read_text().splitlines()
-    assert [line.split(" | ")[0].strip("| ") for line in lines if "**0.977**" in line] == ["MLP", "GAI-GS"]
+    assert [line.split(" | ")[0].strip("| ") for line in lines if "**0.977**" in line] == [
+        "MLP",
+        "GAI-GS",
+    ]
 
 
 def test_other_settings_have_rows_of_their_own_without_published_figures(tmp_path):
@@ -178,7 +212,14 @@ def test_other_settings_have_rows_of_their_own_without_published_figures(tmp_pat
             write_system(tmp_path, model, 0.9, overrides=[f"width={width}"])
     report(tmp_path)
     rows = rows_of(tmp_path)
-    assert [*rows] == ["MLP width=16", "MLP width=8", "GAI-GS width=16", "GAI-GS width=8", "mean", "knn"]
+    assert [*rows] == [
+        "MLP width=16",
+        "MLP width=8",
+        "GAI-GS width=16",
+        "GAI-GS width=8",
+        "mean",
+        "knn",
+    ]
     assert "published" not in "".join(rows["mean"])
 
 
@@ -192,7 +233,10 @@ def test_a_baseline_that_is_a_system_too_comes_once_unless_it_scores_otherwise(t
     report(tmp_path / "other")
     medians = {name: float(row["median SSIM"]) for name, row in rows_of(tmp_path / "other").items()}
     assert medians == {"GAI-GS": 0.9, "knn": 0.7, "knn (baseline)": 0.9, "mean": 0.6}
-    files = {run.overrides["model"]: run.folder / "predictions.npz" for run in read_runs(tmp_path / "other")}
+    files = {
+        run.overrides["model"]: run.folder / "predictions.npz"
+        for run in read_runs(tmp_path / "other")
+    }
     firsts = {name: values[0] for name, values in scores_of_systems(files, "ssim").items()}
     assert firsts == {"gaigs": 0.9, "knn": 0.7, "mean": 0.6, "knn (baseline)": 0.9}
 
@@ -205,7 +249,9 @@ def test_figures_of_different_test_links_are_not_drawn(tmp_path, facts):
     assert not [*tmp_path.glob("systems_*.png")]
     baselines = ["mean", "knn"]
     if "split" in facts:
-        baselines = [f"{name} {split}" for split in ("official", "runs of 20") for name in baselines]
+        baselines = [
+            f"{name} {split}" for split in ("official", "runs of 20") for name in baselines
+        ]
     assert [*rows_of(tmp_path)][2:] == baselines
 
 
@@ -219,7 +265,10 @@ def test_a_seed_that_failed_is_noted_and_one_that_was_run_twice_counts_once(tmp_
     rows = rows_of(tmp_path)
     assert float(rows["MLP"]["median SSIM"]) == 0.8
     assert not any(title.endswith(", sd") for title in rows["MLP"])
-    assert "- without a result: MLP: seed 0: the disk is full\n" in (tmp_path / "systems.md").read_text()
+    assert (
+        "- without a result: MLP: seed 0: the disk is full\n"
+        in (tmp_path / "systems.md").read_text()
+    )
 
 
 # --- figures ---
@@ -264,12 +313,20 @@ def test_learning_curves(higher_is_better, scale):
 )
 def test_other_tasks_draw_the_distribution_of_their_scores(tmp_path, task, kind, label, medians):
     for name, own in (("gaigs", [-1.0, 2.0, 3.0]), ("mlp", [4.0, -5.0, 6.0])):
-        content = {f"{kind}_{name}": own, f"{kind}_{name}_trend": [8.0] * 3, f"{kind}_knn": [9.0, 9.0, 9.0]}
-        np.savez(tmp_path / f"{name}.npz", **{key: np.array(value) for key, value in content.items()})
+        content = {
+            f"{kind}_{name}": own,
+            f"{kind}_{name}_trend": [8.0] * 3,
+            f"{kind}_knn": [9.0, 9.0, 9.0],
+        }
+        np.savez(
+            tmp_path / f"{name}.npz", **{key: np.array(value) for key, value in content.items()}
+        )
     files = {"GAI-GS": tmp_path / "gaigs.npz", "MLP": tmp_path / "mlp.npz"}
     kind = registry("task").get(task)
     (ax,) = figures_of(kind).of_systems(kind, files, "a")["cdf"].axes
-    assert [line.get_label() for line in ax.lines if not line.get_label().startswith("_")] == medians
+    assert [
+        line.get_label() for line in ax.lines if not line.get_label().startswith("_")
+    ] == medians
     assert ax.get_xlabel() == label
 
 
@@ -298,5 +355,7 @@ def test_a_package_brings_published_figures_of_its_own(tmp_path, monkeypatch):
     assert len(published["scores"]["spectrum"]) == 2
     for broken in ("names: 3", "scores: {spectrum: [{title: a}]}", "a: [", "3"):
         file.write_text(broken)
-        with pytest.raises(ValueError, match=r"published\.yaml must have the form of conf/published\.yaml: "):
+        with pytest.raises(
+            ValueError, match=r"published\.yaml must have the form of conf/published\.yaml: "
+        ):
             read_published()

@@ -16,7 +16,9 @@ def run(task, **models):
 
 
 def printed(table, styles=False, width=120):
-    console = Console(width=width, record=True, force_terminal=True, color_system="standard", file=StringIO())
+    console = Console(
+        width=width, record=True, force_terminal=True, color_system="standard", file=StringIO()
+    )
     console.print(table)
     return console.export_text(styles=styles)
 
@@ -42,7 +44,9 @@ def csi(median, aligned):
     }  # fmt: skip
 
 
-SPECTRA = run("spectrum", gaigs=spectrum(0.912, 0.05), mean=spectrum(0.667, 0.2), knn=spectrum(0.962, 0.04))
+SPECTRA = run(
+    "spectrum", gaigs=spectrum(0.912, 0.05), mean=spectrum(0.667, 0.2), knn=spectrum(0.962, 0.04)
+)
 RSSI = run("rssi", gaigs=rssi(3.25), mean=rssi(6.25))
 MODELS = ("gaigs", "mean", "knn", "friis", "path_loss", "gaussian_process")
 
@@ -58,7 +62,8 @@ def test_best_of_each_metric_is_bold():
     assert "\x1b[1m6.250\x1b[0m" not in errors
     assert errors.count("\x1b[1m14.0\x1b[0m") == 2  # a tie
     nearly = printed(
-        metrics_table(run("spectrum", gaigs=spectrum(0.97712, 0.04), knn=spectrum(0.97708, 0.05))), styles=True
+        metrics_table(run("spectrum", gaigs=spectrum(0.97712, 0.04), knn=spectrum(0.97708, 0.05))),
+        styles=True,
     )
     assert nearly.count("\x1b[1m0.977\x1b[0m") == 2, "equal as printed"
 
@@ -74,9 +79,17 @@ def test_table_says_where_the_numbers_come_from():
 @pytest.mark.parametrize(
     ("task", "scores", "shown"),
     [
-        ("spectrum", spectrum(0.9125, 0.1), ["ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae"]),
+        (
+            "spectrum",
+            spectrum(0.9125, 0.1),
+            ["ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae"],
+        ),
         ("rssi", rssi(13.25), ["mae_db", "median_ae_db", "rmse_db"]),
-        ("csi", csi(-11.5, 21.5), ["snr_db_median", "snr_db_mean", "snr_aligned_db_median", "nmse_db"]),
+        (
+            "csi",
+            csi(-11.5, 21.5),
+            ["snr_db_median", "snr_db_mean", "snr_aligned_db_median", "nmse_db"],
+        ),
     ],
 )
 def test_all_models_and_the_validation_score_fit_eighty_columns(task, scores, shown):
@@ -88,20 +101,26 @@ def test_all_models_and_the_validation_score_fit_eighty_columns(task, scores, sh
     assert max(map(len, lines)) <= 80
     assert not any("…" in line for line in lines)
     for i, model in enumerate(MODELS):
-        (row,) = (line.replace("│", " ").split() for line in lines if line.startswith(f"│ {model} "))
+        (row,) = (
+            line.replace("│", " ").split() for line in lines if line.startswith(f"│ {model} ")
+        )
         assert row == [model, *(written(scores[name]) for name in shown), written(77.25 + i)]
     titles = [known[name].title for name in shown]
     assert heads(metrics) == ["model", *titles, f"{titles[0]}, validation"]
 
 
 def test_channels_of_unknown_phase_are_led_by_the_score_that_they_have():
-    scores = {name: score for name, score in csi(1.5, 21.5).items() if not name.startswith("snr_db")}
+    scores = {
+        name: score for name, score in csi(1.5, 21.5).items() if not name.startswith("snr_db")
+    }
     metrics = run("csi", gaigs=scores, mean=scores | {"snr_aligned_db_median": 20.25}) | {
         "validation": {"gaigs": scores}
     }
     title = "median SNR, phase removed [dB]"
     assert heads(metrics) == ["model", title, "NMSE [dB]", f"{title}, validation"]
-    assert verdict(metrics).startswith("gaigs is 1.25 dB above mean in median SNR, phase removed on")
+    assert verdict(metrics).startswith(
+        "gaigs is 1.25 dB above mean in median SNR, phase removed on"
+    )
 
 
 def test_receivers_stand_below_with_the_first_metric_of_each_model():
@@ -123,10 +142,18 @@ def test_receivers_stand_below_with_the_first_metric_of_each_model():
 @pytest.mark.parametrize(
     ("metrics", "sentence"),
     [
-        (SPECTRA, "gaigs is 0.245 above mean and 0.050 below knn in median SSIM on split runs of 20 [hard]."),
+        (
+            SPECTRA,
+            "gaigs is 0.245 above mean and 0.050 below knn in median SSIM on split runs of 20 [hard].",
+        ),
         (RSSI, "gaigs is 3.00 dB below mean in MAE (lower is better) on split runs of 20 [hard]."),
         (
-            run("spectrum", gaigs=spectrum(0.9, 0), knn=spectrum(0.9004, 0), mean=spectrum(0.8996, 0)),
+            run(
+                "spectrum",
+                gaigs=spectrum(0.9, 0),
+                knn=spectrum(0.9004, 0),
+                mean=spectrum(0.8996, 0),
+            ),
             "gaigs is level with knn and level with mean in median SSIM on split runs of 20 [hard].",
         ),
         (
@@ -134,8 +161,14 @@ def test_receivers_stand_below_with_the_first_metric_of_each_model():
             "gaigs is 2.32 dB below mean, 0.20 dB above knn and level with path_loss in MAE (lower is better) on split "
             "runs of 20 [hard].",
         ),
-        (run("rssi", knn=rssi(4.158)), "knn is at 4.16 dB in MAE (lower is better) on split runs of 20 [hard]."),
-        (run("spectrum", knn=spectrum(0.9, 0)), "knn is at 0.900 in median SSIM on split runs of 20 [hard]."),
+        (
+            run("rssi", knn=rssi(4.158)),
+            "knn is at 4.16 dB in MAE (lower is better) on split runs of 20 [hard].",
+        ),
+        (
+            run("spectrum", knn=spectrum(0.9, 0)),
+            "knn is at 0.900 in median SSIM on split runs of 20 [hard].",
+        ),
         (
             run("csi", gaigs=csi(12.25, 13), friis=csi(-3.5, 20)),
             "gaigs is 15.75 dB above friis in median SNR on split runs of 20 [hard].",
@@ -148,7 +181,15 @@ def test_verdict(metrics, sentence):
 
 @pytest.mark.parametrize(
     ("value", "text"),
-    [(0.96251, "0.963"), (1234.56, "1,234.6"), (-3.0, "-3.000"), (20000, "20,000"), (0, "0"), ("ga", "ga"), (None, "")],
+    [
+        (0.96251, "0.963"),
+        (1234.56, "1,234.6"),
+        (-3.0, "-3.000"),
+        (20000, "20,000"),
+        (0, "0"),
+        ("ga", "ga"),
+        (None, ""),
+    ],
 )
 def test_written(value, text):
     assert written(value) == text

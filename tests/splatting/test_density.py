@@ -19,7 +19,9 @@ N = 20
 CHANGES = {
     "prune": lambda gaussians, optimizer, chosen: density.prune(gaussians, optimizer, chosen),
     "clone": lambda gaussians, optimizer, chosen: density.clone(gaussians, optimizer, chosen),
-    "split": lambda gaussians, optimizer, chosen: density.split(gaussians, optimizer, chosen, torch.Generator()),
+    "split": lambda gaussians, optimizer, chosen: density.split(
+        gaussians, optimizer, chosen, torch.Generator()
+    ),
 }
 
 
@@ -36,7 +38,14 @@ def gaussians(scene):
 
 
 def make(scene, channels, count):
-    options = {"count": count, "near": 2.0, "far": 5.0, "spread": 0.5, "opacity": 0.1, "signal": 1.0}
+    options = {
+        "count": count,
+        "near": 2.0,
+        "far": 5.0,
+        "spread": 0.5,
+        "opacity": 0.1,
+        "signal": 1.0,
+    }
     return Gaussians(scene, zone=(0.0, math.pi / 2), channels=channels, **options)
 
 
@@ -87,11 +96,17 @@ def test_the_optimizer_keeps_the_state_of_remaining_gaussians(gaussians, scene, 
     memories = {name: dict(optimizer.state[parameter]) for name, parameter in old.items()}
     CHANGES[name](gaussians, optimizer, chosen)
 
-    origin = torch.arange(N)[~chosen] if name == "prune" else torch.cat((torch.arange(N), torch.arange(N)[chosen]))
+    origin = (
+        torch.arange(N)[~chosen]
+        if name == "prune"
+        else torch.cat((torch.arange(N), torch.arange(N)[chosen]))
+    )
     kept = min(N, len(origin))
     new = dict(gaussians.named_parameters())
     assert {id(p) for p in optimizer.state} & {id(p) for p in old.values()} == set()
-    for group, (parameter_name, parameter) in zip(optimizer.param_groups, new.items(), strict=False):
+    for group, (parameter_name, parameter) in zip(
+        optimizer.param_groups, new.items(), strict=False
+    ):
         assert group["name"] == parameter_name
         assert len(group["params"]) == 1
         assert group["params"][0] is parameter
@@ -107,8 +122,14 @@ def test_the_optimizer_keeps_the_state_of_remaining_gaussians(gaussians, scene, 
     assert optimizer.param_groups[-1]["name"] == "network"
 
 
-SCALED = {name: getattr(torch.optim, name) for name in ("AdamW", "Adagrad", "Adafactor") if hasattr(torch.optim, name)}
-"""Optimizers whose steps do not depend on the gradient's size; Adafactor (torch 2.5) keeps rows and columns."""
+SCALED = {
+    name: getattr(torch.optim, name)
+    for name in ("AdamW", "Adagrad", "Adafactor")
+    if hasattr(torch.optim, name)
+}
+"""Optimizers whose steps do not depend on the gradient's size; Adafactor (torch 2.5) keeps rows and
+columns.
+"""
 
 
 @pytest.mark.parametrize("name", CHANGES)
@@ -138,7 +159,9 @@ def test_an_empty_choice_changes_nothing_and_frozen_means_stay_frozen(gaussians,
 def test_pruning_keeps_all_others_and_refuses_to_remove_all(gaussians, chosen):
     before = {key: value.clone() for key, value in gaussians.state_dict().items()}
     density.prune(gaussians, optimizer_of(gaussians), chosen)
-    assert all(torch.equal(value, before[key][~chosen]) for key, value in gaussians.state_dict().items())
+    assert all(
+        torch.equal(value, before[key][~chosen]) for key, value in gaussians.state_dict().items()
+    )
     with pytest.raises(ValueError, match="pruning would remove all 13 Gaussians"):
         density.prune(gaussians, optimizer_of(gaussians), torch.ones(13, dtype=torch.bool))
     assert len(gaussians) == 13
@@ -155,7 +178,9 @@ def test_a_clone_and_its_original_cover_what_one_did(gaussians, chosen):
     missed = torch.sigmoid(-originals.detach().double()).square()
     torch.testing.assert_close(missed, torch.sigmoid(-logits[chosen]), rtol=1e-4, atol=0)
     covered = -torch.log1p(-torch.sigmoid(originals.detach().double())) * 2
-    torch.testing.assert_close(covered, torch.nn.functional.softplus(logits[chosen]), rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        covered, torch.nn.functional.softplus(logits[chosen]), rtol=1e-4, atol=0
+    )
     assert torch.equal(gaussians.opacity_logits[:N][~chosen].double(), logits[~chosen])
     assert torch.equal(gaussians.means[N:], gaussians.means[:N][chosen])
     assert torch.equal(gaussians.signal[N:], gaussians.signal[:N][chosen])
@@ -186,14 +211,21 @@ def test_halves_are_smaller_and_all_else_stays(gaussians):
     torch.testing.assert_close(gaussians.scales[halves] * 1.6, before["log_scales"][[5, 5]].exp())
     for key in ("quats", "opacity_logits", "signal"):
         assert torch.equal(gaussians.state_dict()[key][halves], before[key][[5, 5]])
-    assert all(torch.equal(value[:N][~chosen], before[key][~chosen]) for key, value in gaussians.state_dict().items())
+    assert all(
+        torch.equal(value[:N][~chosen], before[key][~chosen])
+        for key, value in gaussians.state_dict().items()
+    )
 
 
 def test_the_places_of_halves_follow_the_whole(scene):
     count = 4000
     gaussians = make(scene, channels=1, count=count)
     with torch.no_grad():
-        for name, value in (("means", [1.0, 2, 3]), ("quats", [0.3, -1.0, 0.5, 0.2]), ("log_scales", [0.0, -1, -2])):
+        for name, value in (
+            ("means", [1.0, 2, 3]),
+            ("quats", [0.3, -1.0, 0.5, 0.2]),
+            ("log_scales", [0.0, -1, -2]),
+        ):
             getattr(gaussians, name).copy_(torch.tensor(value).expand(count, -1))
     covariance = gaussians.covariances[0].detach()
     everyone = torch.ones(count, dtype=torch.bool)
@@ -201,5 +233,7 @@ def test_the_places_of_halves_follow_the_whole(scene):
     density.split(gaussians, optimizer_of(gaussians), everyone, torch.Generator().manual_seed(0))
     places = gaussians.means.detach()
     # 8,000 draws show a covariance to a fraction sqrt(2 / 8000) = 1.6 % of the largest variance.
-    torch.testing.assert_close(places.T.cov(), covariance, rtol=0, atol=0.08 * covariance.max().item())
+    torch.testing.assert_close(
+        places.T.cov(), covariance, rtol=0, atol=0.08 * covariance.max().item()
+    )
     torch.testing.assert_close(places.mean(0), torch.tensor([1.0, 2, 3]), rtol=0, atol=0.06)

@@ -31,7 +31,9 @@ def gaussians_of(scene, **options):
     return Gaussians(scene, **(OPTIONS | options))
 
 
-@pytest.mark.parametrize(("low", "high"), [(-math.pi / 2, math.pi / 2), (0.0, math.pi / 2), (0.2, 0.6)])
+@pytest.mark.parametrize(
+    ("low", "high"), [(-math.pi / 2, math.pi / 2), (0.0, math.pi / 2), (0.2, 0.6)]
+)
 def test_the_lattice_is_even(low, high):
     count = 2000
     points = fibonacci_lattice(count, low, high)
@@ -69,8 +71,12 @@ def test_initial_widths_reach_the_neighbours(scene):
     distances = points.norm(dim=-1)
     directions = (points / distances[:, None]).numpy()
     angles = cKDTree(directions).query(directions, 2)[0][:, 1].mean()
-    torch.testing.assert_close(gaussians.scales.detach(), (gaussians.scales[:, :1]).expand(-1, 3).detach())
-    assert (gaussians.scales[:, 0] / distances).mean().item() == pytest.approx(0.5 * angles, rel=0.1)
+    torch.testing.assert_close(
+        gaussians.scales.detach(), (gaussians.scales[:, :1]).expand(-1, 3).detach()
+    )
+    assert (gaussians.scales[:, 0] / distances).mean().item() == pytest.approx(
+        0.5 * angles, rel=0.1
+    )
 
 
 def test_activations(scene):
@@ -78,7 +84,10 @@ def test_activations(scene):
     torch.testing.assert_close(gaussians.opacities, torch.full((41,), 0.1))
     torch.testing.assert_close(gaussians.unit_quats.norm(dim=-1), torch.ones(41))
     torch.testing.assert_close(
-        torch.linalg.eigvalsh(gaussians.covariances).sqrt(), gaussians.scales.sort(-1).values, rtol=1e-3, atol=1e-5
+        torch.linalg.eigvalsh(gaussians.covariances).sqrt(),
+        gaussians.scales.sort(-1).values,
+        rtol=1e-3,
+        atol=1e-5,
     )
     assert gaussians.signal.shape == (41, 2, 1)
 
@@ -107,7 +116,9 @@ def test_a_state_dict_may_have_another_number_of_gaussians(scene):
     trained, fresh = gaussians_of(scene, count=70), gaussians_of(scene)
     fresh.means.requires_grad_(False)
     holder = nn.ModuleDict({"gaussians": fresh})
-    holder.load_state_dict({f"gaussians.{name}": value for name, value in trained.state_dict().items()})
+    holder.load_state_dict(
+        {f"gaussians.{name}": value for name, value in trained.state_dict().items()}
+    )
     assert len(fresh) == 70
     for name in Gaussians.PARAMETERS:
         assert torch.equal(getattr(fresh, name), getattr(trained, name))
@@ -130,7 +141,13 @@ def test_a_ply_has_the_columns_that_splatting_viewers_read(scene, tmp_path, chan
     columns = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"]
     columns += [f"f_rest_{i}" for i in range(len(rest))]
     columns += ["opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]
-    assert [(p.name, p.val_dtype) for p in vertices.properties] == [(column, "f4") for column in columns]
+    assert [(p.name, p.val_dtype) for p in vertices.properties] == [
+        (column, "f4") for column in columns
+    ]
     expected = [*gaussians.means[4].tolist(), 0, 0, 0, *signal[:3, 0].tolist(), *rest]
-    expected += [gaussians.opacity_logits[4].item(), *gaussians.log_scales[4].tolist(), *gaussians.quats[4].tolist()]
+    expected += [
+        gaussians.opacity_logits[4].item(),
+        *gaussians.log_scales[4].tolist(),
+        *gaussians.quats[4].tolist(),
+    ]
     assert [float(vertices[name][4]) for name in columns] == expected

@@ -48,9 +48,13 @@ def part(links, **options):
 
 @pytest.fixture
 def links():
-    """A cloud; the data's own parts are the even links against every fourth of the odd ones, out of order."""
+    """A cloud; the data's own parts are the even links against every fourth of the odd ones, out of
+    order.
+    """
     places = 3 * torch.rand(N, 3, generator=torch.Generator().manual_seed(1))
-    return links_at(places, official=lambda: (torch.arange(0, N, 2).flip(0), torch.arange(1, N, 4).flip(0)))
+    return links_at(
+        places, official=lambda: (torch.arange(0, N, 2).flip(0), torch.arange(1, N, 4).flip(0))
+    )
 
 
 @each_split
@@ -79,7 +83,9 @@ def test_official_parts_are_asked_for_by_the_official_split_alone(links, options
 def test_random_holds_out_the_fraction(links, test):
     result = part(links, name="random", test=test, validation=0)
     assert len(result.test) == round(test * N)
-    assert 0.3 < result.test.double().mean() / N < 0.7  # drawn from everywhere, not the head or the tail
+    assert (
+        0.3 < result.test.double().mean() / N < 0.7
+    )  # drawn from everywhere, not the head or the tail
 
 
 def test_sparse_parts_are_nested_and_share_their_test(links):
@@ -91,12 +97,17 @@ def test_sparse_parts_are_nested_and_share_their_test(links):
     assert torch.equal(more.test, random.test)
 
 
-@given(seed=st.integers(0, 10**6), edge=st.floats(0.2, 1.4), far=st.sampled_from([0.0, -50.0, 1000.0]))
+@given(
+    seed=st.integers(0, 10**6), edge=st.floats(0.2, 1.4), far=st.sampled_from([0.0, -50.0, 1000.0])
+)
 def test_cubes_stay_whole(seed, edge, far):
     points = 3 * torch.rand(200, 3, generator=torch.Generator().manual_seed(seed)) + far
     result = part(links_at(points), name="blocks", edge=edge, seed=seed, validation=0.2)
     cubes = np.floor((points.double().numpy() - points.double().numpy().min(0)) / edge).astype(int)
-    parts = [{tuple(cubes[i]) for i in p.tolist()} for p in (result.train, result.validation, result.test)]
+    parts = [
+        {tuple(cubes[i]) for i in p.tolist()}
+        for p in (result.train, result.validation, result.test)
+    ]
     assert all(parts)
     assert sum(map(len, parts)) == len(set.union(*parts))
 
@@ -107,7 +118,10 @@ def test_cubes_stay_whole(seed, edge, far):
         ({"name": "official", "validation": 0.1}, "official, validation 0.1, seed 0"),
         ({"name": "official", "length": 4}, "official, validation 0.1 in runs of 4, seed 0"),
         ({"name": "sparse", "train": 60}, "sparse 60, test 0.2, validation 0.15, seed 0"),
-        ({"name": "runs", "length": 20, "test": 0.3}, "runs of 20, test 0.3, validation 0.1, seed 0"),
+        (
+            {"name": "runs", "length": 20, "test": 0.3},
+            "runs of 20, test 0.3, validation 0.1, seed 0",
+        ),
         ({"name": "blocks", "edge": 0.25, "validation": 0}, "blocks 0.25 m, test 0.2, seed 0"),
     ],
 )
@@ -119,16 +133,25 @@ def test_names_say_the_numbers(links, options, name):
     ("options", "message"),
     [
         ({"name": "cubes"}, "unknown split 'cubes'.*; there are: blocks, .*official"),
-        ({"name": "random", "edge": 0.5, "length": 3}, "'random' has no option 'edge' .*or 'length'.*; it has: test"),
+        (
+            {"name": "random", "edge": 0.5, "length": 3},
+            "'random' has no option 'edge' .*or 'length'.*; it has: test",
+        ),
         ({"name": "blocks"}, "'blocks' needs option edge"),
         ({"name": "random", "test": 1.0}, r"split.test must be in \[0, 1\), got 1"),
         ({"name": "random", "validation": 1}, r"split.validation must be in \[0, 1\), got 1"),
         ({"name": "official", "validation": 1.5}, "split.validation must be"),
         ({"name": "official", "length": 0}, "split.length must be a whole number of rows"),
         ({"name": "blocks", "edge": 0}, r"split.edge must be from 1e-06 to 1e\+06 m, got 0"),
-        *((options | {"seed": -1}, "split.seed must be a whole number from 0 to") for options in SPLITS),
+        *(
+            (options | {"seed": -1}, "split.seed must be a whole number from 0 to")
+            for options in SPLITS
+        ),
         ({"name": "sparse", "train": 321}, r"split.train must be in 1\.\.320"),
-        ({"name": "blocks", "edge": 50.0}, r"split.test=0\.2 holds out whole .* two of them or more, got 1 with 400"),
+        (
+            {"name": "blocks", "edge": 50.0},
+            r"split.test=0\.2 holds out whole .* two of them or more, got 1 with 400",
+        ),
     ],
 )
 def test_unusable_options_are_refused(links, options, message):
@@ -137,7 +160,9 @@ def test_unusable_options_are_refused(links, options, message):
 
 
 def test_data_without_official_parts_says_so(links):
-    with pytest.raises(ValueError, match="no official split; choose split=random, sparse, runs or blocks"):
+    with pytest.raises(
+        ValueError, match="no official split; choose split=random, sparse, runs or blocks"
+    ):
         part(replace(links, official=None), name="official")
 
 
@@ -146,7 +171,9 @@ def test_data_without_official_parts_says_so(links):
 
 @pytest.fixture
 def heard():
-    """Links by which up to six receivers heard 120 rows; the first 90 rows are for training. Row 7 was not heard."""
+    """Links by which up to six receivers heard 120 rows; the first 90 rows are for training. Row 7
+    was not heard.
+    """
     generator = torch.Generator().manual_seed(5)
     heard = torch.rand(120, 6, generator=generator) < 0.6
     heard[7] = False
@@ -168,21 +195,33 @@ def test_runs_count_rows(heard):
 def test_official_validation_in_runs_of_rows(heard):
     rows = heard.rows
     official = (rows < 100).nonzero()[:, 0], (rows >= 100).nonzero()[:, 0]
-    result = part(replace(heard, official=lambda: official), name="official", length=10, validation=0.45)
+    result = part(
+        replace(heard, official=lambda: official), name="official", length=10, validation=0.45
+    )
     validating = rows[result.validation].unique()
-    assert {(row // 10).item() for row in validating}.isdisjoint((rows[result.train] // 10).tolist())
+    assert {(row // 10).item() for row in validating}.isdisjoint(
+        (rows[result.train] // 10).tolist()
+    )
     assert len(validating) == pytest.approx(45, abs=10)
     assert torch.equal(result.test, official[1])
 
 
-@pytest.mark.parametrize(("rows", "length", "expected"), [(126, 100, 3), (4000, 100, 100), (30, 100, 1), (126, 2, 2)])
+@pytest.mark.parametrize(
+    ("rows", "length", "expected"), [(126, 100, 3), (4000, 100, 100), (30, 100, 1), (126, 2, 2)]
+)
 def test_official_runs_are_short_enough_for_four_to_validate(rows, length, expected):
     """Of 126 rows one run of 100 would be most of the training."""
-    links = links_at(torch.rand(rows + 9, 3), official=lambda: torch.arange(rows + 9).split((rows, 9)))
+    links = links_at(
+        torch.rand(rows + 9, 3), official=lambda: torch.arange(rows + 9).split((rows, 9))
+    )
     result = part(links, name="official", length=length, validation=0.1)
     assert 0.05 * rows < len(result.validation) <= 0.1 * rows
     assert len(result.validation) % expected == 0
-    assert len((result.validation // expected).unique()) == len(result.validation) / expected >= min(4, 0.1 * rows)
+    assert (
+        len((result.validation // expected).unique())
+        == len(result.validation) / expected
+        >= min(4, 0.1 * rows)
+    )
     assert (f"runs of {expected}" in result.name) == (expected > 1)
 
 
@@ -208,16 +247,21 @@ def test_fractions_count_places_not_readings(options, has_rows):
 def test_a_place_that_is_read_again_changes_no_other_draw(links, options):
     if options["name"] in ("runs", "blocks"):
         pytest.skip("runs and cubes are drawn as such")
-    again = replace(links, query=replace(links.query, transmitters=links.query.transmitters.clone()))
+    again = replace(
+        links, query=replace(links.query, transmitters=links.query.transmitters.clone())
+    )
     again.query.transmitters[200] = again.query.transmitters[100]
     for before, after in zip(
-        part(links, **options).parts().values(), part(again, **options).parts().values(), strict=True
+        part(links, **options).parts().values(),
+        part(again, **options).parts().values(),
+        strict=True,
     ):
         assert len(set(before.tolist()) ^ set(after.tolist())) <= 2
 
 
 @pytest.mark.parametrize(
-    ("count", "validating", "name"), [(20, 2, 0.1), (36, 3, 0.1), (40, 9, 0.28), (100, 9, 0.11), (400, 32, 0.1)]
+    ("count", "validating", "name"),
+    [(20, 2, 0.1), (36, 3, 0.1), (40, 9, 0.28), (100, 9, 0.11), (400, 32, 0.1)],
 )
 def test_few_links_leave_enough_for_intervals(count, validating, name):
     split = part(links_at(torch.rand(count, 3)), name="random")
@@ -230,7 +274,9 @@ def test_few_links_leave_enough_for_intervals(count, validating, name):
 # --- configuration ---
 
 
-@pytest.mark.parametrize("file", sorted((conf_dir() / "split").glob("*.yaml")), ids=lambda file: file.stem)
+@pytest.mark.parametrize(
+    "file", sorted((conf_dir() / "split").glob("*.yaml")), ids=lambda file: file.stem
+)
 def test_a_configuration_has_every_option_with_its_default(file):
     config = OmegaConf.load(file)
     mandatory = OmegaConf.missing_keys(config)

@@ -3,12 +3,18 @@
 
 def broken(kind, change, method="forward"):
     """A class whose method's result is changed by a function of the result and the arguments."""
-    return type("Broken", (kind,), {method: lambda self, *given: change(getattr(kind, method)(self, *given), *given)})
+    return type(
+        "Broken",
+        (kind,),
+        {method: lambda self, *given: change(getattr(kind, method)(self, *given), *given)},
+    )
 
 
 def fed(kind, change, method="forward"):
     """A class whose method is called with changed arguments."""
-    return type("Fed", (kind,), {method: lambda self, *given: getattr(kind, method)(self, *change(*given))})
+    return type(
+        "Fed", (kind,), {method: lambda self, *given: getattr(kind, method)(self, *change(*given))}
+    )
 
 
 def field(name, change):

@@ -56,11 +56,17 @@ def seed():
             r"the token scene must be of shape \(3, 0\), got \(3, 8\)",
         ),
         (
-            fed(EuclideanTokenizer, lambda p, o, query: (p, o, replace(query, transmitters=0 * query.transmitters))),
+            fed(
+                EuclideanTokenizer,
+                lambda p, o, query: (p, o, replace(query, transmitters=0 * query.transmitters)),
+            ),
             "tokens of two transmitters must differ",
         ),
         (
-            fed(EuclideanTokenizer, lambda p, o, query: (Placed(p.means + torch.rand_like(p.means)), o, query)),
+            fed(
+                EuclideanTokenizer,
+                lambda p, o, query: (Placed(p.means + torch.rand_like(p.means)), o, query),
+            ),
             "two calls must give the same gaussians",
         ),
         (
@@ -79,16 +85,30 @@ def test_a_faulty_tokenizer_is_found(tokenizer, message):
     ("change", "message"),
     [
         (field("attenuations", lambda part: 0 * part), r"attenuations must lie in \(0, 1\]"),
-        (field("delta_quats", lambda part: part - part.mean(0)), "delta_quats must not depend on the other queries"),
-        (field("delta_signal", lambda part: part.squeeze(-1)), r"delta_signal must be of shape \(3, 7, 2, 1\)"),
+        (
+            field("delta_quats", lambda part: part - part.mean(0)),
+            "delta_quats must not depend on the other queries",
+        ),
+        (
+            field("delta_signal", lambda part: part.squeeze(-1)),
+            r"delta_signal must be of shape \(3, 7, 2, 1\)",
+        ),
         (lambda residuals, *_: [*residuals], "a deformation must give Residuals, got list"),
-        (field("delta_opacities", lambda part: (0 * part).sqrt()), "the gradient of .* must be finite"),
+        (
+            field("delta_opacities", lambda part: (0 * part).sqrt()),
+            "the gradient of .* must be finite",
+        ),
     ],
 )
 def test_a_faulty_deformation_is_found(change, message):
-    heads, sizes = ["rotation", "signal", "opacity", "attenuation"], {"attenuation_layers": 1, "signal_layers": 1}
+    heads, sizes = (
+        ["rotation", "signal", "opacity", "attenuation"],
+        {"attenuation_layers": 1, "signal_layers": 1},
+    )
     kind = broken(TwoBranch, change)
-    build = lambda tokenizer_widths, channels, scene: kind(tokenizer_widths, channels, width=8, heads=heads, **sizes)
+    build = lambda tokenizer_widths, channels, scene: kind(
+        tokenizer_widths, channels, width=8, heads=heads, **sizes
+    )
     with pytest.raises(AssertionError, match=message):
         check_deformation(build, SCENE)
 
@@ -99,7 +119,9 @@ def test_a_deformation_without_tokens_keeps_the_contract():
 
         def forward(self, tokens, placed, query):
             assert tokens is None
-            return Residuals(delta_opacities=placed.means.new_zeros(len(query), placed.means.shape[1]))
+            return Residuals(
+                delta_opacities=placed.means.new_zeros(len(query), placed.means.shape[1])
+            )
 
     check_deformation(lambda **context: Constant(), SCENE)
 
@@ -133,7 +155,11 @@ MEAN = "the loss must be the mean over its links"
     [
         (averaged(Squared, lambda errors: errors.square().sum()), "rssi", MEAN),
         (averaged(Absolute, lambda errors: errors[:1].abs().mean()), "rssi", MEAN),
-        (averaged(Absolute, lambda errors: (errors - 1).abs().mean()), "rssi", "the loss must be least at the labels"),
+        (
+            averaged(Absolute, lambda errors: (errors - 1).abs().mean()),
+            "rssi",
+            "the loss must be least at the labels",
+        ),
         (ROOT, "rssi", "the gradient of the values at the labels must be finite"),
         (broken(Absolute, extra_term, "__call__"), "rssi", "terms must be the same for all values"),
         (broken(RelativeError, relative_error_of_all, "__call__"), "csi", MEAN),
@@ -180,7 +206,9 @@ class Mirror(Placement):
         images = query.transmitters[:, None] * query.transmitters.new_tensor([1, 1, -1])
         ones, own = images.new_ones(b, 1 + count), images.new_ones(1)
         free = gaussians if count else None
-        beside = lambda mine, theirs, axis: mine if free is None else torch.cat((mine, theirs()), axis)
+        beside = lambda mine, theirs, axis: (
+            mine if free is None else torch.cat((mine, theirs()), axis)
+        )
         return Placed(
             means=beside(images, lambda: free.means.expand(b, -1, -1), 1),
             lengths=beside(images.norm(dim=-1), lambda: ones[:, 1:], 1),
@@ -205,20 +233,44 @@ def weighted_by_receiver(placed, _, query):
 @pytest.mark.parametrize(
     ("placement", "message"),
     [
-        (broken(Halfway, lambda placed, *_: placed.means), "a placement must give a Placed, got Tensor"),
-        (broken(Halfway, field("means", lambda part: part[0])), r"means must be of shape \(3, 40, 3\), got \(40, 3\)"),
+        (
+            broken(Halfway, lambda placed, *_: placed.means),
+            "a placement must give a Placed, got Tensor",
+        ),
+        (
+            broken(Halfway, field("means", lambda part: part[0])),
+            r"means must be of shape \(3, 40, 3\), got \(40, 3\)",
+        ),
         (broken(Halfway, shifted), "means must not depend on the other queries"),
         (broken(Halfway, field("lengths", lambda part: -part)), r"lengths must lie in \[0, inf\]"),
-        (broken(Halfway, field("lengths", lambda part: (0 * part).sqrt())), "the gradient of transmitters must be fin"),
+        (
+            broken(Halfway, field("lengths", lambda part: (0 * part).sqrt())),
+            "the gradient of transmitters must be fin",
+        ),
         (having(Mirror, keeps_free=False), "the free Gaussians, 40, must be among .*, got 1"),
         (having(Mirror, parameter_groups=lambda self: {}), "must be in one of parameter_groups"),
-        (broken(Mirror, field("signal", lambda part: None)), "must be given together, and signal is missing"),
+        (
+            broken(Mirror, field("signal", lambda part: None)),
+            "must be given together, and signal is missing",
+        ),
         (broken(Mirror, field("quats", lambda part: 2 * part)), "quats must be of length 1"),
         (broken(Mirror, field("scales", lambda part: 0 * part)), "scales must be positive"),
-        (broken(Mirror, field("opacities", lambda part: 2 * part)), r"opacities must lie in \[0, 1\]"),
-        (broken(Mirror, field("gains", lambda part: part.real)), "gains must be torch.complex64 as its input"),
-        (broken(Mirror, weighted_by_receiver), "gains must not depend on the receiver unless sees_receivers"),
-        (broken(Mirror, field("bandwidth", lambda part: part.expand(41))), r"bandwidth must be of shape \(\), got"),
+        (
+            broken(Mirror, field("opacities", lambda part: 2 * part)),
+            r"opacities must lie in \[0, 1\]",
+        ),
+        (
+            broken(Mirror, field("gains", lambda part: part.real)),
+            "gains must be torch.complex64 as its input",
+        ),
+        (
+            broken(Mirror, weighted_by_receiver),
+            "gains must not depend on the receiver unless sees_receivers",
+        ),
+        (
+            broken(Mirror, field("bandwidth", lambda part: part.expand(41))),
+            r"bandwidth must be of shape \(\), got",
+        ),
     ],
 )
 def test_a_faulty_placement_is_found(placement, message):
@@ -277,23 +329,47 @@ def narrow(value, image, query):
 @pytest.mark.parametrize(
     ("pooling", "task", "message"),
     [
-        (broken(OfMap, lambda value, image, _: image.square().sum(1).sqrt()), "spectrum", "of silent maps must be fin"),
-        (broken(OfMap, lambda v, image, _: v / image.abs().max()), "spectrum", "must not depend on the other maps"),
+        (
+            broken(OfMap, lambda value, image, _: image.square().sum(1).sqrt()),
+            "spectrum",
+            "of silent maps must be fin",
+        ),
+        (
+            broken(OfMap, lambda v, image, _: v / image.abs().max()),
+            "spectrum",
+            "must not depend on the other maps",
+        ),
         (
             broken(OfMap, lambda v, *_: v.flatten(1)),
             "spectrum",
             r"the value must be of shape \(3, 18, 36\), got",
         ),
-        (broken(OfMap, windowed), "spectrum", "a list of rays must have the values of their pixels"),
+        (
+            broken(OfMap, windowed),
+            "spectrum",
+            "a list of rays must have the values of their pixels",
+        ),
         (having(OfMap, zone=(1.0, -1.0)), "spectrum", "zone must be two elevations"),
         (OfMap, "rssi", "labels of task 'rssi' need a pooling with a grid"),
         (having(Power, floor=0.0), "rssi", "the value of silence must be finite"),
         (broken(Power, clamped), "rssi", "the gradient of silent maps must be finite"),
         (broken(Power, narrow), "rssi", "the value of 12 decades in float16 must be finite"),
-        (broken(Power, lambda v, image, _: v.to(image.dtype)), "rssi", "a silent map in float16 must be torch.float32"),
-        (having(Power, fit=lambda self, links: setattr(self, "floor", 2.0)), "rssi", "state dict must restore it"),
+        (
+            broken(Power, lambda v, image, _: v.to(image.dtype)),
+            "rssi",
+            "a silent map in float16 must be torch.float32",
+        ),
+        (
+            having(Power, fit=lambda self, links: setattr(self, "floor", 2.0)),
+            "rssi",
+            "state dict must restore it",
+        ),
         (Power, "csi", r"the value must be of shape \(3, 4, 5\), got \(3,\)"),
-        (fed(PathRssi, lambda heard, *_: (heard / heard.abs().max(), *_), "read"), "rssi", "depend on the other paths"),
+        (
+            fed(PathRssi, lambda heard, *_: (heard / heard.abs().max(), *_), "read"),
+            "rssi",
+            "depend on the other paths",
+        ),
         (
             broken(PathRssi, lambda v, *_: v[:, None], "read"),
             "rssi",
@@ -332,17 +408,34 @@ SKEW = torch.tensor([[1.0], [1.001]])
 @pytest.mark.parametrize(
     ("projection", "message"),
     [
-        (broken(Mercator, lambda j, points: j * SKEW.to(points), "jacobian"), "jacobian must be the derivative of"),
-        (broken(Equirectangular, without_bound, "jacobian"), "factors at hard places must be finite"),
-        (broken(Equirectangular, lambda p, _: replace(p, v=p.v + 1e-6), "plane"), "plane.v must be coordinates' v"),
-        (broken(Equirectangular, lambda p, _: replace(p, period=None), "plane"), "a plane must have the projection's"),
+        (
+            broken(Mercator, lambda j, points: j * SKEW.to(points), "jacobian"),
+            "jacobian must be the derivative of",
+        ),
+        (
+            broken(Equirectangular, without_bound, "jacobian"),
+            "factors at hard places must be finite",
+        ),
+        (
+            broken(Equirectangular, lambda p, _: replace(p, v=p.v + 1e-6), "plane"),
+            "plane.v must be coordinates' v",
+        ),
+        (
+            broken(Equirectangular, lambda p, _: replace(p, period=None), "plane"),
+            "a plane must have the projection's",
+        ),
         (
             broken(Mercator, lambda p, _: replace(p, v=p.v.reshape(-1, 1)), "plane"),
             r"plane.v of a list of rays must be of shape \(1, 1\) or \(1, 108\), got \(108, 1\)",
         ),
-        (broken(DirectionCosine, lambda p, _: Plane(p.u.float(), p.v.float(), None), "plane"), "directions' dtype"),
         (
-            broken(Mercator, lambda splats, *_: replace(splats, visible=splats.depths < 100), "project"),
+            broken(DirectionCosine, lambda p, _: Plane(p.u.float(), p.v.float(), None), "plane"),
+            "directions' dtype",
+        ),
+        (
+            broken(
+                Mercator, lambda splats, *_: replace(splats, visible=splats.depths < 100), "project"
+            ),
             "a Gaussian must be hidden if it sits on the receiver",
         ),
     ],
@@ -362,7 +455,11 @@ def mixed(result, *_):
 
 def eight_channels(splats, signal, *others):
     """Draws eight channels, and repeats the first beyond."""
-    return splats, torch.cat((signal[..., :8], signal[..., :1].expand_as(signal)[..., 8:]), -1), *others
+    return (
+        splats,
+        torch.cat((signal[..., :8], signal[..., :1].expand_as(signal)[..., 8:]), -1),
+        *others,
+    )
 
 
 @pytest.mark.parametrize(
@@ -376,17 +473,28 @@ def eight_channels(splats, signal, *others):
             changed(lambda s, *given: (replace(s, depths=0 * s.depths), *given)),
             "random: map must be that",
         ),
-        (changed(lambda s, g, o, a, plane: (s, g, o, None, plane)), "attenuations: map must be that"),
+        (
+            changed(lambda s, g, o, a, plane: (s, g, o, None, plane)),
+            "attenuations: map must be that",
+        ),
         (
             changed(lambda s, *given: (replace(s, means2d=s.means2d.detach()), *given)),
             "random: gradient of means2d must be that of the formula",
         ),
-        (changed(lambda s, signal, *given: (s, signal.nan_to_num(), *given)), "NaN in signal must show as NaN in the"),
         (
-            broken(TorchRasterizer, lambda result, *_: [part.float() for part in result], "__call__"),
+            changed(lambda s, signal, *given: (s, signal.nan_to_num(), *given)),
+            "NaN in signal must show as NaN in the",
+        ),
+        (
+            broken(
+                TorchRasterizer, lambda result, *_: [part.float() for part in result], "__call__"
+            ),
             r"random: map must be torch\.float64 as its input, got torch\.float32",
         ),
-        (broken(TorchRasterizer, mixed, "__call__"), "random: a map must not depend on other transmitters"),
+        (
+            broken(TorchRasterizer, mixed, "__call__"),
+            "random: a map must not depend on other transmitters",
+        ),
         (changed(eight_channels), "many channels: map must be that"),
         (having(TorchRasterizer, used=None), "used must name the rasterizer, got None"),
     ],

@@ -47,7 +47,9 @@ def test_the_channels_of_the_example_follow_the_direct_path():
     for k in range(24):
         position = links.receivers[links.query.receivers[k]].pose.position
         distance = (links.query.transmitters[k] - position).double().norm().item()
-        slopes = torch.angle((links.labels[k, :, 1:] * links.labels[k, :, :-1].conj()).mean()).item()
+        slopes = torch.angle(
+            (links.labels[k, :, 1:] * links.labels[k, :, :-1].conj()).mean()
+        ).item()
         steps = links.task.frequencies.diff()[0].item()
         assert abs(slopes + 2 * torch.pi * steps * distance / 299_792_458) < 0.5
 
@@ -69,21 +71,45 @@ def with_query(**changes):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        (with_query(transmitters=torch.zeros(24, 3, dtype=torch.float64)), "transmitters must be torch.float32"),
+        (
+            with_query(transmitters=torch.zeros(24, 3, dtype=torch.float64)),
+            "transmitters must be torch.float32",
+        ),
         (with_query(transmitters=torch.full((24, 3), torch.nan)), "transmitters must be finite"),
         (with_query(receivers=torch.full((24,), 2)), "the query must point into receivers"),
-        (with_query(frequencies=torch.full((24,), 2.4)), r"frequencies must be from 10000 to 3e\+11 Hz"),
+        (
+            with_query(frequencies=torch.full((24,), 2.4)),
+            r"frequencies must be from 10000 to 3e\+11 Hz",
+        ),
         ({"receivers": LINKS.receivers[:1] * 2}, "receivers must have different names"),
         ({"rows": torch.zeros(24).long()}, "links of one row must have one transmitter position"),
         ({"rows": -torch.arange(24)}, "rows must count from 0"),
-        ({"official": lambda: (torch.arange(20), torch.arange(19, 24))}, "no link may stand twice in train, test"),
-        ({"official": lambda: (torch.arange(20).flip(0), torch.arange(20, 24))}, "train must ascend"),
-        ({"official": lambda: (torch.arange(20), torch.arange(0))}, "leave links to train and to test on"),
+        (
+            {"official": lambda: (torch.arange(20), torch.arange(19, 24))},
+            "no link may stand twice in train, test",
+        ),
+        (
+            {"official": lambda: (torch.arange(20).flip(0), torch.arange(20, 24))},
+            "train must ascend",
+        ),
+        (
+            {"official": lambda: (torch.arange(20), torch.arange(0))},
+            "leave links to train and to test on",
+        ),
         ({"labels": torch.full((24, 18, 36), 1.5)}, r"spectra must lie in \[0, 1\]"),
-        ({"labels": torch.zeros(24, 36, 18)}, r"labels must be of shape \(9, 18, 36\), got \(9, 36, 18\)"),
+        (
+            {"labels": torch.zeros(24, 36, 18)},
+            r"labels must be of shape \(9, 18, 36\), got \(9, 36, 18\)",
+        ),
         ({"labels": torch.zeros(24, 18, 36, dtype=torch.float64)}, "labels must be torch.float32"),
-        ({"labels": Labels(lambda i: torch.rand(len(i), 18, 36))}, "labels read twice must be the same"),
-        ({"labels": Labels(lambda i: LINKS.labels[i] * LINKS.labels[i].mean())}, "must not depend on the others"),
+        (
+            {"labels": Labels(lambda i: torch.rand(len(i), 18, 36))},
+            "labels read twice must be the same",
+        ),
+        (
+            {"labels": Labels(lambda i: LINKS.labels[i] * LINKS.labels[i].mean())},
+            "must not depend on the others",
+        ),
         ({"split": replace(LINKS.split, test=torch.arange(3))}, "no link may stand twice"),
         ({"split": replace(LINKS.split, test=torch.arange(24, 26))}, "must point at the 24 links"),
     ],
@@ -135,7 +161,10 @@ GLOBAL = taking(lambda _: by_row(torch.Generator().manual_seed(int(torch.randint
         (taking(lambda generator: by_row(generator).flip(0)), "test must ascend"),
         (taking(lambda generator: torch.arange(4)), "another seed must give another split"),
         (overlapping, "no link may stand twice in train, validation, test"),
-        (lambda seed: replace(taking(by_row)(seed), name="by row"), "a split's name must differ between seeds"),
+        (
+            lambda seed: replace(taking(by_row)(seed), name="by row"),
+            "a split's name must differ between seeds",
+        ),
         (GLOBAL, "the same seed must give the same split in any random state"),
     ],
 )
@@ -159,7 +188,11 @@ def blind(self, labels, values):
 
 
 def cheerful(self, scores):
-    return Rssi.summarise(self, scores) if len(scores[self.monitor]) else dict.fromkeys(self.metrics(), 0.0)
+    return (
+        Rssi.summarise(self, scores)
+        if len(scores[self.monitor])
+        else dict.fromkeys(self.metrics(), 0.0)
+    )
 
 
 class Parted(Spectrum):
@@ -182,7 +215,9 @@ class Careless(Spectrum):
 
     def thinning(self, rays=None):
         thin = super().thinning(rays=rays)
-        return lambda batch, generator: thin(batch, torch.Generator().manual_seed(int(torch.randint(10**6, ()))))
+        return lambda batch, generator: thin(
+            batch, torch.Generator().manual_seed(int(torch.randint(10**6, ())))
+        )
 
 
 SPECTRUM = LINKS.task.directions.elevations, LINKS.task.directions.azimuths, "none"
@@ -191,20 +226,37 @@ SPECTRUM = LINKS.task.directions.elevations, LINKS.task.directions.azimuths, "no
 @pytest.mark.parametrize(
     ("task", "message"),
     [
-        (having(Rssi, scores=lambda self, labels, values: Rssi.scores(self, labels, values - 0.5)), "must score best"),
+        (
+            having(
+                Rssi, scores=lambda self, labels, values: Rssi.scores(self, labels, values - 0.5)
+            ),
+            "must score best",
+        ),
         (having(Rssi, higher_is_better=True), "true values must score best"),
         (broken(Rssi, pooled, "scores"), "the score mae_db must not depend on the other samples"),
         (
-            having(Rssi, scores=lambda self, labels, values: {"mae_db": (values - labels).detach().double().abs()}),
+            having(
+                Rssi,
+                scores=lambda self, labels, values: {
+                    "mae_db": (values - labels).detach().double().abs()
+                },
+            ),
             "values of different number must be a ValueError",
         ),
         (having(Csi, scores=blind), "values that are NaN must be a ValueError"),
         (having(Rssi, summarise=cheerful), "a summary of no samples must be a ValueError"),
         (
-            broken(Rssi, lambda numbers, *_: {f"{name}_db": number for name, number in numbers.items()}, "summarise"),
+            broken(
+                Rssi,
+                lambda numbers, *_: {f"{name}_db": number for name, number in numbers.items()},
+                "summarise",
+            ),
             "summarise must give some of mae_db, median_ae_db, rmse_db, got mae_db_db",
         ),
-        (broken(Spectrum, lambda o: o | {"normalisation": "forgotten"}, "options"), "task's state must restore it"),
+        (
+            broken(Spectrum, lambda o: o | {"normalisation": "forgotten"}, "options"),
+            "task's state must restore it",
+        ),
         (Parted, "labels and directions must be thinned together"),
         (Careless, "only the generator may decide the thinning"),
         (having(Rssi, name="nobody's"), 'a task must have its registered name, got "nobody\'s"'),
@@ -231,7 +283,9 @@ class Grey(Model):
         self.grey = nn.Parameter(torch.full((), 0.5))
 
     def forward(self, batch):
-        return Prediction(self.level * self.grey * self.grey.new_ones(len(batch), *batch.directions.shape), {})
+        return Prediction(
+            self.level * self.grey * self.grey.new_ones(len(batch), *batch.directions.shape), {}
+        )
 
 
 class Level(Model):
@@ -257,7 +311,9 @@ def test_sound_models_keep_the_contract():
 
 def changed(change, kind=Grey):
     """A model whose value is changed by a function of the value and the batch."""
-    return broken(kind, lambda prediction, batch: prediction._replace(value=change(prediction.value, batch)))
+    return broken(
+        kind, lambda prediction, batch: prediction._replace(value=change(prediction.value, batch))
+    )
 
 
 def shaded(value, batch):
@@ -274,7 +330,11 @@ def without_nan(self, transmitters, *others, **options):
 
 def without_the_last(self, batch):
     value = Model.evaluate(self, batch)
-    return value if self.chunk is None else value * (torch.arange(value.shape[-1]) < value.shape[-1] - 1)
+    return (
+        value
+        if self.chunk is None
+        else value * (torch.arange(value.shape[-1]) < value.shape[-1] - 1)
+    )
 
 
 def flat_list(self, places, *_, **options):
@@ -284,7 +344,10 @@ def flat_list(self, places, *_, **options):
 @pytest.mark.parametrize(
     ("model", "message"),
     [
-        (having(Grey, parameter_groups=lambda self: {"network": []}), "must be in one of parameter_groups"),
+        (
+            having(Grey, parameter_groups=lambda self: {"network": []}),
+            "must be in one of parameter_groups",
+        ),
         (
             changed(lambda v, batch: v.mean() * v.new_ones(len(batch), 18, 36)),
             "must give the directions",
@@ -293,7 +356,10 @@ def flat_list(self, places, *_, **options):
             having(Grey, fit=lambda self, links: setattr(self, "level", links.labels.mean())),
             "a model's state dict must restore its predictions",
         ),
-        (changed(lambda value, batch: value * len(batch)), "the batch size must not change predictions"),
+        (
+            changed(lambda value, batch: value * len(batch)),
+            "the batch size must not change predictions",
+        ),
         (changed(lambda value, batch: (value * 0).sqrt()), "the gradient of grey must be finite"),
         (having(Grey, predict=flat_list), "a grid of positions must give a grid of predictions"),
         (having(Grey, predict=without_nan), "NaN as a position must be a ValueError"),
@@ -303,13 +369,24 @@ def flat_list(self, places, *_, **options):
             "links to several receivers must get the values of single links",
         ),
         (having(Grey, facts=lambda self: {"mean": torch.zeros(())}), "facts must be plain values"),
-        (having(Grey, trained_by="osmosis"), "trained_by must be one of .*'descent'.*, got 'osmosis'"),
         (
-            broken(Grey, lambda result, batch: result._replace(penalties={"each": result.value.flatten(1)[:, 0]})),
+            having(Grey, trained_by="osmosis"),
+            "trained_by must be one of .*'descent'.*, got 'osmosis'",
+        ),
+        (
+            broken(
+                Grey,
+                lambda result, batch: result._replace(
+                    penalties={"each": result.value.flatten(1)[:, 0]}
+                ),
+            ),
             r"the penalty each must be of shape \(\), got \(5,\)",
         ),
         (having(Grey, evaluate=without_the_last), "chunk must not change values"),
-        (changed(lambda value, batch: value.sort().values, Level), "must get the values of single links"),
+        (
+            changed(lambda value, batch: value.sort().values, Level),
+            "must get the values of single links",
+        ),
         (changed(lambda value, batch: value.double(), Level), "predictions must be torch.float32"),
     ],
 )

@@ -39,7 +39,9 @@ OPTIONS = {
 
 
 class Plane(Model):
-    """A label that rises with elevation and azimuth, times a gain that a network gives for the transmitter."""
+    """A label that rises with elevation and azimuth, times a gain that a network gives for the
+    transmitter.
+    """
 
     learning_rates: Mapping[str, float] = {"slope": 0.01, "network": 0.02}
     penalty_weights: Mapping[str, float] = {"gain": 0.5}
@@ -55,7 +57,9 @@ class Plane(Model):
     def forward(self, batch):
         directions = batch.directions
         rises = self.slope[0] * directions.elevations, self.slope[1] * directions.azimuths
-        image = rises[0][:, None] + rises[1] if isinstance(directions, Grid) else rises[0] + rises[1]
+        image = (
+            rises[0][:, None] + rises[1] if isinstance(directions, Grid) else rises[0] + rises[1]
+        )
         gain = self.network(batch.query.transmitters)
         self.batch = batch
         self.prediction = Prediction(
@@ -84,7 +88,9 @@ def make_links():
     generator = torch.Generator().manual_seed(0)
     grid = Grid.degrees(range(24), range(30))
     return Links(
-        query=Query(torch.rand(PLACES, 3, generator=generator), torch.zeros(PLACES, dtype=torch.long)),
+        query=Query(
+            torch.rand(PLACES, 3, generator=generator), torch.zeros(PLACES, dtype=torch.long)
+        ),
         receivers=(Receiver("gateway1", Pose.from_xyzw((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))),),
         labels=torch.rand(PLACES, 24, 30, generator=generator),
         task=Spectrum(grid.elevations, grid.azimuths, "none"),
@@ -96,8 +102,14 @@ def make_module(links, model=None, loss=None, seed=0, kind=Descent, **options):
     """The training of a plane by the paper's loss, or of another model by another loss."""
     torch.manual_seed(0)
     model = model or Plane(links.scene)
-    loss = loss or (Absolute(links.task) if "rays" in options.get("thinning", {}) else L1Ssim(links.task, ssim=0.25))
-    return kind(model=model, loss=loss, identity={"who": "the plane"}, seed=seed, **OPTIONS | options)
+    loss = loss or (
+        Absolute(links.task)
+        if "rays" in options.get("thinning", {})
+        else L1Ssim(links.task, ssim=0.25)
+    )
+    return kind(
+        model=model, loss=loss, identity={"who": "the plane"}, seed=seed, **OPTIONS | options
+    )
 
 
 def fit(module, links, folder, steps, *callbacks, resume=None, at_a_time=2, **options):
@@ -109,7 +121,9 @@ def fit(module, links, folder, steps, *callbacks, resume=None, at_a_time=2, **op
         enable_checkpointing=any(isinstance(callback, Checkpoint) for callback in callbacks),
         logger=CSVLogger(folder, "log"), default_root_dir=folder, **options,
     )  # fmt: skip
-    batches = Batches(links, links.split.train, module.batch_size, 0, ENDLESS if steps == -1 else steps)
+    batches = Batches(
+        links, links.split.train, module.batch_size, 0, ENDLESS if steps == -1 else steps
+    )
     validation = InOrder(links, links.split.validation, at_a_time)
     trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
     return trainer

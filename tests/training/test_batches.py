@@ -38,7 +38,9 @@ def links():
 def at(links, places, frequencies=None):
     """The links moved to numbered places."""
     transmitters = places.float()[:, None].expand(len(links), 3)
-    return replace(links, query=replace(links.query, transmitters=transmitters, frequencies=frequencies))
+    return replace(
+        links, query=replace(links.query, transmitters=transmitters, frequencies=frequencies)
+    )
 
 
 def numbers(batch):
@@ -58,7 +60,11 @@ def test_a_pass_goes_through_every_link_once(links):
     for passed in range(3):
         drawn = draw(links, (passed + 1) * PASS)[passed * PASS :]
         assert sorted(n for batch in drawn for n in numbers(batch)) == links.split.train.tolist()
-    first, second, other = draw(links, PASS), draw(links, 2 * PASS)[PASS:], draw(links, PASS, seed=1)
+    first, second, other = (
+        draw(links, PASS),
+        draw(links, 2 * PASS)[PASS:],
+        draw(links, PASS, seed=1),
+    )
     assert len({str([numbers(batch) for batch in own]) for own in (first, second, other)}) == 3
 
 
@@ -86,7 +92,9 @@ def test_a_place_is_a_position_and_a_frequency(links):
         pairs = {n // 2 for n in held}
         assert sorted(held) == [n for n in range(PLACES) if n // 2 in pairs]
     apart = [{n // 4 for n in numbers(batch)} for batch in drawn]
-    assert any(a & b for a in apart for b in apart if a is not b), "carriers of one position need not come together"
+    assert any(a & b for a in apart for b in apart if a is not b), (
+        "carriers of one position need not come together"
+    )
 
 
 @pytest.mark.parametrize("start", [1, PASS, 2 * PASS + 1])
@@ -108,7 +116,9 @@ def test_a_pass_for_scores_keeps_the_order(links):
     assert process() == (0, 1)
 
 
-@pytest.mark.parametrize(("size", "steps", "option"), [(0, 1, "training.batch_size"), (1, -1, "trainer.max_steps")])
+@pytest.mark.parametrize(
+    ("size", "steps", "option"), [(0, 1, "training.batch_size"), (1, -1, "trainer.max_steps")]
+)
 def test_sizes_below_one_are_refused(links, size, steps, option):
     with pytest.raises(ValueError, match=f"{option} must be at least 1, got"):
         Batches(links, links.split.train, size, 0, steps)
@@ -128,7 +138,9 @@ def on_each(monkeypatch, processes, work):
 
 PLACED = {
     "a place a link": torch.arange(PLACES + 4),
-    "places of 1, 2, 3 ... links": torch.repeat_interleave(torch.arange(1, 8), torch.arange(1, 8))[: PLACES + 4],
+    "places of 1, 2, 3 ... links": torch.repeat_interleave(torch.arange(1, 8), torch.arange(1, 8))[
+        : PLACES + 4
+    ],
 }
 """Numbers of the links' places."""
 
@@ -136,20 +148,28 @@ PLACED = {
 @pytest.mark.parametrize("processes", [2, 3])
 @pytest.mark.parametrize("size", [1, 5, 100])  # 1: fewer places than processes, 5: an uneven rest
 @pytest.mark.parametrize("places", PLACED)
-def test_processes_share_each_batch_and_their_mean_is_that_of_the_batch(links, monkeypatch, processes, size, places):
+def test_processes_share_each_batch_and_their_mean_is_that_of_the_batch(
+    links, monkeypatch, processes, size, places
+):
     links = at(links, PLACED[places])
     steps = 2 * -(-len(links.query.transmitters[:PLACES].unique(dim=0)) // size)
     whole = draw(links, steps, size)
     shared = on_each(monkeypatch, processes, lambda: draw(links, steps, size))
     # A value of each link, and of each place, as a loss and a penalty are means of them.
-    of_link = torch.randn(PLACES + 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    of_place = torch.randn(PLACES + 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    of_link = torch.randn(
+        PLACES + 4, generator=torch.Generator().manual_seed(1), dtype=torch.float64
+    )
+    of_place = torch.randn(
+        PLACES + 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64
+    )
     of_places = lambda batch: of_place[batch.query.transmitters[:, 0].unique().long()].mean()
     assert {len(batches) for batches in shared} == {steps}
     for batch, *parts in zip(whole, *shared, strict=True):
         held = [part for part in parts if part.shares != (0, 0)]
         assert sorted(n for part in held for n in numbers(part)) == sorted(numbers(batch))
-        where = [place for part in held for place in part.query.transmitters[:, 0].unique().tolist()]
+        where = [
+            place for part in held for place in part.query.transmitters[:, 0].unique().tolist()
+        ]
         assert len(where) == len({*where}), "no place is parted"
         assert len(held) == min(processes, len(where))
         assert all(len(part) > 0 for part in parts), "each process has a loss to take part with"
@@ -168,5 +188,7 @@ def test_processes_share_what_is_scored(links, monkeypatch, processes, size):
     assert [len(batches) for batches in drawn] == length == [-(-PLACES // size)] * processes
     assert all(len(batch) > 0 and len(batch) <= size for batches in drawn for batch in batches)
     assert {share for batches in drawn for batch in batches for share in batch.shares} <= {0.0, 1.0}
-    counted = [n for batches in drawn for batch in batches if batch.shares[0] for n in numbers(batch)]
+    counted = [
+        n for batches in drawn for batch in batches if batch.shares[0] for n in numbers(batch)
+    ]
     assert sorted(counted) == links.split.train.tolist()

@@ -38,7 +38,9 @@ class Clock(Callback):
     def on_train_batch_end(self, trainer, module, outputs, *_):
         self.losses.append(outputs["loss"].item())
         if trainer.global_step == self.at:
-            next(callback for callback in trainer.callbacks if isinstance(callback, KeepLast)).interrupt(15)
+            next(
+                callback for callback in trainer.callbacks if isinstance(callback, KeepLast)
+            ).interrupt(15)
 
     def on_validation_start(self, trainer, module):
         self.now += self.validation
@@ -66,11 +68,18 @@ def train(links, tmp_path, monkeypatch):
 
     def train(clock, module=None, steps=-1, resume=None, searched=0.0, **options):
         monkeypatch.setattr(budget_module, "time", clock)
-        given = {"max_steps": steps, "max_time": "00:00:00:10", "val_check_interval": "00:00:00:04"} | options
+        given = {
+            "max_steps": steps,
+            "max_time": "00:00:00:10",
+            "val_check_interval": "00:00:00:04",
+        } | options
         given, budget = make_budget(given, searched)
         del given["max_steps"]
         module = module or make_module(links)
-        keep = KeepBest(tmp_path / "best.ckpt", None), KeepLast(tmp_path / "last.ckpt", every=math.inf)
+        keep = (
+            KeepBest(tmp_path / "best.ckpt", None),
+            KeepLast(tmp_path / "last.ckpt", every=math.inf),
+        )
         callbacks = [clock, budget, Revision(links, 0), *keep]
         return fit(module, links, tmp_path, steps, *callbacks, resume=resume, **given)
 
@@ -95,12 +104,17 @@ def test_a_training_ends_and_validates_by_time(train, tmp_path, spent, options, 
     last = options.get("steps", validated[-1])
     assert trainer.global_step == last
     assert trainer.callbacks[1].seconds == last + spent * len(validated)
-    assert torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] in (*validated, last)
+    assert torch.load(tmp_path / "best.ckpt", weights_only=True)["global_step"] in (
+        *validated,
+        last,
+    )
 
 
 def test_rates_fall_with_the_time(train, links):
     clock = Clock()
-    module = make_module(links, learning_rates={"slope": 1.0, "network": 0.5}, schedule={"warmup": 0, "final": 0.01})
+    module = make_module(
+        links, learning_rates={"slope": 1.0, "network": 0.5}, schedule={"warmup": 0, "final": 0.01}
+    )
     train(clock, module)
     share = [0, *(k / 10 for k in range(9))]  # as of the end of the step before
     assert clock.rates == pytest.approx([0.01**done for done in share])
@@ -109,7 +123,9 @@ def test_rates_fall_with_the_time(train, links):
 @pytest.mark.parametrize(("searched", "steps"), [(3.0, 7), (5.0, 5), (30.0, 5)])
 def test_a_search_counts_but_leaves_half_of_the_time(train, links, searched, steps):
     clock = Clock()
-    module = make_module(links, learning_rates={"slope": 1.0, "network": 0.5}, schedule={"warmup": 0, "final": 0.01})
+    module = make_module(
+        links, learning_rates={"slope": 1.0, "network": 0.5}, schedule={"warmup": 0, "final": 0.01}
+    )
     trainer = train(clock, module, searched=searched)
     assert trainer.global_step == steps
     assert trainer.callbacks[1].seconds == searched + steps
@@ -119,7 +135,11 @@ def test_a_search_counts_but_leaves_half_of_the_time(train, links, searched, ste
 def test_of_steps_and_time_the_larger_share_counts(train, links):
     clock = Clock()
     schedule = {"warmup": 0, "final": 0.01}
-    train(clock, make_module(links, learning_rates={"slope": 1.0, "network": 0.5}, schedule=schedule), steps=5)
+    train(
+        clock,
+        make_module(links, learning_rates={"slope": 1.0, "network": 0.5}, schedule=schedule),
+        steps=5,
+    )
     assert clock.rates == pytest.approx([0.01 ** (k / 5) for k in range(5)])
     trainer = SimpleNamespace(max_steps=50, callbacks=[SimpleNamespace()])
     assert share_done(trainer)(20) == 20 / 50
@@ -133,7 +153,9 @@ def test_revisions_come_after_their_shares_of_the_time(train, links, caplog):
     caplog.set_level("INFO")
     module = make_module(links, Turned(links.scene))
     train(Clock(), module)
-    lines = [record.getMessage() for record in caplog.records if record.name == "gaigs.training.revision"]
+    lines = [
+        record.getMessage() for record in caplog.records if record.name == "gaigs.training.revision"
+    ]
     assert lines == ["step 0: turned", "step 3: turned", "step 4: turned", "step 9: turned"]
     assert module.model.turns == [0, 1, 2, 3]
     module = make_module(links, Turned(links.scene))
@@ -163,15 +185,24 @@ def test_a_revision_ends_with_the_time_and_leaves_the_model_as_it_was(train, lin
     assert trainer.global_step == 4, "one step more, which is validated"
     assert clock.now <= 12
     assert clock.validated[-1] == 4
-    lines = [record.getMessage() for record in caplog.records if record.name == "gaigs.training.revision"]
-    assert lines == ["step 0: turned", "step 3: the time is up within a revision, which is not made"]
+    lines = [
+        record.getMessage() for record in caplog.records if record.name == "gaigs.training.revision"
+    ]
+    assert lines == [
+        "step 0: turned",
+        "step 3: the time is up within a revision, which is not made",
+    ]
     assert (module.model.slope - module.model.before).abs().max() < 0.02, "of one step, not of 0.1"
 
 
 @pytest.mark.parametrize("at", [3, 4])
 def test_a_training_that_goes_on_has_the_time_that_was_spent(train, links, tmp_path, at):
-    """Stopped between validations and at one, it sees what an uninterrupted one sees, whatever the clock shows now."""
-    make = lambda: make_module(links, Turned(links.scene), learning_rates={"slope": 0.05, "network": 0.02})
+    """Stopped between validations and at one, it sees what an uninterrupted one sees, whatever the
+    clock shows now.
+    """
+    make = lambda: make_module(
+        links, Turned(links.scene), learning_rates={"slope": 0.05, "network": 0.02}
+    )
     whole, part, rest = Clock(), Clock(at=at), Clock(start=5000.0)
     torch.manual_seed(0)
     uninterrupted, stopped, resumed = make(), make(), make()
@@ -201,7 +232,9 @@ def test_a_training_whose_time_is_up_takes_no_step_more(train, tmp_path):
 
 def test_the_search_of_the_first_process_counts():
     _, budget = make_budget({"max_time": "00:00:00:10"}, 4.0)
-    trainer = SimpleNamespace(strategy=SimpleNamespace(broadcast=lambda own: (1.0,) * len(own)), should_stop=False)
+    trainer = SimpleNamespace(
+        strategy=SimpleNamespace(broadcast=lambda own: (1.0,) * len(own)), should_stop=False
+    )
     budget.on_fit_start(trainer, None)
     assert (budget.searched, budget.seconds, budget.limit) == (1.0, 1.0, 10.0)
 
@@ -212,7 +245,9 @@ def test_the_clock_of_the_first_process_decides():
     budget.spent = 99.0
     asked = []
     strategy = SimpleNamespace(broadcast=lambda value: asked.append(value) or first)
-    trainer = SimpleNamespace(strategy=strategy, should_stop=False, global_step=7, val_check_batch=None)
+    trainer = SimpleNamespace(
+        strategy=strategy, should_stop=False, global_step=7, val_check_batch=None
+    )
     trainer.sanity_checking, trainer.loggers = False, []
     first = 4.0
     budget.on_train_batch_end(trainer, None)
@@ -235,7 +270,11 @@ def test_the_clock_of_the_first_process_decides():
         ({"max_steps": 5, "val_check_interval": 2, "max_time": None}, None, None),
         ({"max_steps": -1, "val_check_interval": 2, "max_time": "00:01:03:20"}, 3800.0, None),
         ({"max_steps": 5, "val_check_interval": {"minutes": 2}}, None, 120.0),
-        ({"max_steps": -1, "val_check_interval": "00:00:00:09", "max_time": {"minutes": 3}}, 180.0, 9.0),
+        (
+            {"max_steps": -1, "val_check_interval": "00:00:00:09", "max_time": {"minutes": 3}},
+            180.0,
+            9.0,
+        ),
     ],
 )
 def test_times_and_steps_become_a_budget(options, max_time, every):

@@ -1,4 +1,6 @@
-"""The best and the last checkpoint: when they are written, and that a training goes on from the last."""
+"""The best and the last checkpoint: when they are written, and that a training goes on from the
+last.
+"""
 
 import errno
 import math
@@ -20,12 +22,16 @@ from gaigs.splatting.loss.absolute import Absolute
 from gaigs.training.checkpoints import Interrupted, KeepBest, KeepLast, save
 
 SPECTRA, RSSI = make_links().task, Rssi()
-ALONE = SimpleNamespace(reduce_boolean_decision=lambda decision, all: decision, barrier=lambda: None)
+ALONE = SimpleNamespace(
+    reduce_boolean_decision=lambda decision, all: decision, barrier=lambda: None
+)
 """The strategy of one process."""
 
 
 class Trainer(SimpleNamespace):
-    """The parts of Lightning's trainer that the callbacks use; a checkpoint is the number of its step."""
+    """The parts of Lightning's trainer that the callbacks use; a checkpoint is the number of its
+    step.
+    """
 
     def __init__(self, **state):
         state = {"enable_validation": True, "val_check_batch": 5, "loggers": []} | state
@@ -131,7 +137,9 @@ class Ready(Level):
         (Ready, None, 7, 7, {"limit_val_batches": 0}),  # without validation the end
     ],
 )
-def test_the_best_of_start_validations_and_end_is_kept(links, tmp_path, model, validation, steps, kept, options):
+def test_the_best_of_start_validations_and_end_is_kept(
+    links, tmp_path, model, validation, steps, kept, options
+):
     labels = torch.full((len(links),), 100.0)
     labels[links.split.validation] = validation or 0.0
     readings = replace(links, labels=labels, task=Rssi())
@@ -164,7 +172,10 @@ def test_the_last_is_never_written_between_a_step_and_its_validation(tmp_path, v
         if path.is_file():
             saved.append((moment, int(path.read_text())))
             path.unlink()
-    assert saved == [("validation" if validation and number % 5 == 0 else "step", number) for number in range(1, 12)]
+    assert saved == [
+        ("validation" if validation and number % 5 == 0 else "step", number)
+        for number in range(1, 12)
+    ]
 
 
 @pytest.mark.usefixtures("unsealed")
@@ -178,13 +189,18 @@ def test_the_last_waits_for_its_time(tmp_path, monkeypatch):
         elif path.is_file():
             written.append(trainer.global_step)
             path.unlink()
-    assert written == [4, 8], "at 116 s and 132 s, the first steps 15 s after the start and after the write before"
+    assert written == [4, 8], (
+        "at 116 s and 132 s, the first steps 15 s after the start and after the write before"
+    )
 
 
 def test_lightnings_trial_validation_does_not_count(tmp_path):
     trainer = Trainer()
     trainer.sanity_checking = True
-    for callback in (KeepBest(tmp_path / "best.ckpt", patience=1), KeepLast(tmp_path / "last.ckpt", every=0)):
+    for callback in (
+        KeepBest(tmp_path / "best.ckpt", patience=1),
+        KeepLast(tmp_path / "last.ckpt", every=0),
+    ):
         trainer.validate(callback, 0.9)
     assert not trainer.should_stop
     assert not list(tmp_path.iterdir())
@@ -241,7 +257,9 @@ def test_a_thread_sets_no_handlers(tmp_path):
 @pytest.mark.parametrize(("first", "hears"), [(True, False), (False, True)])
 def test_of_several_processes_all_stop_at_the_signal_of_one(tmp_path, first, hears):
     path, asked = tmp_path / "last.ckpt", []
-    strategy = SimpleNamespace(reduce_boolean_decision=lambda decision, all: asked.append(decision) or True)
+    strategy = SimpleNamespace(
+        reduce_boolean_decision=lambda decision, all: asked.append(decision) or True
+    )
     strategy.barrier = lambda: None
     trainer = Trainer(strategy=strategy, is_global_zero=first, enable_validation=False)
     path.with_suffix(".part").write_text("another process's")

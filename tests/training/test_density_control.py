@@ -18,7 +18,9 @@ MIDDLE = (1.0, 2.0, 0.5)
 @pytest.fixture
 def module(links):
     """Six Gaussians 2 m from the receiver, the third wide, the sixth faint."""
-    scene = replace(links.scene, receivers=(Receiver("gateway1", Pose.from_xyzw(MIDDLE, (0.0, 0.0, 0.0, 1.0))),))
+    scene = replace(
+        links.scene, receivers=(Receiver("gateway1", Pose.from_xyzw(MIDDLE, (0.0, 0.0, 0.0, 1.0))),)
+    )
     options = {"count": 6, "near": 2.0, "far": 2.0, "spread": 1.0, "opacity": 0.5, "signal": 1.0}
     gaussians = Gaussians(scene, zone=(0.0, math.pi / 2), channels=2, **options)
     with torch.no_grad():
@@ -26,11 +28,20 @@ def module(links):
         gaussians.log_scales[2, 1] = math.log(1.0)
         gaussians.opacity_logits[5] = -9
     optimizer = torch.optim.AdamW(gaussians.parameters(), lr=1e-9)
-    return SimpleNamespace(model=SimpleNamespace(primitives=gaussians, scene=scene), optimizer=optimizer)
+    return SimpleNamespace(
+        model=SimpleNamespace(primitives=gaussians, scene=scene), optimizer=optimizer
+    )
 
 
 def control(**options):
-    given = {"every": 2, "start": 2, "stop": 6, "gradient": 1.0, "split_angle": 0.2, "opacity": 0.01}
+    given = {
+        "every": 2,
+        "start": 2,
+        "stop": 6,
+        "gradient": 1.0,
+        "split_angle": 0.2,
+        "opacity": 0.01,
+    }
     return DensityControl(**(given | {"max_count": 100, "seed": 0} | options))
 
 
@@ -43,7 +54,9 @@ def step(callback, module, number, pulls, processes=1):
     callback.on_before_optimizer_step(None, module, module.optimizer)
     module.optimizer.step()
     module.strategy = SimpleNamespace(_setup_model=lambda module: "wrapped anew", model="wrapped")
-    trainer = SimpleNamespace(global_step=number, optimizers=[module.optimizer], world_size=processes)
+    trainer = SimpleNamespace(
+        global_step=number, optimizers=[module.optimizer], world_size=processes
+    )
     trainer.strategy = module.strategy
     callback.on_train_batch_end(trainer, module)
     return len(gaussians)
@@ -52,7 +65,8 @@ def step(callback, module, number, pulls, processes=1):
 def test_narrow_gaussians_are_cloned_wide_ones_split_faint_ones_pruned(module):
     callback = control()
     before = module.model.primitives.scales.detach().clone()
-    # The bound is 1 per radian, 0.5 per metre at 2 m: the mean pull of the two steps decides, 0.6 and 0.45.
+    # The bound is 1 per radian, 0.5 per metre at 2 m: the mean pull of the two steps decides, 0.6
+    # and 0.45.
     assert step(callback, module, 1, [0.0, 0.9, 0.9, 0.45, 0.0, 0.0]) == 6
     assert step(callback, module, 2, [0.0, 0.3, 0.3, 0.45, 0.0, 0.0]) == 7
     scales = module.model.primitives.scales
@@ -66,7 +80,9 @@ def test_narrow_gaussians_are_cloned_wide_ones_split_faint_ones_pruned(module):
 def test_rounds_keep_the_schedule_and_forget_the_pull_before_them(module):
     callback = control(start=4, stop=6)
     counts = [step(callback, module, number, [9.0]) for number in range(1, 10)]
-    assert counts == [6, 6, 6, 6, 6, 7, 7, 7, 7], "at 4 one is cloned and one pruned, at 6 one cloned"
+    assert counts == [6, 6, 6, 6, 6, 7, 7, 7, 7], (
+        "at 4 one is cloned and one pruned, at 6 one cloned"
+    )
     callback = control(stop=100)
     step(callback, module, 1, [9.0])
     assert step(callback, module, 2, [9.0]) == 8
@@ -79,14 +95,18 @@ def test_the_number_grows_to_the_bound_by_the_hardest_pulled(module):
     marks = torch.arange(6.0)
     module.model.primitives.signal.data[:, 0, 0] = marks
     step(control(every=1, start=1, max_count=8), module, 1, [2.0, 5.0, 1.0, 4.0, 3.0, 0.0])
-    assert sorted(module.model.primitives.signal[:, 0, 0].tolist()) == sorted([*marks.tolist(), 1, 3])
+    assert sorted(module.model.primitives.signal[:, 0, 0].tolist()) == sorted(
+        [*marks.tolist(), 1, 3]
+    )
 
 
 def test_density_control_goes_on_from_its_state(module):
     first, second = control(), control()
     step(first, module, 1, [9.0])
     second.load_state_dict(first.state_dict())
-    assert step(second, module, 2, [0.0]) == 6, "half of 9 is above the bound: one cloned, one pruned"
+    assert step(second, module, 2, [0.0]) == 6, (
+        "half of 9 is above the bound: one cloned, one pruned"
+    )
 
 
 def test_of_several_processes_each_wraps_the_new_parameters(module):

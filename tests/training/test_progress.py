@@ -17,9 +17,14 @@ def trainer(step, steps, **options):
 
 @pytest.mark.parametrize(
     ("steps", "share", "shown"),
-    [(1500, 1499 / 1500, r"1499/1500 [\d.]+ steps/s \S+ loss 0\.250 ssim 0\.500"), (-1, 0.25, r"1499 steps .*")],
+    [
+        (1500, 1499 / 1500, r"1499/1500 [\d.]+ steps/s \S+ loss 0\.250 ssim 0\.500"),
+        (-1, 0.25, r"1499 steps .*"),
+    ],
 )
-def test_the_line_fits_80_columns_and_counts_steps_or_time(capsys, monkeypatch, steps, share, shown):
+def test_the_line_fits_80_columns_and_counts_steps_or_time(
+    capsys, monkeypatch, steps, share, shown
+):
     monkeypatch.setenv("COLUMNS", "80")
     _, budget = make_budget({"max_steps": steps, "max_time": "00:00:03:00"})
     own = trainer(1200, steps, callbacks=[budget], progress_bar_metrics={"v_num": 3})

@@ -37,7 +37,9 @@ def make(links):
 
 
 def log_of(caplog):
-    return [record.getMessage() for record in caplog.records if record.name == "gaigs.training.revision"]
+    return [
+        record.getMessage() for record in caplog.records if record.name == "gaigs.training.revision"
+    ]
 
 
 @pytest.mark.parametrize("at", [1, 4])
@@ -47,15 +49,34 @@ def test_a_resumed_training_is_revised_as_an_uninterrupted_one(links, tmp_path, 
     path = tmp_path / "last.ckpt"
     uninterrupted, stopped, resumed = make(links), make(links), make(links)
     torch.manual_seed(0)
-    fit(uninterrupted, links, tmp_path, 8, Revision(links, 0), whole, KeepLast(tmp_path / "w.ckpt", every=math.inf))
-    lines = [f"step {step}: turned for the {number}th time" for number, step in enumerate((0, 2, 4))]
+    fit(
+        uninterrupted,
+        links,
+        tmp_path,
+        8,
+        Revision(links, 0),
+        whole,
+        KeepLast(tmp_path / "w.ckpt", every=math.inf),
+    )
+    lines = [
+        f"step {step}: turned for the {number}th time" for number, step in enumerate((0, 2, 4))
+    ]
     assert log_of(caplog) == lines
     caplog.clear()
     torch.manual_seed(0)
     with pytest.raises(Interrupted, match=f"stopped after step {at}$"):
         fit(stopped, links, tmp_path, 8, Revision(links, 0), part, KeepLast(path, every=math.inf))
     torch.manual_seed(7)
-    fit(resumed, links, tmp_path, 8, Revision(links, 0), rest, KeepLast(path, every=math.inf), resume=path)
+    fit(
+        resumed,
+        links,
+        tmp_path,
+        8,
+        Revision(links, 0),
+        rest,
+        KeepLast(path, every=math.inf),
+        resume=path,
+    )
     assert log_of(caplog) == lines
     assert part.losses + rest.losses == whole.losses
     for name, value in uninterrupted.model.state_dict().items():
@@ -86,7 +107,9 @@ def test_a_revision_gets_no_more_links_than_it_needs(links, tmp_path):
     count = 2 * LINKS
     copies = torch.arange(count) % len(links)
     parts = torch.arange(count - 1), torch.arange(0), torch.arange(count - 1, count)
-    many = replace(links, query=links.query[copies], labels=links.labels[copies], split=Split("most", *parts))
+    many = replace(
+        links, query=links.query[copies], labels=links.labels[copies], split=Split("most", *parts)
+    )
     module = make(many)
     fit(module, many, tmp_path, 4, Revision(many, 0), limit_val_batches=0)
     for _, train, validation, _, _ in module.model.looks:

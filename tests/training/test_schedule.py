@@ -34,7 +34,9 @@ def rates(schedule, optimizer, steps):
 def test_each_group_has_its_rate_and_the_network_alone_decays(groups):
     optimizer = make_optimizer(ADAM, groups, RATES | {"signal": 9.0})
     assert type(optimizer) is torch.optim.AdamW
-    settings = [(group["name"], group["lr"], group["weight_decay"]) for group in optimizer.param_groups]
+    settings = [
+        (group["name"], group["lr"], group["weight_decay"]) for group in optimizer.param_groups
+    ]
     assert settings == [("means", 0.5, 0.0), ("network", 0.1, 0.3)]
     held = [[id(parameter) for parameter in group["params"]] for group in optimizer.param_groups]
     assert held == [[id(parameter) for parameter in group] for group in groups.values()]
@@ -72,15 +74,39 @@ def test_a_step_is_fused_where_torch_can(groups, target, options, fused):
     ("options", "error", "message"),
     [
         *(
-            ({"_target_": target}, ValueError, rf"_target_ must be a class of torch\.optim, got '{target}'")
+            (
+                {"_target_": target},
+                ValueError,
+                rf"_target_ must be a class of torch\.optim, got '{target}'",
+            )
             for target in ("os.system", "AdamW", "torch.nn.Linear", "torch.optim.AdanW", None)
         ),
-        ({"momentun": 0.9}, ValueError, r"training\.optimizer has no option 'momentun' \(did you mean 'momentum'\?\)"),
-        ({"lr": 0.1}, ValueError, r"takes no lr, as each group has its own; set training\.learning_rates"),
+        (
+            {"momentun": 0.9},
+            ValueError,
+            r"training\.optimizer has no option 'momentun' \(did you mean 'momentum'\?\)",
+        ),
+        (
+            {"lr": 0.1},
+            ValueError,
+            r"takes no lr, as each group has its own; set training\.learning_rates",
+        ),
         ({"params": []}, ValueError, "training.optimizer has no option 'params'"),
-        ({"nesterov": "yes"}, TypeError, r"training\.optimizer option 'nesterov' must be true or false, got 'yes'"),
-        ({"momentum": -1.0}, ValueError, r"training\.optimizer cannot be made \(.* Invalid momentum value: -1\.0"),
-        ({"weight_decay": float("nan")}, TypeError, r"option 'weight_decay' must be a finite number, got nan"),
+        (
+            {"nesterov": "yes"},
+            TypeError,
+            r"training\.optimizer option 'nesterov' must be true or false, got 'yes'",
+        ),
+        (
+            {"momentum": -1.0},
+            ValueError,
+            r"training\.optimizer cannot be made \(.* Invalid momentum value: -1\.0",
+        ),
+        (
+            {"weight_decay": float("nan")},
+            TypeError,
+            r"option 'weight_decay' must be a finite number, got nan",
+        ),
     ],
 )
 def test_options_of_the_optimizer_are_its_own(groups, options, error, message):
@@ -98,7 +124,9 @@ def test_rates_rise_linearly_and_fall_exponentially(groups, warmup, final):
     drawn = rates(schedule, optimizer, 21)
     rise = [min(1.0, (k + 1) / warmup) if warmup else 1.0 for k in range(21)]
     factors = torch.tensor([rise[k] * final ** (k / 20) for k in range(21)], dtype=torch.float64)
-    torch.testing.assert_close(drawn, factors[:, None] * torch.tensor([0.5, 0.1], dtype=torch.float64))
+    torch.testing.assert_close(
+        drawn, factors[:, None] * torch.tensor([0.5, 0.1], dtype=torch.float64)
+    )
     if warmup <= 20:
         assert drawn[-1].tolist() == pytest.approx([0.5 * final, 0.1 * final])
 
@@ -114,13 +142,37 @@ def test_a_schedule_of_torch_is_stepped_once_a_step(groups):
 @pytest.mark.parametrize(
     ("config", "error", "message"),
     [
-        ({"warmup": -1, "final": 0.1}, ValueError, r"training\.schedule\.warmup must be at least 0 steps, got -1"),
-        ({"warmup": 0, "final": 0.0}, ValueError, r"training\.schedule\.final must be in \(0, 1\], got 0\.0"),
-        ({"warmup": 0.5, "final": 1.0}, TypeError, r"schedule option 'warmup' must be a whole number, got 0\.5"),
-        ({"warmpu": 5, "final": 1.0}, ValueError, r"has no option 'warmpu' \(did you mean 'warmup'\?\)"),
+        (
+            {"warmup": -1, "final": 0.1},
+            ValueError,
+            r"training\.schedule\.warmup must be at least 0 steps, got -1",
+        ),
+        (
+            {"warmup": 0, "final": 0.0},
+            ValueError,
+            r"training\.schedule\.final must be in \(0, 1\], got 0\.0",
+        ),
+        (
+            {"warmup": 0.5, "final": 1.0},
+            TypeError,
+            r"schedule option 'warmup' must be a whole number, got 0\.5",
+        ),
+        (
+            {"warmpu": 5, "final": 1.0},
+            ValueError,
+            r"has no option 'warmpu' \(did you mean 'warmup'\?\)",
+        ),
         ({"warmup": 5}, ValueError, r"training\.schedule needs option final"),
-        (CONSTANT | {"warmup": 5}, ValueError, r"training\.schedule has no option 'warmup'.* it has: factor"),
-        (CONSTANT | {"_target_": "torch.optim.SGD"}, ValueError, r"must be a class of torch\.optim\.lr_scheduler, got"),
+        (
+            CONSTANT | {"warmup": 5},
+            ValueError,
+            r"training\.schedule has no option 'warmup'.* it has: factor",
+        ),
+        (
+            CONSTANT | {"_target_": "torch.optim.SGD"},
+            ValueError,
+            r"must be a class of torch\.optim\.lr_scheduler, got",
+        ),
     ],
 )
 def test_impossible_schedules_are_refused(groups, config, error, message):

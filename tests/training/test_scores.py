@@ -30,11 +30,16 @@ def test_links_count_alike_in_any_process(monkeypatch, processes, size):
         monkeypatch.setattr(batches, "process", lambda rank=rank: (rank, processes))
         scores = MeanScores(links.task)
         for batch in InOrder(links, index, size):
-            held = [(links.query.transmitters == place).all(1).nonzero().item() for place in batch.query.transmitters]
+            held = [
+                (links.query.transmitters == place).all(1).nonzero().item()
+                for place in batch.query.transmitters
+            ]
             scores.add(batch, values[held])
         means = scores.over_processes(strategy)
     expected = links.task.scores(links.labels[index], values[index])
-    assert means == pytest.approx({name: score.mean().item() for name, score in expected.items()}, rel=1e-12)
+    assert means == pytest.approx(
+        {name: score.mean().item() for name, score in expected.items()}, rel=1e-12
+    )
     assert MeanScores(links.task).over_processes(Sum()) == {}, "without links there is no mean"
 
 

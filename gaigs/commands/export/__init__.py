@@ -1,4 +1,6 @@
-"""Export for other programs: radio maps, predictions, the learnt room and its paths, by the suffix of the file."""
+"""Export for other programs: radio maps, predictions, the learnt room and its paths, by the suffix
+of the file.
+"""
 
 from pathlib import Path
 
@@ -36,14 +38,16 @@ def export(
 
     Args:
         model: A fitted or loaded model.
-        file: ``.tif``, ``.geojson``, ``.nc``, ``.png`` or ``.pdf`` for the radio map, with deviations where the model
-            states them; ``.csv`` or ``.nc`` for predictions at places; ``.glb``, ``.gltf``, ``.obj`` or ``.xml`` (a
-            scene of Mitsuba for Sionna RT) for the learnt room; ``.deepmimo`` for the paths of mirrored channels, a
-            folder with a scenario of DeepMIMO v4.
-        places: Of predictions and scenarios: positions (n, 3) [m], from which each receiver hears; a query; or links,
-            whose test is predicted and written beside its labels.
+        file: ``.tif``, ``.geojson``, ``.nc``, ``.png`` or ``.pdf`` for the radio map, with
+            deviations where the model states them; ``.csv`` or ``.nc`` for predictions at places;
+            ``.glb``, ``.gltf``, ``.obj`` or ``.xml`` (a scene of Mitsuba for Sionna RT) for the
+            learnt room; ``.deepmimo`` for the paths of mirrored channels, a folder with a scenario
+            of DeepMIMO v4.
+        places: Of predictions and scenarios: positions (n, 3) [m], from which each receiver hears;
+            a query; or links, whose test is predicted and written beside its labels.
         pitch, height: Of a radio map [m], as for ``gaigs.radio_map``.
-        frequency: Carrier of radio map, places and materials of the room [Hz]; None: that of the training links.
+        frequency: Carrier of radio map, places and materials of the room [Hz]; None: that of the
+            training links.
         interval: Probability with which the intervals of predictions hold the label.
 
     Returns:
@@ -51,7 +55,8 @@ def export(
 
     Raises:
         TypeError: The model is not a ``gaigs.Model``.
-        ValueError: The suffix is unknown, the model has no radio map or room, or an option is out of range.
+        ValueError: The suffix is unknown, the model has no radio map or room, or an option is out
+            of range.
         ImportError: A package is not installed.
         OSError: A file cannot be written.
 
@@ -78,7 +83,9 @@ def export(
 def check_suffix(file: Path) -> str:
     """The suffix of a file to be written; a ``ValueError`` for an unknown one."""
     if (suffix := file.suffix.lower()) not in SUFFIXES:
-        raise ValueError(f"an exported file must end with one of {', '.join(SUFFIXES)}, got {file.name!r}")
+        raise ValueError(
+            f"an exported file must end with one of {', '.join(SUFFIXES)}, got {file.name!r}"
+        )
     return suffix
 
 
@@ -89,13 +96,21 @@ def run(config: dict, folder: Path) -> None:
     options = dict(config["export"])
     form, places = options.pop("format"), options.pop("places")
     if form is None:
-        raise ValueError(f"command=export needs export.format, one of {', '.join(one[1:] for one in SUFFIXES)}")
+        raise ValueError(
+            f"command=export needs export.format, one of {', '.join(one[1:] for one in SUFFIXES)}"
+        )
     suffix = check_suffix(Path(f"export.{form}"))
     model = load(config["folder"], config["trust"])
     takes_places = suffix in (*PREDICTIONS, SCENARIO)
     if places is None and takes_places and (suffix not in MAPS or not model.scene.task.is_scalar):
         places = "test"
-    name = "predictions" if suffix in PREDICTIONS and places else "radio_map" if suffix in MAPS else "room"
+    name = (
+        "predictions"
+        if suffix in PREDICTIONS and places
+        else "radio_map"
+        if suffix in MAPS
+        else "room"
+    )
     if places == "test":
         places = links_of(config["folder"], config["trust"])
     elif isinstance(places, str):

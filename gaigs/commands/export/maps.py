@@ -39,7 +39,9 @@ def layers(floor: RadioMap, scene: Scene) -> dict[str, Layer]:
     found = {"value": Layer(floor.quantity, floor.unit, floor.values)}
     if floor.deviations is not None:
         unit = getattr(scene.task, "error_unit", floor.unit)
-        found["deviation"] = Layer(f"standard deviation of {floor.quantity}", unit, floor.deviations)
+        found["deviation"] = Layer(
+            f"standard deviation of {floor.quantity}", unit, floor.deviations
+        )
     return found
 
 
@@ -49,35 +51,55 @@ def title(floor: RadioMap) -> str:
 
 
 def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
-    """Bands of value and deviation, one receiver after the other, north up, in the projected system of the frame.
+    """Bands of value and deviation, one receiver after the other, north up, in the projected system
+    of the frame.
 
     Source: OGC GeoTIFF Standard 1.1; names of bands as GDAL stores them.
     """
     x, y = axes_on_map(file, floor, scene.frame)
     width, height = np.diff(x[:2])[0], np.diff(y[:2])[0]
     kinds = layers(floor, scene).values()
-    bands = np.stack([kind.values[:, ::-1] for kind in kinds], 1).reshape(-1, len(y), len(x)).astype(np.float32)
-    words = [f"{name}: {with_unit(kind.quantity, kind.unit)}" for name in floor.receivers for kind in kinds]
+    bands = (
+        np.stack([kind.values[:, ::-1] for kind in kinds], 1)
+        .reshape(-1, len(y), len(x))
+        .astype(np.float32)
+    )
+    words = [
+        f"{name}: {with_unit(kind.quantity, kind.unit)}"
+        for name in floor.receivers
+        for kind in kinds
+    ]
     items = "".join(
         f'<Item name="DESCRIPTION" sample="{band}" role="description">{escape(word)}</Item>'
         for band, word in enumerate(words)
     )
     tags: list[tuple] = [
         (33550, "d", 3, (width, height, 0.0), True),  # ModelPixelScale
-        (33922, "d", 6, (0.0, 0.0, 0.0, x[0] - width / 2, y[-1] + height / 2, 0.0), True),  # ModelTiepoint
+        (
+            33922,
+            "d",
+            6,
+            (0.0, 0.0, 0.0, x[0] - width / 2, y[-1] + height / 2, 0.0),
+            True,
+        ),  # ModelTiepoint
         (42112, "s", 0, f"<GDALMetadata>{items}</GDALMetadata>".encode(), True),
     ]
     if scene.frame is not None:  # GeoKeyDirectory: projected, pixels are areas, EPSG code
         keys = (1, 1, 1, 3, 1024, 0, 1, 1, 1025, 0, 1, 1, 3072, 0, 1, scene.frame.epsg)
         tags.append((34735, "H", len(keys), keys, True))
-    options: dict[str, Any] = {"photometric": "minisblack", "planarconfig": "separate", "metadata": None}
+    options: dict[str, Any] = {
+        "photometric": "minisblack",
+        "planarconfig": "separate",
+        "metadata": None,
+    }
     with atomic_write(file) as part:
         tifffile.imwrite(part, bands, description=title(floor).encode(), extratags=tags, **options)
     return [file]
 
 
 def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
-    """A point for each place, with value and deviation at each receiver, ``ap`` and ``ap deviation``.
+    """A point for each place, with value and deviation at each receiver, ``ap`` and ``ap
+    deviation``.
 
     If a receiver has such a name, the keys are ``ap value`` and ``ap deviation``.
 
@@ -98,10 +120,15 @@ def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     features = [
         {
             "type": "Feature",
-            "geometry": {"type": "Point", "coordinates": [round(east, 8), round(north, 8)]},  # of degrees: 1 mm
+            "geometry": {
+                "type": "Point",
+                "coordinates": [round(east, 8), round(north, 8)],
+            },  # of degrees: 1 mm
             "properties": {name: round(column[row], 4) for name, column in columns.items()},
         }
-        for row, (east, north) in enumerate(zip(x.ravel().tolist(), y.ravel().tolist(), strict=True))
+        for row, (east, north) in enumerate(
+            zip(x.ravel().tolist(), y.ravel().tolist(), strict=True)
+        )
     ]
     content = {"type": "FeatureCollection", "title": title(floor), "features": features}
     write_text(file, json.dumps(content, ensure_ascii=False) + "\n")
@@ -123,8 +150,12 @@ def write_map_netcdf(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
         standard = {axis: {"standard_name": f"projection_{axis}_coordinate"} for axis in "xy"}
         shared["grid_mapping"] = "crs"
     for axis, values in (("x", x), ("y", y)):
-        variables[axis] = Variable((axis,), values, {"units": "m", "axis": axis.upper(), **standard[axis]})
-    variables["z"] = Variable((), np.array(floor.height), {"units": "m", "long_name": "height of the transmitter"})
+        variables[axis] = Variable(
+            (axis,), values, {"units": "m", "axis": axis.upper(), **standard[axis]}
+        )
+    variables["z"] = Variable(
+        (), np.array(floor.height), {"units": "m", "long_name": "height of the transmitter"}
+    )
     if floor.frequency is not None:
         carrier = {"units": "Hz", "standard_name": "radiation_frequency"}
         variables["frequency"] = Variable((), np.array(floor.frequency), carrier)
@@ -157,7 +188,9 @@ def write_figures(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 
 
 def axes_on_map(file: Path, floor: RadioMap, frame: Frame | None) -> tuple[ndarray, ndarray]:
-    """Coordinates x and y of the map's places in the system of the frame, or without one in the data's own [m]."""
+    """Coordinates x and y of the map's places in the system of the frame, or without one in the
+    data's own [m].
+    """
     if frame is None:
         log.warning("%s has no coordinate system: x and y are metres in the data's own frame", file)
         return floor.x, floor.y

@@ -36,10 +36,11 @@ def write_predictions(
     """Writes predictions with their deviations and intervals, ``.csv`` or ``.nc``.
 
     Args:
-        places: Positions (n, 3) [m], from which each receiver hears; a query; or links, whose test is predicted and
-            written beside its labels.
+        places: Positions (n, 3) [m], from which each receiver hears; a query; or links, whose test
+            is predicted and written beside its labels.
         frequency: Carrier of positions [Hz]; None: the only known one.
-        interval: Probability with which an interval holds the label. A model without intervals gives values alone.
+        interval: Probability with which an interval holds the label. A model without intervals
+            gives values alone.
 
     Raises:
         ValueError: There is no place, or a place, frequency or probability is impossible.
@@ -52,7 +53,9 @@ def write_predictions(
         subcarriers = None if places.held_out is None else asked.task.frequencies
         labels = asked.labels[places.split.test]
     if not 0 < interval < 1:
-        raise ValueError(f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}")
+        raise ValueError(
+            f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}"
+        )
     if subcarriers is None and model.calibration is not None and model.calibration.gives(interval):
         found = model.predict(query, interval=interval)
     else:
@@ -61,8 +64,12 @@ def write_predictions(
     task = asked.task if subcarriers is not None else scene.task
     absent = torch.tensor(False).expand(len(query), *task.shape)
     if isinstance(task, Csi):  # elements that a receiver's array lacks
-        absent = lacking(scene.receivers, query.receivers.cpu(), task.elements)[..., None].expand_as(absent)
-        blank = lambda part: part if part is None or part.ndim < 3 else part.cpu().masked_fill(absent, math.nan)
+        absent = lacking(scene.receivers, query.receivers.cpu(), task.elements)[
+            ..., None
+        ].expand_as(absent)
+        blank = lambda part: (
+            part if part is None or part.ndim < 3 else part.cpu().masked_fill(absent, math.nan)
+        )
         found, labels = Estimate(*map(blank, found)), blank(labels)
     variables = tabulate(query, scene, task, found, labels)
     if scene.frame is not None:
@@ -72,13 +79,19 @@ def write_predictions(
         return [file]
     about = {"title": f"{task.quantity} predicted by gaigs", "interval": interval}
     if scene.frame is not None:
-        about |= {"frame_epsg": scene.frame.epsg, "frame_x": scene.frame.x, "frame_y": scene.frame.y}
+        about |= {
+            "frame_epsg": scene.frame.epsg,
+            "frame_x": scene.frame.x,
+            "frame_y": scene.frame.y,
+        }
     write_netcdf(file, variables, about)
     return [file]
 
 
 def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -> Query:
-    """The links of ``places``, one or more, as for ``write_predictions``; ``kind`` names the file in errors."""
+    """The links of ``places``, one or more, as for ``write_predictions``; ``kind`` names the file
+    in errors.
+    """
     if places is None:
         raise ValueError(f"{kind} take places: positions [m], a query, or links with a test")
     if isinstance(places, Links):
@@ -87,15 +100,22 @@ def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -
     elif isinstance(places, Query):
         query = places
     else:
-        points, names = as_positions("places", places), [receiver.name for receiver in scene.receivers]
+        points, names = (
+            as_positions("places", places),
+            [receiver.name for receiver in scene.receivers],
+        )
         query, _ = Query.from_positions(points, None, frequency, names, scene.frequencies)
     if not len(query):
         raise ValueError(f"{kind} take one place or more; give positions [m], or links with a test")
     return query
 
 
-def tabulate(query: Query, scene: Scene, task: Task, found: Estimate, labels: Tensor | None) -> dict[str, Variable]:
-    """Columns of links, axes of labels, and values by links and axes; complex values as real and imaginary part."""
+def tabulate(
+    query: Query, scene: Scene, task: Task, found: Estimate, labels: Tensor | None
+) -> dict[str, Variable]:
+    """Columns of links, axes of labels, and values by links and axes; complex values as real and
+    imaginary part.
+    """
     places, metres = query.transmitters.cpu().double().numpy(), {"units": "m"}
     variables = {axis: Variable(("link",), places[:, k], metres) for k, axis in enumerate("xyz")}
     if scene.frame is not None:
@@ -106,15 +126,25 @@ def tabulate(query: Query, scene: Scene, task: Task, found: Estimate, labels: Te
     variables["receiver"] = Variable(("link",), names[query.receivers.cpu().numpy()])
     if query.frequencies is not None:
         carriers = query.frequencies.cpu().double().numpy()
-        variables["frequency"] = Variable(("link",), carriers, {"units": "Hz", "standard_name": "radiation_frequency"})
+        variables["frequency"] = Variable(
+            ("link",), carriers, {"units": "Hz", "standard_name": "radiation_frequency"}
+        )
     axes = axes_of(task)
     variables |= axes
-    parts = {"value": found.value, "deviation": found.std, "lower": found.lower, "upper": found.upper}
+    parts = {
+        "value": found.value,
+        "deviation": found.std,
+        "lower": found.lower,
+        "upper": found.upper,
+    }
     parts |= {"radius": found.radius, "measured": labels}
     for name, part in parts.items():
         if part is None:
             continue
-        part, unit = part.detach().cpu(), {"units": task.unit or "1", "long_name": f"{task.quantity}: {name}"}
+        part, unit = (
+            part.detach().cpu(),
+            {"units": task.unit or "1", "long_name": f"{task.quantity}: {name}"},
+        )
         if name in ("deviation", "radius"):
             unit["units"] = getattr(task, "error_unit", task.unit) or "1"
         of_link = part.reshape(len(part), *[1] * (len(task.shape) + 1 - part.ndim), *part.shape[1:])
@@ -126,35 +156,55 @@ def tabulate(query: Query, scene: Scene, task: Task, found: Estimate, labels: Te
 
 
 def axes_of(task: Any) -> dict[str, Variable]:
-    """The axes of a label: elements and subcarriers, elevations and azimuths, or numbers of another task's."""
+    """The axes of a label: elements and subcarriers, elevations and azimuths, or numbers of another
+    task's.
+    """
     if task.directions is not None:
         angles = {"elevation": task.directions.elevations, "azimuth": task.directions.azimuths}
-        degrees = {name: np.degrees(values.double().numpy()).round(6) for name, values in angles.items()}
-        return {name: Variable((name,), values, {"units": "degree"}) for name, values in degrees.items()}
+        degrees = {
+            name: np.degrees(values.double().numpy()).round(6) for name, values in angles.items()
+        }
+        return {
+            name: Variable((name,), values, {"units": "degree"}) for name, values in degrees.items()
+        }
     if isinstance(task, Csi):
         subcarriers = Variable(("subcarrier",), task.frequencies.double().numpy(), {"units": "Hz"})
-        return {"element": Variable(("element",), np.arange(task.elements, dtype=np.int32)), "subcarrier": subcarriers}
+        return {
+            "element": Variable(("element",), np.arange(task.elements, dtype=np.int32)),
+            "subcarrier": subcarriers,
+        }
     names = [f"axis_{axis}" for axis in range(len(task.shape))]
     return {
-        name: Variable((name,), np.arange(size, dtype=np.int32)) for name, size in zip(names, task.shape, strict=True)
+        name: Variable((name,), np.arange(size, dtype=np.int32))
+        for name, size in zip(names, task.shape, strict=True)
     }
 
 
-def write_csv(file: Path, variables: Mapping[str, Variable], absent: Bool[np.ndarray, " n *shape"]) -> None:
-    """A row for each number of each link that is not absent: columns of the link, of the axes, and of the values."""
-    axes = {name: one.values.tolist() for name, one in variables.items() if one.dimensions == (name,)}
+def write_csv(
+    file: Path, variables: Mapping[str, Variable], absent: Bool[np.ndarray, " n *shape"]
+) -> None:
+    """A row for each number of each link that is not absent: columns of the link, of the axes, and
+    of the values.
+    """
+    axes = {
+        name: one.values.tolist() for name, one in variables.items() if one.dimensions == (name,)
+    }
     links = {name: one.values.tolist() for name, one in variables.items() if name in LINK}
     values = {name: one.values for name, one in variables.items() if name not in axes | links}
     shown = lambda value, digits=7: value if isinstance(value, str) else f"{value:.{digits}g}"
     digits = [10 if name in ("easting", "northing") else 7 for name in links]
-    places = [*itertools.product(*([f"{number:.10g}" for number in axis] for axis in axes.values()))]
+    places = [
+        *itertools.product(*([f"{number:.10g}" for number in axis] for axis in axes.values()))
+    ]
 
     def rows() -> Iterator[Sequence[str]]:
         yield [*links, *axes, *values]
         for number, link in enumerate(zip(*links.values(), strict=True)):
             start = [*map(shown, link, digits)]
             own = (map(shown, part[number].ravel().tolist()) for part in values.values())
-            for place, row, is_absent in zip(places, zip(*own, strict=True), absent[number].ravel(), strict=True):
+            for place, row, is_absent in zip(
+                places, zip(*own, strict=True), absent[number].ravel(), strict=True
+            ):
                 if not is_absent:
                     yield [*start, *place, *row]
 

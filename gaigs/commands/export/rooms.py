@@ -1,4 +1,6 @@
-"""Learnt rooms for 3-D programs, as glTF and Wavefront OBJ, and for ray tracers, as scenes of Mitsuba."""
+"""Learnt rooms for 3-D programs, as glTF and Wavefront OBJ, and for ray tracers, as scenes of
+Mitsuba.
+"""
 
 import base64
 import cmath
@@ -36,7 +38,9 @@ COLOUR = 0.0, 0.45, 0.70, 0.35
 """Red, green, blue and opacity of planes: the figures' blue, through which the room shows."""
 
 THINNEST = 1e-5
-"""Thickness of the sheets of obstacles [m]: thin against the wavelength, so that only the conductance counts."""
+"""Thickness of the sheets of obstacles [m]: thin against the wavelength, so that only the
+conductance counts.
+"""
 
 FREE_SPACE = 376.73
 """Wave impedance of free space [ohm]."""
@@ -46,11 +50,14 @@ CARRIERS_OF_ITU = 1e9, 40e9
 
 
 def write_room(model: Model, file: Path, frequency: float | None = None) -> list[Path]:
-    """Writes the planes and obstacles that a model has learnt, of an ensemble its first member; gives the files.
+    """Writes the planes and obstacles that a model has learnt, of an ensemble its first member;
+    gives the files.
 
     Args:
-        file: ``.gltf``, ``.glb``, ``.obj``, or a scene ``.xml`` of Mitsuba, whose meshes get a folder beside it.
-        frequency: Carrier of a scene's materials [Hz]; None: that of the training links, of several the middle one.
+        file: ``.gltf``, ``.glb``, ``.obj``, or a scene ``.xml`` of Mitsuba, whose meshes get a
+            folder beside it.
+        frequency: Carrier of a scene's materials [Hz]; None: that of the training links, of several
+            the middle one.
 
     Raises:
         ValueError: The model has no planes, or a scene's carrier is unknown or impossible.
@@ -59,39 +66,57 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
     if suffix == ".xml":
         frequency = own.scene.middle_frequency if frequency is None else frequency
         if frequency is None:
-            raise ValueError("materials depend on the carrier, which the data do not know; set frequency=... [Hz]")
+            raise ValueError(
+                "materials depend on the carrier, which the data do not know; set frequency=... [Hz]"
+            )
         frequency = float(frequency)
         check_carrier("frequency", frequency)
     found = export.trace_paths(own.placement, own.traced)
     planes = export.outlines(own.placement, found)
     corners = np.concatenate([found.ends, *(plane.corners for plane in planes)])
     sheets, rest = fit_sheets(own.placement, own.traced, corners.min(0), corners.max(0))
-    meshes = [*map(mesh_of, planes), *(mesh_of_sheet(number, sheet) for number, sheet in enumerate(sheets))]
+    meshes = [
+        *map(mesh_of, planes),
+        *(mesh_of_sheet(number, sheet) for number, sheet in enumerate(sheets)),
+    ]
     if suffix == ".obj":
         write_text(file, export.wavefront_obj(own.placement, found, sheets))
         return [file]
     if frequency is None or suffix != ".xml":
-        extras = [*({"share": plane.share} for plane in planes), *({"loss_db": sheet.loss_db} for sheet in sheets)]
+        extras = [
+            *({"share": plane.share} for plane in planes),
+            *({"loss_db": sheet.loss_db} for sheet in sheets),
+        ]
         write_gltf(file, meshes, extras)
         return [file]
     chosen = materials(own.placement, own.traced, frequency)
-    bsdfs = [itu_bsdf(chosen[plane.number], frequency) for plane in planes] + [*map(sheet_bsdf, sheets)]
+    bsdfs = [itu_bsdf(chosen[plane.number], frequency) for plane in planes] + [
+        *map(sheet_bsdf, sheets)
+    ]
     comments = [f"Materials for {frequency:.7g} Hz.", *map(str, own.scene.flat_axes)]
     if own.scene.task.dtype.is_complex:
-        for receiver, gain in zip(own.scene.receivers, traced_gains(own, rest).tolist(), strict=True):
+        for receiver, gain in zip(
+            own.scene.receivers, traced_gains(own, rest).tolist(), strict=True
+        ):
             turned = f"{abs(gain):.4g}, turned by {math.degrees(cmath.phase(gain)):.2f} degrees"
             conjugated = ", then conjugated" if own.pooling.array_sign > 0 else ""
-            comments.append(f"Channels of {receiver.name} are those traced times {turned}{conjugated}.")
+            comments.append(
+                f"Channels of {receiver.name} are those traced times {turned}{conjugated}."
+            )
     return write_scene(file, meshes, bsdfs, comments)
 
 
 def mirrored_of(kind: str, model: Model) -> MirroredSplatting:
-    """The mirrored Gaussians of a model, without its kriging, of an ensemble those of its first member."""
+    """The mirrored Gaussians of a model, without its kriging, of an ensemble those of its first
+    member.
+    """
     own = model
     while isinstance(own, Wrapper):
         own = own.underlying
     if not isinstance(own, MirroredSplatting):
-        raise ValueError(f"{kind} takes a model 'mirrored', got {name_of(own)!r}; train it on the same data")
+        raise ValueError(
+            f"{kind} takes a model 'mirrored', got {name_of(own)!r}; train it on the same data"
+        )
     return own
 
 
@@ -109,9 +134,13 @@ def mesh_of_sheet(number: int, sheet: Sheet) -> Mesh:
 
 @torch.no_grad()
 def traced_gains(model: MirroredSplatting, rest: float) -> Complex[Tensor, " receivers"]:
-    """Gain of each receiver's channels over those that Sionna RT traces; ``rest`` is that of ``fit_sheets`` [Np]."""
+    """Gain of each receiver's channels over those that Sionna RT traces; ``rest`` is that of
+    ``fit_sheets`` [Np].
+    """
     placement = model.placement
-    amplitudes = (placement.receiver_gains + placement.path_gains[0] + rest).exp() * model.pooling.strength
+    amplitudes = (
+        placement.receiver_gains + placement.path_gains[0] + rest
+    ).exp() * model.pooling.strength
     return torch.polar(amplitudes, placement.receiver_phases)
 
 
@@ -128,7 +157,10 @@ def itu_bsdf(material: Material, frequency: float) -> Bsdf:
 
     For a carrier [Hz] outside the tables it is the extrapolated numbers of this carrier.
     """
-    name, thickness = f"{material.name}-{1e3 * material.thickness:.4g}mm", ("thickness", material.thickness)
+    name, thickness = (
+        f"{material.name}-{1e3 * material.thickness:.4g}mm",
+        ("thickness", material.thickness),
+    )
     if CARRIERS_OF_ITU[0] <= frequency <= CARRIERS_OF_ITU[1]:
         return Bsdf(name, "itu-radio-material", (("type", material.name), thickness))
     numbers = TABULATED[material.name][0], conductivity(material.name, frequency)
@@ -137,14 +169,28 @@ def itu_bsdf(material: Material, frequency: float) -> Bsdf:
 
 
 def sheet_bsdf(sheet: Sheet) -> Bsdf:
-    """A sheet of obstacles, which reflects nothing: all of that energy is scattered, which Sionna RT leaves out."""
+    """A sheet of obstacles, which reflects nothing: all of that energy is scattered, which Sionna
+    RT leaves out.
+    """
     conductivity = sheet.conductance / (THINNEST * FREE_SPACE)
-    properties = (("thickness", THINNEST), ("conductivity", conductivity), ("scattering_coefficient", 1.0))
-    return Bsdf(f"sheet-{sheet.loss_db:.4g}dB", "radio-material", (("relative_permittivity", 1.0), *properties))
+    properties = (
+        ("thickness", THINNEST),
+        ("conductivity", conductivity),
+        ("scattering_coefficient", 1.0),
+    )
+    return Bsdf(
+        f"sheet-{sheet.loss_db:.4g}dB",
+        "radio-material",
+        (("relative_permittivity", 1.0), *properties),
+    )
 
 
-def write_scene(file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comments: Sequence[str] = ()) -> list[Path]:
-    """Writes a scene of Mitsuba for Sionna RT, and a mesh ``.ply`` of each surface beside it; gives the files."""
+def write_scene(
+    file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comments: Sequence[str] = ()
+) -> list[Path]:
+    """Writes a scene of Mitsuba for Sionna RT, and a mesh ``.ply`` of each surface beside it; gives
+    the files.
+    """
     scene = ElementTree.Element("scene", version="2.1.0")
     for comment in ("Learnt by gaigs; metres, z up.", *comments):
         scene.append(ElementTree.Comment(f" {re.sub('-+', '-', comment)} "))
@@ -158,7 +204,9 @@ def write_scene(file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comme
     with only_run(folder, waits=True):
         for mesh, bsdf in zip(meshes, bsdfs, strict=True):
             vertices = np.array([*mesh.vertices], dtype=[(axis, "f4") for axis in "xyz"])
-            faces = np.array([(face,) for face in mesh.triangles()], dtype=[("vertex_indices", "i4", (3,))])
+            faces = np.array(
+                [(face,) for face in mesh.triangles()], dtype=[("vertex_indices", "i4", (3,))]
+            )
             elements = [PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]
             # Named by content: a scene that is read meanwhile never has another scene's meshes.
             digest = hashlib.sha256(vertices.tobytes() + faces.tobytes()).hexdigest()[:8]
@@ -166,7 +214,9 @@ def write_scene(file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comme
             with atomic_write(files[-1]) as part:
                 PlyData(elements, byte_order="<").write(str(part))
             shape = ElementTree.SubElement(scene, "shape", type="ply", id=f"mesh-{mesh.name}")
-            ElementTree.SubElement(shape, "string", name="filename", value=f"{folder.name}/{files[-1].name}")
+            ElementTree.SubElement(
+                shape, "string", name="filename", value=f"{folder.name}/{files[-1].name}"
+            )
             ElementTree.SubElement(shape, "boolean", name="face_normals", value="true")
             ElementTree.SubElement(shape, "ref", id=bsdf.name, name="bsdf")
         ElementTree.indent(scene)
@@ -178,7 +228,8 @@ def write_scene(file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comme
 
 
 def write_gltf(file: Path, meshes: Sequence[Mesh], extras: Sequence[Mapping[str, float]]) -> None:
-    """Writes meshes as glTF 2.0, ``.glb`` or, with its buffer within, ``.gltf``; a node each, with its extras.
+    """Writes meshes as glTF 2.0, ``.glb`` or, with its buffer within, ``.gltf``; a node each, with
+    its extras.
 
     The root's rotation turns z up into glTF's y up.
     """
@@ -186,11 +237,24 @@ def write_gltf(file: Path, meshes: Sequence[Mesh], extras: Sequence[Mapping[str,
 
     def add(array: np.ndarray, kind: str, target: int) -> int:
         nonlocal buffer
-        views.append({"buffer": 0, "byteOffset": len(buffer), "byteLength": array.nbytes, "target": target})
-        component = 5126 if array.dtype == np.float32 else 5125  # float and unsigned int, of OpenGL as the targets
+        views.append(
+            {"buffer": 0, "byteOffset": len(buffer), "byteLength": array.nbytes, "target": target}
+        )
+        component = (
+            5126 if array.dtype == np.float32 else 5125
+        )  # float and unsigned int, of OpenGL as the targets
         accessors.append(
-            {"bufferView": len(views) - 1, "componentType": component, "count": len(array), "type": kind}
-            | ({"min": array.min(0).tolist(), "max": array.max(0).tolist()} if kind == "VEC3" else {})
+            {
+                "bufferView": len(views) - 1,
+                "componentType": component,
+                "count": len(array),
+                "type": kind,
+            }
+            | (
+                {"min": array.min(0).tolist(), "max": array.max(0).tolist()}
+                if kind == "VEC3"
+                else {}
+            )
         )
         buffer += array.tobytes()  # both types have 4 bytes, so that all parts stay aligned
         return len(views) - 1
@@ -201,7 +265,11 @@ def write_gltf(file: Path, meshes: Sequence[Mesh], extras: Sequence[Mapping[str,
         faces = add(np.array(mesh.triangles(), np.uint32).ravel(), "SCALAR", 34963)
         primitive = {"attributes": {"POSITION": corners}, "indices": faces, "material": 0}
         shapes.append({"name": mesh.name, "primitives": [primitive]})
-    turned = {"name": "room", "children": [*range(1, len(meshes) + 1)], "rotation": [-(0.5**0.5), 0, 0, 0.5**0.5]}
+    turned = {
+        "name": "room",
+        "children": [*range(1, len(meshes) + 1)],
+        "rotation": [-(0.5**0.5), 0, 0, 0.5**0.5],
+    }
     nodes = [{"name": mesh.name, "mesh": k, "extras": extras[k]} for k, mesh in enumerate(meshes)]
     look = {"baseColorFactor": COLOUR, "metallicFactor": 0}
     content = {
@@ -216,7 +284,9 @@ def write_gltf(file: Path, meshes: Sequence[Mesh], extras: Sequence[Mapping[str,
         "buffers": [{"byteLength": len(buffer)}],
     }
     if file.suffix.lower() == ".gltf":
-        content["buffers"][0]["uri"] = "data:application/octet-stream;base64," + base64.b64encode(buffer).decode()
+        content["buffers"][0]["uri"] = (
+            "data:application/octet-stream;base64," + base64.b64encode(buffer).decode()
+        )
         write_text(file, json.dumps(content) + "\n")
         return
     text = json.dumps(content).encode()

@@ -20,19 +20,26 @@ from gaigs.processes import only_run
 log = logging.getLogger(__name__)
 
 FAINT = 1e-6
-"""Amplitude over that of a link's strongest path below which a path is left out: float32 rounds by as much."""
+"""Amplitude over that of a link's strongest path below which a path is left out: float32 rounds by
+as much.
+"""
 
 
 @torch.no_grad()
-def write_scenario(model: Model, folder: Path, places: object, frequency: float | None = None) -> list[Path]:
-    """Writes the paths of mirrored channels from places to all receivers, without kriging; gives the folder.
+def write_scenario(
+    model: Model, folder: Path, places: object, frequency: float | None = None
+) -> list[Path]:
+    """Writes the paths of mirrored channels from places to all receivers, without kriging; gives
+    the folder.
 
     Args:
         folder: A missing or empty one.
-        places, frequency: As for ``gaigs.commands.export.predictions.write_predictions``; places are the users.
+        places, frequency: As for ``gaigs.commands.export.predictions.write_predictions``; places
+            are the users.
 
     Raises:
-        ValueError: The channels are not sums of mirrored paths, there is no place, or the folder is not empty.
+        ValueError: The channels are not sums of mirrored paths, there is no place, or the folder is
+            not empty.
     """
     own = mirrored_of("a scenario", model)
     if not own.has_margins:
@@ -47,19 +54,28 @@ def write_scenario(model: Model, folder: Path, places: object, frequency: float 
     unit = own.pooling.strength.item() * speed_of_light / (4 * math.pi * carrier.item())
     stations = []
     for number, receiver in enumerate(own.scene.receivers):
-        query = Query(users, torch.full((len(users),), number), carrier.to(users).expand(len(users)))
+        query = Query(
+            users, torch.full((len(users),), number), carrier.to(users).expand(len(users))
+        )
         parts = [part.to(own.placement.middle.device) for part in query.parts(64)]
         which = [torch.arange(len(part), device=part.receivers.device) for part in parts]
-        heard = [own.paths(own.excite(part), rows, number, part) for part, rows in zip(parts, which, strict=True)]
+        heard = [
+            own.paths(own.excite(part), rows, number, part)
+            for part, rows in zip(parts, which, strict=True)
+        ]
         gains = torch.cat([paths.amplitudes for paths in heard]).cpu().to(torch.complex128).numpy()
         sizes = np.abs(gains)
         gains = np.where(sizes > FAINT * sizes.max(1, keepdims=True), unit * gains, 0)
-        bounces = export.trace_paths(own.placement, query).bounces[:, :, ::-1].astype(float)  # from the receiver on
+        bounces = (
+            export.trace_paths(own.placement, query).bounces[:, :, ::-1].astype(float)
+        )  # from the receiver on
         stations.append((receiver.pose.position.double().numpy(), gains, bounces))
     folder.mkdir(parents=True, exist_ok=True)
     with only_run(folder):
         check_empty(folder)  # another process may have begun to write it
         deepmimo.write(folder, carrier.item(), users.double().numpy(), stations)
-    names = ", ".join(f"t000_tx{number:03} = {one.name}" for number, one in enumerate(own.scene.receivers))
+    names = ", ".join(
+        f"t000_tx{number:03} = {one.name}" for number, one in enumerate(own.scene.receivers)
+    )
     log.info("%s: base stations %s", folder, names)
     return [folder]

@@ -61,7 +61,8 @@ class View:
         return [each.facts() for each in self.contents]
 
     def save(self, path: str | Path) -> None:
-        """Writes one HTML file with all predictions of some places, which any browser opens without a server.
+        """Writes one HTML file with all predictions of some places, which any browser opens without
+        a server.
 
         Raises:
             OSError: The file cannot be written.
@@ -69,7 +70,8 @@ class View:
         write_text(path, self.page(self.stored()))
 
     def serve(self, port: int = 8080) -> None:
-        """Serves the page on this machine until Ctrl-C; the model predicts wherever the transmitter is dragged.
+        """Serves the page on this machine until Ctrl-C; the model predicts wherever the transmitter
+        is dragged.
 
         Args:
             port: Of http://127.0.0.1; 0 for any free one.
@@ -80,18 +82,30 @@ class View:
         try:
             serving = server(self.page(), list(self.contents), port)
         except OSError as error:
-            raise OSError(f"port {port} cannot be opened ({error.strerror}); take another, or 0 for any") from None
+            raise OSError(
+                f"port {port} cannot be opened ({error.strerror}); take another, or 0 for any"
+            ) from None
         with serving:
-            print(f"open http://127.0.0.1:{serving.server_port} in a browser; Ctrl-C ends", flush=True)
+            print(
+                f"open http://127.0.0.1:{serving.server_port} in a browser; Ctrl-C ends", flush=True
+            )
             serving.serve_forever()
 
     def page(self, stored: dict | None = None) -> str:
         """The HTML page; without stored predictions it asks the server that sent it."""
-        colours = {name: [colormaps[name](i, bytes=True)[:3] for i in range(256)] for name in COLOURS}
+        colours = {
+            name: [colormaps[name](i, bytes=True)[:3] for i in range(256)] for name in COLOURS
+        }
         content = {"runs": self.facts, "stored": stored, "colours": colours}
-        packed = gzip.compress(json.dumps(content, default=int, separators=(",", ":")).encode(), mtime=0)
+        packed = gzip.compress(
+            json.dumps(content, default=int, separators=(",", ":")).encode(), mtime=0
+        )
         read = lambda name: files("gaigs.commands.view").joinpath(name).read_text(encoding="utf-8")
-        parts = {"style": read("page.css"), "drawing": read("drawing.js"), "script": read("page.js")}
+        parts = {
+            "style": read("page.css"),
+            "drawing": read("drawing.js"),
+            "script": read("page.js"),
+        }
         parts["content"] = base64.b64encode(packed).decode()
         text = read("page.html")
         for name, part in parts.items():
@@ -99,7 +113,9 @@ class View:
         return text
 
     def stored(self) -> dict:
-        """Predictions for transmitters at even places in the box of the training transmitters, for all receivers."""
+        """Predictions for transmitters at even places in the box of the training transmitters, for
+        all receivers.
+        """
         scene = self.contents[0].scene
         count = len(scene.receivers)
         places = even_places(scene.lower, scene.upper, max(FEWEST, PLACES // count))
@@ -107,7 +123,9 @@ class View:
         heights = heights[evenly(torch.arange(len(heights)), max(1, MAPS // count))].tolist()
         runs = []
         for one in self.contents:
-            answers = [[one.answer(place, k, STEP) for k in range(count)] for place in places.tolist()]
+            answers = [
+                [one.answer(place, k, STEP) for k in range(count)] for place in places.tolist()
+            ]
             maps = [[one.slice(z, k) for k in range(count)] for z in heights] if one.has_map else []
             links = [one.comparison(k, STEP) for k in range(len(one.tests))]
             runs.append({"answers": answers, "maps": maps, "links": links})
@@ -128,7 +146,8 @@ def view(model: Model, links: Links | None = None, other: Model | None = None) -
 
     Raises:
         TypeError: A model is not a ``gaigs.Model``.
-        ValueError: The links, or the other model, have other receivers; or the links have another task.
+        ValueError: The links, or the other model, have other receivers; or the links have another
+            task.
 
     Example:
         >>> model = gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0))
@@ -141,7 +160,9 @@ def view(model: Model, links: Links | None = None, other: Model | None = None) -
         check_instance("links", links, Links)
     shown = [one for one in (model, other) if one is not None]
     names = [name_of(one.trend if isinstance(one, Kriging) else one) for one in shown]
-    return View(side_by_side([Contents(one, links, name) for one, name in zip(shown, names, strict=True)]))
+    return View(
+        side_by_side([Contents(one, links, name) for one, name in zip(shown, names, strict=True)])
+    )
 
 
 def side_by_side(contents: list[Contents]) -> list[Contents]:
@@ -149,7 +170,9 @@ def side_by_side(contents: list[Contents]) -> list[Contents]:
     own = contents[0].scene
     for each in contents[1:]:
         names = [[one.name for one in scene.receivers] for scene in (own, each.scene)]
-        if names[0] != names[1] or not torch.allclose(own.positions(own.lower), each.scene.positions(own.lower)):
+        if names[0] != names[1] or not torch.allclose(
+            own.positions(own.lower), each.scene.positions(own.lower)
+        ):
             raise ValueError(
                 f"two models side by side must have the same receivers, got {', '.join(names[0][:5])} and "
                 f"{', '.join(names[1][:5])}, or other positions; view them one by one"
@@ -169,13 +192,21 @@ def contents_of(source: str | Path, trust: bool = False) -> Contents:
 def run(config: dict) -> None:
     """Serves the view of a run's folder or of a checkpoint, or writes it into one file."""
     if config["folder"] is None:
-        raise ValueError("command=view needs the folder of a finished run, or a checkpoint; add folder=runs/...")
+        raise ValueError(
+            "command=view needs the folder of a finished run, or a checkpoint; add folder=runs/..."
+        )
     call("view", show, config["view"], folder=config["folder"], trust=config["trust"])
 
 
-def show(folder: str, trust: bool, other: str | None = None, out: str | None = None, port: int = 8080) -> None:
+def show(
+    folder: str, trust: bool, other: str | None = None, out: str | None = None, port: int = 8080
+) -> None:
     """One run, or two side by side: in a file ``out``, or without one by a server."""
-    shown = View(side_by_side([contents_of(source, trust) for source in (folder, other) if source is not None]))
+    shown = View(
+        side_by_side(
+            [contents_of(source, trust) for source in (folder, other) if source is not None]
+        )
+    )
     if out is None:
         shown.serve(port)
         return

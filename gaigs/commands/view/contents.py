@@ -57,7 +57,9 @@ class Contents:
         kinds["channel"] = isinstance(self.task, Csi)
         self.kind = next((kind for kind, fits in kinds.items() if fits), None)
         self.frequency = self.scene.middle_frequency
-        self.interval = 0.5 if model.calibration is not None and model.calibration.gives(0.5) else None
+        self.interval = (
+            0.5 if model.calibration is not None and model.calibration.gives(0.5) else None
+        )
         self.lock = threading.Lock()  # models hold what they compute for a moment
         self.tests = torch.zeros(0, dtype=torch.long)
         if links is not None and links.held_out is None:
@@ -76,7 +78,9 @@ class Contents:
             return self.links.labels[self.tests], torch.cat([part.cpu() for part in batches])
 
     def facts(self) -> dict:
-        """All that does not depend on the transmitter: axes and units, room, Gaussians, receivers, errors of links."""
+        """All that does not depend on the transmitter: axes and units, room, Gaussians, receivers,
+        errors of links.
+        """
         quantity = with_unit(self.task.quantity, self.task.unit)
         facts: dict[str, Any] = {
             "title": self.title,
@@ -95,9 +99,13 @@ class Contents:
         }  # fmt: skip
         if self.kind == "spectrum":
             grid = self.task.directions
-            facts |= {name: plain(getattr(grid, name).rad2deg()) for name in ("elevations", "azimuths")}
+            facts |= {
+                name: plain(getattr(grid, name).rad2deg()) for name in ("elevations", "azimuths")
+            }
         if self.links is not None:
-            known = self.links.query.transmitters[evenly(self.links.split.train, 1000)].unique(dim=0)
+            known = self.links.query.transmitters[evenly(self.links.split.train, 1000)].unique(
+                dim=0
+            )
             facts |= {"edges": plain(self.links.edges), "places": plain(known)}
         with self.lock:
             gaussians, learnt = self.model.primitives, call_optional(self.model, "learnt_room")
@@ -106,7 +114,9 @@ class Contents:
                 strengths = gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)
                 strongest = strengths.topk(min(STRONGEST, len(strengths))).indices
                 parts = gaussians.means, gaussians.covariances, gaussians.opacities, strengths
-                facts["splats"]["gaussians"] = splats(*(part[strongest].cpu().numpy() for part in parts))
+                facts["splats"]["gaussians"] = splats(
+                    *(part[strongest].cpu().numpy() for part in parts)
+                )
                 facts["splats"]["gaussians"]["total"] = len(strengths)
         if learnt is not None:
             facts["planes"] = [
@@ -115,9 +125,13 @@ class Contents:
             ]
             if learnt.matter is not None:
                 centres, widths, densities = learnt.matter
-                losses = densities * math.sqrt(2 * math.pi) * np.exp(np.log(widths).mean(1))  # through the middle [dB]
+                losses = (
+                    densities * math.sqrt(2 * math.pi) * np.exp(np.log(widths).mean(1))
+                )  # through the middle [dB]
                 covariances = widths[:, :, None] ** 2 * np.eye(3)
-                facts["splats"]["obstacles"] = splats(centres, covariances, 1 - 10 ** (-losses / 10), losses)
+                facts["splats"]["obstacles"] = splats(
+                    centres, covariances, 1 - 10 ** (-losses / 10), losses
+                )
         if len(self.tests):
             query, (labels, values) = self.links.query[self.tests], self.compared
             scores = self.task.scores(labels, values)[self.task.monitor]
@@ -125,7 +139,9 @@ class Contents:
                 "places": plain(query.transmitters),
                 "receivers": query.receivers.tolist(),
                 "scores": plain(scores),
-                "title": with_unit("error", self.task.error_unit) if self.kind == "level" else self.task.pair_score,
+                "title": with_unit("error", self.task.error_unit)
+                if self.kind == "level"
+                else self.task.pair_score,
                 "rises": bool(self.task.higher_is_better),
             }
         return facts
@@ -138,7 +154,9 @@ class Contents:
             step: Every so many rows and columns of a spectrum.
         """
         answer: dict[str, Any] = {}
-        value, std, snr = self._estimate(torch.tensor([place]), None if self.kind == "level" else receiver)
+        value, std, snr = self._estimate(
+            torch.tensor([place]), None if self.kind == "level" else receiver
+        )
         if self.kind == "level":
             answer["levels"] = plain(value[0])
             answer["stds"] = None if std is None else plain(std[0])
@@ -150,10 +168,14 @@ class Contents:
             answer["level"] = plain(level(value)[0])
             answer["std"] = None if std is None else plain(level(std)[0])
             answer["snr"] = None if snr is None else plain(snr[0].clamp_max(140))
-        query, _ = Query.from_positions([place], receiver, self.frequency, self._names, self.scene.frequencies)
+        query, _ = Query.from_positions(
+            [place], receiver, self.frequency, self._names, self.scene.frequencies
+        )
         with self.lock:
             paths = call_optional(self.model, "learnt_paths", query) or []
-        answer["paths"] = [{"points": plain(path.points), "power": plain(path.power_db)} for path in paths]
+        answer["paths"] = [
+            {"points": plain(path.points), "power": plain(path.power_db)} for path in paths
+        ]
         return answer | {"place": plain(place)}
 
     def slice(self, height: float, receiver: int) -> dict:
@@ -161,8 +183,12 @@ class Contents:
         lower, upper = (corner[:2].double().numpy() for corner in self.scene.box)
         pitch = float((upper - lower).max()) / POINTS
         counts = np.maximum(np.ceil((upper - lower) / pitch).astype(int), 1)
-        x, y = (low + pitch * (np.arange(count) + 0.5) for low, count in zip(lower, counts, strict=True))
-        places = np.stack((*np.meshgrid(x, y), np.full((len(y), len(x)), height)), -1).astype(np.float32)
+        x, y = (
+            low + pitch * (np.arange(count) + 0.5) for low, count in zip(lower, counts, strict=True)
+        )
+        places = np.stack((*np.meshgrid(x, y), np.full((len(y), len(x)), height)), -1).astype(
+            np.float32
+        )
         # In parts, so that a drag need not wait for the whole map.
         parts = torch.from_numpy(places.reshape(-1, 3)).split(POINTS)
         found = torch.cat([self._estimate(part, receiver)[0] for part in parts])
@@ -180,17 +206,26 @@ class Contents:
             return {"label": grey(label, step), "prediction": grey(value, step)}
         if self.kind == "channel":
             element = int(loudest(label))
-            return {"curves": {"predicted": self._curve(value, element), "measured": self._curve(label, element)}}
+            return {
+                "curves": {
+                    "predicted": self._curve(value, element),
+                    "measured": self._curve(label, element),
+                }
+            }
         return {}
 
     @property
     def _names(self) -> list[str]:
         return [receiver.name for receiver in self.scene.receivers]
 
-    def _estimate(self, points: Float[Tensor, "b 3"], receiver: Any) -> tuple[Tensor, Tensor | None, Tensor | None]:
+    def _estimate(
+        self, points: Float[Tensor, "b 3"], receiver: Any
+    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
         """Values, deviations and expected SNR [dB], on the CPU; None if the model has none."""
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ExtrapolationWarning)  # a transmitter may be dragged anywhere
+            warnings.simplefilter(
+                "ignore", ExtrapolationWarning
+            )  # a transmitter may be dragged anywhere
             options = {"frequency": self.frequency, "batch_size": POINTS, "interval": self.interval}
             with self.lock:
                 found: Any = self.model.predict(points, receiver, **options)
@@ -203,8 +238,13 @@ class Contents:
             x, responses = np.arange(1, len(channel) + 1), channel[:, 0].numpy()
             names = "element", "|h| [dB]"
         else:
-            delays, responses = impulse_response(channel[element].numpy(), self.task.frequencies.numpy())
-            x, names = 1e9 * delays, ("delay [ns]", f"|impulse response| [dB], element {element + 1}")
+            delays, responses = impulse_response(
+                channel[element].numpy(), self.task.frequencies.numpy()
+            )
+            x, names = (
+                1e9 * delays,
+                ("delay [ns]", f"|impulse response| [dB], element {element + 1}"),
+            )
         return {
             "x": plain(x),
             "y": plain(np.maximum(decibels(responses), 20 * math.log10(LEAST))),
@@ -215,16 +255,24 @@ class Contents:
 
 def plain(values: Any) -> Any:
     """Numbers for JSON: four significant digits, at least three decimals below 10,000."""
-    array = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64)
+    array = np.asarray(
+        values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64
+    )
     largest = float(np.abs(array).max(initial=1e-30))
     return np.round(array, max(3, 3 - math.floor(math.log10(largest)))).tolist()
 
 
 def grey(image: Float[Tensor, "rows columns"], step: int = 1) -> dict:
-    """An image as bytes, 255 for an amplitude of 1, by their changes from pixel to pixel, which pack well."""
+    """An image as bytes, 255 for an amplitude of 1, by their changes from pixel to pixel, which
+    pack well.
+    """
     levels = (255 * image[::step, ::step].clamp(0, 1)).round().to(torch.uint8).numpy()
     changes = np.diff(levels.ravel(), prepend=np.uint8(0))
-    return {"rows": len(levels), "step": step, "changes": base64.b64encode(changes.tobytes()).decode()}
+    return {
+        "rows": len(levels),
+        "step": step,
+        "changes": base64.b64encode(changes.tobytes()).decode(),
+    }
 
 
 def splats(

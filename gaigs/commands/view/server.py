@@ -14,9 +14,11 @@ log = logging.getLogger(__name__)
 
 
 def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServer:
-    """A server of the page at ``/`` and of answers at ``/answer``, ``/slice`` and ``/comparison``; not started.
+    """A server of the page at ``/`` and of answers at ``/answer``, ``/slice`` and ``/comparison``;
+    not started.
 
-    It answers to names of this machine alone: a page of a foreign name that is made to lead here reads nothing.
+    It answers to names of this machine alone: a page of a foreign name that is made to lead here
+    reads nothing.
     """
 
     def respond(path: str, asked: dict[str, Any]) -> str:
@@ -37,7 +39,9 @@ def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServe
         def do_GET(self) -> None:
             url = urlsplit(self.path)
             kind, status = "application/json", HTTPStatus.OK
-            if not re.fullmatch(r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?", self.headers.get("Host", "").lower()):
+            if not re.fullmatch(
+                r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?", self.headers.get("Host", "").lower()
+            ):
                 kind, status = "text/plain; charset=utf-8", HTTPStatus.FORBIDDEN
                 text = "this server answers to the names localhost and 127.0.0.1 alone\n"
             elif url.path == "/":
@@ -46,7 +50,10 @@ def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServe
                 try:
                     text = respond(url.path, dict(parse_qsl(url.query)))
                 except Exception as error:  # the page shows it, and the server goes on
-                    status, text = HTTPStatus.BAD_REQUEST, json.dumps({"error": str(error) or repr(error)})
+                    status, text = (
+                        HTTPStatus.BAD_REQUEST,
+                        json.dumps({"error": str(error) or repr(error)}),
+                    )
             data = text.encode()
             self.send_response(status)
             self.send_header("Content-Type", kind)

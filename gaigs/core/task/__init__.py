@@ -39,7 +39,8 @@ class Metric(NamedTuple):
 
 
 class Task(ABC):
-    """The contract of kind ``task``. A data set makes its task, and a checkpoint stores it with the scene.
+    """The contract of kind ``task``. A data set makes its task, and a checkpoint stores it with the
+    scene.
 
     Attributes:
         name: The registered name.
@@ -105,20 +106,25 @@ class Task(ABC):
 
     @abstractmethod
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
-        """The numbers of a table by name, in the order of ``metrics``, from the result of ``scores``.
+        """The numbers of a table by name, in the order of ``metrics``, from the result of
+        ``scores``.
 
         Raises:
             ValueError: There is no sample.
         """
 
     def logged(self, means: dict[str, float]) -> dict[str, float]:
-        """Values logged after a validation, from the mean of each score over its links; by default these means."""
+        """Values logged after a validation, from the mean of each score over its links; by default
+        these means.
+        """
         return means
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor] | None:
-        """Scores of a mean of many labels as the prediction, from scores of one label as that of another.
+        """Scores of a mean of many labels as the prediction, from scores of one label as that of
+        another.
 
-        Labels that scatter alike and independently leave half of the squared difference. By default None: unknown.
+        Labels that scatter alike and independently leave half of the squared difference. By default
+        None: unknown.
         """
         return None
 
@@ -128,7 +134,9 @@ class Task(ABC):
         """The numbers that ``summarise`` may give; runs are compared by the first that it gives."""
 
     def options(self) -> dict:
-        """Arguments of the constructor, as plain tensors, lists, numbers and strings; by default none."""
+        """Arguments of the constructor, as plain tensors, lists, numbers and strings; by default
+        none.
+        """
         return {}
 
     def state(self) -> dict:
@@ -136,33 +144,43 @@ class Task(ABC):
         return {"name": self.name, **self.options()}
 
     def align(self, labels: Tensor, values: Tensor) -> Tensor:
-        """Labels turned onto predictions by all that is unknown of each link; by default as they are.
+        """Labels turned onto predictions by all that is unknown of each link; by default as they
+        are.
 
-        Losses, kriging and look-ups compare the result with the predictions. Shapes are (k, *shape); either k may be 1.
+        Losses, kriging and look-ups compare the result with the predictions. Shapes are (k,
+        *shape); either k may be 1.
         """
         return labels
 
     def fingerprint(self, values: Tensor) -> Tensor:
-        """Real numbers (k, m) of labels or predictions that change steadily with the place; by default at most
-        ``NUMBERS`` of their own, evenly spread."""
+        """Real numbers (k, m) of labels or predictions that change steadily with the place; by
+        default at most ``NUMBERS`` of their own, evenly spread."""
         return thin_labels(values, NUMBERS).float()
 
     def thinning(self) -> Thinning:
-        """The part of a batch that a step reads, by default all; parameters are options of ``training.thinning``."""
+        """The part of a batch that a step reads, by default all; parameters are options of
+        ``training.thinning``.
+        """
         return lambda batch, generator: batch
 
     def packed(self, values: Tensor) -> np.ndarray:
         """Labels or predictions for ``predictions.npz``; by default as they are."""
         return values.numpy()
 
-    def stored(self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
-        """Arrays of a model for ``predictions.npz``, by the key before ``_<model>``; by default all scores."""
+    def stored(
+        self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]
+    ) -> dict[str, np.ndarray]:
+        """Arrays of a model for ``predictions.npz``, by the key before ``_<model>``; by default all
+        scores.
+        """
         return {name: score.numpy() for name, score in scores.items()}
 
 
 def need_samples(scores: Tensor) -> None:
     if not len(scores):
-        raise ValueError("a summary needs at least one sample, got none; the split leaves nothing to test on")
+        raise ValueError(
+            "a summary needs at least one sample, got none; the split leaves nothing to test on"
+        )
 
 
 def check_range(task: Task, labels: Tensor, name: str) -> None:

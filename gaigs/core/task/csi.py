@@ -1,4 +1,6 @@
-"""Channel state information: a complex channel at each element of the receiver's array and each subcarrier."""
+"""Channel state information: a complex channel at each element of the receiver's array and each
+subcarrier.
+"""
 
 import math
 from collections.abc import Sequence
@@ -13,7 +15,8 @@ from gaigs.core.task import Metric, Task, check_values, need_samples
 from gaigs.registry import check_type, register
 
 HIGHEST = 140.0
-"""Highest reported SNR [dB]: the resolution of complex64; a perfect prediction has no finite SNR."""
+"""Highest reported SNR [dB]: the resolution of complex64; a perfect prediction has no finite SNR.
+"""
 
 PHASES = ("known", "per_link", "per_link_and_delay")
 """Values of ``data.phase``."""
@@ -25,23 +28,27 @@ class Csi(Task):
 
     Scores of a link, with error e = h - h' over its elements and subcarriers:
 
-    - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is the SNR after the best global phase of the prediction,
-      for a receiver and a transmitter without a common clock.
-      Where ``phase`` is not known, this is the only SNR, and all scores are those of the aligned error.
-    - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²), at least 0. Its mean is monitored: a few links in deep shadow, with
+    - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is the SNR after the best global phase of
+    the prediction,
+      for a receiver and a transmitter without a common clock. Where ``phase`` is not known, this is
+      the only SNR, and all scores are those of the aligned error.
+    - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²), at least 0. Its mean is monitored: a few links in
+    deep shadow, with
       an SNR of -50 dB, would dominate a mean SNR.
 
-    All links together have an NMSE [dB], 10 log10(sum |e|² / sum |h|²), in which strong links count most.
+    All links together have an NMSE [dB], 10 log10(sum |e|² / sum |h|²), in which strong links count
+    most.
 
     Args:
-        elements: Of the largest array of the receivers; 1 for single antennas. Labels are 0 at elements that a smaller
-            array lacks.
+        elements: Of the largest array of the receivers; 1 for single antennas. Labels are 0 at
+            elements that a smaller array lacks.
         frequencies: Of the subcarriers (s,) [Hz]; absolute.
-        phase: ``known``; ``per_link`` where each link has a phase of its own, which its elements and subcarriers share;
-            ``per_link_and_delay`` where it also has its own delay and gain.
+        phase: ``known``; ``per_link`` where each link has a phase of its own, which its elements
+            and subcarriers share; ``per_link_and_delay`` where it also has its own delay and gain.
 
     Raises:
-        ValueError: There is no element or subcarrier, a frequency is not positive and finite, or the phase is unknown.
+        ValueError: There is no element or subcarrier, a frequency is not positive and finite, or
+            the phase is unknown.
 
     Source: NeWRF, 2024, and NeRF², 2023, "Evaluation".
     """
@@ -62,9 +69,13 @@ class Csi(Task):
         if elements < 1:
             raise ValueError(f"a channel needs at least one element, got {elements}")
         if not len(frequencies) or not ((frequencies > 0) & frequencies.isfinite()).all():
-            raise ValueError(f"subcarriers must have positive, finite frequencies [Hz], got {frequencies.tolist()[:3]}")
+            raise ValueError(
+                f"subcarriers must have positive, finite frequencies [Hz], got {frequencies.tolist()[:3]}"
+            )
         if len(frequencies.unique()) < len(frequencies):
-            raise ValueError("subcarriers must have different frequencies, got one twice; leave it out")
+            raise ValueError(
+                "subcarriers must have different frequencies, got one twice; leave it out"
+            )
         if phase not in PHASES:
             raise ValueError(f"data.phase must be {' or '.join(PHASES)}, got {phase!r}")
         self.elements, self.frequencies, self.phase = elements, frequencies, phase
@@ -84,39 +95,52 @@ class Csi(Task):
     def options(self) -> dict:
         return {"elements": self.elements, "frequencies": self.frequencies, "phase": self.phase}
 
-    def align(self, labels: Complex[Tensor, "#k e s"], values: Complex[Tensor, "#k e s"]) -> Complex[Tensor, "k e s"]:
+    def align(
+        self, labels: Complex[Tensor, "#k e s"], values: Complex[Tensor, "#k e s"]
+    ) -> Complex[Tensor, "k e s"]:
         """Labels with the phase that suits the predictions best; as they are if ``phase`` is known.
 
-        With ``per_link_and_delay`` they have the best delay and the power of the predictions too. A gradient flows
-        through this power, so that no loss of the result depends on the scale of the predictions.
+        With ``per_link_and_delay`` they have the best delay and the power of the predictions too. A
+        gradient flows through this power, so that no loss of the result depends on the scale of the
+        predictions.
         """
         if self.phase == "known":
             return labels
         turned = labels * self._turns(labels, values).to(labels)
         if self.phase == "per_link":
             return turned
-        sizes, wanted = (part.to(torch.complex128).flatten(1).norm(dim=1) for part in (turned, values))
+        sizes, wanted = (
+            part.to(torch.complex128).flatten(1).norm(dim=1) for part in (turned, values)
+        )
         is_heard = (sizes > 0) & (wanted > 0)
         gains = torch.where(is_heard, wanted, 1) / torch.where(is_heard, sizes, 1)
         return turned * gains[:, None, None].to(turned.real)
 
     def fingerprint(self, values: Complex[Tensor, "k e s"]) -> Float[Tensor, "k m"]:
-        """Products of the elements' channels, and of those some subcarriers apart, over the link's power.
+        """Products of the elements' channels, and of those some subcarriers apart, over the link's
+        power.
 
         Both change slowly with the place, unlike phases.
         """
         power = values.abs().square().sum((1, 2), keepdim=True)
         between = (values @ values.mH / power)[:, *torch.triu_indices(*[self.elements] * 2)]
         count = len(self.frequencies)
-        lags = torch.fft.ifft(torch.fft.fft(values, 2 * count).abs().square()).sum(1)[:, :count] / power[:, 0]
+        lags = (
+            torch.fft.ifft(torch.fft.fft(values, 2 * count).abs().square()).sum(1)[:, :count]
+            / power[:, 0]
+        )
         lags = lags.abs().to(lags) if self.phase == "per_link_and_delay" else lags
         parts = torch.cat((between, lags), 1)
         return super().fingerprint(torch.cat((parts.real, parts.imag), 1))
 
     def phase_sign(
-        self, labels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"], receivers: Int[Tensor, " k"]
+        self,
+        labels: Complex[Tensor, "k e s"],
+        waves: Complex[Tensor, "k e s"],
+        receivers: Int[Tensor, " k"],
     ) -> int:
-        """The sign with which phases follow path lengths, -1 or 1; 0 if known phases follow neither.
+        """The sign with which phases follow path lengths, -1 or 1; 0 if known phases follow
+        neither.
 
         Arguments are as for ``gaigs.core.phases.phase_sign``.
         """
@@ -129,7 +153,9 @@ class Csi(Task):
         """The frequencies if delays are unknown."""
         return self.frequencies if self.phase == "per_link_and_delay" else None
 
-    def _turns(self, labels: Complex[Tensor, "#k e s"], values: Complex[Tensor, "#k e s"]) -> Complex[Tensor, "k 1 s"]:
+    def _turns(
+        self, labels: Complex[Tensor, "#k e s"], values: Complex[Tensor, "#k e s"]
+    ) -> Complex[Tensor, "k 1 s"]:
         return alignment(labels, values, self._rates)
 
     @classmethod
@@ -148,16 +174,19 @@ class Csi(Task):
         }
 
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
-        """SNR of each link, with its phase and without, SINAD [dB], and the powers of error and label.
+        """SNR of each link, with its phase and without, SINAD [dB], and the powers of error and
+        label.
 
-        Without the first where ``phase`` is not known. A label that is zero throughout has no SNR, and is a
-        ``ValueError``.
+        Without the first where ``phase`` is not known. A label that is zero throughout has no SNR,
+        and is a ``ValueError``.
         """
         check_values(labels, values, self.shape, "channels")
         h, guess = (part.detach().cpu().to(torch.complex128) for part in (labels, values))
         power = h.abs().square().sum((1, 2))
         if silent := int((power == 0).sum()):
-            raise ValueError(f"labels must not be zero throughout, got {silent} such channels; leave them out")
+            raise ValueError(
+                f"labels must not be zero throughout, got {silent} such channels; leave them out"
+            )
         aligned = self._turns(h, guess).conj() * guess
         if self.phase == "per_link_and_delay":
             sizes = guess.abs().square().sum((1, 2))
@@ -174,30 +203,52 @@ class Csi(Task):
         }
 
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
-        """Median, mean and percentiles of the SNRs (linear interpolation), mean SINAD, and the NMSE of all links."""
+        """Median, mean and percentiles of the SNRs (linear interpolation), mean SINAD, and the NMSE
+        of all links.
+        """
         need_samples(scores["label_power"])
         numbers: dict[str, float] = {}
         for name in ("snr_db", "snr_aligned_db"):
             if name in scores:
-                p10, median, p90 = torch.quantile(scores[name], scores[name].new_tensor([0.1, 0.5, 0.9])).tolist()
+                p10, median, p90 = torch.quantile(
+                    scores[name], scores[name].new_tensor([0.1, 0.5, 0.9])
+                ).tolist()
                 mean = scores[name].mean().item()
-                numbers |= {f"{name}_median": median, f"{name}_mean": mean, f"{name}_p10": p10, f"{name}_p90": p90}
+                numbers |= {
+                    f"{name}_median": median,
+                    f"{name}_mean": mean,
+                    f"{name}_p10": p10,
+                    f"{name}_p90": p90,
+                }
         numbers["sinad_db_mean"] = scores["sinad_db"].mean().item()
-        numbers["nmse_db"] = decibels(scores["error_power"].sum(), scores["label_power"].sum()).item()
+        numbers["nmse_db"] = decibels(
+            scores["error_power"].sum(), scores["label_power"].sum()
+        ).item()
         return {name: numbers[name] for name in self.metrics() if name in numbers}
 
     def logged(self, means: dict[str, float]) -> dict[str, float]:
         """The mean scores, with the NMSE in place of the powers."""
-        error, power = (torch.tensor(means[name], dtype=torch.float64) for name in ("error_power", "label_power"))
+        error, power = (
+            torch.tensor(means[name], dtype=torch.float64)
+            for name in ("error_power", "label_power")
+        )
         kept = {name: mean for name, mean in means.items() if not name.endswith("_power")}
         return kept | {"nmse_db": decibels(error, power).item()}
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
         """Half of the error's power: 3 dB more."""
         error, power = scores["error_power"] / 2, scores["label_power"]
-        snr = {name: score + 10 * math.log10(2) for name, score in scores.items() if name.startswith("snr")}
+        snr = {
+            name: score + 10 * math.log10(2)
+            for name, score in scores.items()
+            if name.startswith("snr")
+        }
         snr = {name: score.clamp(max=HIGHEST) for name, score in snr.items()}
-        return snr | {"sinad_db": -decibels(error, power + error), "error_power": error, "label_power": power}
+        return snr | {
+            "sinad_db": -decibels(error, power + error),
+            "error_power": error,
+            "label_power": power,
+        }
 
 
 def decibels(error: Float[Tensor, "*k"], power: Float[Tensor, "*k"]) -> Float[Tensor, "*k"]:

@@ -10,9 +10,11 @@ from gaigs.core.task import Metric, Task, check_values, need_samples
 
 
 class Scalar(Task):
-    """One real number a link, with a unit; a subclass gives ``name``, ``quantity``, ``unit`` and ``error_unit``.
+    """One real number a link, with a unit; a subclass gives ``name``, ``quantity``, ``unit`` and
+    ``error_unit``.
 
-    ``error_unit`` is the unit of a difference of labels; its lower case ends the names of scores and metrics.
+    ``error_unit`` is the unit of a difference of labels; its lower case ends the names of scores
+    and metrics.
     """
 
     error_unit: str
@@ -39,7 +41,9 @@ class Scalar(Task):
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
         """The absolute error of each prediction."""
         check_values(labels, values, (), "readings")
-        return {self.monitor: (values.detach().cpu().double() - labels.detach().cpu().double()).abs()}
+        return {
+            self.monitor: (values.detach().cpu().double() - labels.detach().cpu().double()).abs()
+        }
 
     @property
     def pair_score(self) -> str:
@@ -56,7 +60,9 @@ class Scalar(Task):
         numbers = errors.mean(), torch.quantile(errors, 0.5), errors.square().mean().sqrt()
         return dict(zip(self.metrics(), (number.item() for number in numbers), strict=True))
 
-    def stored(self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
+    def stored(
+        self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]
+    ) -> dict[str, np.ndarray]:
         """``error``: prediction minus label."""
         return {"error": (values - labels).numpy()}
 

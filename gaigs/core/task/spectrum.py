@@ -19,7 +19,9 @@ SSIM_WINDOW = 7
 """Edge of scikit-image's default uniform window [pixels]."""
 
 MIN_MAX = "min-max of each spectrum's amplitude"
-"""Normalisation of the measured sets: (s - min s) / (max s - min s) over the pixels of one spectrum s."""
+"""Normalisation of the measured sets: (s - min s) / (max s - min s) over the pixels of one spectrum
+s.
+"""
 
 
 @register("task", "spectrum")
@@ -29,8 +31,8 @@ class Spectrum(Task):
     Args:
         elevations: Of the rows, in the array's frame [rad].
         azimuths: Of the columns, in the array's frame [rad].
-        normalisation: Scale of the labels, in words of docs/data.md; by default each spectrum has a pixel of 0 and one
-            of 1.
+        normalisation: Scale of the labels, in words of docs/data.md; by default each spectrum has a
+            pixel of 0 and one of 1.
 
     Source: the protocol of GAI-GS, "Evaluation"; Wang et al., Image Quality Assessment, 2004.
     """
@@ -47,7 +49,10 @@ class Spectrum(Task):
         azimuths: Float[Tensor, " columns"] | Float[np.ndarray, " columns"] | Sequence[float],
         normalisation: str = MIN_MAX,
     ):
-        grid = Grid(torch.as_tensor(elevations, dtype=torch.float32), torch.as_tensor(azimuths, dtype=torch.float32))
+        grid = Grid(
+            torch.as_tensor(elevations, dtype=torch.float32),
+            torch.as_tensor(azimuths, dtype=torch.float32),
+        )
         self.directions: Grid = as_directions(grid, grid, self.name)
         self.normalisation = normalisation
 
@@ -57,7 +62,11 @@ class Spectrum(Task):
 
     def options(self) -> dict:
         grid = self.directions
-        return {"elevations": grid.elevations, "azimuths": grid.azimuths, "normalisation": self.normalisation}
+        return {
+            "elevations": grid.elevations,
+            "azimuths": grid.azimuths,
+            "normalisation": self.normalisation,
+        }
 
     @classmethod
     def metrics(cls) -> dict[str, Metric]:
@@ -72,28 +81,36 @@ class Spectrum(Task):
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
         """SSIM and mean absolute error of each predicted spectrum.
 
-        SSIM is scikit-image's with its default window and ``data_range=1``, in float64; the training loss uses another
-        window. Values outside [0, 1] are scored as they are. Spectra below the window's size are a ``ValueError``.
+        SSIM is scikit-image's with its default window and ``data_range=1``, in float64; the
+        training loss uses another window. Values outside [0, 1] are scored as they are. Spectra
+        below the window's size are a ``ValueError``.
         """
         if min(self.shape) < SSIM_WINDOW:
-            raise ValueError(f"SSIM needs at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, got {self.shape}")
+            raise ValueError(
+                f"SSIM needs at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, got {self.shape}"
+            )
         check_values(labels, values, self.shape, "spectra")
         labels, values = labels.detach().cpu().double(), values.detach().cpu().double()
         pairs = zip(labels.numpy(), values.numpy(), strict=True)
         ssim = [structural_similarity(label, value, data_range=1.0) for label, value in pairs]
-        return {"ssim": torch.tensor(ssim, dtype=torch.float64), "mae": (labels - values).abs().mean((1, 2))}
+        return {
+            "ssim": torch.tensor(ssim, dtype=torch.float64),
+            "mae": (labels - values).abs().mean((1, 2)),
+        }
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
         """SSIM s becomes 2 s / (1 + s), below 0 becomes 0; absolute errors fall by the root of 2.
 
-        Two labels with the same mean that scatter about a pattern have as SSIM the pattern's share s of the variance;
-        the pattern and one label have 2 s / (1 + s).
+        Two labels with the same mean that scatter about a pattern have as SSIM the pattern's share
+        s of the variance; the pattern and one label have 2 s / (1 + s).
         """
         shares = scores["ssim"].clamp(min=0)
         return {"ssim": 2 * shares / (1 + shares), "mae": scores["mae"] / math.sqrt(2)}
 
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
-        """Median, mean and percentiles of SSIM over the samples (linear interpolation), and the mean of MAE."""
+        """Median, mean and percentiles of SSIM over the samples (linear interpolation), and the
+        mean of MAE.
+        """
         ssim, mae = scores["ssim"], scores["mae"]
         need_samples(ssim)
         p10, median, p90 = torch.quantile(ssim, ssim.new_tensor([0.1, 0.5, 0.9])).tolist()
@@ -101,28 +118,39 @@ class Spectrum(Task):
         return dict(zip(self.metrics(), numbers, strict=True))
 
     def thinning(self, stride: int = 1, rays: int | None = None) -> Thinning:
-        """Every ``stride``-th row and column, with random first ones, or ``rays`` random pixels for all links alike.
+        """Every ``stride``-th row and column, with random first ones, or ``rays`` random pixels for
+        all links alike.
 
-        Neighbouring pixels of a spectrum are far closer than the array resolves. Of a small grid at least three rows
-        and columns stay.
+        Neighbouring pixels of a spectrum are far closer than the array resolves. Of a small grid at
+        least three rows and columns stay.
         """
         rows, columns = self.shape
         if stride < 1:
             raise ValueError(f"training.thinning.stride must be at least 1, got {stride}")
-        stride = max(1, min(stride, min(rows, columns) // 3))  # which leaves the SSIM loss its smallest window
+        stride = max(
+            1, min(stride, min(rows, columns) // 3)
+        )  # which leaves the SSIM loss its smallest window
         if rays is not None and not (1 <= rays <= rows * columns and stride == 1):
             most = rows * columns
-            raise ValueError(f"training.thinning.rays must be in 1..{most} with stride=1, got {rays}, stride {stride}")
+            raise ValueError(
+                f"training.thinning.rays must be in 1..{most} with stride=1, got {rays}, stride {stride}"
+            )
 
         def grid(batch: Batch, generator: torch.Generator) -> Batch:
             row, column = torch.randint(stride, (2,), generator=generator).tolist()
             own = slice(row, None, stride), slice(column, None, stride)
-            return replace(batch, directions=batch.directions.thin(*own), labels=batch.labels[:, *own])
+            return replace(
+                batch, directions=batch.directions.thin(*own), labels=batch.labels[:, *own]
+            )
 
         def scattered(batch: Batch, generator: torch.Generator) -> Batch:
-            chosen = torch.randperm(rows * columns, generator=generator)[:rays].to(batch.labels.device)
+            chosen = torch.randperm(rows * columns, generator=generator)[:rays].to(
+                batch.labels.device
+            )
             return replace(
-                batch, directions=batch.directions.flatten()[chosen], labels=batch.labels.flatten(1)[:, chosen]
+                batch,
+                directions=batch.directions.flatten()[chosen],
+                labels=batch.labels.flatten(1)[:, chosen],
             )
 
         return grid if rays is None else scattered
@@ -130,6 +158,8 @@ class Spectrum(Task):
     def packed(self, values: Float[Tensor, "k rows columns"]) -> np.ndarray:
         return values.half().numpy()
 
-    def stored(self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]) -> dict[str, np.ndarray]:
+    def stored(
+        self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]
+    ) -> dict[str, np.ndarray]:
         """``ssim``."""
         return {"ssim": scores["ssim"].numpy()}

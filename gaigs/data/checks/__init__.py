@@ -1,4 +1,6 @@
-"""Checks of data against their own geometry: units, axes, signs and orders in which they may have been written."""
+"""Checks of data against their own geometry: units, axes, signs and orders in which they may have
+been written.
+"""
 
 from collections.abc import Iterator
 from typing import Any

@@ -1,4 +1,6 @@
-"""Checks of complex channels: conventions under which geometry explains them, and phases that it does not."""
+"""Checks of complex channels: conventions under which geometry explains them, and phases that it
+does not.
+"""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -14,8 +16,19 @@ from gaigs.core.scene import Scene, direct_waves
 from gaigs.data.checks.conventions import conventions
 from gaigs.data.checks.finding import Finding
 from gaigs.data.checks.hypotheses import Sample, sample_at
-from gaigs.data.checks.subcarriers import check_constant_subcarriers, check_powers, order_of_subcarriers
-from gaigs.data.checks.waves import aligned_likeness, coherence, has_extent, level_share, likeness, without_geometry
+from gaigs.data.checks.subcarriers import (
+    check_constant_subcarriers,
+    check_powers,
+    order_of_subcarriers,
+)
+from gaigs.data.checks.waves import (
+    aligned_likeness,
+    coherence,
+    has_extent,
+    level_share,
+    likeness,
+    without_geometry,
+)
 
 
 class Measure(NamedTuple):
@@ -51,7 +64,9 @@ def check_channels(links: Any) -> Iterator[Finding]:
 
 
 def check_signs(sample: Sample) -> Iterator[Finding]:
-    """A finding if channels lack a part, or if one that is never negative seems to be their amplitude."""
+    """A finding if channels lack a part, or if one that is never negative seems to be their
+    amplitude.
+    """
     parts = {"real": sample.labels.real, "imaginary": sample.labels.imag}
     for name, part in parts.items():
         if sample.labels.numel() < 100 or part.min() < 0:
@@ -63,7 +78,9 @@ def check_signs(sample: Sample) -> Iterator[Finding]:
 
 
 def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterator[Finding]:
-    """Findings if phases of channels do not follow the geometry, or disagree with those that are declared."""
+    """Findings if phases of channels do not follow the geometry, or disagree with those that are
+    declared.
+    """
     task = links.task
     few = sample.some(192)
     is_known, has_gain = task.phase == "known", task.phase != "per_link_and_delay"
@@ -71,10 +88,20 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
     waves = direct_waves(everywhere, links.query[train], task.frequencies)
     sign = phase_sign(labels, waves, receivers) if is_known else 0
-    coherent = Measure(coherence, 0.1, 0.8, "the direct wave explains {} of the channels", "in the mean over links")
+    coherent = Measure(
+        coherence, 0.1, 0.8, "the direct wave explains {} of the channels", "in the mean over links"
+    )
     each = likeness if has_gain else aligned_likeness
-    within = Measure(each, 0.3, 0.8, "the direct wave explains {} of each channel", "of the power within a link")
-    level = Measure(level_share, 0.22, 0.3, "distance explains {} of the levels' spread", "of the spread of levels")
+    within = Measure(
+        each, 0.3, 0.8, "the direct wave explains {} of each channel", "of the power within a link"
+    )
+    level = Measure(
+        level_share,
+        0.22,
+        0.3,
+        "distance explains {} of the levels' spread",
+        "of the spread of levels",
+    )
     for score in (coherent,) * is_known + (within,) * (not sign):
         found = best_convention(few, score)
         if found is not None:
@@ -84,13 +111,17 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
         return
     strange = strange_parts(labels, waves, receivers, task.frequencies, sign) if sign else {}
     if strange:  # unless another convention explains as much with a calibrated array
-        found = best_convention(few, coherent._replace(measure=partial(coherence, is_calibrated=True)))
+        found = best_convention(
+            few, coherent._replace(measure=partial(coherence, is_calibrated=True))
+        )
         if found is not None and found.fits > 0.7 * coherence(few):
             yield found
             return
     is_fixed = any(elements or delay is not None for elements, _, delay in strange.values())
     is_enough = len(train) >= MANY * len(receivers.unique())
-    if not is_fixed and (phase := unknown_phase(labels, waves, receivers, task.frequencies, task.phase)):
+    if not is_fixed and (
+        phase := unknown_phase(labels, waves, receivers, task.frequencies, task.phase)
+    ):
         common = "phase" if is_known else "delay"
         yield Finding(
             "phase of each link",
@@ -120,12 +151,15 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
             if delay is not None:
                 late = f"take a delay of {1e9 * delay:.3g} ns off h, or set data.phase=per_link_and_delay"
             yield Finding(
-                "phases of subcarriers", f"the subcarriers of {links.receivers[receiver].name} {unexplained}", late
+                "phases of subcarriers",
+                f"the subcarriers of {links.receivers[receiver].name} {unexplained}",
+                late,
             )
 
 
 def best_convention(sample: Sample, score: Measure) -> Finding | None:
-    """A finding about the conventions by which geometry explains the channels best, if it is clearly better so.
+    """A finding about the conventions by which geometry explains the channels best, if it is
+    clearly better so.
 
     Conventions that explain them equally well are named together.
     """
@@ -136,14 +170,17 @@ def best_convention(sample: Sample, score: Measure) -> Finding | None:
     for one in conventions(few, score.measure):
         changed = one.change(few)
         share = score.measure(changed)
-        # Channels that are alike at all links fit any convention under which distances hardly differ.
+        # Channels that are alike at all links fit any convention under which distances hardly
+        # differ.
         is_telling = share > max(read, score.least / 2) and has_extent(changed)
         if is_telling and share > 1.1 * score.measure(without_geometry(changed)) + 0.02:
             tried.append((share, one))
     likely = sorted((share for share, _ in tried), reverse=True)[:8]
     if not likely:
         return None
-    fitting = [(score.measure(one.change(sample)), one) for share, one in tried if share >= likely[-1]]
+    fitting = [
+        (score.measure(one.change(sample)), one) for share, one in tried if share >= likely[-1]
+    ]
     fits = max(share for share, _ in fitting)
     is_better = fits > 1.5 * read + 0.05 or 1 - fits < (1 - read) / 2
     if fits < score.least or not is_better:
@@ -153,4 +190,6 @@ def best_convention(sample: Sample, score: Measure) -> Finding | None:
     mends = list(dict.fromkeys(one.mend for one in best))[:3]
     text = score.sentence.format(f"{fits:.0%}")
     text += f" in place of {max(read, 0):.0%} if {' or '.join(names)}"
-    return Finding(names[0], text, " or ".join(mends), read=read, fits=fits, score=f"share {score.meaning}")
+    return Finding(
+        names[0], text, " or ".join(mends), read=read, fits=fits, score=f"share {score.meaning}"
+    )

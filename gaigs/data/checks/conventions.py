@@ -44,7 +44,9 @@ def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
         yield changing(name, ["labels"], lambda labels: labels.flip(2), mend)
     for unit, factor in {"kHz": 1e3, "MHz": 1e6}.items():
         mend = f"frequencies = {factor:g} * frequencies"
-        yield changing(f"frequencies are in {unit}", ["frequencies"], partial(torch.mul, other=factor), mend)
+        yield changing(
+            f"frequencies are in {unit}", ["frequencies"], partial(torch.mul, other=factor), mend
+        )
     is_constant = sample.labels.sgn().mean(0).abs() > 0.9999  # (e, s), the phase of all links
     is_relative = is_constant[:, 0].any() and not is_constant[:, -1].any()
     if is_relative or is_constant.all():
@@ -57,7 +59,12 @@ def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
 
 def of_arrays(sample: Sample) -> Iterator[Hypothesis]:
     """Orders and units of elements, and orientations."""
-    yield changing("elements are in reversed order", ["labels"], lambda labels: labels.flip(1), "h = h[:, ::-1]")
+    yield changing(
+        "elements are in reversed order",
+        ["labels"],
+        lambda labels: labels.flip(1),
+        "h = h[:, ::-1]",
+    )
     count = sample.labels.shape[1]
     for rows in range(2, count // 2 + 1):
         if count % rows == 0:
@@ -75,10 +82,22 @@ def of_orientations(sample: Sample) -> Iterator[Hypothesis]:
     if torch.allclose(sample.rotations, torch.eye(3).to(sample.rotations)):
         return
     for name, move, mend in (
-        ("rotations lead from the world to the array", lambda turns: turns.mT, "rotation = rotation.T"),
+        (
+            "rotations lead from the world to the array",
+            lambda turns: turns.mT,
+            "rotation = rotation.T",
+        ),
         ("elements have the world's axes", lambda turns: turns.mT @ turns, "rotation = np.eye(3)"),
-        ("quaternions have the order w, x, y, z", partial(_rolled, by=-1), "quaternion = np.roll(quaternion, -1)"),
-        ("quaternions have the order x, y, z, w", partial(_rolled, by=1), "quaternion = np.roll(quaternion, 1)"),
+        (
+            "quaternions have the order w, x, y, z",
+            partial(_rolled, by=-1),
+            "quaternion = np.roll(quaternion, -1)",
+        ),
+        (
+            "quaternions have the order x, y, z, w",
+            partial(_rolled, by=1),
+            "quaternion = np.roll(quaternion, 1)",
+        ),
     ):
         yield changing(name, ["rotations"], move, mend)
 
@@ -98,19 +117,34 @@ def of_axes(sample: Sample, ends: Sequence[Sequence[str]]) -> Iterator[Hypothesi
             signs = [1, 1, 1]
             signs[axis] = -1
             if own == ("elements",) or not has_wall[axis]:
-                yield _everywhere(own, f"{subject} have {name} negated", f" * {signs}", torch.tensor(signs).diag())
+                yield _everywhere(
+                    own, f"{subject} have {name} negated", f" * {signs}", torch.tensor(signs).diag()
+                )
     for own in (own for own in ends if own in (("tx",), ("rx",))):
         for name, order in {"y, z, x": [2, 0, 1], "z, x, y": [1, 2, 0]}.items():
-            yield _everywhere(own, f"{own[0]} have the order {name}", f"[:, {order}]", torch.eye(3)[:, order])
+            yield _everywhere(
+                own, f"{own[0]} have the order {name}", f"[:, {order}]", torch.eye(3)[:, order]
+            )
 
 
 def of_angles() -> Iterator[Hypothesis]:
     """Places computed from angles, about their receiver or the origin."""
-    polar, other = "elevations taken for polar angles, or the reverse", "elevation = np.pi / 2 - elevation"
+    polar, other = (
+        "elevations taken for polar angles, or the reverse",
+        "elevation = np.pi / 2 - elevation",
+    )
     for name, move, mend in (
-        ("azimuths clockwise from north", lambda points: points[:, [1, 0, 2]], "azimuth = np.pi / 2 - azimuth"),
+        (
+            "azimuths clockwise from north",
+            lambda points: points[:, [1, 0, 2]],
+            "azimuth = np.pi / 2 - azimuth",
+        ),
         (polar, _tilted, other),
-        (polar, lambda points: -_tilted(points), other),  # below the horizon the azimuth is turned by half a circle
+        (
+            polar,
+            lambda points: -_tilted(points),
+            other,
+        ),  # below the horizon the azimuth is turned by half a circle
         ("radians taken for degrees", _widened, "angles = np.rad2deg(angles)"),
     ):
         yield Hypothesis(f"tx are of {name}", partial(_about_receivers, move=move), mend)
@@ -119,7 +153,13 @@ def of_angles() -> Iterator[Hypothesis]:
 
 def of_units(ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
     """Places and elements in other units than metres; km is the rarest."""
-    for unit, factor in {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "km": 1e3}.items():
+    for unit, factor in {
+        "mm": 1e-3,
+        "cm": 1e-2,
+        "inches": 0.0254,
+        "feet": 0.3048,
+        "km": 1e3,
+    }.items():
         for own in sorted(ends, key=len, reverse=True):
             yield _scaled(own, unit, factor)
 
@@ -136,17 +176,26 @@ def of_plans(sample: Sample) -> Iterator[Hypothesis]:
         move = partial(_mirrored, ends=low + high, axes=axes)
         mend = f"rx[:, {axes}] = (tx.min(0) + tx.max(0) - rx)[:, {axes}], as rows of a picture run downwards"
         yield changing(f"rx have {name} from the other end", ["positions"], move, mend)
-    yield _everywhere(("rx",), "rx have x and y negated", " * [-1, -1, 1]", torch.diag(torch.tensor([-1, -1, 1])))
+    yield _everywhere(
+        ("rx",), "rx have x and y negated", " * [-1, -1, 1]", torch.diag(torch.tensor([-1, -1, 1]))
+    )
     for name, point, mend in (
         ("lowest corner", low, "tx.min(0)"),
         ("middle", (low + high) / 2, "(tx.min(0) + tx.max(0)) / 2"),
     ):
         shift = point * point.new_tensor([1, 1, 0])
-        yield changing(f"the origin of rx is the {name} of tx", ["positions"], shift.add, f"rx[:, :2] += ({mend})[:2]")
+        yield changing(
+            f"the origin of rx is the {name} of tx",
+            ["positions"],
+            shift.add,
+            f"rx[:, :2] += ({mend})[:2]",
+        )
 
 
 def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[Hypothesis]:
-    """The order of receivers by which the links of each fit one's place best; shifted by one if there are many."""
+    """The order of receivers by which the links of each fit one's place best; shifted by one if
+    there are many.
+    """
     count = len(sample.positions)
     own = torch.arange(count)
     orders = [own.roll(1), own.roll(-1)][: count - 1]
@@ -155,7 +204,9 @@ def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator
         for receiver in sample.receivers.unique().tolist():
             links = sample.at((sample.receivers == receiver).nonzero()[:, 0])
             for place in range(count):
-                fits[receiver, place] = measure(replace(links, receivers=torch.full_like(links.receivers, place)))
+                fits[receiver, place] = measure(
+                    replace(links, receivers=torch.full_like(links.receivers, place))
+                )
         orders.append(torch.from_numpy(linear_sum_assignment(-fits.numpy())[1]))
     for order in orders:
         is_shift = len((order - own).remainder(count).unique()) == 1
@@ -172,7 +223,9 @@ def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hy
     """Points of some ends times a matrix, which ``mend`` writes in numpy."""
     parts = {"tx": "transmitters", "rx": "positions", "elements": "elements"}
     lines = "; ".join(f"{end} = {end}{mend}" for end in ends)
-    return changing(name, [parts[end] for end in ends], partial(torch.matmul, other=matrix.double()), lines)
+    return changing(
+        name, [parts[end] for end in ends], partial(torch.matmul, other=matrix.double()), lines
+    )
 
 
 def _scaled(ends: Sequence[str], unit: str, factor: float) -> Hypothesis:
@@ -182,7 +235,10 @@ def _scaled(ends: Sequence[str], unit: str, factor: float) -> Hypothesis:
 
 def _changed(sample: Sample, parts: Sequence[str], move: Move) -> Sample:
     values = {name: getattr(sample, name) for name in parts}
-    moved = {name: tuple(map(move, own)) if isinstance(own, tuple) else move(own) for name, own in values.items()}
+    moved = {
+        name: tuple(map(move, own)) if isinstance(own, tuple) else move(own)
+        for name, own in values.items()
+    }
     return replace(sample, **moved)
 
 
@@ -195,7 +251,9 @@ def _from_receivers(sample: Sample) -> Sample:
     return replace(sample, transmitters=sample.transmitters + sample.positions[sample.receivers])
 
 
-def _mirrored(points: Float[Tensor, "r 3"], ends: Float[Tensor, "3"], axes: Sequence[int]) -> Float[Tensor, "r 3"]:
+def _mirrored(
+    points: Float[Tensor, "r 3"], ends: Float[Tensor, "3"], axes: Sequence[int]
+) -> Float[Tensor, "r 3"]:
     moved = points.clone()
     moved[:, axes] = (ends - points)[:, axes]
     return moved
@@ -208,7 +266,9 @@ def _transposed(labels: Complex[Tensor, "n e s"], rows: int) -> Complex[Tensor, 
 def _rolled(rotations: Float[Tensor, "r 3 3"], by: int) -> Float[Tensor, "r 3 3"]:
     """Rotations of quaternions whose four numbers are rolled."""
     quaternions = Rotation.from_matrix(rotations.numpy()).as_quat()
-    return torch.from_numpy(Rotation.from_quat(torch.from_numpy(quaternions).roll(by, 1).numpy()).as_matrix())
+    return torch.from_numpy(
+        Rotation.from_quat(torch.from_numpy(quaternions).roll(by, 1).numpy()).as_matrix()
+    )
 
 
 def _tilted(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -220,13 +280,19 @@ def _tilted(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
 def _widened(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
     """Points at 180 / pi times their azimuth and elevation."""
     azimuths, elevations, distances = to_spherical(points)
-    return distances[:, None] * from_spherical(math.degrees(1) * azimuths, math.degrees(1) * elevations)
+    return distances[:, None] * from_spherical(
+        math.degrees(1) * azimuths, math.degrees(1) * elevations
+    )
 
 
 def _with_carrier(sample: Sample, at_elements: bool) -> Sample:
-    """Channels times the direct wave's phase at the middle of the band, alike at all elements or not."""
+    """Channels times the direct wave's phase at the middle of the band, alike at all elements or
+    not.
+    """
     distances = direct_distances(sample)
     if not at_elements:
         distances = distances.mean(1, keepdim=True)
     phases = -2 * math.pi * sample.frequencies.mean() / speed_of_light * distances
-    return replace(sample, labels=sample.labels * torch.polar(torch.ones_like(phases), phases)[..., None])
+    return replace(
+        sample, labels=sample.labels * torch.polar(torch.ones_like(phases), phases)[..., None]
+    )

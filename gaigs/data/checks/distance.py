@@ -23,7 +23,9 @@ class Law(NamedTuple):
 
 
 class Gain(NamedTuple):
-    """Mean errors of data as read and under another convention [dB], and the gain of log likelihood."""
+    """Mean errors of data as read and under another convention [dB], and the gain of log
+    likelihood.
+    """
 
     read: float
     fits: float
@@ -46,12 +48,14 @@ def decades_of(distances: Float[Tensor, "*h n"]) -> Float[Tensor, "*h n"]:
 
 
 def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = False) -> Law:
-    """The law of distance of each receiver, by Huber's weights, so that a few wrong levels do not bend it.
+    """The law of distance of each receiver, by Huber's weights, so that a few wrong levels do not
+    bend it.
 
     Args:
         logarithms: Logarithms of the links' distances, under h conventions at once.
         sample: Receivers and levels of the links.
-        patterns: True for receivers with a main direction: a harmonic of the azimuth is fitted, too; without h.
+        patterns: True for receivers with a main direction: a harmonic of the azimuth is fitted,
+            too; without h.
 
     Source: Huber, Robust estimation of a location parameter, 1964.
     """
@@ -81,11 +85,15 @@ def explained(sample: Sample) -> float:
     return max(0.0, 1 - (law.errors.abs().mean() / mean.errors.abs().mean().clamp_min(1e-9)).item())
 
 
-def compare(read: Float[Tensor, " n"], fits: Float[Tensor, " n"], sample: Sample, cells: int = 6) -> Gain:
-    """Gain of errors about one law over those about another, where errors above 30 dB count as 30 dB.
+def compare(
+    read: Float[Tensor, " n"], fits: Float[Tensor, " n"], sample: Sample, cells: int = 6
+) -> Gain:
+    """Gain of errors about one law over those about another, where errors above 30 dB count as 30
+    dB.
 
-    Shadowing is alike at near places, so that each receiver's cells, at most ``cells`` along x and along y, count as
-    single observations. The log likelihood of m of them with a mean error of s is -m log(s), up to a constant.
+    Shadowing is alike at near places, so that each receiver's cells, at most ``cells`` along x and
+    along y, count as single observations. The log likelihood of m of them with a mean error of s is
+    -m log(s), up to a constant.
     """
     before = read.abs().clamp_max(30).mean().item()
     after = fits.abs().clamp_max(30).mean().item()
@@ -103,7 +111,10 @@ def _sums(values: Float[Tensor, "*h n"], sample: Sample) -> Float[Tensor, "*h r"
 
 
 def _without(
-    others: Float[Tensor, "*h n c"], values: Float[Tensor, "*h n"], weights: Float[Tensor, "*h n"], sample: Sample
+    others: Float[Tensor, "*h n c"],
+    values: Float[Tensor, "*h n"],
+    weights: Float[Tensor, "*h n"],
+    sample: Sample,
 ) -> Float[Tensor, "*h n"]:
     """Values less their weighted least-squares fit by some columns at each receiver."""
     if others.shape[-1] == 1:

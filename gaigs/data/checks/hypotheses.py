@@ -43,7 +43,10 @@ class Sample:
 
     def at(self, index: Int[Tensor, " k"]) -> "Sample":
         """Some of the links."""
-        parts = {name: getattr(self, name)[index] for name in ("index", "transmitters", "receivers", "labels")}
+        parts = {
+            name: getattr(self, name)[index]
+            for name in ("index", "transmitters", "receivers", "labels")
+        }
         return replace(self, **parts)
 
     def some(self, most: int) -> "Sample":

@@ -1,4 +1,6 @@
-"""Checks of received levels: units, signs, marks, single levels that are wrong, and the places of receivers."""
+"""Checks of received levels: units, signs, marks, single levels that are wrong, and the places of
+receivers.
+"""
 
 import math
 from collections.abc import Iterator
@@ -37,7 +39,9 @@ def check_levels(links: Any) -> Iterator[Finding]:
 
 
 def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
-    """A finding about levels that are positive: powers, amplitudes, or decibels without sign or of another unit."""
+    """A finding about levels that are positive: powers, amplitudes, or decibels without sign or of
+    another unit.
+    """
     low, high = np.quantile(levels.numpy(), (0.05, 0.95)).tolist()
     text = f"{int((levels > 0).sum())} levels are above 0 dBm, {levels.min():.3g} to {levels.max():.3g}"
     known = sample_of_given(links)
@@ -45,8 +49,12 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
     if high > 100 * max(low, 1e-300) or levels.max() < 0.1:
         yield _linear_unit(known, text, math.log10(np.median(levels)))
         return
-    if known is None or explained(replace(known[0], labels=-known[0].labels)) >= explained(known[0]):
-        yield Finding("sign of levels", text, "was a sign lost, or are they path losses? levels = -levels")
+    if known is None or explained(replace(known[0], labels=-known[0].labels)) >= explained(
+        known[0]
+    ):
+        yield Finding(
+            "sign of levels", text, "was a sign lost, or are they path losses? levels = -levels"
+        )
         return
     mend = "percent, scaled, dB over the noise, or dBuV? levels = levels - 107 of dBuV at 50 ohm"
     yield Finding("unit of levels", f"{text}, and fall with the distance", mend)
@@ -66,7 +74,10 @@ def _linear_unit(known: tuple[Sample, list[str]] | None, text: str, middle: floa
     if -14 < slope < -4 and fits > 0.1:
         unit, mend = "volts", "levels = 20 * np.log10(levels) + 13 at 50 ohm"
     elif 10 * middle + 30 < -20:
-        unit, mend = "watts", "levels = 10 * np.log10(levels / 1e-3), or 10 * np.log10(levels) of mW"
+        unit, mend = (
+            "watts",
+            "levels = 10 * np.log10(levels / 1e-3), or 10 * np.log10(levels) of mW",
+        )
     elif 10 * middle < -10:
         unit, mend = "mW", "levels = 10 * np.log10(levels)"
     else:
@@ -112,7 +123,9 @@ def check_columns(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 
 
 def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterator[Finding]:
-    """Findings about levels far from those of near places, and about levels that no near place shares."""
+    """Findings about levels far from those of near places, and about levels that no near place
+    shares.
+    """
     sample = sample_of(replace(links, split=None), most)
     near = apart_from_neighbours(sample)
     is_placed = torch.ones(len(links.receivers), dtype=torch.bool)
@@ -137,11 +150,15 @@ def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterato
         named.append(f"{row}({at}) at {name}: {level:.3g} dBm, its neighbours {usual:.3g} dBm")
     more = f" and {len(wrong) - shown} more" if len(wrong) > shown else ""
     mend = "correct them, or leave them out as nan"
-    yield Finding("single levels", f"levels are far from those of near places: {', '.join(named)}{more}", mend)
+    yield Finding(
+        "single levels", f"levels are far from those of near places: {', '.join(named)}{more}", mend
+    )
 
 
 def apart_from_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, " n"]:
-    """Each level less the median of the nearest ones of its receiver [dB]; 0 where it has fewer than 6 links."""
+    """Each level less the median of the nearest ones of its receiver [dB]; 0 where it has fewer
+    than 6 links.
+    """
     apart = torch.zeros_like(sample.labels)
     for number in range(len(sample.positions)):
         own = (sample.receivers == number).nonzero()[:, 0]
@@ -157,12 +174,16 @@ def apart_from_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, 
 def check_places_of_levels(
     sample: Sample, near: Float[Tensor, " n"], is_placed: Bool[Tensor, " r"]
 ) -> Iterator[Finding]:
-    """A finding if levels follow neither the distance nor their neighbours, as in a wrong order of rows."""
+    """A finding if levels follow neither the distance nor their neighbours, as in a wrong order of
+    rows.
+    """
     own = is_placed[sample.receivers] & (near != 0)
     flat = fit_law(torch.zeros_like(near), sample).errors[own]
     if not own.any() or near[own].abs().mean() < 0.95 * flat.abs().mean():
         return
-    logarithms = fit_law(torch.zeros_like(near), replace(sample, labels=decades(sample))).errors[own]
+    logarithms = fit_law(torch.zeros_like(near), replace(sample, labels=decades(sample))).errors[
+        own
+    ]
     squares = logarithms.square().sum()
     slope = (logarithms @ flat / squares).item()
     deviation = (flat.square().mean() / squares).sqrt().item()

@@ -31,7 +31,9 @@ def check_places(links: Any) -> Iterator[Finding]:
     if len(sites) > 1 and near.sum() > 1:  # one may be measured beside a receiver
         text = f"{int(near.sum())} places are where a receiver stands"
         yield Finding("places at a receiver", text)
-    if links.task.is_scalar:  # antennas of one mast may share their place; levels show whether they do
+    if (
+        links.task.is_scalar
+    ):  # antennas of one mast may share their place; levels show whether they do
         return
     for a, b in itertools.combinations(given, 2):
         turned = (receivers[a].pose.rotation - receivers[b].pose.rotation).norm()
@@ -51,11 +53,19 @@ def check_extent(links: Any) -> Iterator[Finding]:
     is_global = abs(x) <= 180 and abs(y) <= 90 and math.hypot(x, y) > 30 * across > 0
     if links.frame is None and is_global and across < 0.3:
         text = f"x and y of places span {across:.2g} m around ({x:.7g}, {y:.7g})"
-        yield Finding("unit of places", text, "are they degrees? convert them to metres, as data=rssi_wide does")
+        yield Finding(
+            "unit of places",
+            text,
+            "are they degrees? convert them to metres, as data=rssi_wide does",
+        )
     elif links.frame is None and span < 0.3:  # less than a table
         yield Finding("unit of places", f"places span {span:.3g} m", "are they in km or degrees?")
-    elif links.task.is_scalar and (scale := scale_of(sites)):  # spectra and channels show whether they are
-        yield Finding("unit of places", f"places span {span:.3g} m, as if {scale}", "give them in metres")
+    elif links.task.is_scalar and (
+        scale := scale_of(sites)
+    ):  # spectra and channels show whether they are
+        yield Finding(
+            "unit of places", f"places span {span:.3g} m, as if {scale}", "give them in metres"
+        )
     if len(sites) > 1 and given:
         stands = _stands(links)[given]
         closest = torch.cdist(sites.double(), stands.double()).min().item()
@@ -65,7 +75,9 @@ def check_extent(links: Any) -> Iterator[Finding]:
 
 
 def scale_of(places: Float[Tensor, "n 3"]) -> str:
-    """How places seem to be scaled: to 0..1, -1..1 or -0.5..0.5, or standardised; empty if they are not."""
+    """How places seem to be scaled: to 0..1, -1..1 or -0.5..0.5, or standardised; empty if they are
+    not.
+    """
     low, high = places.min().item(), places.max().item()
     for lower, upper in ((0.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)):
         margin = 0.15 * (upper - lower)  # places seldom reach the walls of the room that was scaled
@@ -125,7 +137,9 @@ def check_arrays(links: Any) -> Iterator[Finding]:
 
 
 def check_walls(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> Iterator[Finding]:
-    """A finding if walls are in another unit or elsewhere than transmitters and receivers as seen from above."""
+    """A finding if walls are in another unit or elsewhere than transmitters and receivers as seen
+    from above.
+    """
     own = _diagonal(walls[:, :2])
     room = _diagonal(places[:, :2])
     if own and room and not 1 / 50 < own / room < 50:  # millimetres differ by 1000

@@ -26,14 +26,17 @@ def check_receivers(links: Any) -> Iterator[Finding]:
     sample, names = known
     found = [*check_conventions(sample)]
     exchanged = [*check_order(sample, names)]
-    # Gateways in the corners of a room that is mirrored seem exchanged, too: the clearly closer fit counts.
+    # Gateways in the corners of a room that is mirrored seem exchanged, too: the clearly closer fit
+    # counts.
     if exchanged and (not found or _share(exchanged[0]) < 0.9 * _share(found[0])):
         found = exchanged
     yield from found or [*check_origin(sample)] or check_each(sample, names)
 
 
 def check_power(links: Any) -> Iterator[Finding]:
-    """A finding if no usual transmitter has such levels at such distances: places may be in mm, cm or km."""
+    """A finding if no usual transmitter has such levels at such distances: places may be in mm, cm
+    or km.
+    """
     known = sample_of_given(links)
     if known is None or links.frame is not None:
         return
@@ -51,16 +54,24 @@ def check_power(links: Any) -> Iterator[Finding]:
     strong = powers(1e8).quantile(0.95).item()
     middle = f"levels of {sample.labels.median():.3g} dBm at {distances.median():.3g} m take a transmitter of "
     if strong > 60:
-        yield Finding("unit of places", f"{middle}{strong:.2g} dBm in free space", "are places in mm or cm?")
+        yield Finding(
+            "unit of places", f"{middle}{strong:.2g} dBm in free space", "are places in mm or cm?"
+        )
     elif offsets[:, 2].abs().min() > 300 and powers(4e8).quantile(0.95) > 40:
         text = f"receivers are {offsets[:, 2].abs().min():.3g} m above or below all places"
         yield Finding("unit of places", text, "are places in mm?")
     elif (weak := powers(6e9).quantile(0.95).item()) < -40:
-        yield Finding("unit of places", f"{middle}{weak:.2g} dBm in free space", "are places in km?")
+        yield Finding(
+            "unit of places", f"{middle}{weak:.2g} dBm in free space", "are places in km?"
+        )
 
 
-def sample_of_given(links: Any, most: int = 2000, fewest: int = 8) -> tuple[Sample, list[str]] | None:
-    """Some links of the receivers with a given place and ``fewest`` links or more, and the receivers' names."""
+def sample_of_given(
+    links: Any, most: int = 2000, fewest: int = 8
+) -> tuple[Sample, list[str]] | None:
+    """Some links of the receivers with a given place and ``fewest`` links or more, and the
+    receivers' names.
+    """
     sample = sample_of(links, most)
     counts = sample.receivers.bincount(minlength=len(sample.positions))
     used = counts >= fewest
@@ -74,13 +85,20 @@ def sample_of_given(links: Any, most: int = 2000, fewest: int = 8) -> tuple[Samp
 
 def check_conventions(sample: Sample) -> Iterator[Finding]:
     """A finding if levels follow the distance clearly better in another unit or with other axes."""
-    rows = [*of_frames(), *of_units([("tx",), ("rx",)]), *of_axes(sample, [("rx",)]), *of_plans(sample)]
+    rows = [
+        *of_frames(),
+        *of_units([("tx",), ("rx",)]),
+        *of_axes(sample, [("rx",)]),
+        *of_plans(sample),
+    ]
     logarithms = torch.stack([decades(row.change(sample)) for row in rows])  # (h, n)
     errors = fit_law(logarithms, sample).errors
     best = int(errors.abs().clamp_max(30).mean(1).argmin())
     gain = _gain(sample, errors[best])
     if gain is not None:
-        yield _finding("coordinates of receivers", "levels", gain, f"if {rows[best].name}", rows[best].mend)
+        yield _finding(
+            "coordinates of receivers", "levels", gain, f"if {rows[best].name}", rows[best].mend
+        )
 
 
 def check_order(sample: Sample, names: Sequence[str]) -> Iterator[Finding]:
@@ -97,7 +115,11 @@ def check_order(sample: Sample, names: Sequence[str]) -> Iterator[Finding]:
     order = torch.from_numpy(linear_sum_assignment(costs.numpy())[1])
     moved = (order != torch.arange(count)).nonzero()[:, 0]
     own = torch.isin(sample.receivers, moved).nonzero()[:, 0]
-    gain = _gain(_only(sample, moved), errors[order[sample.receivers[own]], own]) if len(moved) else None
+    gain = (
+        _gain(_only(sample, moved), errors[order[sample.receivers[own]], own])
+        if len(moved)
+        else None
+    )
     if gain is None:
         return
     mend = "are names or places exchanged?"
@@ -136,7 +158,9 @@ def check_each(sample: Sample, names: Sequence[str], most: int = 4) -> Iterator[
 
 
 def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain | None]:
-    """The shift of all receivers along x and y that explains levels best, within twice the places' extent."""
+    """The shift of all receivers along x and y that explains levels best, within twice the places'
+    extent.
+    """
     low, high = sample.transmitters.amin(0), sample.transmitters.amax(0)
     offsets = sample.transmitters - sample.positions[sample.receivers]  # (n, 3)
     shift = ((low + high) / 2 - sample.positions.mean(0))[:2]
@@ -169,8 +193,12 @@ def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) ->
 
 
 def _finding(fault: str, subject: str, gain: Gain, under: str, mend: str) -> Finding:
-    text = f"{subject} follow the distance to {gain.fits:.2g} dB instead of {gain.read:.2g} dB {under}"
-    return Finding(fault, text, mend, gain.read, gain.fits, "mean error about the law of distance [dB]")
+    text = (
+        f"{subject} follow the distance to {gain.fits:.2g} dB instead of {gain.read:.2g} dB {under}"
+    )
+    return Finding(
+        fault, text, mend, gain.read, gain.fits, "mean error about the law of distance [dB]"
+    )
 
 
 def _share(finding: Finding) -> float:

@@ -1,4 +1,6 @@
-"""Checks of spatial spectra: constant ones, and conventions by which bright directions follow the transmitters."""
+"""Checks of spatial spectra: constant ones, and conventions by which bright directions follow the
+transmitters.
+"""
 
 import itertools
 import math
@@ -12,7 +14,14 @@ from torch import Tensor
 
 from gaigs.core.geometry import Grid, from_spherical, to_spherical
 from gaigs.core.task.spectrum import SSIM_WINDOW
-from gaigs.data.checks.conventions import changing, of_axes, of_frames, of_orientations, of_receivers, of_units
+from gaigs.data.checks.conventions import (
+    changing,
+    of_axes,
+    of_frames,
+    of_orientations,
+    of_receivers,
+    of_units,
+)
 from gaigs.data.checks.finding import Finding
 from gaigs.data.checks.hypotheses import Hypothesis, Sample, sample_of
 from gaigs.data.checks.places import scale_of
@@ -33,12 +42,16 @@ def check_extremes(links: Any) -> Iterator[Finding]:
     task, labels = links.task, links.labels
     if min(task.shape) < SSIM_WINDOW:
         rows, columns = task.shape
-        raise ValueError(f"spectra must have {SSIM_WINDOW} x {SSIM_WINDOW} pixels or more, got {rows} x {columns}")
+        raise ValueError(
+            f"spectra must have {SSIM_WINDOW} x {SSIM_WINDOW} pixels or more, got {rows} x {columns}"
+        )
     parts = (labels[index].flatten(1) for index in torch.arange(len(labels)).split(256))
     low, high = torch.cat([torch.stack((part.amin(1), part.amax(1)), 1) for part in parts]).T
     constant = low == high
     if constant.all():
-        raise ValueError(f"a spectrum must have pixels of different values; all {len(labels)} are constant")
+        raise ValueError(
+            f"a spectrum must have pixels of different values; all {len(labels)} are constant"
+        )
     lacking = torch.zeros_like(constant)
     if task.normalisation.startswith("min-max"):
         lacking = ((low != 0) | (high != 1)) & ~constant
@@ -64,8 +77,8 @@ class Limits:
         better: Least excess of the score over that of the data as read.
         share: The same as a share of the score.
         known: Score of the data as read above which two faults at once are not sought.
-        of_others, of_axes, of_pairs: The excess in standard errors. Axes that point the other way need more, as
-            reflections look like them; hundreds of pairs need most.
+        of_others, of_axes, of_pairs: The excess in standard errors. Axes that point the other way
+            need more, as reflections look like them; hundreds of pairs need most.
     """
 
     fewest: int = 16
@@ -81,11 +94,13 @@ class Limits:
 
 
 def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Finding]:
-    """The convention by which spectra are bright where the transmitters stand, if it is not the one read.
+    """The convention by which spectra are bright where the transmitters stand, if it is not the one
+    read.
 
-    The score of a spectrum says how rare a pixel is that is as bright as the one towards its transmitter,
-    less the same in other spectra of the receiver. So what is bright in every spectrum scores nothing, and
-    a link behind walls about 0 by every convention. The strongest pixel need not be the direct path.
+    The score of a spectrum says how rare a pixel is that is as bright as the one towards its
+    transmitter, less the same in other spectra of the receiver. So what is bright in every spectrum
+    scores nothing, and a link behind walls about 0 by every convention. The strongest pixel need
+    not be the direct path.
     """
     limits = limits or Limits()
     sample = sample_of(links, limits.most)
@@ -107,13 +122,19 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
     single += of_receivers(sample, lambda own: directions.scores(own).mean().item())
     tries = [(single, limits.of_others, 1), (axes, limits.of_axes, 1)]
     if read.mean() < limits.known:
-        pairs = itertools.chain.from_iterable(itertools.product(*two) for two in itertools.combinations(groups, 2))
-        tries.append(([both(*pair) for pair in pairs], limits.of_pairs, 2))  # by every other link: there are hundreds
+        pairs = itertools.chain.from_iterable(
+            itertools.product(*two) for two in itertools.combinations(groups, 2)
+        )
+        tries.append(
+            ([both(*pair) for pair in pairs], limits.of_pairs, 2)
+        )  # by every other link: there are hundreds
     best: Hypothesis | None = None
     best_score = 0.0
     for candidates, deviations, step in tries:
         some = sample.at(torch.arange(0, len(read), step))
-        means = [directions.scores(candidate.change(some)).mean().item() for candidate in candidates]
+        means = [
+            directions.scores(candidate.change(some)).mean().item() for candidate in candidates
+        ]
         likeliest = candidates[next(k for k, mean in enumerate(means) if mean > max(means) - 0.01)]
         scores = directions.scores(likeliest.change(sample))
         score = scores.mean().item()
@@ -136,13 +157,19 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
         return
     alike = near_likeness(sample)
     # Near places of a survey have more in common, also behind walls.
-    if len(read) >= limits.near and read.mean() < 2 * read.std() / math.sqrt(len(read)) and alike < 0.1:
+    if (
+        len(read) >= limits.near
+        and read.mean() < 2 * read.std() / math.sqrt(len(read))
+        and alike < 0.1
+    ):
         text = f"spectra are not bright towards their transmitters, and near places have a correlation of {alike:.2f}"
         yield Finding("order of rows", text, "are places and spectra in the same order?")
 
 
 def near_likeness(sample: Sample) -> float:
-    """Mean correlation of each spectrum with that of the nearest other place, without what all have in common."""
+    """Mean correlation of each spectrum with that of the nearest other place, without what all have
+    in common.
+    """
     pixels = sample.labels.flatten(1)
     likeness = torch.corrcoef(pixels - pixels.mean(0))  # (n, n)
     apart = torch.cdist(sample.transmitters, sample.transmitters).fill_diagonal_(math.inf)
@@ -174,7 +201,9 @@ class Directions:
         azimuths, elevations, _ = to_spherical(sample.local.float())
         rows = (elevations[:, None] - self.grid.elevations).abs().argmin(1)
         columns = torch.cos(azimuths[:, None] - self.grid.azimuths).argmax(1)
-        brighter = 1 - sample.labels[:, rows, columns]  # share of brighter pixels (spectrum, transmitter)
+        brighter = (
+            1 - sample.labels[:, rows, columns]
+        )  # share of brighter pixels (spectrum, transmitter)
         # ln(1 / share) as in a likelihood: the top per cent counts more than the top tenth.
         least = 0.02
         rareness = ((brighter + least).log() / math.log(least)).clamp_min(0)
@@ -199,7 +228,11 @@ def pixel_changes(sample: Sample) -> list[Hypothesis]:
     """Other orders of the pixels, and other signs."""
     changes = [
         ("rows are upside down", lambda labels: labels.flip(1), "spectra = spectra[:, ::-1]"),
-        ("amplitudes are inverted, as in a grey map", lambda labels: 1 - labels, "spectra = 1 - spectra"),
+        (
+            "amplitudes are inverted, as in a grey map",
+            lambda labels: 1 - labels,
+            "spectra = 1 - spectra",
+        ),
     ]
     if sample.labels.shape[1] == sample.labels.shape[2]:
         mend = "spectra = spectra.swapaxes(1, 2)"
@@ -216,7 +249,9 @@ def column_changes(grid: Grid) -> list[Hypothesis]:
         source = torch.cos(azimuths[:, None] - grid.azimuths).argmax(1)  # (columns,)
         return lambda own: replace(own, labels=own.labels[:, :, source])
 
-    is_symmetric = torch.allclose(grid.azimuths, -grid.azimuths.flip(0), atol=1e-3)  # such as -90..90 degrees
+    is_symmetric = torch.allclose(
+        grid.azimuths, -grid.azimuths.flip(0), atol=1e-3
+    )  # such as -90..90 degrees
     columns = "::-1" if is_symmetric else "-np.arange(columns)"
     changes = [
         Hypothesis("azimuths run clockwise", moved(0.0, -1), f"spectra = spectra[:, :, {columns}]"),
@@ -243,7 +278,9 @@ def order_changes(links: Any) -> list[Hypothesis]:
     }
     for first in (0, 1):
         names = [str(k + first) for k in range(total)]
-        orders[f"spectra are sorted by name ({first}, 10, 11, ... 2)"] = sorted(range(total), key=names.__getitem__)
+        orders[f"spectra are sorted by name ({first}, 10, 11, ... 2)"] = sorted(
+            range(total), key=names.__getitem__
+        )
     changes = []
     for name, order in orders.items():
         places = links.query.transmitters[order].double()
@@ -253,26 +290,40 @@ def order_changes(links: Any) -> list[Hypothesis]:
 
 
 def scaling_changes(sample: Sample, grid: Grid) -> list[Hypothesis]:
-    """Transmitters that were scaled, with the scales and offsets along the axes that suit the spectra best."""
+    """Transmitters that were scaled, with the scales and offsets along the axes that suit the
+    spectra best.
+    """
     scale = scale_of(sample.transmitters)
     mend = "undo it, such as tx = middle + half_extent * tx"
-    return [Hypothesis(f"tx are {scale}", change, mend) for change in _unscaled(sample, grid)] if scale else []
+    return (
+        [Hypothesis(f"tx are {scale}", change, mend) for change in _unscaled(sample, grid)]
+        if scale
+        else []
+    )
 
 
 def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sample], Sample]]:
-    """Positive scales s and offsets t of the axes by random threes of links, for the receiver with most links.
+    """Positive scales s and offsets t of the axes by random threes of links, for the receiver with
+    most links.
 
-    The direction u of a link's brightest pixel and its position x obey u x (s x + t) = 0, six equations of
-    three links for s and t but for a common factor. Threes are many, as a reflection may be the brightest.
+    The direction u of a link's brightest pixel and its position x obey u x (s x + t) = 0, six
+    equations of three links for s and t but for a common factor. Threes are many, as a reflection
+    may be the brightest.
     """
     receiver = int(sample.receivers.bincount().argmax())
     own = (sample.receivers == receiver).nonzero()[:, 0]
     brightest = sample.labels[own].flatten(1).argmax(1)
     pixels = grid.flatten()[brightest]
-    towards = from_spherical(pixels.azimuths, pixels.elevations).double() @ sample.rotations[receiver].T  # (k, 3)
+    towards = (
+        from_spherical(pixels.azimuths, pixels.elevations).double() @ sample.rotations[receiver].T
+    )  # (k, 3)
     units = torch.eye(3, dtype=torch.float64).expand(len(own), 3, 3)
-    crossed = torch.linalg.cross(units, towards[:, None].expand(-1, 3, -1)).mT  # (k, 3, 3), columns e x u
-    equations = torch.cat((crossed * sample.transmitters[own, None], crossed), 2)  # (k, 3, 6), of s and t
+    crossed = torch.linalg.cross(
+        units, towards[:, None].expand(-1, 3, -1)
+    ).mT  # (k, 3, 3), columns e x u
+    equations = torch.cat(
+        (crossed * sample.transmitters[own, None], crossed), 2
+    )  # (k, 3, 6), of s and t
     generator = torch.Generator().manual_seed(0)
     threes = torch.stack([torch.randperm(len(own), generator=generator)[:3] for _ in range(draws)])
     systems = equations[threes].flatten(1, 2)  # (draws, 9, 6)

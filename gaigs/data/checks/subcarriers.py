@@ -16,19 +16,25 @@ from gaigs.io.tables import shortened
 
 
 def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
-    """True for each subcarrier at which all links have one value, or none: a guard or null subcarrier.
+    """True for each subcarrier at which all links have one value, or none: a guard or null
+    subcarrier.
 
     An element may have another value than others. Fewer than five links tell nothing.
     """
     count = len(links.task.frequencies)
     chosen = torch.arange(count)
     few = evenly(torch.arange(len(links)), 64)
-    for index in (few, torch.arange(len(links))):  # most subcarriers are channels, which few links show
+    for index in (
+        few,
+        torch.arange(len(links)),
+    ):  # most subcarriers are channels, which few links show
         values = links.labels[index]
         absent = lacking(links.receivers, links.query.receivers[index], values.shape[1])  # (n, e)
         strengths = values.abs().amax((1, 2))[:, None, None]
         values = values[..., chosen]
-        first = values[absent.int().argmin(0), torch.arange(values.shape[1])]  # (e, k), of a link with the element
+        first = values[
+            absent.int().argmin(0), torch.arange(values.shape[1])
+        ]  # (e, k), of a link with the element
         is_same = ((values == first) | absent[..., None]).all(0).all(0)
         is_faint = (values.abs() <= 1e-6 * strengths).all(0).all(0)  # 0 but for rounding
         chosen = chosen[is_same | is_faint]
@@ -48,23 +54,30 @@ def check_constant_subcarriers(links: Any) -> Iterator[Finding]:
     constant = constant_subcarriers(links)
     if constant.any() and not constant.all():
         text = constant_sentence(constant, links.task.frequencies)
-        yield Finding("constant subcarriers", text.format("as guard or null subcarriers"), "leave them out")
+        yield Finding(
+            "constant subcarriers", text.format("as guard or null subcarriers"), "leave them out"
+        )
 
 
 def check_powers(sample: Sample) -> Iterator[Finding]:
-    """A finding about subcarriers that are 30 dB from the usual one: guards with noise, pilots or unscaled ones."""
+    """A finding about subcarriers that are 30 dB from the usual one: guards with noise, pilots or
+    unscaled ones.
+    """
     powers = sample.labels.abs().square().mean((0, 1)).clamp_min(1e-300)  # (s,)
     odd = (10 * (powers / powers.median()).log10()).abs() > 30
     if len(sample.labels) >= 5 and odd.any():
         named = shortened([f"{carrier / 1e9:.6g}" for carrier in sample.frequencies[odd].tolist()])
         text = f"{int(odd.sum())} of {len(odd)} subcarriers are 30 dB or more from the usual one in power: {named} GHz"
-        yield Finding("power of subcarriers", text, "leave them out if they are guards, or scale them alike")
+        yield Finding(
+            "power of subcarriers", text, "leave them out if they are guards, or scale them alike"
+        )
 
 
 def order_of_subcarriers(sample: Sample) -> Finding | None:
     """A finding if channels jump within the band, and go on from its last to its first subcarrier.
 
-    The correlation of neighbouring subcarriers tells, for which each link may have a phase and a delay of its own.
+    The correlation of neighbouring subcarriers tells, for which each link may have a phase and a
+    delay of its own.
     """
     order = sample.frequencies.argsort()
     count = len(order)
@@ -73,7 +86,9 @@ def order_of_subcarriers(sample: Sample) -> Finding | None:
         return None
     powers = values.abs().square().mean((1, 2), keepdim=True)
     values = values / torch.where(powers > 0, powers, 1).sqrt()
-    steps = values.roll(-1, 2) * values.conj()  # (n, e, s), the last from the band's end to its start
+    steps = (
+        values.roll(-1, 2) * values.conj()
+    )  # (n, e, s), the last from the band's end to its start
     turn = steps.sum((1, 2), keepdim=True).sgn().conj()
     # Where a subcarrier is left out between two, the phase turns twice as far.
     likeness = torch.stack([(steps * turn**power).sum((0, 1)).abs() for power in (1, 2)]).amax(0)
@@ -95,4 +110,11 @@ def order_of_subcarriers(sample: Sample) -> Finding | None:
         f"channels jump at subcarrier {after} of {count}, with a correlation of {least:.2f}, and go on from the last "
         f"subcarrier to the first, with {around:.2f}: FFT order?"
     )
-    return Finding("order of subcarriers", text, mend, read=least, fits=around, score="correlation of subcarriers")
+    return Finding(
+        "order of subcarriers",
+        text,
+        mend,
+        read=least,
+        fits=around,
+        score="correlation of subcarriers",
+    )

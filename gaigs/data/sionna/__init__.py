@@ -39,16 +39,20 @@ def traced_room(
     heights: Sequence[float] | None = None,
     diffraction: bool = True,
 ) -> Links:
-    """Spectra of transmitters at random places in a room; the official split tests on the last fifth of them.
+    """Spectra of transmitters at random places in a room; the official split tests on the last
+    fifth of them.
 
-    Paths are traced the first time, which takes a minute, and stored. The other options are those of ``synthetic``.
+    Paths are traced the first time, which takes a minute, and stored. The other options are those
+    of ``synthetic``.
 
     Args:
         room: ``l_shape``, ``slanted`` or ``furnished``.
-        scene: File of one's own surfaces, as ``sionna.rt.load_scene`` loads it (Mitsuba XML); None for the room.
+        scene: File of one's own surfaces, as ``sionna.rt.load_scene`` loads it (Mitsuba XML); None
+            for the room.
         receiver: Position of the array in the scene [m].
         facing: Point in the scene that the array faces [m]; None for the middle of all surfaces.
-        heights: Lowest and highest z of transmitters in the scene [m]; None for 0.3 to 2 m above the lowest surface.
+        heights: Lowest and highest z of transmitters in the scene [m]; None for 0.3 to 2 m above
+            the lowest surface.
         diffraction: False if edges bend no waves, the default of Sionna RT itself.
 
     Raises:
@@ -78,7 +82,11 @@ def find_room(
     """
     if scene is not None:
         return find_scene(scene, option, receivers, facing, heights, diffraction)
-    if given := [key for key, value in ((option, receivers), ("facing", facing), ("heights", heights)) if value]:
+    if given := [
+        key
+        for key, value in ((option, receivers), ("facing", facing), ("heights", heights))
+        if value
+    ]:
         raise ValueError(f"data.{given[0]} is an option of data.scene; rooms have their own")
     if name not in ROOMS:
         raise ValueError(f"room must be one of {', '.join(ROOMS)}, got {name!r}")
@@ -106,16 +114,24 @@ def find_scene(
     positions = check_points(f"data.{option}", receivers)
     if heights is not None and not (len(heights) == 2 and heights[0] < heights[1]):
         raise ValueError(f"data.heights must be the lowest and the highest z [m], got {[*heights]}")
-    room = SceneFile(Path(file).expanduser(), positions, None if heights is None else (heights[0], heights[1]))
+    room = SceneFile(
+        Path(file).expanduser(), positions, None if heights is None else (heights[0], heights[1])
+    )
     space = room.space
-    middle = (space.lower + space.upper) / 2 if target is None else check_points("data.facing", [target])[0].tolist()
+    middle = (
+        (space.lower + space.upper) / 2
+        if target is None
+        else check_points("data.facing", [target])[0].tolist()
+    )
 
     return SimulatedRoom(
         pose=facing(positions[0].tolist(), [*middle]),
         gateways=tuple(gateway(f"rx{k}", position) for k, position in enumerate(positions)),
         edges=room.edges(),
         place=room.place,
-        frequency_offsets=lambda bandwidth: sample_paths(bandwidth, float(np.linalg.norm(space.upper - space.lower))),
+        frequency_offsets=lambda bandwidth: sample_paths(
+            bandwidth, float(np.linalg.norm(space.upper - space.lower))
+        ),
         respond=partial(respond_in_parts, room, diffraction),
     )
 

@@ -1,4 +1,6 @@
-"""Traced paths, stored on disk: they are the same for every spectrum, bandwidth and number of subcarriers."""
+"""Traced paths, stored on disk: they are the same for every spectrum, bandwidth and number of
+subcarriers.
+"""
 
 import hashlib
 import json
@@ -33,7 +35,9 @@ def find_paths(
     frequency: float,
     diffraction: bool = True,
 ) -> Paths:
-    """The paths in a room, traced by ``tracing.trace`` the first time and read by ``keep`` afterwards."""
+    """The paths in a room, traced by ``tracing.trace`` the first time and read by ``keep``
+    afterwards.
+    """
     surfaces: dict[str, object] = (
         {"scene": room.digest}
         if isinstance(room, SceneFile)
@@ -47,7 +51,13 @@ def find_paths(
         "receiver": receiver.tolist(),
         "transmitters": transmitters.tolist(),
         "frequency": float(frequency),
-        "settings": [tracing.DEPTH, tracing.RAYS, tracing.CANDIDATES, tracing.CHUNK, tracing.WEAKEST],
+        "settings": [
+            tracing.DEPTH,
+            tracing.RAYS,
+            tracing.CANDIDATES,
+            tracing.CHUNK,
+            tracing.WEAKEST,
+        ],
     }
     if not diffraction:
         key["diffraction"] = False
@@ -55,20 +65,30 @@ def find_paths(
 
     def trace() -> dict[str, np.ndarray]:
         if isinstance(room, SceneFile):
-            paths = tracing.trace_scene(room.load(frequency), receiver, transmitters, reflections=reflections)
+            paths = tracing.trace_scene(
+                room.load(frequency), receiver, transmitters, reflections=reflections
+            )
         else:
             paths = tracing.trace(room.meshes(), receiver, transmitters, frequency, reflections)
-        return {"images": paths.images.numpy().astype(np.float32), "gains": paths.gains.numpy().astype(np.complex64)}
+        return {
+            "images": paths.images.numpy().astype(np.float32),
+            "gains": paths.gains.numpy().astype(np.complex64),
+        }
 
     arrays = keep(key, trace, f"tracing the paths of {len(transmitters)} transmitters")
-    return Paths(torch.from_numpy(arrays["images"]).double(), torch.from_numpy(arrays["gains"]).to(torch.complex128))
+    return Paths(
+        torch.from_numpy(arrays["images"]).double(),
+        torch.from_numpy(arrays["gains"]).to(torch.complex128),
+    )
 
 
-def keep(key: Mapping[str, object], make: Callable[[], dict[str, np.ndarray]], task: str) -> dict[str, np.ndarray]:
+def keep(
+    key: Mapping[str, object], make: Callable[[], dict[str, np.ndarray]], task: str
+) -> dict[str, np.ndarray]:
     """Arrays by name from a file in ``$XDG_CACHE_HOME/gaigs/sionna``, which is made the first time.
 
-    The key has all that the arrays depend on beside the packages, as JSON; ``task`` names the computation in the log. A
-    damaged file is a ``ValueError``.
+    The key has all that the arrays depend on beside the packages, as JSON; ``task`` names the
+    computation in the log. A damaged file is a ``ValueError``.
     """
     key = {"version": VERSION, "packages": tracing.find_packages(), **key}
     folder = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "gaigs" / "sionna"

@@ -94,12 +94,14 @@ class MeshRoom:
 
     Attributes:
         floor: Corners (x, y) of the floor, counterclockwise [m].
-        ceiling: Corners of the ceiling, each above that of the floor [m]; where they differ walls lean.
+        ceiling: Corners of the ceiling, each above that of the floor [m]; where they differ walls
+            lean.
         height: Height of the ceiling [m].
         convex: Corners of the convex parts of floor and ceiling.
         walls: Material of each wall, from a corner to the next.
         slabs: Materials of floor and ceiling.
-        antenna: Position of the array [m], the point that it faces [m], and its rotation about its normal [deg].
+        antenna: Position of the array [m], the point that it faces [m], and its rotation about its
+            normal [deg].
         gateways: Positions of the receivers with a single antenna, by name [m].
     """
 
@@ -114,16 +116,27 @@ class MeshRoom:
     gateways: dict[str, tuple[float, float, float]]
 
     def meshes(self) -> list[Mesh]:
-        """Walls, floor, ceiling and furniture. Neighbouring walls of one material are one mesh, with a true edge."""
+        """Walls, floor, ceiling and furniture. Neighbouring walls of one material are one mesh,
+        with a true edge.
+        """
         count = len(self.floor)
-        corners = (*((x, y, 0.0) for x, y in self.floor), *((x, y, self.height) for x, y in self.ceiling))
+        corners = (
+            *((x, y, 0.0) for x, y in self.floor),
+            *((x, y, self.height) for x, y in self.ceiling),
+        )
         sides: dict[str, list[tuple[int, ...]]] = {}
         for k, material in enumerate(self.walls):
             after = (k + 1) % count
             sides.setdefault(material, []).append((k, after, count + after, count + k))
         above = tuple(tuple(count + k for k in part) for part in self.convex)
-        shell = [Mesh(f"{material} walls", material, corners, tuple(faces)) for material, faces in sides.items()]
-        shell += [Mesh("floor", self.slabs[0], corners, self.convex), Mesh("ceiling", self.slabs[1], corners, above)]
+        shell = [
+            Mesh(f"{material} walls", material, corners, tuple(faces))
+            for material, faces in sides.items()
+        ]
+        shell += [
+            Mesh("floor", self.slabs[0], corners, self.convex),
+            Mesh("ceiling", self.slabs[1], corners, above),
+        ]
         return [*map(_compact, shell), *(cuboid.mesh() for cuboid in self.furniture)]
 
     def pose(self) -> Pose:
@@ -133,7 +146,9 @@ class MeshRoom:
     def is_free(self, points: Float[Tensor, "k 3"]) -> Bool[Tensor, " k"]:
         """True for points [m] inside, with the margins from walls and furniture."""
         share = points[:, 2:] / self.height
-        outline = torch.lerp(points.new_tensor(self.floor), points.new_tensor(self.ceiling), share[..., None])
+        outline = torch.lerp(
+            points.new_tensor(self.floor), points.new_tensor(self.ceiling), share[..., None]
+        )
         start, end = outline, outline.roll(-1, 1)  # of each wall, at the height of each point
         along, to = end - start, points[:, None, :2] - start
         # Even-odd rule: the number of walls that a ray along x meets.
@@ -151,7 +166,10 @@ class MeshRoom:
 def facing(position: Sequence[float], target: Sequence[float], turn: float = 0.0) -> Pose:
     """Pose at a position [m] whose normal points at a target [m], rotated about the normal [deg]."""
     normal = torch.tensor(target, dtype=torch.float64) - torch.tensor(position, dtype=torch.float64)
-    azimuth, depression = torch.atan2(normal[1], normal[0]), torch.atan2(-normal[2], normal[:2].norm())
+    azimuth, depression = (
+        torch.atan2(normal[1], normal[0]),
+        torch.atan2(-normal[2], normal[:2].norm()),
+    )
     angles = [azimuth.item(), math.pi / 2 + depression.item(), math.radians(turn)]
     return Pose.from_xyzw(position, Rotation.from_euler("ZYZ", angles).as_quat())
 
@@ -170,9 +188,13 @@ def edges(meshes: Sequence[Mesh]) -> Float[Tensor, "k 2 3"]:
         corners = torch.tensor(mesh.vertices, dtype=torch.float64)
         normals: dict[tuple[int, int], list[Tensor]] = {}
         for face in mesh.faces:
-            normal = torch.linalg.cross(corners[face[1]] - corners[face[0]], corners[face[2]] - corners[face[0]])
+            normal = torch.linalg.cross(
+                corners[face[1]] - corners[face[0]], corners[face[2]] - corners[face[0]]
+            )
             for start, end in zip(face, (*face[1:], face[0]), strict=True):
-                normals.setdefault((min(start, end), max(start, end)), []).append(normal / normal.norm())
+                normals.setdefault((min(start, end), max(start, end)), []).append(
+                    normal / normal.norm()
+                )
         for (start, end), found in normals.items():
             # The product of coplanar faces' normals is 1 or -1, up to rounding.
             if len(found) < 2 or (found[0] @ found[1]).abs() < 1 - 1e-9:

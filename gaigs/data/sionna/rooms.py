@@ -12,19 +12,28 @@ def _table(name: str, x: float, y: float, length: float, width: float) -> tuple[
     ]
     return (
         Cuboid(name, "wood", (x - half[0], y - half[1], 0.7), (x + half[0], y + half[1], 0.74)),
-        *(Cuboid(leg, "wood", (u - 0.03, v - 0.03, 0.0), (u + 0.03, v + 0.03, 0.69)) for leg, u, v in legs),
+        *(
+            Cuboid(leg, "wood", (u - 0.03, v - 0.03, 0.0), (u + 0.03, v + 0.03, 0.69))
+            for leg, u, v in legs
+        ),
     )
 
 
 def _stool(name: str, x: float, y: float, turn: float) -> tuple[Cuboid, ...]:
     """A stool about (x, y) on a metal foot [m], turned [deg]."""
     return (
-        Cuboid(f"{name}, seat", "wood", (x - 0.22, y - 0.22, 0.43), (x + 0.22, y + 0.22, 0.47), turn),
-        Cuboid(f"{name}, foot", "metal", (x - 0.04, y - 0.04, 0.0), (x + 0.04, y + 0.04, 0.42), turn),
+        Cuboid(
+            f"{name}, seat", "wood", (x - 0.22, y - 0.22, 0.43), (x + 0.22, y + 0.22, 0.47), turn
+        ),
+        Cuboid(
+            f"{name}, foot", "metal", (x - 0.04, y - 0.04, 0.0), (x + 0.04, y + 0.04, 0.42), turn
+        ),
     )
 
 
-def _shelves(name: str, lower: tuple[float, float], upper: tuple[float, float], heights: tuple[float, ...]) -> tuple:
+def _shelves(
+    name: str, lower: tuple[float, float], upper: tuple[float, float], heights: tuple[float, ...]
+) -> tuple:
     """An open bookcase: boards between two sides at its ends along y [m]."""
     (x0, y0), (x1, y1) = lower, upper
     parts = [
@@ -52,7 +61,12 @@ L_SHAPE = MeshRoom(
         Cuboid("sofa", "wood", (2.7, 4.4, 0.0), (3.6, 6.0, 0.75)),
     ),
     antenna=((7.75, 3.15, 2.5), (2.4, 2.0, 0.4), 30.0),
-    gateways={"east": (7.9, 0.9, 2.2), "south": (3.0, 0.1, 1.4), "corner": (3.7, 6.2, 2.3), "west": (0.1, 2.6, 1.8)},
+    gateways={
+        "east": (7.9, 0.9, 2.2),
+        "south": (3.0, 0.1, 1.4),
+        "corner": (3.7, 6.2, 2.3),
+        "west": (0.1, 2.6, 1.8),
+    },
 )
 """An L of 8 x 6.6 m: waves from one arm arrive around the corner alone."""
 
@@ -71,9 +85,16 @@ SLANTED = MeshRoom(
         Cuboid("screen", "glass", (2.9, 2.0, 0.0), (2.96, 3.2, 1.7), -30.0),
     ),
     antenna=((0.25, 0.25, 2.6), (4.3, 3.2, 0.5), -50.0),
-    gateways={"west": (0.1, 4.2, 2.3), "south": (2.4, 0.1, 1.5), "north": (3.6, 5.1, 2.2), "slope": (5.3, 1.4, 1.9)},
+    gateways={
+        "west": (0.1, 4.2, 2.3),
+        "south": (2.4, 0.1, 1.5),
+        "north": (3.6, 5.1, 2.2),
+        "slope": (5.3, 1.4, 1.9),
+    },
 )
-"""A room under a roof of 6.8 x 5.2 m: its east wall leans inwards by 29 degrees and is oblique in plan by 9."""
+"""A room under a roof of 6.8 x 5.2 m: its east wall leans inwards by 29 degrees and is oblique in
+plan by 9.
+"""
 
 FURNISHED = MeshRoom(
     floor=((0, 0), (7.6, 0), (7.6, 5.6), (0, 5.6)),
@@ -108,7 +129,12 @@ FURNISHED = MeshRoom(
         *_stool("stool 5", 5.8, 2.0, -35.0),
     ),
     antenna=((7.35, 0.3, 2.45), (2.2, 3.3, 0.4), 70.0),
-    gateways={"west": (0.1, 2.2, 2.2), "south": (3.6, 0.1, 1.6), "east": (7.5, 3.6, 2.4), "north": (3.7, 5.5, 2.0)},
+    gateways={
+        "west": (0.1, 2.2, 2.2),
+        "south": (3.6, 0.1, 1.6),
+        "east": (7.5, 3.6, 2.4),
+        "north": (3.7, 5.5, 2.0),
+    },
 )
 """A flat of one room, 7.6 x 5.6 m, with 22 pieces of furniture that block many paths."""
 

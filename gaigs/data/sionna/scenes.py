@@ -38,7 +38,8 @@ class SceneFile:
     Attributes:
         file: Surfaces with the radio materials of Sionna RT.
         receivers: Positions (k, 3) [m].
-        heights: Lowest and highest z of transmitters [m]; None: 0.3 to 2 m above the lowest surface.
+        heights: Lowest and highest z of transmitters [m]; None: 0.3 to 2 m above the lowest
+            surface.
     """
 
     file: Path
@@ -51,19 +52,26 @@ class SceneFile:
         files = [self.file]
         for name in ElementTree.parse(self.file).iterfind(".//string[@name='filename']"):
             files.append(self.file.parent / name.get("value", ""))
-        return hashlib.sha256(b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)).hexdigest()
+        return hashlib.sha256(
+            b"".join(hashlib.sha256(file.read_bytes()).digest() for file in files)
+        ).hexdigest()
 
     def load(self, frequency: float | None = None) -> Any:
         """The scene of Sionna RT at a carrier [Hz]; a ``ValueError`` if it cannot be loaded."""
         rt = tracing.find_sionna()
         if not self.file.is_file():
-            raise FileNotFoundError(f"no scene at {self.file}; set data.scene to a scene file (Mitsuba XML)")
+            raise FileNotFoundError(
+                f"no scene at {self.file}; set data.scene to a scene file (Mitsuba XML)"
+            )
         try:
             scene = rt.load_scene(str(self.file))
             if not scene.objects:
                 raise ValueError("no surfaces")
-        except Exception as error:  # Mitsuba's parser raises exceptions of many types, with a traceback in the message
-            cause = re.sub(r"Traceback \(most recent call last\):.*\n(?=\S)", "", str(error), flags=re.DOTALL)
+        # Mitsuba's parser raises exceptions of many types, with a traceback in the message
+        except Exception as error:
+            cause = re.sub(
+                r"Traceback \(most recent call last\):.*\n(?=\S)", "", str(error), flags=re.DOTALL
+            )
             raise ValueError(
                 f"cannot load {self.file}: {' '.join(cause.split())}; expected a scene that sionna.rt.load_scene loads"
             ) from error
@@ -71,16 +79,24 @@ class SceneFile:
             try:
                 tracing.set_up(scene, frequency)
             except ValueError as error:
-                raise ValueError(f"{self.file} has no materials at {frequency:.6g} Hz: {error}") from error
+                raise ValueError(
+                    f"{self.file} has no materials at {frequency:.6g} Hz: {error}"
+                ) from error
         return scene
 
     @cached_property
     def space(self) -> "FreeSpace":
-        """The free space; a ``ValueError`` if a receiver stands farther from the surfaces than these are long."""
+        """The free space; a ``ValueError`` if a receiver stands farther from the surfaces than
+        these are long.
+        """
         scene = self.load().mi_scene
-        lower, upper = (np.array(corner, float).reshape(3) for corner in (scene.bbox().min, scene.bbox().max))
+        lower, upper = (
+            np.array(corner, float).reshape(3) for corner in (scene.bbox().min, scene.bbox().max)
+        )
         for receiver in self.receivers.double().numpy():
-            if np.linalg.norm(receiver - receiver.clip(lower, upper)) > np.linalg.norm(upper - lower):
+            if np.linalg.norm(receiver - receiver.clip(lower, upper)) > np.linalg.norm(
+                upper - lower
+            ):
                 bounds = f"{lower.round(3).tolist()} to {upper.round(3).tolist()}"
                 raise ValueError(
                     f"receivers must stand in the scene, whose surfaces lie from {bounds} m, got {receiver.tolist()}"
@@ -93,7 +109,9 @@ class SceneFile:
         low, high = self.heights or (space.floor + 0.3, space.floor + 2.0)
         lower = torch.tensor([*space.lower[:2], low]).float()
         upper = torch.tensor([*space.upper[:2], high]).float()
-        inside = (space.centres[:, 2] > low - space.pitch) & (space.centres[:, 2] < high + space.pitch)
+        inside = (space.centres[:, 2] > low - space.pitch) & (
+            space.centres[:, 2] < high + space.pitch
+        )
         if not space.reached[inside].any():
             raise ValueError(
                 f"{self.file}: expected free space at z from {low:.4g} to {high:.4g} m that the receivers see into, "
@@ -116,15 +134,17 @@ class SceneFile:
             faces = number.ravel()[part["faces"].numpy().reshape(-1, 3)]
             a, b, c = corners[faces].transpose(1, 0, 2)
             faces = faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 0]
-            meshes.append(Mesh("", "", tuple(map(tuple, corners.tolist())), tuple(map(tuple, faces.tolist()))))
+            meshes.append(
+                Mesh("", "", tuple(map(tuple, corners.tolist())), tuple(map(tuple, faces.tolist())))
+            )
         return edges(meshes)
 
 
 class FreeSpace:
     """The part of a scene that can be reached from its receivers without passing through a surface.
 
-    Neighbouring cells of a grid are joined if no surface lies between their centres. So closed rooms end at their
-    walls, and solids are left out, also those without a bottom on the ground.
+    Neighbouring cells of a grid are joined if no surface lies between their centres. So closed
+    rooms end at their walls, and solids are left out, also those without a bottom on the ground.
 
     Attributes:
         floor: Height of the lowest surface [m].
@@ -152,7 +172,9 @@ class FreeSpace:
             pairs.append(np.stack((near[:-1].ravel(), near[1:].ravel()), -1))
         joined = np.concatenate(pairs)
         joined = joined[self.is_open(self.centres[joined[:, 0]], self.centres[joined[:, 1]])]
-        graph = coo_matrix((np.ones(len(joined), bool), tuple(joined.T)), (number.size, number.size))
+        graph = coo_matrix(
+            (np.ones(len(joined), bool), tuple(joined.T)), (number.size, number.size)
+        )
         part = connected_components(graph, directed=False)[1]
         around = np.indices((3, 3, 3)).reshape(3, -1).T - 1
         cells = self.cells(receivers)[:, None] + around
@@ -186,12 +208,16 @@ class FreeSpace:
         around = around[np.abs(around).any(1)]
         around *= MARGIN / np.linalg.norm(around, axis=1, keepdims=True)
         ends = places[:, None] + around
-        clear = self.is_open(places.repeat(len(around), 0), ends.reshape(-1, 3)).reshape(len(places), -1)
+        clear = self.is_open(places.repeat(len(around), 0), ends.reshape(-1, 3)).reshape(
+            len(places), -1
+        )
         return torch.from_numpy(free & clear.all(1))
 
 
 def check_points(name: str, points: Sequence[Sequence[float]] | None) -> Float[Tensor, "k 3"]:
-    """Positions of an option [m]; a ``ValueError`` if there is none, or one has not three coordinates."""
+    """Positions of an option [m]; a ``ValueError`` if there is none, or one has not three
+    coordinates.
+    """
     if not points or not all(isinstance(point, Sequence) and len(point) == 3 for point in points):
         raise ValueError(f"{name} must be x, y, z of each receiver in the scene [m], got {points}")
     return as_positions(name, [[*point] for point in points])

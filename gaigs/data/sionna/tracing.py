@@ -23,17 +23,23 @@ from gaigs.data.sionna.meshes import THICKNESS, Mesh
 from gaigs.data.synthetic.image_source import MATERIALS, Paths, conductivity
 
 DEPTH = 3
-"""Largest number of reflections, passages through surfaces and diffractions of a path; a wardrobe is two passages."""
+"""Largest number of reflections, passages through surfaces and diffractions of a path; a wardrobe
+is two passages.
+"""
 
 CHUNK = 10
-"""Transmitters traced at a time. Chains of surfaces to all of them share a table, in which some displace others."""
+"""Transmitters traced at a time. Chains of surfaces to all of them share a table, in which some
+displace others.
+"""
 
 RAYS, CANDIDATES = 500_000, 1_000_000
-"""Rays from a receiver for each chunk, and chains tried, which is also the size of that table: 50 transmitters with 80
-chains each would lose 1 to 6 dB of the power at one place in ten."""
+"""Rays from a receiver for each chunk, and chains tried, which is also the size of that table: 50
+transmitters with 80 chains each would lose 1 to 6 dB of the power at one place in ten."""
 
 WEAKEST = 1e-4
-"""Fraction of a transmitter's power in the weakest paths that are left out: two thirds of its paths."""
+"""Fraction of a transmitter's power in the weakest paths that are left out: two thirds of its
+paths.
+"""
 
 
 def find_packages() -> dict[str, str]:
@@ -41,20 +47,37 @@ def find_packages() -> dict[str, str]:
     try:
         return {name: metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
     except metadata.PackageNotFoundError as error:
-        raise ImportError(f"rooms of the ray tracer need {error.name}: pip install 'gaigs[sionna]'") from error
+        raise ImportError(
+            f"rooms of the ray tracer need {error.name}: pip install 'gaigs[sionna]'"
+        ) from error
 
 
 def find_llvm() -> str:
-    """The libLLVM for the ray tracer's kernels: DRJIT_LIBLLVM_PATH, else the newest; a ``RuntimeError`` before 17."""
+    """The libLLVM for the ray tracer's kernels: DRJIT_LIBLLVM_PATH, else the newest; a
+    ``RuntimeError`` before 17.
+    """
     oldest = 17  # with 15 and 16 the process aborts at the first kernel
     chosen = os.environ.get("DRJIT_LIBLLVM_PATH")
-    folders = f"{sys.prefix}/lib", "/usr/lib/*-linux-gnu", "/usr/lib64", "/usr/lib/llvm-*/lib", "/usr/local/lib"
+    folders = (
+        f"{sys.prefix}/lib",
+        "/usr/lib/*-linux-gnu",
+        "/usr/lib64",
+        "/usr/lib/llvm-*/lib",
+        "/usr/local/lib",
+    )
     names = "libLLVM.so*", "libLLVM-[0-9]*.so*", "libLLVM.dylib"
-    files = [chosen] if chosen else [file for folder in folders for name in names for file in glob(f"{folder}/{name}")]
+    files = (
+        [chosen]
+        if chosen
+        else [file for folder in folders for name in names for file in glob(f"{folder}/{name}")]
+    )
     versions = {file: llvm_version(file) for file in dict.fromkeys(map(os.path.realpath, files))}
     newest = max(versions, key=versions.__getitem__, default="")
     if versions.get(newest, 0) < oldest:
-        found = ", ".join(f"{file} ({version or 'no libLLVM of 16 or later'})" for file, version in versions.items())
+        found = ", ".join(
+            f"{file} ({version or 'no libLLVM of 16 or later'})"
+            for file, version in versions.items()
+        )
         raise RuntimeError(
             f"the ray tracer needs libLLVM {oldest} or later, got {found or 'none'}; install it (Debian: apt-get "
             "install libllvm19), or set DRJIT_LIBLLVM_PATH to its file"
@@ -63,12 +86,16 @@ def find_llvm() -> str:
 
 
 def llvm_version(file: str) -> int:
-    """Major version of a libLLVM, 0 before 16 and if loading fails; an old one aborts the process that loads it."""
+    """Major version of a libLLVM, 0 before 16 and if loading fails; an old one aborts the process
+    that loads it.
+    """
     code = (
         "import ctypes, sys; number = ctypes.c_uint(); "
         "ctypes.CDLL(sys.argv[1]).LLVMGetVersion(ctypes.byref(number), None, None); print(number.value)"
     )
-    done = subprocess.run([sys.executable, "-c", code, file], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        [sys.executable, "-c", code, file], capture_output=True, text=True, check=False
+    )
     return int(done.stdout) if done.returncode == 0 else 0
 
 
@@ -79,13 +106,15 @@ def trace(
     frequency: float,
     reflections: int | None = None,
 ) -> Paths:
-    """The paths at a carrier [Hz] from transmitters to a receiver point [m], strongest first; gains are padded with 0.
+    """The paths at a carrier [Hz] from transmitters to a receiver point [m], strongest first; gains
+    are padded with 0.
 
-    By reciprocity the rays leave the single receiver. Both ends have an isotropic, vertically polarised antenna: its
-    field runs along the meridians about the vertical. A path that is reflected and passes through surfaces equals a
-    straight one from an image of the transmitter, at the path's length in the direction of arrival. Length and
-    direction of a diffracted path are exact at the receiver point, and its wave is more curved than that of its image.
-    With a largest number of reflections there are no diffractions, as in ``trace_scene``.
+    By reciprocity the rays leave the single receiver. Both ends have an isotropic, vertically
+    polarised antenna: its field runs along the meridians about the vertical. A path that is
+    reflected and passes through surfaces equals a straight one from an image of the transmitter, at
+    the path's length in the direction of arrival. Length and direction of a diffracted path are
+    exact at the receiver point, and its wave is more curved than that of its image. With a largest
+    number of reflections there are no diffractions, as in ``trace_scene``.
 
     Raises:
         ImportError: Sionna RT is not installed.
@@ -94,9 +123,13 @@ def trace(
 
     Source: Sionna RT technical report, arXiv:2504.21719; materials as in ITU-R P.2040-3, table 3.
     """
-    paths = trace_scene(make_scene(meshes, frequency), receiver, transmitters, reflections=reflections)
+    paths = trace_scene(
+        make_scene(meshes, frequency), receiver, transmitters, reflections=reflections
+    )
     if deaf := [k for k, gains in enumerate(paths.gains) if not gains.any()]:
-        raise ValueError(f"a path must lead to each transmitter, got none to {transmitters[deaf[0]].tolist()}; move it")
+        raise ValueError(
+            f"a path must lead to each transmitter, got none to {transmitters[deaf[0]].tolist()}; move it"
+        )
     return paths
 
 
@@ -109,13 +142,20 @@ def trace_scene(
 ) -> Paths:
     """As ``trace``, in a scene that is ``set_up``; without a path all gains are 0.
 
-    With a largest number of reflections there are no diffractions: each triangle of a curved surface has edges.
+    With a largest number of reflections there are no diffractions: each triangle of a curved
+    surface has edges.
     """
     found = []
     for paths in solve(scene, receiver, transmitters, depth, diffraction=reflections is None):
-        found += _strongest(paths, receiver.double().numpy(), float(scene.wavelength[0]), reflections)
-    images = pad_sequence([torch.from_numpy(places) for places, _ in found], batch_first=True, padding_value=1e3)
-    return Paths(images, pad_sequence([torch.from_numpy(gains) for _, gains in found], batch_first=True))
+        found += _strongest(
+            paths, receiver.double().numpy(), float(scene.wavelength[0]), reflections
+        )
+    images = pad_sequence(
+        [torch.from_numpy(places) for places, _ in found], batch_first=True, padding_value=1e3
+    )
+    return Paths(
+        images, pad_sequence([torch.from_numpy(gains) for _, gains in found], batch_first=True)
+    )
 
 
 def solve(
@@ -125,7 +165,9 @@ def solve(
     depth: int = DEPTH,
     diffraction: bool = True,
 ) -> Iterator[Any]:
-    """The paths of ``sionna.rt`` to each ``CHUNK`` of the transmitters, which stand in the scene only meanwhile."""
+    """The paths of ``sionna.rt`` to each ``CHUNK`` of the transmitters, which stand in the scene
+    only meanwhile.
+    """
     from sionna import rt
 
     scene.add(rt.Transmitter("receiver", receiver.tolist()))
@@ -151,7 +193,9 @@ def find_sionna() -> Any:
     os.environ["DRJIT_LIBLLVM_PATH"] = find_llvm()  # read once, when the first kernel is compiled
     import mitsuba
 
-    mitsuba.set_variant("llvm_ad_mono_polarized")  # on the processor, before the import chooses a graphics card
+    mitsuba.set_variant(
+        "llvm_ad_mono_polarized"
+    )  # on the processor, before the import chooses a graphics card
     from sionna import rt
 
     return rt
@@ -159,7 +203,10 @@ def find_sionna() -> Any:
 
 def open_scene(frequency: float, file: Path | None = None) -> Any:
     """The scene of a Mitsuba file, or an empty one, ``set_up`` at a carrier [Hz]."""
-    low, high = 0.3e9, 40e9  # below, furniture is no larger than the wavelength; above, materials are not tabulated
+    low, high = (
+        0.3e9,
+        40e9,
+    )  # below, furniture is no larger than the wavelength; above, materials are not tabulated
     if not low <= frequency <= high:
         raise ValueError(f"frequency must lie in {low:g}..{high:g} Hz, got {frequency:.6g}")
     scene = find_sionna().load_scene(file and str(file))
@@ -176,7 +223,9 @@ def make_scene(meshes: Sequence[Mesh], frequency: float) -> Any:
     objects, materials = [], {}
     for name in sorted({mesh.material for mesh in meshes}):
         # Sionna's own table refuses frequencies below 1 GHz.
-        materials[name] = rt.RadioMaterial(name, THICKNESS[name], MATERIALS[name][0], conductivity(name, frequency))
+        materials[name] = rt.RadioMaterial(
+            name, THICKNESS[name], MATERIALS[name][0], conductivity(name, frequency)
+        )
     for number, mesh in enumerate(meshes):
         triangles = mesh.triangles()
         properties = mitsuba.Properties()
@@ -187,7 +236,11 @@ def make_scene(meshes: Sequence[Mesh], frequency: float) -> Any:
         parameters["vertex_positions"] = np.ravel(mesh.vertices).astype(np.float32)
         parameters["faces"] = np.ravel(triangles).astype(np.uint32)
         parameters.update()
-        objects.append(rt.SceneObject(mi_mesh=shape, name=f"mesh {number}", radio_material=materials[mesh.material]))
+        objects.append(
+            rt.SceneObject(
+                mi_mesh=shape, name=f"mesh {number}", radio_material=materials[mesh.material]
+            )
+        )
     scene.edit(add=objects)
     return scene
 
@@ -197,7 +250,9 @@ def set_up(scene: Any, frequency: float) -> None:
     from sionna import rt
 
     scene.frequency = frequency
-    scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.tx_array = scene.rx_array = rt.PlanarArray(
+        num_rows=1, num_cols=1, pattern="iso", polarization="V"
+    )
 
 
 def without_weakest(fields: Complex[ndarray, " p"]) -> Int[ndarray, " k"]:
@@ -210,11 +265,17 @@ def without_weakest(fields: Complex[ndarray, " p"]) -> Int[ndarray, " k"]:
 def fields_and_images(
     paths: Any, receiver: Float[ndarray, "3"]
 ) -> tuple[Complex[ndarray, "b p"], Float[ndarray, "b p 3"]]:
-    """Fields of the solver's paths from one receiver, and their images [m]; of fewer paths the rest is 0."""
+    """Fields of the solver's paths from one receiver, and their images [m]; of fewer paths the rest
+    is 0.
+    """
     fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, 0, 0]
-    lengths, zenith, azimuth = (array.numpy()[:, 0].astype(float) for array in (paths.tau, paths.theta_t, paths.phi_t))
+    lengths, zenith, azimuth = (
+        array.numpy()[:, 0].astype(float) for array in (paths.tau, paths.theta_t, paths.phi_t)
+    )
     horizontal = np.sin(zenith)
-    directions = np.stack((horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.cos(zenith)), -1)
+    directions = np.stack(
+        (horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.cos(zenith)), -1
+    )
     return fields, receiver + speed_of_light * lengths[..., None] * directions
 
 
@@ -233,13 +294,17 @@ def _strongest(
     for k, field in enumerate(fields):
         order = without_weakest(field)
         # The path's gain has no spreading of free space, wavelength / (4 pi length).
-        found.append((images[k, order], field[order] * 4 * math.pi * lengths[k, order] / wavelength))
+        found.append(
+            (images[k, order], field[order] * 4 * math.pi * lengths[k, order] / wavelength)
+        )
     return found
 
 
 def frequency_offsets(meshes: Sequence[Mesh], bandwidth: float) -> Float[Tensor, " f"]:
     """Frequencies that sample a band, as by ``sample_band``, for the longest path among meshes."""
-    corners = torch.tensor([corner for mesh in meshes for corner in mesh.vertices], dtype=torch.float64)
+    corners = torch.tensor(
+        [corner for mesh in meshes for corner in mesh.vertices], dtype=torch.float64
+    )
     return sample_paths(bandwidth, (corners.amax(0) - corners.amin(0)).norm().item())
 
 

@@ -12,7 +12,14 @@ from gaigs.core.antenna import Receiver
 from gaigs.core.geometry import Grid, Pose
 from gaigs.data import Links
 from gaigs.data.readings import gateway
-from gaigs.data.simulation import PART, SimulatedRoom, draw_places, simulate_spectra, spectrum_offsets, to_spectra
+from gaigs.data.simulation import (
+    PART,
+    SimulatedRoom,
+    draw_places,
+    simulate_spectra,
+    spectrum_offsets,
+    to_spectra,
+)
 from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, is_free, respond, trace
 from gaigs.registry import register
 
@@ -32,7 +39,9 @@ ROOM = Room(
 """The default room; its corner is the world's origin, z points up."""
 
 POSE = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.15403, 0.87354, 0.23087, 0.39989))
-"""Pose of the array: high in the corner at the origin, facing down into the room, and turned about its normal."""
+"""Pose of the array: high in the corner at the origin, facing down into the room, and turned about
+its normal.
+"""
 
 GATEWAYS = {
     "west": (0.1, 2.6, 2.4),
@@ -55,15 +64,18 @@ def furnished_room(
     order: int = 2,
     seed: int = 0,
 ) -> Links:
-    """Spectra of transmitters at random places in the default room; the official split tests on the last fifth of them.
+    """Spectra of transmitters at random places in the default room; the official split tests on the
+    last fifth of them.
 
     Each place sends at each carrier, and these links share a row.
 
     Args:
-        spectrum: ``band``: power averaged over the band, as a channel sounder reports it; paths whose lengths differ by
-            more than speed of light / bandwidth do not interfere. ``carrier``: one frequency, with small-scale fading.
+        spectrum: ``band``: power averaged over the band, as a channel sounder reports it; paths
+            whose lengths differ by more than speed of light / bandwidth do not interfere.
+            ``carrier``: one frequency, with small-scale fading.
         transmitters: Number of places.
-        frequency: One carrier or several [Hz]. The elements are half a wavelength of the highest apart.
+        frequency: One carrier or several [Hz]. The elements are half a wavelength of the highest
+            apart.
         bandwidth: Width of the band around each carrier [Hz].
         order: Largest number of reflections of a path.
         seed: Seed of the places.
@@ -72,7 +84,8 @@ def furnished_room(
         TypeError: A frequency is no number.
         ValueError: An option is out of range.
 
-    Source: the defaults for frequency and bandwidth are those of channel 5 of IEEE 802.15.4 (ultra-wideband).
+    Source: the defaults for frequency and bandwidth are those of channel 5 of IEEE 802.15.4
+    (ultra-wideband).
     """
     return simulate_spectra(default_room(order), spectrum, transmitters, frequency, bandwidth, seed)
 
@@ -97,13 +110,22 @@ def respond_in_parts(
     offsets: Float[Tensor, " f"],
     order: int,
 ) -> Iterator[Complex[Tensor, "part elements f"]]:
-    """``respond`` for the paths of at most ``order`` reflections in any room, ``PART`` transmitters [m] at a time."""
+    """``respond`` for the paths of at most ``order`` reflections in any room, ``PART`` transmitters
+    [m] at a time.
+    """
     for part in transmitters.split(PART):
-        yield respond(trace(room, part, receiver.pose.position, frequency, order), receiver, frequency, offsets)
+        yield respond(
+            trace(room, part, receiver.pose.position, frequency, order),
+            receiver,
+            frequency,
+            offsets,
+        )
 
 
 def place(count: int, seed: int) -> Float[Tensor, "count 3"]:
-    """Random places in the default room [m], uniform over the part of ``REGION`` that is free of furniture."""
+    """Random places in the default room [m], uniform over the part of ``REGION`` that is free of
+    furniture.
+    """
     lower, upper = torch.tensor(REGION)
     return draw_places(lower, upper, lambda points: is_free(ROOM, points), count, seed)
 
@@ -118,12 +140,15 @@ def spectra(
     bandwidth: float,
     order: int,
 ) -> Float[Tensor, "n rows columns"]:
-    """Spectra of transmitters [m] in any room, float32 in [0, 1]; the options are those of ``furnished_room``.
+    """Spectra of transmitters [m] in any room, float32 in [0, 1]; the options are those of
+    ``furnished_room``.
 
     Raises:
         ValueError: An option is out of range, or a transmitter does not stand free in the room.
     """
-    offsets = spectrum_offsets(spectrum, lambda width: frequency_offsets(room, width, order), bandwidth)
+    offsets = spectrum_offsets(
+        spectrum, lambda width: frequency_offsets(room, width, order), bandwidth
+    )
     responses = respond_in_parts(room, transmitters, receiver, frequency, offsets, order)
     return to_spectra(responses, grid, receiver.array, frequency)
 
@@ -140,15 +165,22 @@ def edges(room: Room) -> Float[Tensor, "k 2 3"]:
 
 def wavefront_obj(room: Room) -> str:
     """The room as a Wavefront OBJ file [m]: one object a cuboid, with each wall's material."""
-    # Corners from 1 of the faces in the order of ``Room.walls``, counterclockwise as seen from outside.
+    # Corners from 1 of the faces in the order of ``Room.walls``, counterclockwise as seen from
+    # outside.
     sides = (1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)
     lines = []
     cuboids = [("room", (0.0, 0.0, 0.0), room.size, room.walls)]
-    cuboids += [(box.name, box.lower, box.upper, (f"loss_{box.loss_db:g}_db",) * 6) for box in room.furniture]
+    cuboids += [
+        (box.name, box.lower, box.upper, (f"loss_{box.loss_db:g}_db",) * 6)
+        for box in room.furniture
+    ]
     for number, (name, lower, upper, materials) in enumerate(cuboids):
         lines.append(f"o {name}")
         corners = itertools.product(*zip(lower, upper, strict=True))
         lines += [f"v {x:g} {y:g} {z:g}" for x, y, z in corners]
         for face, material in zip(sides, materials, strict=True):
-            lines += [f"usemtl {material}", "f " + " ".join(str(8 * number + corner) for corner in face)]
+            lines += [
+                f"usemtl {material}",
+                "f " + " ".join(str(8 * number + corner) for corner in face),
+            ]
     return "\n".join(lines) + "\n"

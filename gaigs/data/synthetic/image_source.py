@@ -1,4 +1,6 @@
-"""The image-source method in a furnished box room, in float64; docs/data.md has the formulas and their limits."""
+"""The image-source method in a furnished box room, in float64; docs/data.md has the formulas and
+their limits.
+"""
 
 import itertools
 import math
@@ -22,7 +24,9 @@ MATERIALS = {
     "ceiling_board": (1.48, 0.0011, 1.0750),
     "metal": (1.0, 1e7, 0.0),
 }
-"""Relative permittivity, and c and d of the conductivity c (f / GHz)^d [S/m]; ITU-R P.2040-3, table 3, 1 to 40 GHz."""
+"""Relative permittivity, and c and d of the conductivity c (f / GHz)^d [S/m]; ITU-R P.2040-3, table
+3, 1 to 40 GHz.
+"""
 
 TABULATED = {
     **MATERIALS,
@@ -54,7 +58,8 @@ class Room:
 
     Attributes:
         size: Extent along x, y and z [m].
-        walls: Materials of the walls at x = 0, x = size, y = 0, y = size, of the floor and of the ceiling.
+        walls: Materials of the walls at x = 0, x = size, y = 0, y = size, of the floor and of the
+            ceiling.
     """
 
     size: tuple[float, float, float]
@@ -63,7 +68,8 @@ class Room:
 
 
 def permittivity(material: str, frequency: float) -> complex:
-    """Complex relative permittivity of a material at a frequency [Hz], time dependence exp(+j omega t).
+    """Complex relative permittivity of a material at a frequency [Hz], time dependence exp(+j omega
+    t).
 
     Raises:
         ValueError: The material is unknown, or the frequency is outside the tables.
@@ -73,8 +79,13 @@ def permittivity(material: str, frequency: float) -> complex:
     if material not in MATERIALS:
         raise ValueError(f"unknown material {material!r}; there are: {', '.join(MATERIALS)}")
     if not 1e9 <= frequency <= 40e9:
-        raise ValueError(f"frequency must lie in 1e9..40e9 Hz, where materials are tabulated, got {frequency:.6g}")
-    return complex(MATERIALS[material][0], -conductivity(material, frequency) / (2 * math.pi * epsilon_0 * frequency))
+        raise ValueError(
+            f"frequency must lie in 1e9..40e9 Hz, where materials are tabulated, got {frequency:.6g}"
+        )
+    return complex(
+        MATERIALS[material][0],
+        -conductivity(material, frequency) / (2 * math.pi * epsilon_0 * frequency),
+    )
 
 
 def conductivity(material: str, frequency: float) -> float:
@@ -84,13 +95,17 @@ def conductivity(material: str, frequency: float) -> float:
 
 
 def cells(order: int) -> Int[Tensor, "p 3"]:
-    """Mirrored copies of the room, i along x, j along y, k along z, by |i| + |j| + |k| <= order reflections."""
+    """Mirrored copies of the room, i along x, j along y, k along z, by |i| + |j| + |k| <= order
+    reflections.
+    """
     steps = range(-order, order + 1)
     found = [cell for cell in itertools.product(steps, repeat=3) if sum(map(abs, cell)) <= order]
     return torch.tensor(sorted(found, key=lambda cell: sum(map(abs, cell))))
 
 
-def mirror(points: Float[Tensor, "*#batch 3"], cell: Int[Tensor, "*#batch 3"], size: Float[Tensor, "3"]) -> Tensor:
+def mirror(
+    points: Float[Tensor, "*#batch 3"], cell: Int[Tensor, "*#batch 3"], size: Float[Tensor, "3"]
+) -> Tensor:
     """Positions of the room's points [m] in a mirrored copy of it."""
     return cell * size + torch.where(cell % 2 == 0, points, size - points)
 
@@ -101,9 +116,11 @@ def passes(
     lower: Float[Tensor, "*#batch 3"],
     upper: Float[Tensor, "*#batch 3"],
 ) -> Tensor:
-    """True for segments from ``start`` to ``end`` that pass through the inside of cuboids along the axes.
+    """True for segments from ``start`` to ``end`` that pass through the inside of cuboids along the
+    axes.
 
-    It lies between the last entry and the first exit. A segment within a face has 0 / 0, hence NaN, and does not pass.
+    It lies between the last entry and the first exit. A segment within a face has 0 / 0, hence NaN,
+    and does not pass.
     """
     ray = end - start
     first, second = (lower - start) / ray, (upper - start) / ray
@@ -117,8 +134,10 @@ class Paths:
     """Paths from transmitters to one receiver point, each replaced by a straight one from an image.
 
     Attributes:
-        images: Mirrored transmitters, world frame (b, p, 3) [m]; the first is the transmitter itself.
-        gains: Product of the path's reflection coefficients and penetration losses (b, p); free space has 1.
+        images: Mirrored transmitters, world frame (b, p, 3) [m]; the first is the transmitter
+            itself.
+        gains: Product of the path's reflection coefficients and penetration losses (b, p); free
+            space has 1.
     """
 
     images: Float[Tensor, "b p 3"]
@@ -126,18 +145,24 @@ class Paths:
 
 
 def trace(
-    room: Room, transmitters: Float[Tensor, "b 3"], receiver: Float[Tensor, "3"], frequency: float, order: int
+    room: Room,
+    transmitters: Float[Tensor, "b 3"],
+    receiver: Float[Tensor, "3"],
+    frequency: float,
+    order: int,
 ) -> Paths:
-    """Every path with at most ``order`` reflections between positions [m], with gains at a frequency [Hz].
+    """Every path with at most ``order`` reflections between positions [m], with gains at a
+    frequency [Hz].
 
-    The field is vertically polarised: TE at the four walls, TM at floor and ceiling. The furniture is mirrored with the
-    room, so a path is the straight line from the receiver to an image.
+    The field is vertically polarised: TE at the four walls, TM at floor and ceiling. The furniture
+    is mirrored with the room, so a path is the straight line from the receiver to an image.
 
     Raises:
-        ValueError: A transmitter or the receiver is outside the room or inside furniture; the order is negative; a
-            material is unknown or not tabulated at the frequency.
+        ValueError: A transmitter or the receiver is outside the room or inside furniture; the order
+            is negative; a material is unknown or not tabulated at the frequency.
 
-    Source: Allen and Berkley, Image method for efficiently simulating small-room acoustics, 1979; ITU-R P.2040-3.
+    Source: Allen and Berkley, Image method for efficiently simulating small-room acoustics, 1979;
+    ITU-R P.2040-3.
     """
     if order < 0:
         raise ValueError(f"order must be the largest number of reflections, 0 or more, got {order}")
@@ -158,7 +183,8 @@ def trace(
     for wall, material in enumerate(room.walls):
         axis, side = divmod(wall, 2)
         te, tm = fresnel(permittivity(material, frequency), cosines[..., axis])
-        # The wall on the image's side takes the odd one of m reflections between two opposite walls.
+        # The wall on the image's side takes the odd one of m reflections between two opposite
+        # walls.
         towards = cell[:, axis] > 0 if side else cell[:, axis] < 0
         bounces = (cell[:, axis].abs() + towards) // 2
         gains = gains * (tm if axis == 2 else te) ** bounces
@@ -167,7 +193,9 @@ def trace(
         corners = size.new_tensor([(box.lower, box.upper) for box in room.furniture])
         mirrored = mirror(corners[:, :, None], cell, size)
         through = passes(receiver, images[:, :, None, None], mirrored.amin(1), mirrored.amax(1))
-        loss_db = through.sum(-1).double() @ size.new_tensor([box.loss_db for box in room.furniture])
+        loss_db = through.sum(-1).double() @ size.new_tensor(
+            [box.loss_db for box in room.furniture]
+        )
         gains = gains * 10 ** (-loss_db / 20)
     return Paths(images, gains)
 
@@ -175,15 +203,19 @@ def trace(
 def bounces(
     room: Room, images: Float[Tensor, "b p 3"], receiver: Float[Tensor, "3"], order: int
 ) -> Float[Tensor, "b p order 3"]:
-    """Points at which paths are reflected, from the receiver on, world frame [m]; NaN after the last one.
+    """Points at which paths are reflected, from the receiver on, world frame [m]; NaN after the
+    last one.
 
-    A straight line to an image crosses a plane of the lattice at each reflection; folded back, all are in the room.
+    A straight line to an image crosses a plane of the lattice at each reflection; folded back, all
+    are in the room.
     """
     start, size = receiver.to(images), images.new_tensor(room.size)
     ray = images - start
     planes = torch.arange(1 - order, order + 1).to(images)[:, None] * size
     shares = ((planes - start) / ray[:, :, None]).flatten(2)
-    shares = torch.where((shares > 0) & (shares < 1), shares, torch.nan).sort(-1).values[..., :order]
+    shares = (
+        torch.where((shares > 0) & (shares < 1), shares, torch.nan).sort(-1).values[..., :order]
+    )
     points = (start + shares[..., None] * ray[:, :, None]) / size
     return (points - 2 * (points / 2).round()).abs() * size
 
@@ -192,7 +224,9 @@ def is_free(room: Room, points: Float[Tensor, "*batch 3"]) -> Tensor:
     """True for points inside the room and outside its furniture."""
     free = ((points > 0) & (points < points.new_tensor(room.size))).all(-1)
     for box in room.furniture:
-        free &= ~((points >= points.new_tensor(box.lower)) & (points <= points.new_tensor(box.upper))).all(-1)
+        free &= ~(
+            (points >= points.new_tensor(box.lower)) & (points <= points.new_tensor(box.upper))
+        ).all(-1)
     return free
 
 
@@ -206,22 +240,28 @@ def respond(
 ) -> Complex[Tensor, "b elements f"]:
     """Field at each element of a receiver's array along paths from unit-power transmitters.
 
-    The phase is that of a spherical wave from each image to each element. Gains and the elements' pattern are those of
-    paths to the array's centre at the carrier; ``offsets`` are relative to it [Hz].
+    The phase is that of a spherical wave from each image to each element. Gains and the elements'
+    pattern are those of paths to the array's centre at the carrier; ``offsets`` are relative to it
+    [Hz].
 
     Raises:
         ValueError: A frequency is not positive.
     """
     frequencies = frequency + offsets.double()
     if frequencies.min() <= 0:
-        raise ValueError(f"frequencies must be positive, got {frequencies.min():.6g} Hz; narrow the bandwidth")
+        raise ValueError(
+            f"frequencies must be positive, got {frequencies.min():.6g} Hz; narrow the bandwidth"
+        )
     position, rotation = receiver.pose.position.double(), receiver.pose.rotation.double()
     elements = position + receiver.array.elements.double() @ rotation.T
     found = []
-    # 16 transmitters at a time, because the waves of all paths take many times the memory of their sums.
+    # 16 transmitters at a time, because the waves of all paths take many times the memory of their
+    # sums.
     for images, gains in zip(paths.images.split(16), paths.gains.split(16), strict=True):
         local = (images - position) @ rotation
         gains = gains * receiver.array.gain(local / local.norm(dim=-1, keepdim=True))
         distances = (images[:, :, None] - elements).norm(dim=-1)
-        found.append(torch.einsum("bp,bpnf->bnf", gains, free_space(distances[..., None], frequencies)))
+        found.append(
+            torch.einsum("bp,bpnf->bnf", gains, free_space(distances[..., None], frequencies))
+        )
     return torch.cat(found)

@@ -13,7 +13,8 @@ from gaigs.splatting.gaussians import Placed, Tokens
 class Residuals(NamedTuple):
     """Changes of the Gaussians for a query; None: no change.
 
-    Source: GAI-GS, "Scene Mapping Network": d_rotation, d_scaling, d_signal, d_attn and the attenuation delta.
+    Source: GAI-GS, "Scene Mapping Network": d_rotation, d_scaling, d_signal, d_attn and the
+    attenuation delta.
     """
 
     delta_quats: Float[Tensor, "b n 4"] | None = None
@@ -24,7 +25,8 @@ class Residuals(NamedTuple):
 
 
 class Deformation(nn.Module, ABC):
-    """The contract of kind ``deformation``; a constructor may take ``scene``, ``channels`` and ``tokenizer_widths``.
+    """The contract of kind ``deformation``; a constructor may take ``scene``, ``channels`` and
+    ``tokenizer_widths``.
 
     Attributes:
         reads_tokens: True if it needs tokens; if False, no tokenizer is built.

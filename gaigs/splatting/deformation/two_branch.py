@@ -24,7 +24,8 @@ LEAST_ATTENUATION = 1e-6
 
 
 class TokenLinear(nn.Module):
-    """A linear layer on the concatenation [hidden, E(P_x), E(P_TX), CLS] of every (transmitter, Gaussian) pair.
+    """A linear layer on the concatenation [hidden, E(P_x), E(P_TX), CLS] of every (transmitter,
+    Gaussian) pair.
 
     It is the sum of a linear map of each part, computed b x n times only for ``hidden``.
     """
@@ -34,16 +35,21 @@ class TokenLinear(nn.Module):
         scene, gaussian, transmitter = tokens
         self.bias = nn.Parameter(torch.empty(width))
         self.links, self.gaussians, self.hidden = (
-            nn.Linear(part, width, bias=False) if part else None for part in (scene + transmitter, gaussian, hidden)
+            nn.Linear(part, width, bias=False) if part else None
+            for part in (scene + transmitter, gaussian, hidden)
         )
         bound = max(scene + gaussian + transmitter + hidden, 1) ** -0.5
         for parameter in self.parameters():  # as for one layer over the concatenation
             nn.init.uniform_(parameter, -bound, bound)
 
-    def forward(self, tokens: Tokens, hidden: Float[Tensor, "b n h"] | None = None) -> Float[Tensor, "b n width"]:
+    def forward(
+        self, tokens: Tokens, hidden: Float[Tensor, "b n h"] | None = None
+    ) -> Float[Tensor, "b n width"]:
         result = self.bias
         if self.links is not None:
-            result = result + self.links(torch.cat((tokens.scene, tokens.transmitters), -1))[:, None]
+            result = (
+                result + self.links(torch.cat((tokens.scene, tokens.transmitters), -1))[:, None]
+            )
         if self.gaussians is not None:
             result = result + self.gaussians(tokens.gaussians)
         if self.hidden is not None:
@@ -66,9 +72,10 @@ class ResidualLayer(nn.Module):
 class TwoBranch(Deformation):
     """The paper's two branches, from the tokens of b queries and n Gaussians to residuals.
 
-    Attenuation branch: f = residual layers on [E(P_x), E(P_TX), CLS]; heads for the opacity residual and delta.
-    Signal branch: h = residual layers on [f, E(P_x), E(P_TX), CLS]. Heads on [f, h]: rotation, scale, signal.
-    Heads other than the signal's start at zero residual, delta at ``INITIAL_ATTENUATION``.
+    Attenuation branch: f = residual layers on [E(P_x), E(P_TX), CLS]; heads for the opacity
+    residual and delta. Signal branch: h = residual layers on [f, E(P_x), E(P_TX), CLS]. Heads on
+    [f, h]: rotation, scale, signal. Heads other than the signal's start at zero residual, delta at
+    ``INITIAL_ATTENUATION``.
 
     Args:
         tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens.
@@ -91,7 +98,9 @@ class TwoBranch(Deformation):
     ):
         super().__init__()
         if unknown := set(heads) - set(HEADS):
-            raise ValueError(f"deformation.heads must be among {', '.join(HEADS)}, got {', '.join(sorted(unknown))}")
+            raise ValueError(
+                f"deformation.heads must be among {', '.join(HEADS)}, got {', '.join(sorted(unknown))}"
+            )
         layers = ("attenuation_layers", attenuation_layers, 0), ("signal_layers", signal_layers, 0)
         for option, value, least in (("width", width, 1), *layers):
             if value < least:
@@ -100,7 +109,9 @@ class TwoBranch(Deformation):
         if not heads:
             return
         self.attenuation_first = TokenLinear(tokenizer_widths, width)
-        self.attenuation_rest = nn.Sequential(*(ResidualLayer(width) for _ in range(attenuation_layers)))
+        self.attenuation_rest = nn.Sequential(
+            *(ResidualLayer(width) for _ in range(attenuation_layers))
+        )
         for name in ("opacity", "attenuation"):
             if name in heads:
                 self.heads[name] = nn.Linear(width, 1)
@@ -116,7 +127,10 @@ class TwoBranch(Deformation):
                 nn.init.zeros_(head.weight)
                 nn.init.zeros_(head.bias)
         if "attenuation" in heads:
-            nn.init.constant_(self.heads["attenuation"].bias, math.log(INITIAL_ATTENUATION / (1 - INITIAL_ATTENUATION)))
+            nn.init.constant_(
+                self.heads["attenuation"].bias,
+                math.log(INITIAL_ATTENUATION / (1 - INITIAL_ATTENUATION)),
+            )
 
     def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
         if not self.heads:
@@ -125,7 +139,9 @@ class TwoBranch(Deformation):
         features = {"opacity": attenuation, "attenuation": attenuation}
         if self.has_signal_branch:
             signal = self.signal_rest(functional.gelu(self.signal_first(tokens, attenuation)))
-            features |= dict.fromkeys(("rotation", "scale", "signal"), torch.cat((attenuation, signal), -1))
+            features |= dict.fromkeys(
+                ("rotation", "scale", "signal"), torch.cat((attenuation, signal), -1)
+            )
         results = {name: head(features[name]) for name, head in self.heads.items()}
         if "signal" in results:
             results["signal"] = results["signal"][..., None]

@@ -13,7 +13,9 @@ class MeanError(ABC):
 
     def __init__(self, task: Task):
         if task.dtype.is_complex:
-            raise ValueError(f"labels of task {task.name!r} are complex, not real; set loss=log_relative_error")
+            raise ValueError(
+                f"labels of task {task.name!r} are complex, not real; set loss=log_relative_error"
+            )
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and the mean absolute error."""

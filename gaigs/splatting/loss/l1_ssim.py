@@ -16,8 +16,8 @@ from gaigs.registry import register
 class L1Ssim:
     """(1 - ssim) L_MAE + ssim (1 - SSIM) on the label's grid or a thinned one.
 
-    The uniform SSIM window spans the same angle as the reported score's 7 pixels on the label's own grid, at least 3
-    and at most all pixels of the thinned grid.
+    The uniform SSIM window spans the same angle as the reported score's 7 pixels on the label's own
+    grid, at least 3 and at most all pixels of the thinned grid.
 
     Args:
         ssim: Weight of the SSIM term, the paper's 1 - beta.
@@ -29,14 +29,17 @@ class L1Ssim:
         if not 0 <= ssim <= 1:
             raise ValueError(f"loss.ssim must be in [0, 1], got {ssim}")
         if task.directions is None:
-            raise ValueError(f"loss 'l1_ssim' compares spectra, not labels of task {task.name!r}; take another")
+            raise ValueError(
+                f"loss 'l1_ssim' compares spectra, not labels of task {task.name!r}; take another"
+            )
         self.ssim, self.pitch = ssim, task.directions.pitch
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms ``l1`` and ``ssim``.
 
         Raises:
-            ValueError: The batch's directions are a list, which has no windows, or fewer than 3 x 3.
+            ValueError: The batch's directions are a list, which has no windows, or fewer than 3 x
+                3.
         """
         window = find_window("l1_ssim", batch.directions, self.pitch, SSIM_WINDOW)
         similarity = structural_similarity(values, batch.labels, window)
@@ -45,12 +48,16 @@ class L1Ssim:
 
 
 def find_window(loss: str, directions: Directions | None, pitch: float, pixels: int) -> int:
-    """Edge [pixels] of the window on a thinned grid that spans the angle of ``pixels`` (odd) on the label's own grid.
+    """Edge [pixels] of the window on a thinned grid that spans the angle of ``pixels`` (odd) on the
+    label's own grid.
 
-    ``pitch`` is the angle between neighbouring rows of the label's own grid [rad], ``loss`` a name for errors.
+    ``pitch`` is the angle between neighbouring rows of the label's own grid [rad], ``loss`` a name
+    for errors.
     """
     if not isinstance(directions, Grid):
-        raise ValueError(f"loss {loss!r} needs rows and columns; with training.thinning.rays set loss=absolute")
+        raise ValueError(
+            f"loss {loss!r} needs rows and columns; with training.thinning.rays set loss=absolute"
+        )
     smallest = min(directions.shape)
     if smallest < 3:
         raise ValueError(f"loss {loss!r} needs at least 3 x 3 directions, got {directions.shape}")
@@ -61,7 +68,8 @@ def find_window(loss: str, directions: Directions | None, pitch: float, pixels: 
 def structural_similarity(
     values: Float[Tensor, "b rows columns"], labels: Float[Tensor, "b rows columns"], window: int
 ) -> Float[Tensor, ""]:
-    """Mean SSIM over all windows within the image: uniform weights, sample covariances, data range 1.
+    """Mean SSIM over all windows within the image: uniform weights, sample covariances, data range
+    1.
 
     A window of 7 on the full grid gives the reported score, scikit-image's, with gradients.
 
@@ -77,10 +85,14 @@ def structural_similarity(
     return (numerator / ((x.square() + y.square() + 0.01**2) * (variances + 0.03**2))).mean()
 
 
-def window_means(images: Float[Tensor, "*batch rows columns"], window: int) -> Float[Tensor, "*batch r c"]:
-    """Means over every square window within an image, as of ``torch.nn.functional.avg_pool2d`` with stride 1.
+def window_means(
+    images: Float[Tensor, "*batch rows columns"], window: int
+) -> Float[Tensor, "*batch r c"]:
+    """Means over every square window within an image, as of ``torch.nn.functional.avg_pool2d`` with
+    stride 1.
 
-    On a CPU ``avg_pool2d`` adds window² pixels for each mean; here whole images are added along rows, then columns.
+    On a CPU ``avg_pool2d`` adds window² pixels for each mean; here whole images are added along
+    rows, then columns.
     """
     return _WindowMeans.apply(images, window)
 

@@ -10,13 +10,15 @@ from gaigs.splatting.loss.relative_error import RelativeError
 
 @register("loss", "log_relative_error")
 class LogRelativeError(RelativeError):
-    """The mean over the links of ln((1 + r / floor) / (1 + r floor)), r = |h - h'|² / |h|²: the SNR between two bounds.
+    """The mean over the links of ln((1 + r / floor) / (1 + r floor)), r = |h - h'|² / |h|²: the SNR
+    between two bounds.
 
-    Between the bounds of -10 log10(floor) and 10 log10(floor) dB the loss is linear in the SNR in dB, so all links
-    have equal weight. Beyond the bounds a link pulls less and less.
+    Between the bounds of -10 log10(floor) and 10 log10(floor) dB the loss is linear in the SNR in
+    dB, so all links have equal weight. Beyond the bounds a link pulls less and less.
 
     Args:
-        floor: Relative error at the upper bound, its inverse is that at the lower one; 1e-3 is 30 dB.
+        floor: Relative error at the upper bound, its inverse is that at the lower one; 1e-3 is 30
+            dB.
 
     Raises:
         ValueError: The floor is not in (0, 1), or the labels are real.

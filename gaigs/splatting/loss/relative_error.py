@@ -13,8 +13,8 @@ from gaigs.registry import register
 class RelativeError:
     """The mean over the links of r = |h - h'|² / |h|², with labels aligned by ``Task.align``.
 
-    A link in deep shadow outweighs all others: predictions near zero minimise this mean over a room.
-    ``log_relative_error`` does not have that fault.
+    A link in deep shadow outweighs all others: predictions near zero minimise this mean over a
+    room. ``log_relative_error`` does not have that fault.
 
     Source: NeWRF, 2024, where it is called NMSE.
     """
@@ -23,15 +23,20 @@ class RelativeError:
 
     def __init__(self, task: Task):
         if not task.dtype.is_complex:
-            raise ValueError(f"labels of task {task.name!r} are real, not complex channels; set loss=squared")
+            raise ValueError(
+                f"labels of task {task.name!r} are real, not complex channels; set loss=squared"
+            )
         self.task = task
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, which is its only term."""
-        # Scaled by the strongest entry, so that squares of weak channels do not underflow; denormals have no inverse.
+        # Scaled by the strongest entry, so that squares of weak channels do not underflow;
+        # denormals have no inverse.
         labels = self.task.align(batch.labels, values).flatten(1)
         largest = labels.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
-        errors, powers = ((part / largest).abs().square().sum(1) for part in (values.flatten(1) - labels, labels))
+        errors, powers = (
+            (part / largest).abs().square().sum(1) for part in (values.flatten(1) - labels, labels)
+        )
         loss = self.mean(errors / powers)
         return loss, {self.name: loss}
 

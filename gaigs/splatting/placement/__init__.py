@@ -16,9 +16,11 @@ class Placement(nn.Module, ABC):
 
     Attributes:
         sees_receivers: True if the Gaussians of a transmitter depend on the receiver.
-        model: Name of the model of its results; None: any. Numbers under the name GAI-GS are the paper's.
+        model: Name of the model of its results; None: any. Numbers under the name GAI-GS are the
+            paper's.
         has_own: True if it brings Gaussians of its own and needs no free ones.
-        learning_rates: Default learning rate of each parameter group; ``training.learning_rates`` overrides it.
+        learning_rates: Default learning rate of each parameter group; ``training.learning_rates``
+            overrides it.
         penalty_weights: Default weight of each penalty; ``training.penalties`` overrides it.
     """
 
@@ -33,7 +35,8 @@ class Placement(nn.Module, ABC):
         """The Gaussians of each query.
 
         Args:
-            gaussians: The free Gaussians; where ``has_own`` is True, None if there are no free ones.
+            gaussians: The free Gaussians; where ``has_own`` is True, None if there are no free
+                ones.
             query: The links.
         """
 

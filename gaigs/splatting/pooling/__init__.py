@@ -15,9 +15,12 @@ class Pooling(nn.Module, ABC):
     """The contract of kind ``pooling``. A pooling reads maps; a ``PathPooling`` reads paths.
 
     Attributes:
-        channels: Real numbers that a Gaussian sends: channels of the map, or real and imaginary part of a path.
-        grid: Directions of the map that it sums over. None: the map is rendered in the label's directions.
-        zone: Lowest and highest elevation from which the receiver hears anything [rad]; read where ``grid`` is set.
+        channels: Real numbers that a Gaussian sends: channels of the map, or real and imaginary
+            part of a path.
+        grid: Directions of the map that it sums over. None: the map is rendered in the label's
+            directions.
+        zone: Lowest and highest elevation from which the receiver hears anything [rad]; read where
+            ``grid`` is set.
     """
 
     channels: int = 2
@@ -34,7 +37,8 @@ class Pooling(nn.Module, ABC):
         Args:
             received: Maps (b, c, rows, columns), or ``ReceivedPaths``.
             query: The link of each map or set of paths; all to one receiver.
-            directions: Wanted directions, where the label has any and they are not the map's; None: the task's.
+            directions: Wanted directions, where the label has any and they are not the map's; None:
+                the task's.
         """
 
 

@@ -18,7 +18,8 @@ from gaigs.splatting.pooling.beamformer import Beamformer
 
 @register("pooling", "array_response")
 class ArrayResponsePooling(Pooling):
-    """Beamforming with the field at each element: the complex map over the solid angle, times the element's pattern.
+    """Beamforming with the field at each element: the complex map over the solid angle, times the
+    element's pattern.
 
     Args:
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
@@ -31,7 +32,10 @@ class ArrayResponsePooling(Pooling):
         self.grid = sphere("pooling.grid", grid)
 
     def forward(
-        self, image: Float[Tensor, "b 2 rows columns"], query: Query, directions: Directions | None = None
+        self,
+        image: Float[Tensor, "b 2 rows columns"],
+        query: Query,
+        directions: Directions | None = None,
     ) -> Float[Tensor, "b ..."]:
         waves = torch.complex(*image.flatten(2).unbind(1))
         array = self.beamformer.array(query)

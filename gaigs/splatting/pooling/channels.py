@@ -23,8 +23,8 @@ class ChannelPooling(Pooling):
 
     Attributes:
         strength: Amplitude of the channels relative to free space.
-        sign: Sign with which phases follow the direct distance, -1 for the time dependence exp(+j omega t) or 1; 0 for
-            neither, as without a common clock that the data do not declare.
+        sign: Sign with which phases follow the direct distance, -1 for the time dependence exp(+j
+            omega t) or 1; 0 for neither, as without a common clock that the data do not declare.
         array_sign: Sign between the elements and subcarriers of a link, -1 or 1.
     """
 

@@ -18,12 +18,14 @@ from gaigs.splatting.pooling.channels import ChannelPooling
 
 @register("pooling", "element_sum")
 class ElementSum(ChannelPooling):
-    """h(e, f) = g F(d, f) sum_u w(u) a(u) m_f(u) exp(-s j 2 pi f / c x_e . u) over the map's directions u.
+    """h(e, f) = g F(d, f) sum_u w(u) a(u) m_f(u) exp(-s j 2 pi f / c x_e . u) over the map's
+    directions u.
 
-    m_f is the map at subcarrier f, complex: its real parts are the map's channels before all imaginary ones. x_e is an
-    element's place, a its pattern, w the share of the direction's solid angle. F is the wave of free space over the
-    direct distance d (without a common clock its amplitude), g the channels' ``strength`` over it. s is ``array_sign``.
-    At other subcarriers than the labels' the map is that of the nearest one.
+    m_f is the map at subcarrier f, complex: its real parts are the map's channels before all
+    imaginary ones. x_e is an element's place, a its pattern, w the share of the direction's solid
+    angle. F is the wave of free space over the direct distance d (without a common clock its
+    amplitude), g the channels' ``strength`` over it. s is ``array_sign``. At other subcarriers than
+    the labels' the map is that of the nearest one.
 
     Args:
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
@@ -36,21 +38,31 @@ class ElementSum(ChannelPooling):
         self.grid = sphere("pooling.grid", grid)
 
     def forward(
-        self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
+        self,
+        image: Float[Tensor, "b c rows columns"],
+        query: Query,
+        directions: Directions | None = None,
     ) -> Complex[Tensor, "b e s"]:
         """Channels at the elements of the receiver of these links."""
         if not len(query):
-            return torch.zeros(0, *self.scene.task.shape, dtype=image.dtype.to_complex(), device=image.device)
+            return torch.zeros(
+                0, *self.scene.task.shape, dtype=image.dtype.to_complex(), device=image.device
+            )
         nearest = (self.learnt - self.frequencies[:, None]).abs().argmin(1)
         waves = torch.complex(*image.flatten(2).unflatten(1, (2, -1)).unbind(1))[:, nearest]
         steering = self._steering(int(query.receivers[0]), int(self.array_sign)).to(waves)
         channels = (waves.permute(1, 0, 2) @ steering).permute(1, 2, 0)
-        direct = direct_waves(self.scene, query, self.frequencies, int(self.sign), at_elements=False)
+        direct = direct_waves(
+            self.scene, query, self.frequencies, int(self.sign), at_elements=False
+        )
         return self.pad(channels * (self.strength.double() * direct).to(waves))
 
     def _steering(self, receiver: int, sign: int) -> Complex[Tensor, "s p e"]:
         """Contribution of a wave from each direction of the map to each element, float64."""
-        array, directions = self.scene.receivers[receiver].array, self.grid.flatten().vectors().double()
+        array, directions = (
+            self.scene.receivers[receiver].array,
+            self.grid.flatten().vectors().double(),
+        )
         # A wave from the direction u reaches an element at x earlier by x . u / c than the middle.
         delays = directions @ array.elements.double().T / speed_of_light
         phases = -sign * 2 * math.pi * self.frequencies[:, None, None] * delays

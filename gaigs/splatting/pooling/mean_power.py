@@ -14,10 +14,11 @@ from gaigs.splatting.pooling import Pooling, sphere
 
 @register("pooling", "mean_power")
 class MeanPower(Pooling):
-    """The mean over the grid's solid angle of |C_0|^2, or |C_0|^2 + |C_1|^2, and the receiver's noise, in dB.
+    """The mean over the grid's solid angle of |C_0|^2, or |C_0|^2 + |C_1|^2, and the receiver's
+    noise, in dB.
 
-    Powers add, so paths do not cancel: RSSI is averaged over bandwidth and time. A receiver hears its own noise even
-    where nothing arrives, so a silent map is at the floor, with a gradient of 0.
+    Powers add, so paths do not cancel: RSSI is averaged over bandwidth and time. A receiver hears
+    its own noise even where nothing arrives, so a silent map is at the floor, with a gradient of 0.
 
     Args:
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
@@ -30,18 +31,25 @@ class MeanPower(Pooling):
     def __init__(self, grid: Sequence[int] = (4, 8), channels: int = 2, floor_db: float = -60.0):
         super().__init__()
         if channels not in (1, 2):
-            raise ValueError(f"pooling 'mean_power' renders 1 real or 2 complex channels, got channels={channels}")
+            raise ValueError(
+                f"pooling 'mean_power' renders 1 real or 2 complex channels, got channels={channels}"
+            )
         self.channels = channels
         self.floor = noise_amplitude(floor_db)
         self.grid = sphere("pooling.grid", grid)
         self.register_buffer("weights", self.grid.solid_angles, persistent=False)
 
     def forward(
-        self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
+        self,
+        image: Float[Tensor, "b c rows columns"],
+        query: Query,
+        directions: Directions | None = None,
     ) -> Float[Tensor, " b"]:
         """Level relative to the model's trend [dB]; float32 where the map is of half precision."""
         if image.shape[2:] != self.weights.shape:
-            raise ValueError(f"maps must have {tuple(self.weights.shape)} pixels, got {tuple(image.shape[2:])}")
+            raise ValueError(
+                f"maps must have {tuple(self.weights.shape)} pixels, got {tuple(image.shape[2:])}"
+            )
         image = image.to(torch.promote_types(image.dtype, torch.float32))
         # Scaled by the largest, squares neither overflow nor underflow.
         largest = image.detach().abs().amax((1, 2, 3)).clamp(min=self.floor)

@@ -17,15 +17,17 @@ from gaigs.splatting.pooling import Pooling, sphere
 class SoftmaxAttention(Pooling):
     """The attention-weighted average of a map of levels, in bels: the label is ten times it, in dB.
 
-    Each pixel weighs (1 - prior) softmax((m - mean m) / temperature) + prior / pixels. The prior is uniform over
-    pixels, and so over the sphere where their solid angles are equal, as on ``Grid.sphere``.
+    Each pixel weighs (1 - prior) softmax((m - mean m) / temperature) + prior / pixels. The prior is
+    uniform over pixels, and so over the sphere where their solid angles are equal, as on
+    ``Grid.sphere``.
 
     Args:
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
-        temperature: How far below the brightest pixel a pixel still counts, between 1e-6 and 1e6 [bel]; far below the
-            map's range the attention finds the maximum, far above it the mean.
+        temperature: How far below the brightest pixel a pixel still counts, between 1e-6 and 1e6
+            [bel]; far below the map's range the attention finds the maximum, far above it the mean.
         prior: Share of the uniform weights, between 0 and 1; with 1 the average is the plain mean.
-        learn: Train both, as the temperature's logarithm and the prior's logit, which keeps them in their ranges.
+        learn: Train both, as the temperature's logarithm and the prior's logit, which keeps them in
+            their ranges.
 
     Source: GAI-GS, section "Mapping, Projection and Render Module".
     """
@@ -35,11 +37,17 @@ class SoftmaxAttention(Pooling):
     prior_logit: Tensor
 
     def __init__(
-        self, grid: Sequence[int] = (4, 8), temperature: float = 0.434, prior: float = 0.1, learn: bool = False
+        self,
+        grid: Sequence[int] = (4, 8),
+        temperature: float = 0.434,
+        prior: float = 0.1,
+        learn: bool = False,
     ):
         super().__init__()
         if not 1e-6 <= temperature <= 1e6:
-            raise ValueError(f"pooling option temperature must lie between 1e-6 and 1e6 bels, got {temperature}")
+            raise ValueError(
+                f"pooling option temperature must lie between 1e-6 and 1e6 bels, got {temperature}"
+            )
         if not 0 <= prior <= 1:
             raise ValueError(f"pooling option prior must lie between 0 and 1, got {prior}")
         if learn and prior in (0, 1):
@@ -63,12 +71,16 @@ class SoftmaxAttention(Pooling):
         return self.prior_logit.sigmoid()
 
     def forward(
-        self, image: Float[Tensor, "b 1 rows columns"], query: Query, directions: Directions | None = None
+        self,
+        image: Float[Tensor, "b 1 rows columns"],
+        query: Query,
+        directions: Directions | None = None,
     ) -> Float[Tensor, " b"]:
         """Level relative to the model's trend [dB]; float32 where the map is of half precision."""
         bels = image.to(torch.promote_types(image.dtype, torch.float32)).flatten(1)
-        # The paper subtracts the mean, and later the maximum, in which the mean cancels. Subtracting the maximum alone
-        # is the same, and exact for the pixels that count, where one huge value makes the mean swallow the others.
+        # The paper subtracts the mean, and later the maximum, in which the mean cancels.
+        # Subtracting the maximum alone is the same, and exact for the pixels that count, where one
+        # huge value makes the mean swallow the others.
         below = bels - bels.amax(1, keepdim=True).detach()
         attention = (below / self.temperature).softmax(1)
         return 10 * ((1 - self.prior) * (attention * bels).sum(1) + self.prior * bels.mean(1))

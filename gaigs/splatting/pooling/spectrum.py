@@ -21,11 +21,18 @@ class SpectrumPooling(Pooling):
     def __init__(self, channels: int = 2):
         super().__init__()
         if channels not in (1, 2):
-            raise ValueError(f"pooling 'spectrum' renders 1 real or 2 complex channels, got channels={channels}")
+            raise ValueError(
+                f"pooling 'spectrum' renders 1 real or 2 complex channels, got channels={channels}"
+            )
         self.channels = channels
 
     def forward(
-        self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
+        self,
+        image: Float[Tensor, "b c rows columns"],
+        query: Query,
+        directions: Directions | None = None,
     ) -> Float[Tensor, "b rows columns"]:
         """The predicted spectrum; where the map is 0, so is its gradient."""
-        return image[:, 0].abs() if self.channels == 1 else magnitudes(torch.complex(*image.unbind(1)))
+        return (
+            image[:, 0].abs() if self.channels == 1 else magnitudes(torch.complex(*image.unbind(1)))
+        )

@@ -10,10 +10,12 @@ from gaigs.splatting.projection import Projection
 
 @register("projection", "direction_cosine")
 class DirectionCosine(Projection):
-    """(u, v) = (l, m) = (cos(el) cos(az), cos(el) sin(az)), in which a planar array's response is shift-invariant.
+    """(u, v) = (l, m) = (cos(el) cos(az), cos(el) sin(az)), in which a planar array's response is
+    shift-invariant.
 
-    No seam and no pole: smooth on the whole hemisphere. As with a planar array, a direction below the array's plane
-    and its mirror image above are one. Rows and columns of a spectrum mix, so ``plane`` gives full grids.
+    No seam and no pole: smooth on the whole hemisphere. As with a planar array, a direction below
+    the array's plane and its mirror image above are one. Rows and columns of a spectrum mix, so
+    ``plane`` gives full grids.
 
     Source: Van Trees, Optimum Array Processing, 2002, chapter 4.
     """

@@ -11,11 +11,12 @@ from gaigs.splatting.projection.cylindrical import Cylindrical
 
 @register("projection", "mercator")
 class Mercator(Cylindrical):
-    """u = azimuth, v = alpha asinh(tan(elevation)), which equals the paper's alpha log tan(pi/4 + elevation/2).
+    """u = azimuth, v = alpha asinh(tan(elevation)), which equals the paper's alpha log tan(pi/4 +
+    elevation/2).
 
-    alpha maps the elevation limit to the plane's edge v = pi, so that the plane is as high as it is wide. At the
-    default limit, atan(sinh(pi)) = 85.0511 degrees, alpha is 1 and the projection conformal: a small round Gaussian
-    stays round wherever it lies.
+    alpha maps the elevation limit to the plane's edge v = pi, so that the plane is as high as it is
+    wide. At the default limit, atan(sinh(pi)) = 85.0511 degrees, alpha is 1 and the projection
+    conformal: a small round Gaussian stays round wherever it lies.
 
     Options are those of ``Cylindrical``.
 

@@ -7,7 +7,9 @@ import pyopencl as cl
 
 
 def devices() -> list[str]:
-    """The OpenCL devices of this machine, each as "platform: device (kind)"; a ``RuntimeError`` without a driver."""
+    """The OpenCL devices of this machine, each as "platform: device (kind)"; a ``RuntimeError``
+    without a driver.
+    """
     return [name_of(device) for device in _devices()]
 
 
@@ -23,7 +25,9 @@ def _process() -> int:
 
 
 def is_forked() -> bool:
-    """True in a process forked from one that uses OpenCL: it lacks the driver's threads, and would wait for ever."""
+    """True in a process forked from one that uses OpenCL: it lacks the driver's threads, and would
+    wait for ever.
+    """
     return _process() != os.getpid()
 
 
@@ -47,7 +51,11 @@ def _devices() -> list:
 
 def name_of(device) -> str:
     """As ``devices`` lists it."""
-    kinds = (kind for kind in ("CPU", "GPU", "ACCELERATOR") if device.type & getattr(cl.device_type, kind))
+    kinds = (
+        kind
+        for kind in ("CPU", "GPU", "ACCELERATOR")
+        if device.type & getattr(cl.device_type, kind)
+    )
     return f"{device.platform.name}: {device.name} ({' '.join(kinds)})"
 
 
@@ -82,13 +90,17 @@ def _choose(name: str | None):
         chosen = [device for device in found if device.type & cl.device_type.CPU] or found
     if not chosen:
         listed = "; ".join(map(name_of, found))
-        raise ValueError(f"rasterizer 'opencl': no OpenCL device is called {name!r}; there are: {listed}")
+        raise ValueError(
+            f"rasterizer 'opencl': no OpenCL device is called {name!r}; there are: {listed}"
+        )
     return chosen[0]
 
 
 @functools.cache
 def find_fault(queue: cl.CommandQueue) -> str | None:
-    """The driver's reason why a device, such as a processor unknown to its compiler, builds no kernels; or None."""
+    """The driver's reason why a device, such as a processor unknown to its compiler, builds no
+    kernels; or None.
+    """
     try:
         cl.Program(queue.context, "kernel void probe(global int *value) { value[0] = 1; }").build()
     except cl.Error as error:
@@ -99,5 +111,7 @@ def find_fault(queue: cl.CommandQueue) -> str | None:
 def cause_of(error: cl.Error) -> str:
     """The first error in a build's log, or else its last line."""
     lines = [line.strip() for line in str(error).splitlines()]
-    lines = [line for line in lines if line and not line.startswith("(")]  # pyopencl's notes on options and source
+    lines = [
+        line for line in lines if line and not line.startswith("(")
+    ]  # pyopencl's notes on options and source
     return next((line for line in lines if "error:" in line), lines[-1])

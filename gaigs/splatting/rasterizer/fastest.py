@@ -12,7 +12,8 @@ log = logging.getLogger(__name__)
 
 @register("rasterizer", "fastest")
 class FastestRasterizer:
-    """``opencl`` for float32 on the CPU where a driver builds kernels, else ``torch``, also in a forked process.
+    """``opencl`` for float32 on the CPU where a driver builds kernels, else ``torch``, also in a
+    forked process.
 
     The two agree to 2e-6 of the image's maximum, so a checkpoint may be rendered by either.
     """
@@ -30,7 +31,12 @@ class FastestRasterizer:
             log.info("rasterizer: opencl for float32 on the CPU, torch for all else")
 
     def __call__(
-        self, splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane
+        self,
+        splats: Splats,
+        signal: Tensor,
+        opacities: Tensor,
+        attenuations: Tensor | None,
+        plane: Plane,
     ) -> tuple[Tensor, Tensor]:
         arguments = splats, signal, opacities, attenuations, plane
         if self.opencl is not None and self.opencl.takes(*arguments):

@@ -15,24 +15,31 @@ TILE = 16
 """Edge of a tile [pixels]."""
 
 CHUNK, LARGE_CHUNK = 2**20, 2**24
-"""(transmitter, splat, pixel) triples worked on at a time, on the CPU and on others: an array of float32 then has
-4 MiB, which a core's cache holds, or 64 MiB, since a GPU starts an operation as slowly as it does a million triples.
-Some sixteen arrays live at a time."""
+"""(transmitter, splat, pixel) triples worked on at a time, on the CPU and on others: an array of
+float32 then has 4 MiB, which a core's cache holds, or 64 MiB, since a GPU starts an operation as
+slowly as it does a million triples. Some sixteen arrays live at a time."""
 
 
 @register("rasterizer", "torch")
 class TorchRasterizer:
-    """Tiles of 16 x 16 pixels, each against the splats that reach it; the gradient is written by hand.
+    """Tiles of 16 x 16 pixels, each against the splats that reach it; the gradient is written by
+    hand.
 
-    Splats are sorted by depth once, for all transmitters. A tile keeps those whose bounding box, at the opacity
-    ``ALPHA_MIN`` and over all transmitters, meets it. Tiles with lists of similar length are composited together, in
-    small chunks that the backward pass computes anew: memory does not grow with the number of (splat, pixel) pairs.
+    Splats are sorted by depth once, for all transmitters. A tile keeps those whose bounding box, at
+    the opacity ``ALPHA_MIN`` and over all transmitters, meets it. Tiles with lists of similar
+    length are composited together, in small chunks that the backward pass computes anew: memory
+    does not grow with the number of (splat, pixel) pairs.
     """
 
     used = "torch"
 
     def __call__(
-        self, splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane
+        self,
+        splats: Splats,
+        signal: Tensor,
+        opacities: Tensor,
+        attenuations: Tensor | None,
+        plane: Plane,
     ) -> tuple[Tensor, Tensor]:
         order = torch.argsort(splats.depths, stable=True)
         order = order[splats.visible[order]]
@@ -40,7 +47,9 @@ class TorchRasterizer:
         with torch.no_grad():
             tiles = _Tiles(plane, splats.means2d[order], factors, opacities[:, order])
         own = None if attenuations is None else attenuations[:, order]
-        return _Composite.apply(tiles, splats.means2d[order], factors, signal[:, order], opacities[:, order], own)
+        return _Composite.apply(
+            tiles, splats.means2d[order], factors, signal[:, order], opacities[:, order], own
+        )
 
 
 class _Tiles:
@@ -57,8 +66,8 @@ class _Tiles:
         self.chunks: list[tuple[Tensor, Tensor]] = []
         if not len(opacities):
             return
-        # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box has these halves.
-        # Comparisons with NaN keep the splat, so that NaN shows in the map.
+        # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box
+        # has these halves. Comparisons with NaN keep the splat, so that NaN shows in the map.
         reach = (2 * (opacities / ALPHA_MIN).log().clamp_min(0)).sqrt()
         p, q, r = factors.unbind(-1)
         halves = (reach[..., None] * torch.stack((p, torch.hypot(q, r)), -1)).amax(0)
@@ -72,8 +81,12 @@ class _Tiles:
         self.chunks = self._chunks(touches, len(opacities))
 
     def _cut(self, coordinate: Tensor) -> Tensor:
-        """A plane coordinate (rows or 1, columns or 1) as tiles (t, y or 1, x or 1), filled up by repetition."""
-        for axis, (size, tiles) in enumerate(zip(self.shape, (self.down, self.across), strict=True)):
+        """A plane coordinate (rows or 1, columns or 1) as tiles (t, y or 1, x or 1), filled up by
+        repetition.
+        """
+        for axis, (size, tiles) in enumerate(
+            zip(self.shape, (self.down, self.across), strict=True)
+        ):
             if coordinate.shape[axis] == size:
                 filled = torch.arange(tiles * TILE, device=coordinate.device).clamp_max(size - 1)
                 coordinate = coordinate.index_select(axis, filled)
@@ -89,9 +102,13 @@ class _Tiles:
         splats = torch.where(touches, torch.arange(n, device=counts.device), n).sort(1).values
         lengths, tiles = counts.sort(descending=True)
         lengths, chunks, start = lengths.tolist(), [], 0
-        triples = (CHUNK if counts.device.type == "cpu" else LARGE_CHUNK) // (transmitters * TILE * TILE)
+        triples = (CHUNK if counts.device.type == "cpu" else LARGE_CHUNK) // (
+            transmitters * TILE * TILE
+        )
         while start < len(lengths) and lengths[start]:
-            shortest = bisect_right(lengths, -lengths[start] / 2, key=operator.neg)  # fillings at most double the work
+            shortest = bisect_right(
+                lengths, -lengths[start] / 2, key=operator.neg
+            )  # fillings at most double the work
             size = min(max(1, triples // lengths[start]), shortest - start)
             chosen = tiles[start : start + size]
             chunks.append((chosen, splats[chosen, : lengths[start]]))
@@ -101,20 +118,31 @@ class _Tiles:
     def join(self, tiled: Tensor) -> Tensor:
         """Tiles (..., t, y x) as an image (..., rows, columns)."""
         image = tiled.unflatten(-1, (TILE, TILE)).unflatten(-3, (self.down, self.across))
-        return image.transpose(-3, -2).flatten(-4, -3).flatten(-2)[..., : self.shape[0], : self.shape[1]]
+        return (
+            image.transpose(-3, -2)
+            .flatten(-4, -3)
+            .flatten(-2)[..., : self.shape[0], : self.shape[1]]
+        )
 
     def split(self, image: Tensor) -> Tensor:
         """The inverse of ``join``; pixels outside the image are 0."""
         rows, columns = self.shape
-        image = torch.nn.functional.pad(image, (0, self.across * TILE - columns, 0, self.down * TILE - rows))
-        tiled = image.unflatten(-1, (self.across, TILE)).unflatten(-3, (self.down, TILE)).transpose(-3, -2)
+        image = torch.nn.functional.pad(
+            image, (0, self.across * TILE - columns, 0, self.down * TILE - rows)
+        )
+        tiled = (
+            image.unflatten(-1, (self.across, TILE))
+            .unflatten(-3, (self.down, TILE))
+            .transpose(-3, -2)
+        )
         return tiled.flatten(-2).flatten(-3, -2)
 
 
 def _nearest(a: Tensor, b: Tensor, period: tuple[float, float] | None) -> Tensor:
     """a - b taken to the nearest image, by a rounded period and its remainder.
 
-    The period is subtracted from the exact a - b = offset + rest (Knuth's two-sum), so no digit is lost at the seam.
+    The period is subtracted from the exact a - b = offset + rest (Knuth's two-sum), so no digit is
+    lost at the seam.
     """
     offset = a - b
     if period is None:
@@ -126,7 +154,9 @@ def _nearest(a: Tensor, b: Tensor, period: tuple[float, float] | None) -> Tensor
 
 
 class _Weights(NamedTuple):
-    """One chunk composited: all is (b, t, k, y x) but ``left`` (b, t, y x), and ``s`` and ``y`` of ``_weigh``."""
+    """One chunk composited: all is (b, t, k, y x) but ``left`` (b, t, y x), and ``s`` and ``y`` of
+    ``_weigh``.
+    """
 
     s: Tensor
     y: Tensor
@@ -138,14 +168,23 @@ class _Weights(NamedTuple):
 
 
 def _weigh(
-    tiles: _Tiles, chosen: Tensor, k: Tensor, means: Tensor, factors: Tensor, opacities: Tensor, logs: Tensor | None
+    tiles: _Tiles,
+    chosen: Tensor,
+    k: Tensor,
+    means: Tensor,
+    factors: Tensor,
+    opacities: Tensor,
+    logs: Tensor | None,
 ) -> _Weights:
-    """Footprints, opacities and transmittances of one chunk: tiles ``chosen`` (t,) and their splats (t, k)."""
+    """Footprints, opacities and transmittances of one chunk: tiles ``chosen`` (t,) and their splats
+    (t, k).
+    """
     u, v = means[k][..., None, None].unbind(-3)
     du = _nearest(tiles.u[chosen][:, None], u, tiles.period)
     dv = tiles.v[chosen][:, None] - v
     p, q, r = (part[..., None, None] for part in factors[:, k].unbind(-1))
-    # With (s, y) = L^-1 (du, dv) the exponent loses the fewest digits where a splat is long and thin.
+    # With (s, y) = L^-1 (du, dv) the exponent loses the fewest digits where a splat is long and
+    # thin.
     s = du / p
     y = dv / r - (q / r) * s
     exponent = torch.addcmul(-0.5 * s * s, y, y, value=-0.5)
@@ -163,13 +202,18 @@ def _weigh(
 
 
 class _Composite(torch.autograd.Function):
-    """Composites sorted splats. Below, D_i = signal_i . gradient and S_i = sum_{j>i} D_j A_j T_j + left gradient_left:
-    d/dA_i = T_i D_i - S_i / (1 - A_i), and a change of log T behind splat i acts with S_i."""
+    """Composites sorted splats. Below, D_i = signal_i . gradient and S_i = sum_{j>i} D_j A_j T_j +
+    left gradient_left: d/dA_i = T_i D_i - S_i / (1 - A_i), and a change of log T behind splat i
+    acts with S_i."""
 
     @staticmethod
     def forward(ctx, tiles, means, factors, signal, opacities, attenuations):
         ctx.tiles = tiles
-        logs = None if attenuations is None else torch.where(attenuations == 0, OPAQUE, attenuations.log())
+        logs = (
+            None
+            if attenuations is None
+            else torch.where(attenuations == 0, OPAQUE, attenuations.log())
+        )
         ctx.save_for_backward(means, factors, signal, opacities, logs)
         b, _, c = signal.shape
         image = signal.new_zeros(b, c, tiles.down * tiles.across, TILE * TILE)
@@ -200,7 +244,9 @@ class _Composite(torch.autograd.Function):
             behind = flow.flip(-2).cumsum(-2).flip(-2).sub_(flow)
             behind += (w.left * left_gradient[:, chosen])[..., None, :]
             # Gradient by the opacity itself, 0 where the splat does nothing or is clamped.
-            d_alpha = (d.mul_(w.transmittance) - behind / (1 - w.alpha)).mul_(w.live & (w.alpha < ALPHA_MAX))
+            d_alpha = (d.mul_(w.transmittance) - behind / (1 - w.alpha)).mul_(
+                w.live & (w.alpha < ALPHA_MAX)
+            )
             d_opacity = (d_alpha * w.footprint).sum(-1)
             d_exponent = d_alpha.mul_(w.alpha)
             d_logs = None
@@ -208,28 +254,49 @@ class _Composite(torch.autograd.Function):
                 covered = behind.mul_(w.footprint).mul_(w.live)
                 d_logs = covered.sum(-1)
                 d_exponent = d_exponent + covered * logs[:, k][..., None]
-            d_means, d_factors = _moments(d_exponent.unflatten(-1, (TILE, TILE)), w.s, w.y, factors[:, k])
-            found = (d_means.sum(0), d_factors.sum_to_size(factors[:, k].shape), d_signal, d_opacity, d_logs)
+            d_means, d_factors = _moments(
+                d_exponent.unflatten(-1, (TILE, TILE)), w.s, w.y, factors[:, k]
+            )
+            found = (
+                d_means.sum(0),
+                d_factors.sum_to_size(factors[:, k].shape),
+                d_signal,
+                d_opacity,
+                d_logs,
+            )
             for gradient, part, axis in zip(gradients, found, (0, 1, 1, 1, 1), strict=True):
                 if gradient is not None:
                     gradient.index_add_(axis, k.flatten(), part.flatten(axis, axis + 1))
         if logs is not None:
             gradients[-1] /= logs.exp().clamp_min(STEEPEST)
         means, factors, *others = gradients  # the last splat is the filling
-        return None, means[:-1], factors[:, :-1], *(None if other is None else other[:, :-1] for other in others)
+        return (
+            None,
+            means[:-1],
+            factors[:, :-1],
+            *(None if other is None else other[:, :-1] for other in others),
+        )
 
 
 def _filled(means, factors, signal, opacities, logs):
     """The splats and, behind them, one that does nothing: it fills the tiles' lists up."""
     pad, row = torch.nn.functional.pad, (0, 0, 0, 1)
     logs = None if logs is None else pad(logs, (0, 1))
-    return pad(means, row), pad(factors, row, value=1.0), pad(signal, row), pad(opacities, (0, 1)), logs
+    return (
+        pad(means, row),
+        pad(factors, row, value=1.0),
+        pad(signal, row),
+        pad(opacities, (0, 1)),
+        logs,
+    )
 
 
 def _moments(d_exponent: Tensor, s: Tensor, y: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from that of the exponents (b, t, k, y, x).
+    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from that of the exponents (b, t,
+    k, y, x).
 
-    Sums run over s and y themselves: those over du and dv would cancel where a splat is long and thin.
+    Sums run over s and y themselves: those over du and dv would cancel where a splat is long and
+    thin.
     """
     d_y = d_exponent * y
     yy = (d_y * y).sum((-2, -1))

@@ -16,7 +16,9 @@ MAX_OCTAVE = 30
 """Bound of octaves: float32 resolves no positions in waves of a nanometre or a million km."""
 
 BAND_FREQUENCIES = math.pi * 2.0 ** torch.arange(-1, 3)
-"""Of features of the carrier's position in the band, -1 to 1: periods from twice the band to a quarter."""
+"""Of features of the carrier's position in the band, -1 to 1: periods from twice the band to a
+quarter.
+"""
 
 
 @register("tokenizer", "euclidean")
@@ -26,11 +28,14 @@ class EuclideanTokenizer(nn.Module):
     For data with several carriers the network's input also has the carrier's position in the band.
 
     Args:
-        scene: The middles of the transmitters' box and of the receivers are the origins of positions.
-        gaussian_octaves: Lowest and highest octave k of the Gaussians' features, 2^k cycles a metre.
+        scene: The middles of the transmitters' box and of the receivers are the origins of
+            positions.
+        gaussian_octaves: Lowest and highest octave k of the Gaussians' features, 2^k cycles a
+            metre.
         transmitter_octaves: The same for the transmitter; None: see ``learnable_octaves``.
         hidden: Width of the transmitter network's hidden layer.
-        width: Width of E(P_TX). With None for both there is no network, and E(P_TX) are the features themselves.
+        width: Width of E(P_TX). With None for both there is no network, and E(P_TX) are the
+            features themselves.
 
     Source: GAI-GS, "Multi-view Tokenizer"; Tancik et al., Fourier Features, 2020.
     """
@@ -60,7 +65,9 @@ class EuclideanTokenizer(nn.Module):
         self.register_buffer("transmitters_middle", (scene.lower + scene.upper) / 2)
         transmitter_octaves = transmitter_octaves or learnable_octaves(scene)
         for name, limits in (("gaussian", gaussian_octaves), ("transmitter", transmitter_octaves)):
-            self.register_buffer(f"{name}_frequencies", octaves(f"tokenizer option {name}_octaves", *limits))
+            self.register_buffer(
+                f"{name}_frequencies", octaves(f"tokenizer option {name}_octaves", *limits)
+            )
         self.gaussian_width = 3 * (1 + 2 * len(self.gaussian_frequencies))
         features = 3 * (1 + 2 * len(self.transmitter_frequencies))
         if scene.has_band:
@@ -68,14 +75,20 @@ class EuclideanTokenizer(nn.Module):
         self.transmitter_width = features if width is None else width
         self.network: nn.Module = nn.Identity()
         if hidden is not None and width is not None:
-            self.network = nn.Sequential(nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, width))
+            self.network = nn.Sequential(
+                nn.Linear(features, hidden), nn.GELU(), nn.Linear(hidden, width)
+            )
 
     def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
         means = placed.means[0] if len(placed.means) == 1 else placed.means
         gaussians = fourier_features(means - self.receivers_middle, self.gaussian_frequencies)
-        features = fourier_features(query.transmitters - self.transmitters_middle, self.transmitter_frequencies)
+        features = fourier_features(
+            query.transmitters - self.transmitters_middle, self.transmitter_frequencies
+        )
         if self.scene.has_band:
-            band = fourier_features(self.scene.band_positions(query)[:, None], BAND_FREQUENCIES.to(features))
+            band = fourier_features(
+                self.scene.band_positions(query)[:, None], BAND_FREQUENCIES.to(features)
+            )
             features = torch.cat((features, band), 1)
         return Tokens(features.new_zeros(len(query), 0), gaussians, self.network(features))
 
@@ -83,28 +96,35 @@ class EuclideanTokenizer(nn.Module):
 def learnable_octaves(scene: Scene) -> tuple[int, int]:
     """Lowest and highest octave of the transmitter's features that suit the training transmitters.
 
-    Periods range from twice the box's longest edge down to 16 distances between neighbouring transmitters: the network
-    multiplies frequencies, so its input must be well below their sampling limit. For noisy labels they are at least
-    16 m: an RSSI scatters by decibels at any distance, and the network finds how sharp a wall's shadow is.
+    Periods range from twice the box's longest edge down to 16 distances between neighbouring
+    transmitters: the network multiplies frequencies, so its input must be well below their sampling
+    limit. For noisy labels they are at least 16 m: an RSSI scatters by decibels at any distance,
+    and the network finds how sharp a wall's shadow is.
     """
     edge = (scene.upper - scene.lower).max().item()
     # 16 distances: chosen on validation parts of rfid-s23-200 and the built-in room.
     highest = min(round(-math.log2(16 * scene.spacing)), MAX_OCTAVE)
     if scene.task.is_noisy:
-        highest = min(highest, -4)  # 16 m: chosen by leaving out one of the robot's training runs in ble-flat
+        highest = min(
+            highest, -4
+        )  # 16 m: chosen by leaving out one of the robot's training runs in ble-flat
     return min(highest, math.floor(-math.log2(2 * edge))), highest
 
 
 def octaves(option: str, *limits: int) -> Float[Tensor, " octaves"]:
     """Angular frequencies 2 pi 2^k [rad/m] for k from the lowest to the highest limit."""
     if len(limits) != 2 or not -MAX_OCTAVE <= limits[0] <= limits[1] <= MAX_OCTAVE:
-        raise ValueError(f"{option} must be [lowest, highest] within {-MAX_OCTAVE}..{MAX_OCTAVE}, got {list(limits)}")
+        raise ValueError(
+            f"{option} must be [lowest, highest] within {-MAX_OCTAVE}..{MAX_OCTAVE}, got {list(limits)}"
+        )
     return 2 * math.pi * 2.0 ** torch.arange(limits[0], limits[1] + 1)
 
 
 def fourier_features(
     points: Float[Tensor, "*batch d"], frequencies: Float[Tensor, " octaves"]
 ) -> Float[Tensor, "*batch features"]:
-    """[x, sin(w x), cos(w x)] for every coordinate x and angular frequency w: d (1 + 2 octaves) numbers."""
+    """[x, sin(w x), cos(w x)] for every coordinate x and angular frequency w: d (1 + 2 octaves)
+    numbers.
+    """
     phases = (points[..., None] * frequencies).flatten(-2)
     return torch.cat((points, phases.sin(), phases.cos()), -1)

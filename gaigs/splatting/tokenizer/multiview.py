@@ -23,7 +23,10 @@ class MultiviewTokenizer(nn.Module):
     """
 
     def __init__(
-        self, scene: Scene, ga: str | Mapping | nn.Module = "ga", euclidean: str | Mapping | nn.Module = "euclidean"
+        self,
+        scene: Scene,
+        ga: str | Mapping | nn.Module = "ga",
+        euclidean: str | Mapping | nn.Module = "euclidean",
     ):
         super().__init__()
         self.ga = registry("tokenizer").build(ga, scene=scene)

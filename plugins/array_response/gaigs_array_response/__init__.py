@@ -1,4 +1,6 @@
-"""A rival for Gaussian splatting: the field at each array element is learnt, the spectrum follows from the array."""
+"""A rival for Gaussian splatting: the field at each array element is learnt, the spectrum follows
+from the array.
+"""
 
 import math
 from itertools import pairwise
@@ -17,28 +19,31 @@ from gaigs.splatting.tokenizer.euclidean import octaves as angular_frequencies
 
 
 class ArrayResponse(Model):
-    """Transmitter position -> complex field at every element -> min-max normalised Bartlett spectrum.
+    """Transmitter position -> complex field at every element -> min-max normalised Bartlett
+    spectrum.
 
     With f_n the field at element n, which stands at (x_n, y_n) in the array's plane,
 
         s(az, el) = | sum_n f_n exp(-j 2 pi (x_n cos az cos el + y_n sin az cos el)) |
         label = (s - min s) / (max s - min s)
 
-    The extremes are those over the label's whole grid, whatever directions a batch asks for, so that a direction's
-    value does not depend on which others are asked for.
+    The extremes are those over the label's whole grid, whatever directions a batch asks for, so
+    that a direction's value does not depend on which others are asked for.
 
     Args:
-        scene: Receivers and task; positions are taken relative to the middle of the transmitters' box.
+        scene: Receivers and task; positions are taken relative to the middle of the transmitters'
+            box.
         rows, columns: Elements along the array's y and x axis.
         pitch: Distance between neighbouring elements [wavelengths].
-        octaves: Lowest and highest octave k of the Fourier features, 2^k cycles a metre; None takes those that the
-            training transmitters can teach, as the ``euclidean`` tokenizer does.
+        octaves: Lowest and highest octave k of the Fourier features, 2^k cycles a metre; None takes
+            those that the training transmitters can teach, as the ``euclidean`` tokenizer does.
         width, layers: Of the network's hidden layers.
 
     Raises:
         ValueError: The labels are no spectra or of several carriers, or an option is out of range.
 
-    Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the spectra of NeRF².
+    Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the
+    spectra of NeRF².
     """
 
     def __init__(
@@ -62,7 +67,9 @@ class ArrayResponse(Model):
                 f"{len(scene.frequencies)}; use another model"
             )
         if rows < 1 or columns < 1 or rows * columns < 2:
-            raise ValueError(f"an array must have at least 2 elements, got model.rows={rows}, model.columns={columns}")
+            raise ValueError(
+                f"an array must have at least 2 elements, got model.rows={rows}, model.columns={columns}"
+            )
         if not 0 < pitch < math.inf:
             raise ValueError(f"model.pitch must be positive [wavelengths], got {pitch}")
         for option, count, least in (("width", width, 1), ("layers", layers, 0)):
@@ -85,11 +92,14 @@ class ArrayResponse(Model):
         features = fourier_features(query.transmitters - self.middle, self.frequencies)
         fields = self.network(features).unflatten(-1, self.fields)
         fields = fields[torch.arange(len(fields), device=fields.device), query.receivers]
-        # A minimum's gradient is that of one pixel: where it lies is searched without the gradients of all the others.
+        # A minimum's gradient is that of one pixel: where it lies is searched without the gradients
+        # of all the others.
         with torch.no_grad():
             powers = torch.einsum("bf,fcp->bcp", fields, self.steering).square().sum(1)
             extremes = torch.stack((powers.argmin(1), powers.argmax(1)), 1)
-        low, high = magnitudes(torch.einsum("bf,fcbp->bcp", fields, self.steering[..., extremes])).split(1, 1)
+        low, high = magnitudes(
+            torch.einsum("bf,fcbp->bcp", fields, self.steering[..., extremes])
+        ).split(1, 1)
         spectra = magnitudes(torch.einsum("bf,fcp->bcp", fields, self.steer(directions)))
         return Prediction(((spectra - low) / (high - low)).unflatten(1, directions.shape), {})
 
@@ -102,7 +112,9 @@ class ArrayResponse(Model):
 
 
 def magnitudes(parts: Float[Tensor, "b 2 pixels"]) -> Float[Tensor, "b pixels"]:
-    """Of real and imaginary parts, with the gradient 0 at 0; ``norm(dim=1)`` takes ten times as long on a CPU."""
+    """Of real and imaginary parts, with the gradient 0 at 0; ``norm(dim=1)`` takes ten times as
+    long on a CPU.
+    """
     # Of bfloat16, as trainer.precision=bf16-mixed has it, torch makes no complex numbers.
     parts = parts.to(torch.promote_types(parts.dtype, torch.float32))
     return geometry.magnitudes(torch.complex(*parts.unbind(1)))

@@ -1,4 +1,6 @@
-"""GSRF: complex-valued Gaussians that send by direction and turn the phase of waves that pass through them."""
+"""GSRF: complex-valued Gaussians that send by direction and turn the phase of waves that pass
+through them.
+"""
 
 import math
 from collections.abc import Callable, Mapping
@@ -19,29 +21,36 @@ from gaigs_gsrf.rendering import render
 
 
 class Gsrf(Model):
-    """Radiance towards the transmitter, composited along the rays of a sphere about the receiver, then pooled.
+    """Radiance towards the transmitter, composited along the rays of a sphere about the receiver,
+    then pooled.
 
-    S(u) = sum_i psi_i alpha_i(u) prod_{j<i} (1 - alpha_j(u)) exp(j phi_j w_j(u)), front to back by distance to the
-    receiver; ``gaigs_gsrf.rendering`` has the footprint w and alpha, ``gaigs_gsrf.gaussians`` the radiance psi.
+    S(u) = sum_i psi_i alpha_i(u) prod_{j<i} (1 - alpha_j(u)) exp(j phi_j w_j(u)), front to back by
+    distance to the receiver; ``gaigs_gsrf.rendering`` has the footprint w and alpha,
+    ``gaigs_gsrf.gaussians`` the radiance psi.
 
-    The Gaussians on a ray do not depend on the transmitter; they are computed once for each receiver.
+    The Gaussians on a ray do not depend on the transmitter; they are computed once for each
+    receiver.
 
     Args:
         scene: Receivers and task.
         pooling: Configuration of the pooling of the complex map; None if the task has no pooling.
         degree: L of the radiance's Fourier-Legendre series.
         radius: Of the sphere on which footprints are measured [m].
-        count, pitch, margin, opacity, signal: Of the Gaussians at the start, see ``ComplexGaussians``.
+        count, pitch, margin, opacity, signal: Of the Gaussians at the start, see
+            ``ComplexGaussians``.
 
     Raises:
-        ValueError: The links have several carriers; the pooling does not give the task's labels from complex maps; an
-            option is out of range.
+        ValueError: The links have several carriers; the pooling does not give the task's labels
+            from complex maps; an option is out of range.
 
-    Source: GSRF (NeurIPS 2025). There the transmitter moves and a receiver hears spectra; the README says what of it
-        we took.
+    Source: GSRF (NeurIPS 2025). There the transmitter moves and a receiver hears spectra; the
+        README says what of it we took.
     """
 
-    learning_rates: Mapping[str, float] = {**ComplexGaussians.learning_rates, **Model.learning_rates}
+    learning_rates: Mapping[str, float] = {
+        **ComplexGaussians.learning_rates,
+        **Model.learning_rates,
+    }
 
     def __init__(
         self,
@@ -63,7 +72,9 @@ class Gsrf(Model):
         if not 0 < radius < math.inf:
             raise ValueError(f"model.radius must be positive [m], got {radius}")
         if pooling is None:
-            raise ValueError(f"model 'gsrf' has no pooling for labels of task {scene.task.name!r}; use another model")
+            raise ValueError(
+                f"model 'gsrf' has no pooling for labels of task {scene.task.name!r}; use another model"
+            )
         self.pooling, self.radius = registry("pooling").build(pooling, scene=scene), radius
         if self.pooling.channels % 2:
             raise ValueError(
@@ -80,7 +91,16 @@ class Gsrf(Model):
         if self.pooling.grid is None:
             zone = grid.elevations.min().item(), grid.elevations.max().item()
         self.gaussians = ComplexGaussians(
-            scene, zone, self.pooling.channels, degree, radius, count, pitch, margin, opacity, signal
+            scene,
+            zone,
+            self.pooling.channels,
+            degree,
+            radius,
+            count,
+            pitch,
+            margin,
+            opacity,
+            signal,
         )
 
     def fit(self, links: Links) -> None:
@@ -91,12 +111,18 @@ class Gsrf(Model):
         places, which = batch.query.unique(with_receivers=False)
         radiance = self.gaussians.radiance(places.transmitters)
         links, values = [], []
-        for receiver in batch.query.receivers.unique().tolist() or [0]:  # no links have a label's shape too
+        for receiver in batch.query.receivers.unique().tolist() or [
+            0
+        ]:  # no links have a label's shape too
             links.append((batch.query.receivers == receiver).nonzero()[:, 0])
             query = batch.query[links[-1]]
-            value = self.pooling(self._map(radiance[which[links[-1]]], receiver, batch), query, batch.directions)
+            value = self.pooling(
+                self._map(radiance[which[links[-1]]], receiver, batch), query, batch.directions
+            )
             if self.pooling.grid is None and batch.directions is not None:
-                value = value.reshape(len(query), *batch.directions.shape)  # a list of rays was rendered as one row
+                value = value.reshape(
+                    len(query), *batch.directions.shape
+                )  # a list of rays was rendered as one row
             values.append(value)
         return Prediction(torch.cat(values)[torch.cat(links).argsort()], {})
 
@@ -106,7 +132,9 @@ class Gsrf(Model):
         """The receiver's map: the real parts of all complex channels, then the imaginary ones."""
         directions = self.pooling.grid or batch.directions or self.scene.task.directions
         vectors = directions.flatten().to(self.gaussians.means).vectors()
-        waves = render(self.gaussians, radiance, self.scene.receivers[receiver].pose, vectors, self.radius)
+        waves = render(
+            self.gaussians, radiance, self.scene.receivers[receiver].pose, vectors, self.radius
+        )
         shape = directions.shape if len(directions.shape) == 2 else (1, *directions.shape)
         return torch.cat((waves.real, waves.imag), 1).unflatten(2, shape)
 
@@ -131,4 +159,6 @@ class Gsrf(Model):
         """``gaussians.ply`` for 3-D splatting viewers, with the constant term of the series."""
         values = dict(self.gaussians.named_parameters())
         values["signal"] = values["signal"][..., :1]
-        write_ply(folder / "gaussians.ply", values, f"gaigs: {self.pooling.channels} signal channels")
+        write_ply(
+            folder / "gaussians.ply", values, f"gaigs: {self.pooling.channels} signal channels"
+        )

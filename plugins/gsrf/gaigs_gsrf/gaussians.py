@@ -17,13 +17,15 @@ from gaigs.splatting.projection import NEAR
 class ComplexGaussians(Gaussians):
     """Gaussians with complex coefficients of a Fourier-Legendre series, and a phase.
 
-    They start on a cubic grid over the box that holds transmitters and receivers, and a margin around it. Points in
-    whose directions no receiver listens are left out. Their standard deviation at the start is the mean distance
-    between them on the sphere of footprints.
+    They start on a cubic grid over the box that holds transmitters and receivers, and a margin
+    around it. Points in whose directions no receiver listens are left out. Their standard deviation
+    at the start is the mean distance between them on the sphere of footprints.
 
     Args:
-        scene: Its receivers and transmitters say where to put the Gaussians, its carrier how densely.
-        zone: Lowest and highest elevation that anything is heard from, in the receivers' frames [rad].
+        scene: Its receivers and transmitters say where to put the Gaussians, its carrier how
+            densely.
+        zone: Lowest and highest elevation that anything is heard from, in the receivers' frames
+            [rad].
         channels: Real channels: all real parts of the complex ones before all imaginary parts.
         degree: L of the series.
         radius: Of the sphere of footprints [m].
@@ -43,7 +45,11 @@ class ComplexGaussians(Gaussians):
     Source: GSRF (NeurIPS 2025), "Fourier-Legendre radiance field".
     """
 
-    learning_rates: Mapping[str, float] = {**Gaussians.learning_rates, "signal": 1e-2, "phases": 1e-2}
+    learning_rates: Mapping[str, float] = {
+        **Gaussians.learning_rates,
+        "signal": 1e-2,
+        "phases": 1e-2,
+    }
     PARAMETERS = tuple(learning_rates)
 
     def __init__(
@@ -77,7 +83,14 @@ class ComplexGaussians(Gaussians):
                 f"the grid of Gaussians must have a point for each of the {len(scene.receivers)} receivers, got "
                 f"{len(means)} that are heard; raise model.count, or lower model.pitch or model.margin"
             )
-        options = {"near": 1.0, "far": 1.0, "spread": 1.0, "opacity": opacity, "signal": signal, "degree": degree}
+        options = {
+            "near": 1.0,
+            "far": 1.0,
+            "spread": 1.0,
+            "opacity": opacity,
+            "signal": signal,
+            "degree": degree,
+        }
         super().__init__(scene, zone, channels, len(means), **options)
         solid_angle = 2 * math.pi * (math.sin(zone[1]) - math.sin(zone[0]))
         with torch.no_grad():
@@ -89,7 +102,8 @@ class ComplexGaussians(Gaussians):
     def radiance(self, transmitters: Float[Tensor, "b 3"]) -> Complex[Tensor, "b n s"]:
         """Radiance of each towards the transmitters, on s complex channels.
 
-        psi_i = sum_{l <= L, |m| <= l} c_ilm Y_lm at the direction from the Gaussian to the transmitter.
+        psi_i = sum_{l <= L, |m| <= l} c_ilm Y_lm at the direction from the Gaussian to the
+        transmitter.
         """
         offsets = transmitters[:, None] - self.means
         lengths = offsets.norm(dim=-1, keepdim=True)
@@ -100,11 +114,15 @@ class ComplexGaussians(Gaussians):
         return torch.einsum("bnk,nsk->bns", fourier_legendre(directions, self.degree), coefficients)
 
 
-def fourier_legendre(vectors: Float[Tensor, "*batch 3"], degree: int) -> Complex[Tensor, "*batch k"]:
-    """Y_lm = N_lm P_l^|m|(cos theta) exp(j m az), times (-1)^|m| for m < 0, in the order of l and m.
+def fourier_legendre(
+    vectors: Float[Tensor, "*batch 3"], degree: int
+) -> Complex[Tensor, "*batch k"]:
+    """Y_lm = N_lm P_l^|m|(cos theta) exp(j m az), times (-1)^|m| for m < 0, in the order of l and
+    m.
 
-    N_lm = sqrt((2l + 1) / 4 pi (l - |m|)! / (l + |m|)!). Made of the real harmonics, whose recurrence has no factorials
-    and no pole; sqrt(2) N P cos(m az) and sqrt(2) N P sin(m az) are two of them.
+    N_lm = sqrt((2l + 1) / 4 pi (l - |m|)! / (l + |m|)!). Made of the real harmonics, whose
+    recurrence has no factorials and no pole; sqrt(2) N P cos(m az) and sqrt(2) N P sin(m az) are
+    two of them.
 
     Args:
         vectors: Unit vectors.
@@ -113,7 +131,9 @@ def fourier_legendre(vectors: Float[Tensor, "*batch 3"], degree: int) -> Complex
     Source: GSRF (NeurIPS 2025).
     """
     harmonics = spherical_harmonics(vectors, degree)
-    middles = torch.tensor([n**2 + n for n in range(degree + 1) for _ in range(2 * n + 1)], device=vectors.device)
+    middles = torch.tensor(
+        [n**2 + n for n in range(degree + 1) for _ in range(2 * n + 1)], device=vectors.device
+    )
     orders = torch.arange(len(middles), device=vectors.device) - middles
     real, imaginary = (harmonics[..., middles + sign * orders.abs()] for sign in (1, -1))
     size = vectors.new_tensor([1.0, math.sqrt(0.5), -math.sqrt(0.5)])
@@ -122,7 +142,8 @@ def fourier_legendre(vectors: Float[Tensor, "*batch 3"], degree: int) -> Complex
 
 
 def cubic_grid(scene: Scene, count: int, pitch: float, margin: float) -> Float[Tensor, "n 3"]:
-    """Points of a cubic grid over the box of training transmitters and receivers, and a margin around it.
+    """Points of a cubic grid over the box of training transmitters and receivers, and a margin
+    around it.
 
     Args:
         scene: Box, receivers and carrier.
@@ -148,7 +169,9 @@ def cubic_grid(scene: Scene, count: int, pitch: float, margin: float) -> Float[T
     return torch.cartesian_prod(*axes).float()
 
 
-def heard(points: Float[Tensor, "n 3"], scene: Scene, zone: tuple[float, float]) -> Float[Tensor, "k 3"]:
+def heard(
+    points: Float[Tensor, "n 3"], scene: Scene, zone: tuple[float, float]
+) -> Float[Tensor, "k 3"]:
     """Those of some points that a receiver sees between two elevations."""
     seen = torch.zeros(len(points), dtype=torch.bool)
     for receiver in scene.receivers:

@@ -15,11 +15,13 @@ L1, SSIM, FOURIER = 0.44, 0.37, 0.19
 
 
 class GsrfLoss:
-    """Of spectra 0.44 L1 + 0.37 (1 - SSIM) + 0.19 Fourier; of levels the squared error of amplitudes.
+    """Of spectra 0.44 L1 + 0.37 (1 - SSIM) + 0.19 Fourier; of levels the squared error of
+    amplitudes.
 
-    The SSIM window spans 11 pixels of the label's own grid; its weights are uniform, as those of ``l1_ssim``. The
-    Fourier term is the mean squared difference of the two-dimensional discrete Fourier transforms, in the form that
-    keeps energies. By Parseval's theorem that is the mean squared error, and so it is computed.
+    The SSIM window spans 11 pixels of the label's own grid; its weights are uniform, as those of
+    ``l1_ssim``. The Fourier term is the mean squared difference of the two-dimensional discrete
+    Fourier transforms, in the form that keeps energies. By Parseval's theorem that is the mean
+    squared error, and so it is computed.
 
     Args:
         task: Whose labels are compared.
@@ -32,14 +34,17 @@ class GsrfLoss:
 
     def __init__(self, task: Task):
         if task.dtype.is_complex:
-            raise ValueError("loss 'gsrf' takes spectra or levels, got complex labels; take loss=log_relative_error")
+            raise ValueError(
+                "loss 'gsrf' takes spectra or levels, got complex labels; take loss=log_relative_error"
+            )
         self.directions = task.directions
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms; see ``gaigs.splatting.loss.Loss``.
 
         Raises:
-            ValueError: The batch asks for a list of directions, which has no windows, or for fewer than 3 x 3.
+            ValueError: The batch asks for a list of directions, which has no windows, or for fewer
+                than 3 x 3.
         """
         errors = values - batch.labels
         if self.directions is None:
@@ -47,5 +52,9 @@ class GsrfLoss:
             return squared, {"amplitude": squared}
         window = find_window("gsrf", batch.directions, self.directions.pitch, WINDOW)
         similarity = structural_similarity(values, batch.labels, window)
-        terms = {"l1": errors.abs().mean(), "ssim": 1 - similarity, "fourier": errors.square().mean()}
+        terms = {
+            "l1": errors.abs().mean(),
+            "ssim": 1 - similarity,
+            "fourier": errors.square().mean(),
+        }
         return L1 * terms["l1"] + SSIM * terms["ssim"] + FOURIER * terms["fourier"], terms

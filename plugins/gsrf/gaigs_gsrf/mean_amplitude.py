@@ -17,7 +17,8 @@ class MeanAmplitude(Pooling):
     """100 (mean |C_0 + j C_1| - 1) [dBm], the mean over the grid.
 
     Args:
-        grid: Rows and columns of the map over the full sphere, ``Grid.sphere``, whose pixels have equal solid angles.
+        grid: Rows and columns of the map over the full sphere, ``Grid.sphere``, whose pixels have
+            equal solid angles.
 
     Source: GSRF (NeurIPS 2025); the scale of NeRF² (MobiCom 2023).
     """
@@ -42,8 +43,13 @@ class MeanAmplitude(Pooling):
             )
 
     def forward(
-        self, image: Float[Tensor, "b 2 rows columns"], query: Query, directions: Directions | None = None
+        self,
+        image: Float[Tensor, "b 2 rows columns"],
+        query: Query,
+        directions: Directions | None = None,
     ) -> Float[Tensor, " b"]:
-        """Level [dBm], float32 where the map is of half precision; where the map is 0, so is its gradient."""
+        """Level [dBm], float32 where the map is of half precision; where the map is 0, so is its
+        gradient.
+        """
         image = image.to(torch.promote_types(image.dtype, torch.float32))
         return RANGE * (magnitudes(torch.complex(*image.unbind(1))).mean((1, 2)) - 1)

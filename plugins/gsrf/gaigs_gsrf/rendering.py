@@ -1,4 +1,6 @@
-"""Field that arrives along each ray: orthographic splatting on a sphere, composited with complex transmittances."""
+"""Field that arrives along each ray: orthographic splatting on a sphere, composited with complex
+transmittances.
+"""
 
 import torch
 from jaxtyping import Complex, Float, Int
@@ -10,11 +12,13 @@ from gaigs.splatting.rasterizer import ALPHA_MAX
 from gaigs_gsrf.gaussians import ComplexGaussians
 
 CHUNK = 2**21
-"""Pairs of a Gaussian and a ray worked on at a time where no gradient is asked for: 8 MiB an array of float32."""
+"""Pairs of a Gaussian and a ray worked on at a time where no gradient is asked for: 8 MiB an array
+of float32.
+"""
 
 NARROWEST = 1e-3
-"""Smallest standard deviation of a footprint over the sphere's radius: a twentieth of a degree, which no label
-resolves, and four digits above what float32 tells of directions."""
+"""Smallest standard deviation of a footprint over the sphere's radius: a twentieth of a degree,
+which no label resolves, and four digits above what float32 tells of directions."""
 
 
 def render(
@@ -24,7 +28,8 @@ def render(
     vectors: Float[Tensor, "rays 3"],
     radius: float,
 ) -> Complex[Tensor, "b s rays"]:
-    """S(u) = sum_i psi_i alpha_i T_i along rays u from a receiver, with T_i the transmittance of those before.
+    """S(u) = sum_i psi_i alpha_i T_i along rays u from a receiver, with T_i the transmittance of
+    those before.
 
     Args:
         gaussians: Their centres, covariances, opacities and phases.
@@ -44,7 +49,9 @@ def render(
     sent = radiance[:, order].mT
     rays = vectors @ receiver.rotation.mT
     size = len(rays) if torch.is_grad_enabled() else max(1, CHUNK // max(1, len(order)))
-    return torch.cat([sent @ weights(gaussians, order, centres, part, radius) for part in rays.split(size)], 2)
+    return torch.cat(
+        [sent @ weights(gaussians, order, centres, part, radius) for part in rays.split(size)], 2
+    )
 
 
 def weights(
@@ -59,7 +66,8 @@ def weights(
         w_i = exp(-d' Sigma_i^-1 d / 2)      d = radius (u - u_i), from the centre's projection to the ray's point
         alpha_i = min(0.99, o_i w_i)         T_i = prod_{j<i} (1 - alpha_j) exp(j phi_j w_j)
 
-    The covariance Sigma is that of the Gaussian in space: how far away it is does not change its footprint.
+    The covariance Sigma is that of the Gaussian in space: how far away it is does not change its
+    footprint.
 
     Args:
         gaussians: Their covariances, opacities and phases.

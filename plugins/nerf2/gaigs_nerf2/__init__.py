@@ -17,9 +17,11 @@ __all__ = ["Nerf2", "RayMarching", "Samples", "amplitudes_and_phases", "render"]
 
 
 class Nerf2(RayMarching):
-    """Place -> attenuation and a feature; feature, direction and transmitter -> the field sent along the ray.
+    """Place -> attenuation and a feature; feature, direction and transmitter -> the field sent
+    along the ray.
 
-    The first network's input joins its layers again halfway. The second has a layer of ``width`` and one of half of it.
+    The first network's input joins its layers again halfway. The second has a layer of ``width``
+    and one of half of it.
 
     Args:
         scene: Receivers, task, carrier.
@@ -33,7 +35,9 @@ class Nerf2(RayMarching):
     Source: NeRF², 2023.
     """
 
-    learning_rates: Mapping[str, float] = {"network": 2e-3}  # published: 8e-4, falling as a cosine over 30,000 steps
+    learning_rates: Mapping[str, float] = {
+        "network": 2e-3
+    }  # published: 8e-4, falling as a cosine over 30,000 steps
 
     def __init__(
         self,
@@ -61,21 +65,31 @@ class Nerf2(RayMarching):
         self.parts = width, features, features  # inputs of the second network's first layer
         self.join = nn.Linear(sum(self.parts), width)
         self.send = nn.Sequential(
-            nn.Linear(width, width // 2), nn.ReLU(), nn.Linear(width // 2, 2 * self.reading.channels)
+            nn.Linear(width, width // 2),
+            nn.ReLU(),
+            nn.Linear(width // 2, 2 * self.reading.channels),
         )
 
-    def sample(self, query: Query, points: Float[Tensor, "r i 3"], views: Float[Tensor, "r 3"]) -> Samples:
+    def sample(
+        self, query: Query, points: Float[Tensor, "r i 3"], views: Float[Tensor, "r 3"]
+    ) -> Samples:
         places = fourier_features(points, self.frequencies)
         hidden = places
         for number, layer in enumerate(self.layers):
-            hidden = relu(layer(torch.cat((places, hidden), -1) if number == self.joint else hidden))
+            hidden = relu(
+                layer(torch.cat((places, hidden), -1) if number == self.joint else hidden)
+            )
         attenuations, turns = amplitudes_and_phases(self.attenuate(hidden))
         # All links share the layer's output for the ray: it is summed part by part.
         ray, view, transmitter = self.join.weight.split(self.parts, 1)
         ray = linear(self.feature(hidden), ray, self.join.bias)
         ray = ray + linear(fourier_features(views, self.frequencies), view)[:, None]
-        transmitter = linear(fourier_features(query.transmitters - self.middle, self.frequencies), transmitter)
-        amplitudes, phases = amplitudes_and_phases(self.send((ray + transmitter[:, None, None]).relu_()))
+        transmitter = linear(
+            fourier_features(query.transmitters - self.middle, self.frequencies), transmitter
+        )
+        amplitudes, phases = amplitudes_and_phases(
+            self.send((ray + transmitter[:, None, None]).relu_())
+        )
         return Samples(attenuations[..., 0], turns[..., 0], amplitudes, phases)
 
 

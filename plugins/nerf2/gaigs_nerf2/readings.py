@@ -14,8 +14,8 @@ from gaigs.core.scene import Scene, check_elements, direct_waves
 from gaigs.data import Links
 
 REACH = 0.025
-"""A sample's part of a spectrum falls with the distance as 0.025 m / t, as published: lambda / (4 pi) at about
-920 MHz."""
+"""A sample's part of a spectrum falls with the distance as 0.025 m / t, as published: lambda / (4
+pi) at about 920 MHz."""
 
 
 class Reading(nn.Module):
@@ -48,7 +48,9 @@ class Reading(nn.Module):
         """Magnitudes of S, or of the sum of the rays, that would give these labels."""
         raise NotImplementedError
 
-    def forward(self, sums: Complex[Tensor, "b r c"], query: Query, directions: Directions) -> Tensor:
+    def forward(
+        self, sums: Complex[Tensor, "b r c"], query: Query, directions: Directions
+    ) -> Tensor:
         """Values of links to one receiver (b, ...)."""
         raise NotImplementedError
 
@@ -62,7 +64,9 @@ class Spectrum(Reading):
     def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
         return labels
 
-    def forward(self, sums: Complex[Tensor, "b r 1"], query: Query, directions: Directions) -> Tensor:
+    def forward(
+        self, sums: Complex[Tensor, "b r 1"], query: Query, directions: Directions
+    ) -> Tensor:
         return magnitudes(sums[..., 0]).unflatten(1, directions.shape)
 
 
@@ -94,16 +98,19 @@ class Level(Reading):
     def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
         return 1 + labels / 100
 
-    def forward(self, sums: Complex[Tensor, "b r 1"], query: Query, directions: Directions) -> Tensor:
+    def forward(
+        self, sums: Complex[Tensor, "b r 1"], query: Query, directions: Directions
+    ) -> Tensor:
         return 100 * (magnitudes(sums.sum((1, 2))) - 1)
 
 
 class Channel(Reading):
     """F(f) sum_u a(u) exp(-j 2 pi f x_e . u / c) S(u, f) at the element e and the subcarrier f.
 
-    a is the elements' pattern and x_e an element's place. F is the wave of free space over the direct distance. Where
-    the training channels' phases fall with the distance, as for the time dependence exp(+j omega t), the sum is the
-    complex conjugate. Where they follow it with neither sign, F is its amplitude alone.
+    a is the elements' pattern and x_e an element's place. F is the wave of free space over the
+    direct distance. Where the training channels' phases fall with the distance, as for the time
+    dependence exp(+j omega t), the sum is the complex conjugate. Where they follow it with neither
+    sign, F is its amplitude alone.
 
     Args:
         grid: Of the rays.
@@ -132,13 +139,20 @@ class Channel(Reading):
     def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
         return (labels / self._direct(query)).abs()
 
-    def forward(self, sums: Complex[Tensor, "b r c"], query: Query, directions: Directions) -> Tensor:
+    def forward(
+        self, sums: Complex[Tensor, "b r c"], query: Query, directions: Directions
+    ) -> Tensor:
         receiver = int(query.receivers[0]) if len(query) else 0
-        array, directions = self.scene.receivers[receiver].array, directions.flatten().vectors().double()
+        array, directions = (
+            self.scene.receivers[receiver].array,
+            directions.flatten().vectors().double(),
+        )
         # A wave from the direction u reaches an element at x earlier by x . u / c than the middle.
         delays = directions @ array.elements.to(directions).T / speed_of_light
         phases = -2 * math.pi * self.carriers.to(directions)[:, None, None] * delays
-        steering = torch.polar(array.gain(directions)[:, None].expand_as(phases), phases).to(sums)  # (c, r, e)
+        steering = torch.polar(array.gain(directions)[:, None].expand_as(phases), phases).to(
+            sums
+        )  # (c, r, e)
         heard = (sums.permute(2, 0, 1) @ steering).permute(1, 2, 0)
         if self.array_sign < 0:
             heard = heard.conj()
@@ -157,7 +171,8 @@ def make_reading(scene: Scene, rays: list[int], frequency: float) -> Reading:
         frequency: Carrier of levels whose data say none [Hz].
 
     Raises:
-        ValueError: The labels are no spectra, levels or channels, or of several carriers; an option is out of range.
+        ValueError: The labels are no spectra, levels or channels, or of several carriers; an option
+            is out of range.
     """
     task = scene.task
     if scene.has_band:
@@ -171,7 +186,10 @@ def make_reading(scene: Scene, rays: list[int], frequency: float) -> Reading:
         case "spectrum":
             return Spectrum()
         case "rssi":
-            return Level(Grid.sphere(*rays), scene.frequencies[0].item() if len(scene.frequencies) else frequency)
+            return Level(
+                Grid.sphere(*rays),
+                scene.frequencies[0].item() if len(scene.frequencies) else frequency,
+            )
         case "csi":
             return Channel(Grid.sphere(*rays), scene)
     raise ValueError(

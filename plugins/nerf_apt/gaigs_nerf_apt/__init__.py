@@ -19,18 +19,20 @@ from gaigs_nerf_apt.unet import DIVISOR, UNet
 
 
 class NerfApt(RayMarching):
-    """Place -> attenuation and a feature; feature, direction and transmitter -> the field sent along the ray.
+    """Place -> attenuation and a feature; feature, direction and transmitter -> the field sent
+    along the ray.
 
-    An image is the rays of one elevation, side by side around the circle, times the samples along them. A ray is seen
-    with its neighbours, so it must always have the same: a grid of the model's own is marched whatever directions are
-    asked for, and spectra are interpolated from it. While training, batch normalisation makes a link depend on the
-    others of its batch; a trained model's links do not.
+    An image is the rays of one elevation, side by side around the circle, times the samples along
+    them. A ray is seen with its neighbours, so it must always have the same: a grid of the model's
+    own is marched whatever directions are asked for, and spectra are interpolated from it. While
+    training, batch normalisation makes a link depend on the others of its batch; a trained model's
+    links do not.
 
     Args:
         scene: Receivers, task, carrier.
         samples, far, frequency: See ``gaigs_nerf2.RayMarching``; a multiple of 4 samples.
-        rays: Rows and columns of the grid, a multiple of 4: of spectra evenly from the label's lowest elevation to its
-            highest and around the circle, else over the sphere.
+        rays: Rows and columns of the grid, a multiple of 4: of spectra evenly from the label's
+            lowest elevation to its highest and around the circle, else over the sphere.
         octaves: Of the features sin 2^k x and cos 2^k x of positions [m] and directions, k from 0.
         widths: Of both U-Nets at full, half and quarter resolution; the first is the feature's too.
 
@@ -53,7 +55,13 @@ class NerfApt(RayMarching):
         widths: list[int],
     ):
         super().__init__(scene, samples, far, rays, frequency)
-        if samples % DIVISOR or len(rays) != 2 or rays[0] < 2 or rays[1] < DIVISOR or rays[1] % DIVISOR:
+        if (
+            samples % DIVISOR
+            or len(rays) != 2
+            or rays[0] < 2
+            or rays[1] < DIVISOR
+            or rays[1] % DIVISOR
+        ):
             raise ValueError(
                 f"model.samples and the columns of model.rays must be multiples of {DIVISOR}, of at least 2 rows, got "
                 f"{samples} and {rays}"
@@ -70,7 +78,9 @@ class NerfApt(RayMarching):
         self.transmitter = nn.Linear(features, widths[0], bias=False)
 
     def forward(self, batch: Batch) -> Prediction:
-        prediction = super().forward(replace(batch, directions=self.grid.to(batch.query.transmitters)))
+        prediction = super().forward(
+            replace(batch, directions=self.grid.to(batch.query.transmitters))
+        )
         if self.scene.task.directions is None:
             return prediction
         directions = batch.directions or self.scene.task.directions
@@ -83,14 +93,18 @@ class NerfApt(RayMarching):
         parts = query.parts(max(1, self.chunk // len(rays.azimuths)))
         return torch.cat([self.march_at_once(part, receiver, rays) for part in parts])
 
-    def sample(self, query: Query, points: Float[Tensor, "r i 3"], views: Float[Tensor, "r 3"]) -> Samples:
+    def sample(
+        self, query: Query, points: Float[Tensor, "r i 3"], views: Float[Tensor, "r 3"]
+    ) -> Samples:
         rows = self.grid.shape[0]
         places = fourier_features(points, self.frequencies)
         there = as_samples(self.attenuate(as_images(places, rows)), rows)[0]
         (attenuations, turns), feature = amplitudes_and_phases(there[..., :2]), there[..., 2:]
         views = fourier_features(views, self.frequencies)[:, None].expand(-1, points.shape[1], -1)
         ray = as_images(torch.cat((feature, views), -1), rows)
-        shifts = self.transmitter(fourier_features(query.transmitters - self.middle, self.frequencies))
+        shifts = self.transmitter(
+            fourier_features(query.transmitters - self.middle, self.frequencies)
+        )
         amplitudes, phases = amplitudes_and_phases(as_samples(self.send(ray, shifts), rows))
         return Samples(attenuations[..., 0], turns[..., 0], amplitudes, phases)
 
@@ -112,8 +126,12 @@ def as_samples(images: Float[Tensor, "brows c columns i"], rows: int) -> Float[T
     return images.unflatten(0, (-1, rows)).permute(0, 1, 3, 4, 2).flatten(1, 2)
 
 
-def interpolated(values: Float[Tensor, "b rows columns"], grid: Grid, directions: Directions) -> Tensor:
-    """Values on a grid from ``around`` in other directions, linear in elevation and azimuth (b, *directions.shape)."""
+def interpolated(
+    values: Float[Tensor, "b rows columns"], grid: Grid, directions: Directions
+) -> Tensor:
+    """Values on a grid from ``around`` in other directions, linear in elevation and azimuth (b,
+    *directions.shape).
+    """
     rays, (rows, columns) = directions.flatten().to(values), grid.shape
     lowest, highest = grid.elevations[[0, -1]].tolist()
     spread = max(highest - lowest, 1e-6)  # a label may have a single elevation
@@ -121,5 +139,7 @@ def interpolated(values: Float[Tensor, "b rows columns"], grid: Grid, directions
     column = (rays.azimuths * (columns / (2 * math.pi))).remainder(columns)
     below, before = row.long().clamp(max=rows - 2), column.long().clamp(max=columns - 1)
     up, on, behind = row - below, column - before, (before + 1) % columns
-    lower, upper = (torch.lerp(values[:, k, before], values[:, k, behind], on) for k in (below, below + 1))
+    lower, upper = (
+        torch.lerp(values[:, k, before], values[:, k, behind], on) for k in (below, below + 1)
+    )
     return torch.lerp(lower, upper, up).unflatten(1, directions.shape)

@@ -10,7 +10,9 @@ DIVISOR = 4
 
 
 class Convolution(nn.Conv2d):
-    """3 x 3 over rays and samples: the rays close a circle, and there is nothing before the first and last sample."""
+    """3 x 3 over rays and samples: the rays close a circle, and there is nothing before the first
+    and last sample.
+    """
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__(inputs, outputs, 3)
@@ -23,7 +25,9 @@ class Double(nn.Sequential):
     """Two convolutions, each normalised over the batch and through a leaky ReLU."""
 
     def __init__(self, inputs: int, width: int):
-        super().__init__(Convolution(inputs, width), *after(width), Convolution(width, width), *after(width))
+        super().__init__(
+            Convolution(inputs, width), *after(width), Convolution(width, width), *after(width)
+        )
 
 
 def after(width: int) -> tuple[nn.Module, nn.Module]:
@@ -55,9 +59,13 @@ class Gate(nn.Module):
         hidden = max(1, width // 2)
         self.ask = nn.Sequential(nn.Conv2d(width, hidden, 1), nn.BatchNorm2d(hidden))
         self.offer = nn.Sequential(nn.Conv2d(width, hidden, 1), nn.BatchNorm2d(hidden))
-        self.weigh = nn.Sequential(nn.ReLU(), nn.Conv2d(hidden, 1, 1), nn.BatchNorm2d(1), nn.Sigmoid())
+        self.weigh = nn.Sequential(
+            nn.ReLU(), nn.Conv2d(hidden, 1, 1), nn.BatchNorm2d(1), nn.Sigmoid()
+        )
 
-    def forward(self, asked: Float[Tensor, "n c rays samples"], offered: Float[Tensor, "n c rays samples"]) -> Tensor:
+    def forward(
+        self, asked: Float[Tensor, "n c rays samples"], offered: Float[Tensor, "n c rays samples"]
+    ) -> Tensor:
         return offered * self.weigh(self.ask(asked) + self.offer(offered))
 
 
@@ -68,7 +76,8 @@ class UNet(nn.Module):
         inputs, outputs: Numbers at each sample.
         widths: Channels at full, half and quarter resolution.
 
-    Source: NeRF-APT, 2025; Oktay et al., Attention U-Net, 2018; Zhao et al., Pyramid Scene Parsing Network, 2017.
+    Source: NeRF-APT, 2025; Oktay et al., Attention U-Net, 2018; Zhao et al., Pyramid Scene Parsing
+    Network, 2017.
     """
 
     def __init__(self, inputs: int, outputs: int, widths: list[int]):
@@ -76,21 +85,31 @@ class UNet(nn.Module):
         full, half, quarter = widths
         self.first = Convolution(inputs, full)
         self.rest = nn.Sequential(*after(full), Convolution(full, full), *after(full))
-        self.down, self.bottom, self.pyramid = Double(full, half), Double(half, quarter), Pyramid(quarter)
-        self.to_half, self.to_full = nn.ConvTranspose2d(quarter, half, 2, 2), nn.ConvTranspose2d(half, full, 2, 2)
+        self.down, self.bottom, self.pyramid = (
+            Double(full, half),
+            Double(half, quarter),
+            Pyramid(quarter),
+        )
+        self.to_half, self.to_full = (
+            nn.ConvTranspose2d(quarter, half, 2, 2),
+            nn.ConvTranspose2d(half, full, 2, 2),
+        )
         self.gate_half, self.gate_full = Gate(half), Gate(full)
         self.up_half, self.up_full = Double(2 * half, half), Double(2 * full, full)
         self.last = nn.Conv2d(full, outputs, 1)
 
     def forward(
-        self, image: Float[Tensor, "n c rays samples"], shifts: Float[Tensor, "b full"] | None = None
+        self,
+        image: Float[Tensor, "n c rays samples"],
+        shifts: Float[Tensor, "b full"] | None = None,
     ) -> Float[Tensor, "bn outputs rays samples"]:
         """One image after another.
 
         Args:
             image: Features, of one image or several.
-            shifts: Part of the first convolution's output by inputs that are constant over an image and differ
-                between links b. Each image is then seen b times, those of a link one after another.
+            shifts: Part of the first convolution's output by inputs that are constant over an image
+                and differ between links b. Each image is then seen b times, those of a link one
+                after another.
         """
         full = self.first(image)
         if shifts is not None:

@@ -1,4 +1,6 @@
-"""Two optimizers in turn: a discriminator separates labels from predictions, and the model learns to deceive it."""
+"""Two optimizers in turn: a discriminator separates labels from predictions, and the model learns
+to deceive it.
+"""
 
 import torch
 from torch import Tensor
@@ -17,8 +19,8 @@ DISCRIMINATOR = "discriminator"
 class Adversarial(Descent):
     """A step of the discriminator, then a step of all other parameters; both count as one step.
 
-    The model has a method ``discriminate(batch, values)``, which gives a logit for each link (b,), large where it takes
-    the values for labels, and a parameter group ``discriminator``.
+    The model has a method ``discriminate(batch, values)``, which gives a logit for each link (b,),
+    large where it takes the values for labels, and a parameter group ``discriminator``.
 
     Args:
         weight: Weight of the adversarial term beside the loss.
@@ -37,14 +39,18 @@ class Adversarial(Descent):
         if not weight >= 0:
             raise ValueError(f"training.weight must be at least 0, got {weight}")
         if DISCRIMINATOR not in self.model.parameter_groups():
-            raise ValueError(f"adversarial training needs a model with a parameter group {DISCRIMINATOR!r}")
+            raise ValueError(
+                f"adversarial training needs a model with a parameter group {DISCRIMINATOR!r}"
+            )
         self.weight = weight
         self.automatic_optimization = False
 
     def configure_optimizers(self):
         groups = self.model.parameter_groups()
         judged = {DISCRIMINATOR: groups.pop(DISCRIMINATOR)}
-        optimizers = [make_optimizer(self.optimizer, part, self.learning_rates) for part in (groups, judged)]
+        optimizers = [
+            make_optimizer(self.optimizer, part, self.learning_rates) for part in (groups, judged)
+        ]
         done = share_done(self.trainer)
         return optimizers, [make_schedule(self.schedule, each, done) for each in optimizers]
 
@@ -52,7 +58,9 @@ class Adversarial(Descent):
         if self.trainer.world_size > 1:
             raise ValueError("adversarial training takes one process; set trainer.devices=1")
         if getattr(self.trainer.precision_plugin, "scaler", None) is not None:
-            raise ValueError("adversarial training does not scale gradients; set trainer.precision to bf16-mixed or 32")
+            raise ValueError(
+                "adversarial training does not scale gradients; set trainer.precision to bf16-mixed or 32"
+            )
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         batch = self.prepare(batch)
@@ -62,7 +70,9 @@ class Adversarial(Descent):
         judge.zero_grad()
         real = self.model.discriminate(batch, batch.labels)
         fake = self.model.discriminate(batch, value.detach())
-        judged = cross_entropy(real, torch.ones_like(real)) + cross_entropy(fake, torch.zeros_like(fake))
+        judged = cross_entropy(real, torch.ones_like(real)) + cross_entropy(
+            fake, torch.zeros_like(fake)
+        )
         self.manual_backward(judged)
         judge.optimizer.step()  # past Lightning, which would count it as a step of the training
 

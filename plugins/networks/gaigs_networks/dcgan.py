@@ -17,38 +17,46 @@ LAYERS = 4
 
 
 class Dcgan(Network):
-    """Noise and a link's numbers -> a small image of many channels -> twice as large in each of four layers -> label.
+    """Noise and a link's numbers -> a small image of many channels -> twice as large in each of
+    four layers -> label.
 
-    An axis that is shorter than 16 pixels doubles in the last layers alone, so that one number a link is drawn by
-    fully connected layers. Pixels beyond the label's last row and column are cut off. The discriminator goes the
-    same way back, and is shown the link's numbers in every pixel. A prediction takes the noise's mean, 0.
+    An axis that is shorter than 16 pixels doubles in the last layers alone, so that one number a
+    link is drawn by fully connected layers. Pixels beyond the label's last row and column are cut
+    off. The discriminator goes the same way back, and is shown the link's numbers in every pixel. A
+    prediction takes the noise's mean, 0.
 
     Args:
         scene: Receivers, task, box of the training transmitters.
         width: Channels of the largest images; each layer further in has twice as many.
         noise: Count of standard normal numbers that the generator gets beside the link's.
-        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a metre; None: those that
-            the training transmitters can teach.
+        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a
+            metre; None: those that the training transmitters can teach.
         pixel: Of the images that spectra are drawn in [deg].
 
     Raises:
         ValueError: An option is out of range.
 
-    Source: Radford et al., Unsupervised Representation Learning with DCGANs, 2016; the baseline in GAI-GS, "Results".
+    Source: Radford et al., Unsupervised Representation Learning with DCGANs, 2016; the baseline in
+    GAI-GS, "Results".
     """
 
     learning_rates: Mapping[str, float] = {"network": 1e-3, "discriminator": 2e-4}
 
     trained_by = "adversarial"
 
-    def __init__(self, scene: Scene, width: int, noise: int, octaves: tuple[int, int] | None, pixel: float):
+    def __init__(
+        self, scene: Scene, width: int, noise: int, octaves: tuple[int, int] | None, pixel: float
+    ):
         super().__init__(scene, octaves, pixel)
         check_widths(width=width, noise=noise)
         self.noise = noise
         channels, *sizes = self.label.shape
         doublings = [min(LAYERS, (size - 1).bit_length()) for size in sizes]
         widths = [width * 2**k for k in reversed(range(LAYERS))]
-        small = (widths[0], *(-(-size // 2**count) for size, count in zip(sizes, doublings, strict=True)))
+        small = (
+            widths[0],
+            *(-(-size // 2**count) for size, count in zip(sizes, doublings, strict=True)),
+        )
         features = self.question.width
         drawing = [nn.Linear(noise + features, math.prod(small)), nn.Unflatten(1, small)]
         judging = []
@@ -63,7 +71,10 @@ class Dcgan(Network):
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Generator and discriminator."""
-        return {"network": [*self.generator.parameters()], "discriminator": [*self.discriminator.parameters()]}
+        return {
+            "network": [*self.generator.parameters()],
+            "discriminator": [*self.discriminator.parameters()],
+        }
 
     def draw(self, features: Float[Tensor, "b width"]) -> Float[Tensor, "b channels rows columns"]:
         noise = features.new_zeros(len(features), self.noise)
@@ -85,11 +96,18 @@ class Dcgan(Network):
 
 def transposed(inner: int, outer: int, strides: list[int], sizes: list[int]) -> nn.ConvTranspose2d:
     """A layer that multiplies the sides of an image by the strides."""
-    kernels = [4 if stride == 2 else min(size, 3) // 2 * 2 + 1 for stride, size in zip(strides, sizes, strict=True)]
-    return nn.ConvTranspose2d(inner, outer, kernels, strides, [(kernel - 1) // 2 for kernel in kernels])
+    kernels = [
+        4 if stride == 2 else min(size, 3) // 2 * 2 + 1
+        for stride, size in zip(strides, sizes, strict=True)
+    ]
+    return nn.ConvTranspose2d(
+        inner, outer, kernels, strides, [(kernel - 1) // 2 for kernel in kernels]
+    )
 
 
 def convolution(outer: int, inner: int, strides: list[int], sizes: list[int]) -> nn.Conv2d:
-    """A layer that divides them, rounded up: thinned labels have fewer pixels, though never less than one."""
+    """A layer that divides them, rounded up: thinned labels have fewer pixels, though never less
+    than one.
+    """
     kernels = [min(size, 3) // 2 * 2 + 1 for size in sizes]
     return nn.Conv2d(outer, inner, kernels, strides, [kernel // 2 for kernel in kernels])

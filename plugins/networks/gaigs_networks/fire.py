@@ -14,38 +14,50 @@ from gaigs_networks.network import Network, check_widths, linear_layers
 
 
 class Fire(Network):
-    """In training an encoder maps the label to a latent code, and a decoder draws the label from the code.
+    """In training an encoder maps the label to a latent code, and a decoder draws the label from
+    the code.
 
-    With y the label's image and c the link's numbers, a step draws z ~ N(mu(y, c), exp(lambda(y, c))), predicts the
-    decoder's image of (z, c), and adds a penalty on the information in z,
+    With y the label's image and c the link's numbers, a step draws z ~ N(mu(y, c), exp(lambda(y,
+    c))), predicts the decoder's image of (z, c), and adds a penalty on the information in z,
 
         KL = sum_i (mu_i² + exp(lambda_i) - lambda_i - 1) / 2   [nat]
 
     A prediction has no label to look at, and takes the mean of the prior, z = 0.
 
-    The penalty ``kl`` is KL over the count of numbers in an image, in the unit of a mean squared error: times the
-    variance of the labels; of complex ones times 1, as their loss has no unit. With the weight 2 s, it
-    is the bound on the likelihood of labels with independent noise of s times their variance.
+    The penalty ``kl`` is KL over the count of numbers in an image, in the unit of a mean squared
+    error: times the variance of the labels; of complex ones times 1, as their loss has no unit.
+    With the weight 2 s, it is the bound on the likelihood of labels with independent noise of s
+    times their variance.
 
     Args:
         scene: Receivers, task, box of the training transmitters.
-        widths: Of the encoder's layers; those of the decoder are the same in reverse, before its last one.
+        widths: Of the encoder's layers; those of the decoder are the same in reverse, before its
+            last one.
         latent: Length of z.
-        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a metre; None: those that
-            the training transmitters can teach.
+        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a
+            metre; None: those that the training transmitters can teach.
         pixel: Of the images that spectra are drawn in [deg].
 
     Raises:
         ValueError: An option is out of range.
 
-    Source: Liu et al., FIRE, 2021; conditioned as in Sohn et al., Learning Structured Output Representation using Deep
-        Conditional Generative Models, 2015.
+    Source: Liu et al., FIRE, 2021; conditioned as in Sohn et al., Learning Structured Output
+        Representation using Deep Conditional Generative Models, 2015.
     """
 
     learning_rates: Mapping[str, float] = {"network": 1e-3}
-    penalty_weights: Mapping[str, float] = {"kl": 0.2}  # twice the share of the labels' variance taken for noise
+    penalty_weights: Mapping[str, float] = {
+        "kl": 0.2
+    }  # twice the share of the labels' variance taken for noise
 
-    def __init__(self, scene: Scene, widths: list[int], latent: int, octaves: tuple[int, int] | None, pixel: float):
+    def __init__(
+        self,
+        scene: Scene,
+        widths: list[int],
+        latent: int,
+        octaves: tuple[int, int] | None,
+        pixel: float,
+    ):
         super().__init__(scene, octaves, pixel)
         check_widths(widths=widths, latent=latent)
         numbers, features = math.prod(self.label.shape), self.question.width
@@ -53,7 +65,9 @@ class Fire(Network):
         self.encoder = linear_layers([numbers + features, *widths], nn.LeakyReLU())
         self.posterior = nn.Linear(widths[-1], 2 * latent)
         decoder = linear_layers([latent + features, *reversed(widths)], nn.LeakyReLU())
-        self.decoder = nn.Sequential(decoder, nn.Linear(widths[0], numbers), nn.Unflatten(1, self.label.shape))
+        self.decoder = nn.Sequential(
+            decoder, nn.Linear(widths[0], numbers), nn.Unflatten(1, self.label.shape)
+        )
 
     def forward(self, batch: Batch) -> Prediction:
         features = self.question(batch.query)

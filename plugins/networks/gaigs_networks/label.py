@@ -1,4 +1,6 @@
-"""Labels as the images that networks draw: a spectrum in fewer pixels, a level in one, a channel in two colours."""
+"""Labels as the images that networks draw: a spectrum in fewer pixels, a level in one, a channel in
+two colours.
+"""
 
 import math
 
@@ -27,13 +29,15 @@ class LabelImage(nn.Module):
     | one number a link | 1 | 1 | 1 |
     | complex channel | elements | subcarriers | 2: real and imaginary part |
 
-    A spectrum's image has every k-th row and column of the label, and is interpolated linearly between them.
-    Complex labels are scaled by the amplitude that free space has at the median link, times their ``strength`` over
-    free space, which no single link rules. They are not shifted: 0 means the same at every phase.
+    A spectrum's image has every k-th row and column of the label, and is interpolated linearly
+    between them. Complex labels are scaled by the amplitude that free space has at the median link,
+    times their ``strength`` over free space, which no single link rules. They are not shifted: 0
+    means the same at every phase.
 
     Args:
         scene: Whose labels.
-        pixel: Of a spectrum's image: from one row or column to the next, at most [deg]; never less than the label's.
+        pixel: Of a spectrum's image: from one row or column to the next, at most [deg]; never less
+            than the label's.
 
     Attributes:
         shape: Channels, rows, columns.
@@ -46,10 +50,14 @@ class LabelImage(nn.Module):
     def __init__(self, scene: Scene, pixel: float):
         super().__init__()
         if not 0 < pixel <= LARGEST:
-            raise ValueError(f"model.pixel must be above 0 and at most {LARGEST:g} [deg], got {pixel}")
+            raise ValueError(
+                f"model.pixel must be above 0 and at most {LARGEST:g} [deg], got {pixel}"
+            )
         self.scene, self.task, self.grid = scene, scene.task, None
         shape = scene.task.shape
-        rows, columns = (shape[0], math.prod(shape[1:])) if len(shape) > 1 else (1, math.prod(shape))
+        rows, columns = (
+            (shape[0], math.prod(shape[1:])) if len(shape) > 1 else (1, math.prod(shape))
+        )
         if scene.task.directions is not None:
             own = scene.task.directions
             self.grid = own.thin(every(own.elevations, pixel), every(own.azimuths, pixel))
@@ -62,7 +70,9 @@ class LabelImage(nn.Module):
         """Takes mean and scale from the training links."""
         if self.task.dtype.is_complex:
             labels, query = links.labels[links.split.train], links.query[links.split.train]
-            waves = direct_waves(self.scene, query, self.task.frequencies, at_elements=False).expand_as(labels)
+            waves = direct_waves(
+                self.scene, query, self.task.frequencies, at_elements=False
+            ).expand_as(labels)
             usual = waves.abs().square().mean((1, 2)).sqrt().quantile(0.5).item()
             self.scale.fill_(usual * strength(labels, waves, query.receivers))
             return
@@ -78,17 +88,26 @@ class LabelImage(nn.Module):
         self.mean.fill_(mean)
         self.scale.fill_(math.sqrt(variance) if variance > 0 else 1.0)  # labels may all be the same
 
-    def values(self, images: Float[Tensor, "b channels rows columns"], directions: Directions | None) -> Tensor:
-        """The labels that images stand for (b, *shape), of spectra in the directions asked for; None: the label's."""
+    def values(
+        self, images: Float[Tensor, "b channels rows columns"], directions: Directions | None
+    ) -> Tensor:
+        """The labels that images stand for (b, *shape), of spectra in the directions asked for;
+        None: the label's.
+        """
         # Of bfloat16, as trainer.precision=bf16-mixed has it, torch makes no complex numbers.
-        images = images.to(torch.promote_types(images.dtype, torch.float32)) * self.scale + self.mean
+        images = (
+            images.to(torch.promote_types(images.dtype, torch.float32)) * self.scale + self.mean
+        )
         if self.grid is not None:
             return interpolate(images[:, 0], self.grid, directions or self.task.directions)
         numbers = torch.complex(*images.unbind(1)) if self.task.dtype.is_complex else images
         return numbers.reshape(len(images), *self.task.shape)
 
-    def images(self, labels: Tensor, directions: Directions | None) -> Float[Tensor, "b channels rows columns"]:
-        """The images of labels, those of spectra with a pixel for each of the directions that the labels have.
+    def images(
+        self, labels: Tensor, directions: Directions | None
+    ) -> Float[Tensor, "b channels rows columns"]:
+        """The images of labels, those of spectra with a pixel for each of the directions that the
+        labels have.
 
         Raises:
             ValueError: The labels are of single directions, which make no image.
@@ -102,10 +121,16 @@ class LabelImage(nn.Module):
         numbers = torch.view_as_real(labels).movedim(-1, 1) if labels.is_complex() else labels
         return ((numbers - self.mean) / self.scale).reshape(len(labels), channels, rows, columns)
 
-    def own_images(self, labels: Tensor, directions: Directions | None) -> Float[Tensor, "b channels rows columns"]:
+    def own_images(
+        self, labels: Tensor, directions: Directions | None
+    ) -> Float[Tensor, "b channels rows columns"]:
         """The same in the pixels that images have here, whichever directions the labels have."""
         images = self.images(labels, directions)
-        return images if self.grid is None else interpolate(images[:, 0], directions, self.grid)[:, None]
+        return (
+            images
+            if self.grid is None
+            else interpolate(images[:, 0], directions, self.grid)[:, None]
+        )
 
 
 def every(angles: Float[Tensor, " n"], pixel: float) -> slice:
@@ -115,8 +140,11 @@ def every(angles: Float[Tensor, " n"], pixel: float) -> slice:
     return slice(None, None, max(1, int(1.01 * math.radians(pixel) / pitch)) if pitch else 1)
 
 
-def interpolate(values: Float[Tensor, "b rows columns"], grid: Grid, directions: Directions) -> Float[Tensor, "b ..."]:
-    """Values between a grid's pixels, linearly; beyond its first and last row they are those of that row.
+def interpolate(
+    values: Float[Tensor, "b rows columns"], grid: Grid, directions: Directions
+) -> Float[Tensor, "b ..."]:
+    """Values between a grid's pixels, linearly; beyond its first and last row they are those of
+    that row.
 
     Azimuths go round: between the last column and the first one lie pixels like any others.
     """
@@ -127,7 +155,9 @@ def interpolate(values: Float[Tensor, "b rows columns"], grid: Grid, directions:
     return (rows @ values * columns).sum(-1)
 
 
-def shares(known: Float[Tensor, " n"], asked: Float[Tensor, " k"], period: float | None = None) -> Float[Tensor, "k n"]:
+def shares(
+    known: Float[Tensor, " n"], asked: Float[Tensor, " k"], period: float | None = None
+) -> Float[Tensor, "k n"]:
     """Which share each of some known angles has in the value at an angle asked for [rad], float64."""
     count = len(known)
     known, order = known.double().sort()

@@ -12,14 +12,15 @@ from gaigs_networks.network import BatchNorm, Network, check_widths
 
 
 class Mlp(Network):
-    """Hidden layers, each linear, normalised over the batch, leaky rectified and thinned out; then a linear head.
+    """Hidden layers, each linear, normalised over the batch, leaky rectified and thinned out; then
+    a linear head.
 
     Args:
         scene: Receivers, task, box of the training transmitters.
         widths: Of the hidden layers.
         dropout: Share of each hidden layer's numbers that a training step leaves out.
-        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a metre; None: those that
-            the training transmitters can teach.
+        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a
+            metre; None: those that the training transmitters can teach.
         pixel: Of the images that spectra are drawn in [deg].
 
     Raises:
@@ -30,16 +31,30 @@ class Mlp(Network):
 
     learning_rates: Mapping[str, float] = {"network": 3e-3}
 
-    def __init__(self, scene: Scene, widths: list[int], dropout: float, octaves: tuple[int, int] | None, pixel: float):
+    def __init__(
+        self,
+        scene: Scene,
+        widths: list[int],
+        dropout: float,
+        octaves: tuple[int, int] | None,
+        pixel: float,
+    ):
         super().__init__(scene, octaves, pixel)
         check_widths(widths=widths)
         if not 0 <= dropout < 1:
             raise ValueError(f"model.dropout must be in [0, 1), got {dropout}")
         hidden = []
         for before, width in pairwise([self.question.width, *widths]):
-            hidden += [nn.Linear(before, width), BatchNorm(width), nn.LeakyReLU(), nn.Dropout(dropout)]
+            hidden += [
+                nn.Linear(before, width),
+                BatchNorm(width),
+                nn.LeakyReLU(),
+                nn.Dropout(dropout),
+            ]
         shape = self.label.shape
-        self.network = nn.Sequential(*hidden, nn.Linear(widths[-1], math.prod(shape)), nn.Unflatten(1, shape))
+        self.network = nn.Sequential(
+            *hidden, nn.Linear(widths[-1], math.prod(shape)), nn.Unflatten(1, shape)
+        )
 
     def draw(self, features: Float[Tensor, "b width"]) -> Float[Tensor, "b channels rows columns"]:
         return self.network(features)

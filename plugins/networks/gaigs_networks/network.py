@@ -46,22 +46,29 @@ class Network(Model):
 
 
 class BatchNorm(nn.BatchNorm1d):
-    """Batch normalisation of vectors and images; where a channel has one number in all, by the running statistics.
+    """Batch normalisation of vectors and images; where a channel has one number in all, by the
+    running statistics.
 
     A single number has no spread, and the last batch of a pass may hold a single link.
 
     Source: Ioffe and Szegedy, Batch Normalization, 2015.
     """
 
-    def forward(self, x: Float[Tensor, "b channels *pixels"]) -> Float[Tensor, "b channels *pixels"]:
+    def forward(
+        self, x: Float[Tensor, "b channels *pixels"]
+    ) -> Float[Tensor, "b channels *pixels"]:
         if self.training and x.numel() == self.num_features:
-            return batch_norm(x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps)
+            return batch_norm(
+                x, self.running_mean, self.running_var, self.weight, self.bias, eps=self.eps
+            )
         return super().forward(x.flatten(2) if x.ndim > 2 else x).view_as(x)
 
 
 def linear_layers(widths: Sequence[int], activation: nn.Module) -> nn.Sequential:
     """Linear layers from each width to the next one, an activation behind each."""
-    return nn.Sequential(*(part for pair in pairwise(widths) for part in (nn.Linear(*pair), activation)))
+    return nn.Sequential(
+        *(part for pair in pairwise(widths) for part in (nn.Linear(*pair), activation))
+    )
 
 
 def check_widths(**options: int | Sequence[int]) -> None:

@@ -7,20 +7,26 @@ from torch.nn.functional import one_hot
 
 from gaigs.core.query import Query
 from gaigs.core.scene import Scene
-from gaigs.splatting.tokenizer.euclidean import BAND_FREQUENCIES, fourier_features, learnable_octaves
+from gaigs.splatting.tokenizer.euclidean import (
+    BAND_FREQUENCIES,
+    fourier_features,
+    learnable_octaves,
+)
 from gaigs.splatting.tokenizer.euclidean import octaves as angular_frequencies
 
 
 class Question(nn.Module):
-    """Numbers about 1 that tell links apart: where the transmitter stands, who hears, in a band at which carrier.
+    """Numbers about 1 that tell links apart: where the transmitter stands, who hears, in a band at
+    which carrier.
 
-    The place is [x, sin(w x), cos(w x)], x from the middle of the training transmitters' box; x itself is in halves of
-    the box's longest edge. All edges are scaled alike, as a box may be flat.
+    The place is [x, sin(w x), cos(w x)], x from the middle of the training transmitters' box; x
+    itself is in halves of the box's longest edge. All edges are scaled alike, as a box may be flat.
 
     Args:
         scene: Receivers, carriers and the box.
-        octaves: Lowest and highest octave k of the angular frequencies w, 2^k cycles a metre; None takes those that the
-            training transmitters can teach, as the ``euclidean`` tokenizer does.
+        octaves: Lowest and highest octave k of the angular frequencies w, 2^k cycles a metre; None
+            takes those that the training transmitters can teach, as the ``euclidean`` tokenizer
+            does.
 
     Attributes:
         width: How many numbers a link has.

@@ -23,8 +23,8 @@ class WrfKan(Network):
         scene: Receivers, task, box of the training transmitters.
         widths: Between the layers.
         intervals: Of each edge's spline.
-        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a metre; None: those that
-            the training transmitters can teach.
+        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a
+            metre; None: those that the training transmitters can teach.
         pixel: Of the images that spectra are drawn in [deg].
 
     Raises:
@@ -35,7 +35,14 @@ class WrfKan(Network):
 
     learning_rates: Mapping[str, float] = {"network": 3e-3}
 
-    def __init__(self, scene: Scene, widths: list[int], intervals: int, octaves: tuple[int, int] | None, pixel: float):
+    def __init__(
+        self,
+        scene: Scene,
+        widths: list[int],
+        intervals: int,
+        octaves: tuple[int, int] | None,
+        pixel: float,
+    ):
         super().__init__(scene, octaves, pixel)
         check_widths(widths=widths, intervals=intervals)
         sizes = [self.question.width, *widths, math.prod(self.label.shape)]
@@ -47,10 +54,11 @@ class WrfKan(Network):
 
 
 class KanLayer(nn.Module):
-    """y_o = b_o + sum_i ( w_oi silu(x_i) + sum_k c_oik B_k(x_i) ), B_k the cubic B-splines over [-1, 1].
+    """y_o = b_o + sum_i ( w_oi silu(x_i) + sum_k c_oik B_k(x_i) ), B_k the cubic B-splines over
+    [-1, 1].
 
-    The knots are evenly spaced and go on beyond both ends, so that the splines add up to 1 within. Far outside, the
-    base branch, silu, stands alone.
+    The knots are evenly spaced and go on beyond both ends, so that the splines add up to 1 within.
+    Far outside, the base branch, silu, stands alone.
 
     Args:
         inputs, outputs: Widths.
@@ -66,13 +74,17 @@ class KanLayer(nn.Module):
         self.register_buffer("centres", centres, persistent=False)
         self.base = nn.Linear(inputs, outputs)
         self.splines = nn.Parameter(torch.empty(outputs, inputs * len(centres)))
-        nn.init.normal_(self.splines, std=0.1 / math.sqrt(inputs))  # a small part of the base branch, at first
+        nn.init.normal_(
+            self.splines, std=0.1 / math.sqrt(inputs)
+        )  # a small part of the base branch, at first
 
     def forward(self, x: Float[Tensor, "b inputs"]) -> Float[Tensor, "b outputs"]:
         return self.base(silu(x)) + linear(self.basis(x).flatten(1), self.splines)
 
     def basis(self, x: Float[Tensor, "b inputs"]) -> Float[Tensor, "b inputs splines"]:
-        """The value of every B-spline: of width 4 knots, a cubic of the distance to its centre on each of them."""
+        """The value of every B-spline: of width 4 knots, a cubic of the distance to its centre on
+        each of them.
+        """
         distances = ((x[..., None] - self.centres) / self.step).abs()
         outer, inner = (2 - distances).clamp_min(0), (1 - distances).clamp_min(0)
         return outer.pow(3) / 6 - inner.pow(3) * (2 / 3)

@@ -17,17 +17,22 @@ from gaigs.splatting.tokenizer.euclidean import MAX_OCTAVE, fourier_features
 from gaigs_newrf.arrivals import find_origins
 
 MARGIN = 0.5
-"""Of the longest edge of the box of transmitters and receiver. Arrivals are searched in that box, enlarged on each side
-by its own size and by so much: that holds the images behind walls that stand up to half of this outside the box."""
+"""Of the longest edge of the box of transmitters and receiver. Arrivals are searched in that box,
+enlarged on each side by its own size and by so much: that holds the images behind walls that stand
+up to half of this outside the box."""
 
 MOST_LINKS = 256
 """Of each receiver, that the arrivals are searched in."""
 
 DENSITY = -5.0
-"""Where the network's densities start, before the softplus: waves are to come through before anything is learnt."""
+"""Where the network's densities start, before the softplus: waves are to come through before
+anything is learnt.
+"""
 
 LOUD = 0.99
-"""Share of the training channels that shall be no stronger than the network's tanh can make a single path."""
+"""Share of the training channels that shall be no stronger than the network's tanh can make a
+single path.
+"""
 
 
 def render(
@@ -39,8 +44,8 @@ def render(
 ) -> Complex[Tensor, "b e s"]:
     """sum_k sum_i F_i c / (4 pi f z_i) alpha_i prod_{j<i} (1 - alpha_j) exp(-j 2 pi f z_i / c).
 
-    alpha = 1 - exp(-depth). The phase is that of the whole way: the steps Delta_j up to the sample add up to its
-    distance z_i.
+    alpha = 1 - exp(-depth). The phase is that of the whole way: the steps Delta_j up to the sample
+    add up to its distance z_i.
 
     Args:
         fields: Field that a sample i along a ray k sends towards the antenna.
@@ -57,7 +62,8 @@ def render(
 
 
 class Field(nn.Module):
-    """Place and direction -> density, and the field sent from there in that direction to each element.
+    """Place and direction -> density, and the field sent from there in that direction to each
+    element.
 
     Args:
         features: Widths of the features of place and direction.
@@ -75,7 +81,9 @@ class Field(nn.Module):
         self.layers = nn.ModuleList(nn.Linear(size, width) for size in inputs)
         self.density = nn.Linear(width, 1)
         nn.init.constant_(self.density.bias, DENSITY)
-        self.send = nn.Sequential(nn.Linear(width + views, width), nn.ReLU(), nn.Linear(width, 2 * elements))
+        self.send = nn.Sequential(
+            nn.Linear(width + views, width), nn.ReLU(), nn.Linear(width, 2 * elements)
+        )
 
     def forward(
         self, places: Float[Tensor, "*batch features"], views: Float[Tensor, "*batch features"]
@@ -87,20 +95,23 @@ class Field(nn.Module):
             hidden = layer(torch.cat((places, hidden), -1) if joined else hidden).relu()
         sent = self.send(torch.cat((hidden, views), -1))
         # Of bfloat16, as trainer.precision=bf16-mixed has it, torch makes no complex numbers.
-        real, imaginary = sent.to(torch.promote_types(sent.dtype, torch.float32)).tanh().chunk(2, -1)
+        real, imaginary = (
+            sent.to(torch.promote_types(sent.dtype, torch.float32)).tanh().chunk(2, -1)
+        )
         return softplus(self.density(hidden)[..., 0]), torch.complex(real, imaginary)
 
 
 class NeWrf(Model):
     """Channels from a field that stands still, seen along rays from the antenna that moves.
 
-    NeWRF has a transmitter that stands still, antennas at many places, and measured directions of arrival there. Here
-    the receivers stand still and transmitters are at many places. A channel is the same both ways, so rays go from the
-    transmitter's place, and each receiver has a field of its own, in which each of its elements sends. No data set of
-    gaigs has directions of arrival. They are estimated from the delays in the training channels: ``find_origins`` gives
-    points at which a receiver's images seem to stand, the receiver itself first, and from any place rays go towards
-    them. Samples are spread evenly from the antenna to the point, and the last one, on it, lets nothing through: no
-    second pass has to find where along the ray the wave begins.
+    NeWRF has a transmitter that stands still, antennas at many places, and measured directions of
+    arrival there. Here the receivers stand still and transmitters are at many places. A channel is
+    the same both ways, so rays go from the transmitter's place, and each receiver has a field of
+    its own, in which each of its elements sends. No data set of gaigs has directions of arrival.
+    They are estimated from the delays in the training channels: ``find_origins`` gives points at
+    which a receiver's images seem to stand, the receiver itself first, and from any place rays go
+    towards them. Samples are spread evenly from the antenna to the point, and the last one, on it,
+    lets nothing through: no second pass has to find where along the ray the wave begins.
 
     Args:
         scene: Receivers and task.
@@ -111,8 +122,8 @@ class NeWrf(Model):
         width, layers: Of the network.
 
     Raises:
-        ValueError: The labels are no channels, or of one subcarrier, or of several carriers; an array has another
-            number of elements than they; an option is out of range.
+        ValueError: The labels are no channels, or of one subcarrier, or of several carriers; an
+            array has another number of elements than they; an option is out of range.
 
     Source: NeWRF, 2024.
     """
@@ -121,7 +132,14 @@ class NeWrf(Model):
     any_frequency = True
 
     def __init__(
-        self, scene: Scene, arrivals: int, samples: int, octaves: int, view_octaves: int, width: int, layers: int
+        self,
+        scene: Scene,
+        arrivals: int,
+        samples: int,
+        octaves: int,
+        view_octaves: int,
+        width: int,
+        layers: int,
     ):
         super().__init__(scene)
         check_elements("model 'newrf'", scene)
@@ -135,7 +153,14 @@ class NeWrf(Model):
                 f"the field of model 'newrf' is of one carrier, and these links have {len(scene.frequencies)}; take "
                 "another model"
             )
-        least = {"arrivals": 1, "samples": 2, "octaves": 0, "view_octaves": 0, "width": 1, "layers": 1}
+        least = {
+            "arrivals": 1,
+            "samples": 2,
+            "octaves": 0,
+            "view_octaves": 0,
+            "width": 1,
+            "layers": 1,
+        }
         given = arrivals, samples, octaves, view_octaves, width, layers
         for (option, low), value in zip(least.items(), given, strict=True):
             if value < low:
@@ -146,7 +171,9 @@ class NeWrf(Model):
         self.register_buffer("middle", (lower + upper) / 2)
         self.register_buffer("steps", (torch.arange(samples) + 1) / samples, persistent=False)
         self.register_buffer("place_frequencies", 2.0 ** torch.arange(octaves), persistent=False)
-        self.register_buffer("view_frequencies", 2.0 ** torch.arange(view_octaves), persistent=False)
+        self.register_buffer(
+            "view_frequencies", 2.0 ** torch.arange(view_octaves), persistent=False
+        )
         origins = scene.positions(lower)[:, None].expand(-1, arrivals, -1)
         self.register_buffer("origins", origins.clone())
         self.register_buffer("unit", torch.ones(()))
@@ -154,11 +181,15 @@ class NeWrf(Model):
         # A density of 1 is an optical depth of 1 over the step of a ray as long as the box.
         self.density = samples / (upper - lower).norm().item()
         features = 3 * (1 + 2 * octaves), 3 * (1 + 2 * view_octaves)
-        self.fields = nn.ModuleList(Field(features, width, layers, scene.task.elements) for _ in scene.receivers)
+        self.fields = nn.ModuleList(
+            Field(features, width, layers, scene.task.elements) for _ in scene.receivers
+        )
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Takes sign, unit of strength and the points that waves arrive from, from the training channels."""
+        """Takes sign, unit of strength and the points that waves arrive from, from the training
+        channels.
+        """
         train, frequencies = links.split.train, self.scene.task.frequencies
         labels, query = links.labels[train].to(torch.complex128), links.query[train]
         waves = direct_waves(self.scene, query, frequencies)
@@ -177,13 +208,17 @@ class NeWrf(Model):
             upper = torch.maximum(self.scene.upper.double(), first)
             beyond = upper - lower + MARGIN * (upper - lower).max()
             region = torch.stack((lower - beyond, upper + beyond))
-            found = find_origins(falling[own], places, frequencies, first, region, self.origins.shape[1])
+            found = find_origins(
+                falling[own], places, frequencies, first, region, self.origins.shape[1]
+            )
             self.origins[receiver] = found.to(self.origins)
 
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query
         links, values = [], []
-        for receiver in query.receivers.unique().tolist() or [0]:  # no links have a label's shape too
+        for receiver in query.receivers.unique().tolist() or [
+            0
+        ]:  # no links have a label's shape too
             links.append((query.receivers == receiver).nonzero()[:, 0])
             values.append(self._march(query.transmitters[links[-1]], receiver))
         # Several processes train together, and each must have a gradient of all fields.
@@ -198,9 +233,13 @@ class NeWrf(Model):
         # On the very point no direction is seen, and that of length 0 stands for it.
         views = fourier_features(normalize(ways, dim=-1), self.view_frequencies)
         views = views[:, :, None].expand(-1, -1, len(self.steps), -1)
-        densities, fields = self.fields[receiver](fourier_features(points, self.place_frequencies), views)
+        densities, fields = self.fields[receiver](
+            fourier_features(points, self.place_frequencies), views
+        )
         steps = (lengths / len(self.steps)).to(densities)
         depths = self.density * steps[..., None] * densities[..., :-1]
         depths = pad(depths, (0, 1), value=torch.inf)
         distances = lengths[..., None] * self.steps.double()
-        return self.unit * render(fields, depths, distances, self.scene.task.frequencies, int(self.sign))
+        return self.unit * render(
+            fields, depths, distances, self.scene.task.frequencies, int(self.sign)
+        )

@@ -28,25 +28,28 @@ class NGrf(Model):
         h_e(p, f) = g sum_i w_i(p) s_i 2 sigmoid(a_i) exp(j phi_i - alpha_i d_i) G_m(r_ie) G_f(d_i) / G_m(d_i)
         w_i(p) = exp(-(p - mu_i)' Sigma_i^-1 (p - mu_i) / 2)    d_i = |p - mu_i|    r_ie = |p - mu_i - Q_i x_e|
 
-    with the wave of free space G, at the middle m of the band from element to element: an array must be small against
-    the speed of light over the bandwidth. Amplitude a, phase phi and attenuation alpha [1/m] are from a network of
-    [features of mu_i, features of p]. Gaussians add up without order or occlusion.
+    with the wave of free space G, at the middle m of the band from element to element: an array
+    must be small against the speed of light over the bandwidth. Amplitude a, phase phi and
+    attenuation alpha [1/m] are from a network of [features of mu_i, features of p]. Gaussians add
+    up without order or occlusion.
 
-    The paper moves the receiver. Here transmitters move, and by reciprocity p is the transmitter. Each receiver has
-    Gaussians of its own. A Gaussian is an image of the receiver: its quaternion Q turns the covariance and the places
-    x_e of the array's elements. The first Gaussian of a receiver starts on it, the others at random.
+    The paper moves the receiver. Here transmitters move, and by reciprocity p is the transmitter.
+    Each receiver has Gaussians of its own. A Gaussian is an image of the receiver: its quaternion Q
+    turns the covariance and the places x_e of the array's elements. The first Gaussian of a
+    receiver starts on it, the others at random.
 
     Args:
         scene: Receivers and task.
         count: Gaussians of each receiver.
-        margin: Of the box in which Gaussians start, around transmitters and receivers, as a share of its longest edge.
+        margin: Of the box in which Gaussians start, around transmitters and receivers, as a share
+            of its longest edge.
         scale: Standard deviation of the Gaussians at the start, as a share of the scene's extent.
         strength: Standard deviation of s at the start, over that of the first Gaussian, which is 1.
         width, layers: Of the network.
 
     Raises:
-        ValueError: The labels are not channels, or of several carriers; an array has another number of elements than
-            they; an option is out of range.
+        ValueError: The labels are not channels, or of several carriers; an array has another number
+            of elements than they; an option is out of range.
 
     Source: nGRF (Umer et al., arXiv 2508.11668); the README says which parts are ours.
     """
@@ -55,7 +58,16 @@ class NGrf(Model):
         "means": 1e-3, "quats": 1e-3, "log_scales": 5e-3, "strengths": 1e-2, "network": 1.6e-2
     }  # fmt: skip
 
-    def __init__(self, scene: Scene, count: int, margin: float, scale: float, strength: float, width: int, layers: int):
+    def __init__(
+        self,
+        scene: Scene,
+        count: int,
+        margin: float,
+        scale: float,
+        strength: float,
+        width: int,
+        layers: int,
+    ):
         super().__init__(scene)
         check_elements("model 'ngrf'", scene)
         if scene.has_band:
@@ -76,23 +88,37 @@ class NGrf(Model):
         strengths = strength * math.sqrt(0.5) * torch.randn(len(receivers), count, 2)
         strengths[:, 0] = torch.tensor([1.0, 0.0])
         self.means, self.strengths = nn.Parameter(means), nn.Parameter(strengths)
-        self.quats = nn.Parameter(torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(receivers), count, 1))
-        self.log_scales = nn.Parameter(torch.full((len(receivers), count, 3), math.log(scale * scene.extent)))
+        self.quats = nn.Parameter(
+            torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(receivers), count, 1)
+        )
+        self.log_scales = nn.Parameter(
+            torch.full((len(receivers), count, 3), math.log(scale * scene.extent))
+        )
         self.register_buffer("middle", (scene.lower + scene.upper) / 2)
-        self.register_buffer("frequencies", octaves("octaves", *learnable_octaves(scene)), persistent=False)
-        elements = [r.array.elements @ r.pose.rotation.mT.to(r.array.elements) for r in scene.receivers]
-        self.register_buffer("elements", torch.stack(elements).to(means), persistent=False)  # (r, e, 3), world axes
+        self.register_buffer(
+            "frequencies", octaves("octaves", *learnable_octaves(scene)), persistent=False
+        )
+        elements = [
+            r.array.elements @ r.pose.rotation.mT.to(r.array.elements) for r in scene.receivers
+        ]
+        self.register_buffer(
+            "elements", torch.stack(elements).to(means), persistent=False
+        )  # (r, e, 3), world axes
         self.register_buffer("gains", torch.ones(len(receivers), dtype=torch.complex64))
         self.register_buffer("sign", torch.tensor(-1))
         sizes = [6 * (1 + 2 * len(self.frequencies)), *[width] * layers]
-        hidden = [part for pair in itertools.pairwise(sizes) for part in (nn.Linear(*pair), nn.ReLU())]
+        hidden = [
+            part for pair in itertools.pairwise(sizes) for part in (nn.Linear(*pair), nn.ReLU())
+        ]
         self.network = nn.Sequential(*hidden, nn.Linear(width, 3))
         nn.init.zeros_(self.network[-1].weight)
         nn.init.zeros_(self.network[-1].bias)
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits the sign of phases, and the gain g of each receiver over free space, to the training channels."""
+        """Fits the sign of phases, and the gain g of each receiver over free space, to the training
+        channels.
+        """
         train = links.split.train
         labels, query = links.labels[train].to(torch.complex128), links.query[train]
         waves = direct_waves(self.scene, query, self.scene.task.frequencies)
@@ -112,7 +138,10 @@ class NGrf(Model):
         strengths = torch.view_as_complex(self.strengths)[which]
         sources = self._excited(means, query.transmitters, offsets) * weights * strengths
         places = offsets.double()[:, :, None] - (self.elements[which][:, None] @ turns.mT).double()
-        frequencies, lengths = self.scene.task.frequencies.to(places), offsets.double().norm(dim=-1, keepdim=True)
+        frequencies, lengths = (
+            self.scene.task.frequencies.to(places),
+            offsets.double().norm(dim=-1, keepdim=True),
+        )
         middle, sign = frequencies.mean(), int(self.sign)
         band = free_space(lengths, frequencies, sign).to(sources)
         elements = free_space(places.norm(dim=-1), middle, sign) / free_space(lengths, middle, sign)
@@ -120,13 +149,20 @@ class NGrf(Model):
         return Prediction(heard, {})
 
     def _excited(
-        self, means: Float[Tensor, "b n 3"], places: Float[Tensor, "b 3"], offsets: Float[Tensor, "b n 3"]
+        self,
+        means: Float[Tensor, "b n 3"],
+        places: Float[Tensor, "b 3"],
+        offsets: Float[Tensor, "b n 3"],
     ) -> Complex[Tensor, "b n"]:
         """2 sigmoid(a) exp(j phi - alpha d), from the network."""
         features = fourier_features(means.detach() - self.middle, self.frequencies)
-        moving = fourier_features(places - self.middle, self.frequencies)[:, None].expand_as(features)
+        moving = fourier_features(places - self.middle, self.frequencies)[:, None].expand_as(
+            features
+        )
         values = self.network(torch.cat((features, moving), -1))
-        amplitudes, phases, attenuations = values.to(torch.promote_types(values.dtype, torch.float32)).unbind(-1)
+        amplitudes, phases, attenuations = values.to(
+            torch.promote_types(values.dtype, torch.float32)
+        ).unbind(-1)
         passed = (-softplus(attenuations + ATTENUATION) * offsets.norm(dim=-1)).exp()
         return polar(2 * amplitudes.sigmoid() * passed, phases)
 

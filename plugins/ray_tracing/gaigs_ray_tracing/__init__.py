@@ -1,4 +1,6 @@
-"""Ray tracing in a room whose geometry is known, with materials learnt from the training links or as tabulated."""
+"""Ray tracing in a room whose geometry is known, with materials learnt from the training links or
+as tabulated.
+"""
 
 import math
 from collections.abc import Mapping
@@ -26,7 +28,9 @@ NEPER = 20 / math.log(10)
 """Of a field [dB]."""
 
 SILENT = 1e-15
-"""Share of the power sent that a receiver reports where no path leads: -150 dB, below the noise of any."""
+"""Share of the power sent that a receiver reports where no path leads: -150 dB, below the noise of
+any.
+"""
 
 BATCH = 64
 """Links that are fitted to at a time."""
@@ -35,31 +39,33 @@ BATCH = 64
 class RayTracing(Model):
     """Paths by Sionna RT, waves summed up along them at each element of the receiver's array.
 
-    A path's points do not depend on the materials of the surfaces, so each link is traced once. Its gain follows from
-    Fresnel's formulas for slabs: each material's permittivity is 1 + (e - 1) a and its conductivity s b, with e and s
-    as tabulated and a, b learnt, 1 at the start. Diffracted paths keep the gain that they have at the start.
+    A path's points do not depend on the materials of the surfaces, so each link is traced once. Its
+    gain follows from Fresnel's formulas for slabs: each material's permittivity is 1 + (e - 1) a
+    and its conductivity s b, with e and s as tabulated and a, b learnt, 1 at the start. Diffracted
+    paths keep the gain that they have at the start.
 
         channels    h = g sum_p h_p at each element and subcarrier, one complex gain g for each receiver
         RSSI        10 log10 of the mean of |h|^2 over the data's band; where that is unknown, the paths' powers add
         spectra     the conventional beamformer's amplitude over the band, scaled as the labels are
 
-    ``fit`` takes each receiver's gain from the training links, their median: transmit power, cables and the clock's
-    phase. It is trained with the materials. All this is computed on the processor.
+    ``fit`` takes each receiver's gain from the training links, their median: transmit power, cables
+    and the clock's phase. It is trained with the materials. All this is computed on the processor.
 
     Args:
         scene: Receivers and task.
         room: ``built_in``, or a room of the data set ``sionna``.
-        mesh: File of one's own room instead (.obj, .ply, .xml) [m]; None for the room of that name. It is read in
-            ``fit``, and is in the state dict.
+        mesh: File of one's own room instead (.obj, .ply, .xml) [m]; None for the room of that name.
+            It is read in ``fit``, and is in the state dict.
         materials: Which tabulated material a material of the mesh is like, by its name there.
-        calibrate: True to train materials and gains. Else materials are as tabulated, and nothing is trained.
+        calibrate: True to train materials and gains. Else materials are as tabulated, and nothing
+            is trained.
         frequency: Carrier of links whose data say none [Hz]; None where they do.
         depth: Largest number of reflections, passages through surfaces and diffractions of a path.
         rays: That leave each transmitter.
 
     Raises:
-        ValueError: The room is unknown, an option is out of range, or the labels are neither spectra, nor RSSI, nor
-            channels of the receivers' arrays.
+        ValueError: The room is unknown, an option is out of range, or the labels are neither
+            spectra, nor RSSI, nor channels of the receivers' arrays.
 
     Source: Sionna RT technical report, arXiv:2504.21719; slabs and materials as in ITU-R P.2040-3.
     """
@@ -102,7 +108,9 @@ class RayTracing(Model):
             )
         learnt = {"log_permittivities": torch.zeros(0), "log_conductivities": torch.zeros(0)}
         if self.beamformer is None:
-            learnt["log_gains"] = torch.zeros(len(scene.receivers), 2)  # ln of amplitude, phase [rad]
+            learnt["log_gains"] = torch.zeros(
+                len(scene.receivers), 2
+            )  # ln of amplitude, phase [rad]
         for name, start in learnt.items():
             if calibrate:
                 self.register_parameter(name, nn.Parameter(start))
@@ -137,12 +145,14 @@ class RayTracing(Model):
         """Reads the room, traces the links' paths, and fits each receiver's gain.
 
         Raises:
-            FileNotFoundError, ImportError, RuntimeError: As ``gaigs_ray_tracing.rooms.find_meshes`` and
-                ``gaigs.data.sionna.tracing.make_scene``.
+            FileNotFoundError, ImportError, RuntimeError: As ``gaigs_ray_tracing.rooms.find_meshes``
+                and ``gaigs.data.sionna.tracing.make_scene``.
             ValueError: The mesh is damaged or of unknown materials.
         """
         text = wavefront_obj(find_meshes(self.room, self.mesh))
-        self.surfaces = torch.tensor(list(text.encode()), dtype=torch.uint8, device=self.surfaces.device)
+        self.surfaces = torch.tensor(
+            list(text.encode()), dtype=torch.uint8, device=self.surfaces.device
+        )
         self._furnish(text)  # as written, so that a checkpoint has the same
         frequencies = self._carriers(links.query)
         for carrier in frequencies.unique().tolist():
@@ -166,7 +176,9 @@ class RayTracing(Model):
             if is_complex:
                 gain = fit_gain(labels[own], values[own])
                 if gain != 0:
-                    self.log_gains[receiver] = torch.stack((gain.abs().log(), -int(self.sign) * gain.angle()))
+                    self.log_gains[receiver] = torch.stack(
+                        (gain.abs().log(), -int(self.sign) * gain.angle())
+                    )
             else:
                 self.log_gains[receiver, 0] = (labels[own] - values[own]).median() / NEPER
         trained = query.receivers.unique()
@@ -182,11 +194,16 @@ class RayTracing(Model):
         """Those of the materials, and the receivers' gains; empty without calibration."""
         groups = {"materials": ["log_permittivities", "log_conductivities"], "gains": ["log_gains"]}
         parameters = dict(self.named_parameters())
-        return {key: [parameters[name] for name in names if name in parameters] for key, names in groups.items()}
+        return {
+            key: [parameters[name] for name in names if name in parameters]
+            for key, names in groups.items()
+        }
 
     def facts(self) -> dict[str, object]:
         """Materials of the surfaces at the lowest carrier, and the time to trace a place."""
-        carrier = self._carriers(Query(self.scene.lower[None], torch.tensor([0]), self._lowest())).item()
+        carrier = self._carriers(
+            Query(self.scene.lower[None], torch.tensor([0]), self._lowest())
+        ).item()
         slabs = self.slabs(carrier)
         tracer = self._tracer(carrier)
         return {
@@ -206,8 +223,12 @@ class RayTracing(Model):
         query = batch.query.to("cpu")
         frequencies = self._carriers(query)
         task, dtype = self.scene.task, query.transmitters.dtype
-        shape = task.shape if self.beamformer is None else (batch.directions or task.directions).shape
-        value = torch.zeros(len(query), *shape, dtype=dtype.to_complex() if task.dtype.is_complex else dtype)
+        shape = (
+            task.shape if self.beamformer is None else (batch.directions or task.directions).shape
+        )
+        value = torch.zeros(
+            len(query), *shape, dtype=dtype.to_complex() if task.dtype.is_complex else dtype
+        )
         for carrier in frequencies.unique().tolist():
             for receiver in query.receivers.unique().tolist():
                 own = ((frequencies == carrier) & (query.receivers == receiver)).nonzero()[:, 0]
@@ -219,7 +240,9 @@ class RayTracing(Model):
     def _report(self, query: Query, receiver: int, carrier: float, batch: Batch) -> Tensor:
         """Labels of links to one receiver."""
         antenna, task = self.scene.receivers[receiver], self.scene.task
-        traced = padded(self._tracer(carrier).find(query.transmitters, receiver), antenna.pose.position)
+        traced = padded(
+            self._tracer(carrier).find(query.transmitters, receiver), antenna.pose.position
+        )
         paths = Paths(traced.images, gains(traced, self.slabs(carrier)))
         if task.dtype.is_complex:
             amplitude, phase = self.log_gains[receiver].cpu().double()
@@ -232,31 +255,47 @@ class RayTracing(Model):
             return self.beamformer(lags.to(torch.complex64), query, batch.directions)
         if self.scene.bandwidth is None:
             distances = (paths.images - antenna.pose.position.double()).norm(dim=-1)
-            powers = (paths.gains.abs() * free_space(distances, torch.tensor(carrier), 0).real).square().sum(1)
+            powers = (
+                (paths.gains.abs() * free_space(distances, torch.tensor(carrier), 0).real)
+                .square()
+                .sum(1)
+            )
         else:
             powers = respond(paths, antenna, carrier, self.offsets).abs().square().mean((1, 2))
         return 10 * (powers + SILENT).log10() + NEPER * self.log_gains[receiver, 0].cpu().double()
 
     def slabs(self, carrier: float) -> Slabs:
         """Materials of the surfaces at a carrier [Hz]."""
-        real, c, d = torch.tensor([MATERIALS[kind] for kind in self.known.values()], dtype=torch.float64).T
+        real, c, d = torch.tensor(
+            [MATERIALS[kind] for kind in self.known.values()], dtype=torch.float64
+        ).T
         conductivities = c * (carrier / 1e9) ** d * self.log_conductivities.cpu().double().exp()
         permittivities = torch.complex(
             1 + (real - 1) * self.log_permittivities.cpu().double().exp(),
             -conductivities / (2 * math.pi * epsilon_0 * carrier),
         )
-        thicknesses = torch.tensor([THICKNESS[kind] for kind in self.known.values()], dtype=torch.float64)
+        thicknesses = torch.tensor(
+            [THICKNESS[kind] for kind in self.known.values()], dtype=torch.float64
+        )
         return Slabs(permittivities, thicknesses, carrier)
 
     def _tracer(self, carrier: float) -> Tracer:
-        receivers = tuple(tuple(receiver.pose.position.double().tolist()) for receiver in self.scene.receivers)
-        return find_tracer(self.text, tuple(self.known.items()), receivers, carrier, self.depth, self.rays)
+        receivers = tuple(
+            tuple(receiver.pose.position.double().tolist()) for receiver in self.scene.receivers
+        )
+        return find_tracer(
+            self.text, tuple(self.known.items()), receivers, carrier, self.depth, self.rays
+        )
 
     def _lowest(self) -> Float[Tensor, "1"] | None:
         return self.scene.frequencies[:1] if len(self.scene.frequencies) else None
 
     def _carriers(self, query: Query) -> Float[Tensor, " b"]:
         """The frequency of each link [Hz]."""
-        if self.frequency is not None and query.frequencies is None and not self.scene.task.dtype.is_complex:
+        if (
+            self.frequency is not None
+            and query.frequencies is None
+            and not self.scene.task.dtype.is_complex
+        ):
             return torch.full((len(query),), float(self.frequency))
         return carriers(self.scene, query)

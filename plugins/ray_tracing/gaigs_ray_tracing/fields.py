@@ -16,23 +16,26 @@ REFLECTED, PASSED = 1, 2
 """Kinds of interactions of a path; 0 is none."""
 
 GRAZING = 1e-6
-"""Smallest cosine of an angle of incidence: along a surface of air the coefficients would be 0 / 0."""
+"""Smallest cosine of an angle of incidence: along a surface of air the coefficients would be 0 / 0.
+"""
 
 
 class Traced(NamedTuple):
     """Paths from transmitters to a receiver point: p of one link, or (b, p) of several.
 
     Up to d things happen to a path, from its transmitter on. A field has two components across the
-    direction: at the transmitter and at the receiver along the horizontal and down the meridian; at each surface across
-    (TE) and in (TM) the plane of incidence.
+    direction: at the transmitter and at the receiver along the horizontal and down the meridian; at
+    each surface across (TE) and in (TM) the plane of incidence.
 
     Attributes:
         images: Where the transmitter seems to stand (p, 3) [m].
-        strengths: 1; of a diffracted path its whole gain, which does not change with the materials (p,).
+        strengths: 1; of a diffracted path its whole gain, which does not change with the materials
+            (p,).
         kinds: Interaction, 0, ``REFLECTED`` or ``PASSED`` (p, d).
         surfaces: Number of the surface's material (p, d).
         cosines: Of the angles of incidence (p, d).
-        turns: From the components that a field has after one of them to those before the next (p, d + 1, 2, 2).
+        turns: From the components that a field has after one of them to those before the next (p, d
+            + 1, 2, 2).
     """
 
     images: Float[Tensor, "*p 3"]
@@ -44,7 +47,8 @@ class Traced(NamedTuple):
 
 
 def padded(links: Sequence[Traced], receiver: Float[Tensor, "3"]) -> Traced:
-    """The paths of several links (b, p), float64; those that a link has fewer of have the strength 0.
+    """The paths of several links (b, p), float64; those that a link has fewer of have the strength
+    0.
 
     Args:
         links: At least one.
@@ -55,7 +59,14 @@ def padded(links: Sequence[Traced], receiver: Float[Tensor, "3"]) -> Traced:
     )
     # Not at the receiver, from where no direction would lead to them.
     images = torch.where((strengths != 0)[..., None], images.double(), receiver.double() + 1)
-    return Traced(images, strengths.to(torch.complex128), kinds, surfaces.long(), cosines.double(), turns.double())
+    return Traced(
+        images,
+        strengths.to(torch.complex128),
+        kinds,
+        surfaces.long(),
+        cosines.double(),
+        turns.double(),
+    )
 
 
 class Slabs(NamedTuple):
@@ -85,7 +96,9 @@ class Slabs(NamedTuple):
         permittivities = self.permittivities[surfaces]
         single = torch.stack(fresnel(permittivities, cosines))
         root = torch.sqrt(permittivities - (1 - cosines.square()))
-        once = torch.exp(-2j * math.pi * self.frequency / speed_of_light * self.thicknesses[surfaces] * root)
+        once = torch.exp(
+            -2j * math.pi * self.frequency / speed_of_light * self.thicknesses[surfaces] * root
+        )
         several = 1 - single.square() * once.square()  # between the slab's faces
         return single * (1 - once.square()) / several, (1 - single.square()) * once / several
 

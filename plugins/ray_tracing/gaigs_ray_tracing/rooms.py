@@ -23,7 +23,9 @@ FURNITURE = {
     "refrigerator": "metal",
     "column": "concrete",
 }
-"""Materials of the built-in room's furniture. The simulation knows how much each piece dims, and no material."""
+"""Materials of the built-in room's furniture. The simulation knows how much each piece dims, and no
+material.
+"""
 
 SUFFIXES = (".obj", ".ply", ".xml")
 
@@ -47,7 +49,8 @@ def find_meshes(room: str, mesh: str | None) -> list[Mesh]:
     Raises:
         FileNotFoundError: There is no such file.
         ImportError, RuntimeError: A scene file takes Sionna RT, and it cannot be used.
-        ValueError: The file is of another kind, damaged, or without surfaces; or there is no such room.
+        ValueError: The file is of another kind, damaged, or without surfaces; or there is no such
+            room.
     """
     if mesh is not None:
         return _read(Path(mesh))
@@ -70,7 +73,9 @@ def known_materials(meshes: Sequence[Mesh], chosen: Mapping[str, str]) -> dict[s
     """
     there = sorted({mesh.material for mesh in meshes})
     if unused := sorted(set(chosen) - set(there)):
-        raise ValueError(f"model.materials has {', '.join(unused)}, and the materials are {', '.join(there)}")
+        raise ValueError(
+            f"model.materials has {', '.join(unused)}, and the materials are {', '.join(there)}"
+        )
     found = {}
     for name in there:
         plain = name.removeprefix("mat-").removeprefix("itu_").removeprefix("itu-")
@@ -87,7 +92,9 @@ def _read(file: Path) -> list[Mesh]:
     if file.suffix not in SUFFIXES:
         raise ValueError(f"model.mesh must be a file {', '.join(SUFFIXES)}, got {file.name}")
     if not file.is_file():
-        raise FileNotFoundError(f"no mesh at {file}; set model.mesh to a file of surfaces, or to null")
+        raise FileNotFoundError(
+            f"no mesh at {file}; set model.mesh to a file of surfaces, or to null"
+        )
     match file.suffix:
         case ".obj":
             points, groups = read_mesh(file)
@@ -110,10 +117,14 @@ def read_obj(text: str, source: str) -> list[Mesh]:
         source: Its name in errors.
 
     Raises:
-        ValueError: A line holds no numbers where it must, or a face takes vertices that there are not.
+        ValueError: A line holds no numbers where it must, or a face takes vertices that there are
+            not.
     """
     vertices, groups = parse_obj(text.splitlines(), source)
-    return [_mesh(name, material, vertices.tolist(), faces) for (name, material), faces in groups.items()]
+    return [
+        _mesh(name, material, vertices.tolist(), faces)
+        for (name, material), faces in groups.items()
+    ]
 
 
 def _read_ply(file: Path) -> list[Mesh]:
@@ -127,15 +138,20 @@ def _read_scene(file: Path) -> list[Mesh]:
 
     try:
         scene = rt.load_scene(str(file))
-    except Exception as error:  # whatever Mitsuba's parser raises, with a traceback in it where a material is wrong
+    # Whatever Mitsuba's parser raises, with a traceback in it where a material is wrong
+    except Exception as error:
         message, traceback, calls = str(error).partition("Traceback (most recent call last):")
         cause = calls.strip().rpartition("\n")[2] if traceback else ""
         words = " ".join(f"{message} {cause}".split())
-        raise ValueError(f"{file} must be a scene that Sionna RT reads, and is not: {words}") from error
+        raise ValueError(
+            f"{file} must be a scene that Sionna RT reads, and is not: {words}"
+        ) from error
     meshes = []
     for name, shape in scene.objects.items():
         parameters = mitsuba.traverse(shape.mi_mesh)
-        if "vertex_positions" not in parameters:  # as of a rectangle, which has no vertices of its own
+        if (
+            "vertex_positions" not in parameters
+        ):  # as of a rectangle, which has no vertices of its own
             raise ValueError(
                 f"{file}, shape {name!r}, must be a mesh of type ply or obj; export it as one, as Blender does"
             )
@@ -150,4 +166,6 @@ def _mesh(name: str, material: str, vertices: Sequence, faces: Sequence[tuple[in
     """A mesh of those vertices alone that its faces have."""
     numbers = {corner: k for k, corner in enumerate(dict.fromkeys(itertools.chain(*faces)))}
     corners = tuple(tuple(vertices[corner]) for corner in numbers)
-    return Mesh(name, material, corners, tuple(tuple(numbers[corner] for corner in face) for face in faces))
+    return Mesh(
+        name, material, corners, tuple(tuple(numbers[corner] for corner in face) for face in faces)
+    )

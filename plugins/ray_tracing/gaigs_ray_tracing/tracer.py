@@ -1,4 +1,6 @@
-"""Paths by Sionna RT between any transmitters and the receivers of a scene, each link's traced once."""
+"""Paths by Sionna RT between any transmitters and the receivers of a scene, each link's traced
+once.
+"""
 
 import functools
 import time
@@ -29,14 +31,17 @@ MOST = 30_000
 """Links kept in memory beside those of the data, some kilobytes each."""
 
 UPRIGHT = 1e-9
-"""Sine of the angle between two directions below which one is along the other, and no plane is between them."""
+"""Sine of the angle between two directions below which one is along the other, and no plane is
+between them.
+"""
 
 
 class Tracer:
     """The paths of one carrier in a room.
 
-    By tracing, a path is a chain of reflections, passages through surfaces and at most one diffraction, whose points
-    are Sionna RT's. Which paths there are is decided with the materials as tabulated.
+    By tracing, a path is a chain of reflections, passages through surfaces and at most one
+    diffraction, whose points are Sionna RT's. Which paths there are is decided with the materials
+    as tabulated.
 
     Args:
         surfaces: Text of an OBJ file; its materials are names of ``known``.
@@ -62,11 +67,16 @@ class Tracer:
         names = sorted(known)
         self.numbers = np.array([names.index(mesh.material) for mesh in meshes])
         self.normals = np.concatenate([_normals(mesh) for mesh in meshes])
-        self.first = np.cumsum([0, *(len(mesh.triangles()) for mesh in meshes)])  # triangle of each mesh
+        self.first = np.cumsum(
+            [0, *(len(mesh.triangles()) for mesh in meshes)]
+        )  # triangle of each mesh
         self.key = {
             "of": "ray_tracing",
             "surfaces": surfaces,
-            "materials": {name: [known[name], MATERIALS[known[name]], THICKNESS[known[name]]] for name in names},
+            "materials": {
+                name: [known[name], MATERIALS[known[name]], THICKNESS[known[name]]]
+                for name in names
+            },
             "receivers": receivers.tolist(),
             "frequency": frequency,
             "settings": [depth, rays, CHUNK, CANDIDATES, tracing.WEAKEST],
@@ -87,10 +97,15 @@ class Tracer:
 
         def trace() -> dict[str, ndarray]:
             links = [link for place in self._trace(missing) for link in place]
-            arrays = {name: torch.cat([getattr(link, name) for link in links]).numpy() for name in Traced._fields}
+            arrays = {
+                name: torch.cat([getattr(link, name) for link in links]).numpy()
+                for name in Traced._fields
+            }
             return arrays | {"counts": np.array([len(link.strengths) for link in links])}
 
-        title = f"tracing the paths of {len(missing)} transmitters to {len(self.receivers)} receivers"
+        title = (
+            f"tracing the paths of {len(missing)} transmitters to {len(self.receivers)} receivers"
+        )
         arrays = cache.keep(self.key | {"transmitters": missing}, trace, title)
         counts = arrays.pop("counts").tolist()
         parts = (torch.from_numpy(arrays[name]).split(counts) for name in Traced._fields)
@@ -101,7 +116,11 @@ class Tracer:
     def find(self, places: Float[Tensor, "b 3"], receiver: int) -> list[Traced]:
         """The paths of links to one of the receivers."""
         asked = list(map(tuple, places.double().tolist()))
-        missing = [place for place in dict.fromkeys(asked) if place not in self.data and place not in self.others]
+        missing = [
+            place
+            for place in dict.fromkeys(asked)
+            if place not in self.data and place not in self.others
+        ]
         if missing:
             if (len(self.others) + len(missing)) * len(self.receivers) > MOST:
                 self.others = {place: self.others[place] for place in asked if place in self.others}
@@ -124,7 +143,8 @@ class Tracer:
         from sionna import rt
 
         start = time.perf_counter()
-        # Which of two chains stays that share a cell of a table would else be up to the processor's threads.
+        # Which of two chains stays that share a cell of a table would else be up to the processor's
+        # threads.
         solver = rt.PathSolver(deterministic=True)
         identities = {scene.objects[f"mesh {k}"].object_id: k for k in range(len(self.meshes))}
         found: list[list[Traced]] = []
@@ -146,19 +166,29 @@ class Tracer:
         self.places += len(places)
         return found
 
-    def _links(self, paths, places: Float[ndarray, "b 3"], identities: dict[int, int]) -> list[list[Traced]]:
+    def _links(
+        self, paths, places: Float[ndarray, "b 3"], identities: dict[int, int]
+    ) -> list[list[Traced]]:
         """Paths of Sionna RT, by place and receiver."""
         fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, :, 0]
         valid = paths.valid.numpy()
         there = np.zeros_like(valid)
         for receiver, place in np.ndindex(*valid.shape[:2]):
-            there[receiver, place, tracing.without_weakest(fields[receiver, place] * valid[receiver, place])] = True
+            there[
+                receiver,
+                place,
+                tracing.without_weakest(fields[receiver, place] * valid[receiver, place]),
+            ] = True
         receivers, transmitters, _ = there.nonzero()
         pick = lambda tensor: np.moveaxis(tensor.numpy(), 0, 3)[there]
-        types, objects, faces, points = map(pick, (paths.interactions, paths.objects, paths.primitives, paths.vertices))
+        types, objects, faces, points = map(
+            pick, (paths.interactions, paths.objects, paths.primitives, paths.vertices)
+        )
         meshes = np.vectorize(identities.get, otypes=[int])(objects, -1)
         ends = places[transmitters], self.receivers[receivers]
-        traced = self._paths(*ends, fields[there], types, meshes, faces.astype(int), points.astype(float))
+        traced = self._paths(
+            *ends, fields[there], types, meshes, faces.astype(int), points.astype(float)
+        )
         links = [[Traced(*(part[:0] for part in traced))] * len(self.receivers) for _ in places]
         for place, own in enumerate(links):
             for receiver in range(len(self.receivers)):
@@ -220,12 +250,16 @@ class Tracer:
         cosines, turns = np.ones((count, depth)), np.zeros((count, depth + 1, 2, 2))
         for step in range(depth):
             happens = kinds[:, step] > 0
-            normals = self.normals[np.where(happens, self.first[meshes[:, step]] + faces[:, step], 0)]
+            normals = self.normals[
+                np.where(happens, self.first[meshes[:, step]] + faces[:, step], 0)
+            ]
             here, after = directions[:, step], directions[:, step + 1]
             cosines[:, step] = np.abs((here * normals).sum(-1))
             across = np.cross(here, normals)
             sines = np.linalg.norm(across, axis=-1, keepdims=True)
-            across = np.where(sines > UPRIGHT, across / np.where(sines > UPRIGHT, sines, 1), before[:, 0])
+            across = np.where(
+                sines > UPRIGHT, across / np.where(sines > UPRIGHT, sines, 1), before[:, 0]
+            )
             happens = happens[:, None, None]
             own = np.where(happens, np.stack((across, np.cross(across, here)), 1), before)
             turns[:, step] = own @ before.swapaxes(1, 2)

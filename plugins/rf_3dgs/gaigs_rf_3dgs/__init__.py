@@ -16,7 +16,8 @@ from gaigs.splatting.gaussians import SH_DC
 from gaigs_rf_3dgs.geometry import read_geometry
 
 GREY = 0.5
-"""Signal of each Gaussian after its harmonics are reset, as of colours in 3-D Gaussian splatting."""
+"""Signal of each Gaussian after its harmonics are reset, as of colours in 3-D Gaussian splatting.
+"""
 
 GEOMETRY = ("means", "quats", "log_scales")
 """Parameters that the second stage leaves as they are."""
@@ -25,15 +26,18 @@ GEOMETRY = ("means", "quats", "log_scales")
 class Rf3dgs(GaussianSplatting):
     """The splatting pipeline, trained in two stages.
 
-    1. Geometry. Without a file everything is trained, and each Gaussian sends alike for all transmitters, as a
-       photograph does not depend on the transmitter: it learns the common part of the training spectra. With a
-       file there is no training: Gaussians stand at its points.
-    2. Radio. Centres, orientations and scales are frozen and the signal is reset. Trained are opacities and spherical
+    1. Geometry. Without a file everything is trained, and each Gaussian sends alike for all
+    transmitters, as a
+       photograph does not depend on the transmitter: it learns the common part of the training
+       spectra. With a file there is no training: Gaussians stand at its points.
+    2. Radio. Centres, orientations and scales are frozen and the signal is reset. Trained are
+    opacities and spherical
        harmonics over the direction in which a transmitter sees a Gaussian.
 
     Args:
         scene: Receivers and task.
-        geometry: File with the room's points, mesh or splats, see ``gaigs_rf_3dgs.geometry``; None for none.
+        geometry: File with the room's points, mesh or splats, see ``gaigs_rf_3dgs.geometry``; None
+            for none.
         first_stage: Share of the training that the first stage takes without a file.
         **options: As ``GaussianSplatting`` has them.
 
@@ -90,7 +94,9 @@ class Rf3dgs(GaussianSplatting):
     def revisions(self) -> tuple[float, ...]:
         return (self.first_stage if self.geometry is None else 0.0,)
 
-    def revise(self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]) -> str:
+    def revise(
+        self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]
+    ) -> str:
         """Begins the second stage."""
         self.stage.fill_(2)
         self._enter()

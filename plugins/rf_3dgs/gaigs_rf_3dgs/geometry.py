@@ -15,7 +15,9 @@ from gaigs.io.meshes import read_obj, read_ply, triangles
 from gaigs.io.tables import read_points
 
 NEIGHBOURS = 3
-"""A Gaussian at a bare point is as wide as these are away, in root mean square, as 3-D Gaussian splatting starts."""
+"""A Gaussian at a bare point is as wide as these are away, in root mean square, as 3-D Gaussian
+splatting starts.
+"""
 
 NEAREST = 1e-3
 """They count as at least so far away [m]: points that are there twice have no distance."""
@@ -48,8 +50,9 @@ def read_geometry(file: Path, most: int) -> Geometry:
     """Gaussians at a room's points; a mesh is sampled at as many as allowed, evenly over its area.
 
     Args:
-        file: World frame [m]. ``.csv`` with points x,y,z, a heading or not; ``.obj`` with vertices, and faces or not;
-            ``.ply`` with vertices, and faces or not, or with splats, which keep their scales, rotations and opacities.
+        file: World frame [m]. ``.csv`` with points x,y,z, a heading or not; ``.obj`` with vertices,
+            and faces or not; ``.ply`` with vertices, and faces or not, or with splats, which keep
+            their scales, rotations and opacities.
         most: No more than so many Gaussians; of more points, so many are drawn.
 
     Raises:
@@ -58,19 +61,25 @@ def read_geometry(file: Path, most: int) -> Geometry:
     """
     readers = {".csv": _read_csv, ".obj": _read_obj, ".ply": _read_ply}
     if not file.is_file():
-        raise FileNotFoundError(f"no geometry at {file}; set model.geometry to a .csv, .obj or .ply, or to null")
+        raise FileNotFoundError(
+            f"no geometry at {file}; set model.geometry to a .csv, .obj or .ply, or to null"
+        )
     if file.suffix.lower() not in readers:
         raise ValueError(f"model.geometry must be a .csv, .obj or .ply, got {file.name}")
     points, corners, splats = readers[file.suffix.lower()](file)
     values = np.concatenate([points, *splats.values()], 1)
     if not np.isfinite(values).all():
         row = int((~np.isfinite(values)).any(1).argmax())
-        raise ValueError(f"{file} must hold finite numbers, got {values[row].tolist()} at point {row + 1}")
+        raise ValueError(
+            f"{file} must hold finite numbers, got {values[row].tolist()} at point {row + 1}"
+        )
     if len(corners):
         points = _sample(points[corners], most)
     if len(points) <= NEIGHBOURS or most <= NEIGHBOURS:
         count = min(len(points), most)
-        raise ValueError(f"{file} must give at least {NEIGHBOURS + 1} Gaussians, got {count} of gaussians.count={most}")
+        raise ValueError(
+            f"{file} must give at least {NEIGHBOURS + 1} Gaussians, got {count} of gaussians.count={most}"
+        )
     chosen = torch.randperm(len(points))[:most]
     means = torch.from_numpy(points)[chosen].float()
     if splats:
@@ -90,7 +99,9 @@ def _sample(corners: np.ndarray, count: int) -> np.ndarray:
         return np.zeros((0, 3))
     of = torch.multinomial(areas, count, replacement=True)
     along = torch.rand(count, 2, dtype=corners.dtype)
-    along = torch.where(along.sum(1, keepdim=True) > 1, 1 - along, along)  # folded back into the triangle
+    along = torch.where(
+        along.sum(1, keepdim=True) > 1, 1 - along, along
+    )  # folded back into the triangle
     return (corners[of, 0] + (along[..., None] * sides[of]).sum(1)).numpy()
 
 

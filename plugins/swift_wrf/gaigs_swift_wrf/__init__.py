@@ -13,33 +13,45 @@ from gaigs.core.scene import Scene
 from gaigs.model import Model, Prediction
 from gaigs.splatting.deformation.two_branch import TokenLinear
 from gaigs.splatting.gaussians import Tokens, fibonacci_lattice
-from gaigs.splatting.tokenizer.euclidean import BAND_FREQUENCIES, fourier_features, learnable_octaves
+from gaigs.splatting.tokenizer.euclidean import (
+    BAND_FREQUENCIES,
+    fourier_features,
+    learnable_octaves,
+)
 from gaigs.splatting.tokenizer.euclidean import octaves as angular_frequencies
 from gaigs_swift_wrf.plane import PlaneGaussians, add_up
 
 PLANE_FREQUENCIES = 2.0 ** torch.arange(5)
-"""Angular frequencies of the features of a Gaussian's place in the plane: periods from the whole circle to 22.5 deg."""
+"""Angular frequencies of the features of a Gaussian's place in the plane: periods from the whole
+circle to 22.5 deg.
+"""
 
 LARGEST = 2**23
-"""Triples of a link, a direction and a Gaussian that are worked on at a time without a gradient: 32 MiB an array."""
+"""Triples of a link, a direction and a Gaussian that are worked on at a time without a gradient: 32
+MiB an array.
+"""
 
 
 class SwiftWrf(Model):
-    """Transmitter position -> 2-D Gaussians in the plane of azimuth and elevation -> their plain sum.
+    """Transmitter position -> 2-D Gaussians in the plane of azimuth and elevation -> their plain
+    sum.
 
         s(u) = sum_i a_i exp(-(u - m_i)' C_i^-1 (u - m_i) / 2)        C_i = L_i L_i' + pixel variance
 
-    without opacity, depth or order. Each receiver has Gaussians of its own: means m, lower triangular factors L and
-    amplitudes a. A network adds to all three for each transmitter: [PE(m), PE(transmitter), receiver] -> layers of one
-    width with ReLU -> a linear head each; those of means and factors start at 0. Gaussians start on a Fibonacci lattice
-    over the label's directions, each as wide as its neighbours are away, and silent.
+    without opacity, depth or order. Each receiver has Gaussians of its own: means m, lower
+    triangular factors L and amplitudes a. A network adds to all three for each transmitter: [PE(m),
+    PE(transmitter), receiver] -> layers of one width with ReLU -> a linear head each; those of
+    means and factors start at 0. Gaussians start on a Fibonacci lattice over the label's
+    directions, each as wide as its neighbours are away, and silent.
 
     Args:
-        scene: Receivers and task; positions are taken relative to the middle of the transmitters' box.
+        scene: Receivers and task; positions are taken relative to the middle of the transmitters'
+            box.
         count: Gaussians of each receiver.
         width, layers: Of the network.
-        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a metre; None takes those
-            that the training transmitters can teach, as the ``euclidean`` tokenizer does.
+        octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a
+            metre; None takes those that the training transmitters can teach, as the ``euclidean``
+            tokenizer does.
 
     Raises:
         ValueError: The labels are no spectra, or an option is out of range.
@@ -52,7 +64,9 @@ class SwiftWrf(Model):
         **Model.learning_rates,
     }
 
-    def __init__(self, scene: Scene, count: int, width: int, layers: int, octaves: tuple[int, int] | None):
+    def __init__(
+        self, scene: Scene, count: int, width: int, layers: int, octaves: tuple[int, int] | None
+    ):
         super().__init__(scene)
         grid = scene.task.directions
         if grid is None:
@@ -91,7 +105,10 @@ class SwiftWrf(Model):
         self.first = TokenLinear((receivers, 2 * (1 + 2 * len(PLANE_FREQUENCIES)), features), width)
         self.rest = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - 1))
         self.heads = nn.ModuleDict(
-            {name: nn.Linear(width, size) for name, size in (("means", 2), ("factors", 3), ("amplitudes", 1))}
+            {
+                name: nn.Linear(width, size)
+                for name, size in (("means", 2), ("factors", 3), ("amplitudes", 1))
+            }
         )
         for name in ("means", "factors"):
             nn.init.zeros_(self.heads[name].weight)
@@ -100,7 +117,9 @@ class SwiftWrf(Model):
     def forward(self, batch: Batch) -> Prediction:
         directions = batch.directions or self.scene.task.directions
         gaussians = self.deform(batch.query)
-        return Prediction(add_up(gaussians, directions.to(gaussians.means), self.pixel_variance), {})
+        return Prediction(
+            add_up(gaussians, directions.to(gaussians.means), self.pixel_variance), {}
+        )
 
     def deform(self, query: Query) -> PlaneGaussians:
         """The Gaussians of each link."""
@@ -109,19 +128,26 @@ class SwiftWrf(Model):
         receivers = one_hot(query.receivers, len(self.scene.receivers)).to(self.middle)
         transmitters = fourier_features(query.transmitters - self.middle, self.frequencies)
         if self.scene.has_band:
-            band = fourier_features(self.scene.band_positions(query)[:, None], BAND_FREQUENCIES.to(transmitters))
+            band = fourier_features(
+                self.scene.band_positions(query)[:, None], BAND_FREQUENCIES.to(transmitters)
+            )
             transmitters = torch.cat((transmitters, band), 1)
-        # The network says how a place responds to a transmitter; where the Gaussians go is learnt from the image alone.
+        # The network says how a place responds to a transmitter; where the Gaussians go is learnt
+        # from the image alone.
         places = fourier_features(own.means.detach(), PLANE_FREQUENCIES.to(transmitters))
         hidden = relu(self.first(Tokens(receivers, places, transmitters)))
         for layer in self.rest:
             hidden = relu(layer(hidden))
         means, factors, amplitudes = (head(hidden) for head in self.heads.values())
-        return PlaneGaussians(own.means + means, own.factors + factors, own.amplitudes + amplitudes[..., 0])
+        return PlaneGaussians(
+            own.means + means, own.factors + factors, own.amplitudes + amplitudes[..., 0]
+        )
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups = {name: [getattr(self, name)] for name in PlaneGaussians._fields}
-        return groups | {"network": [*self.first.parameters(), *self.rest.parameters(), *self.heads.parameters()]}
+        return groups | {
+            "network": [*self.first.parameters(), *self.rest.parameters(), *self.heads.parameters()]
+        }
 
     def facts(self) -> dict[str, object]:
         """How many Gaussians there are, of all receivers together."""

@@ -15,7 +15,8 @@ class PlaneGaussians(NamedTuple):
 
     Attributes:
         means: Azimuth and elevation (b, n, 2) [rad].
-        factors: p, q and r of the covariance's lower triangular factor [[p, 0], [q, r]] (b, n, 3) [rad].
+        factors: p, q and r of the covariance's lower triangular factor [[p, 0], [q, r]] (b, n, 3)
+            [rad].
         amplitudes: (b, n).
     """
 
@@ -24,8 +25,11 @@ class PlaneGaussians(NamedTuple):
     amplitudes: Float[Tensor, "b n"]
 
 
-def add_up(gaussians: PlaneGaussians, directions: Directions, pixel_variance: float) -> Float[Tensor, " b *shape"]:
-    """sum_i a_i exp(-x' C_i^-1 x / 2), with x the direction less the mean, its azimuth taken to the nearest image.
+def add_up(
+    gaussians: PlaneGaussians, directions: Directions, pixel_variance: float
+) -> Float[Tensor, " b *shape"]:
+    """sum_i a_i exp(-x' C_i^-1 x / 2), with x the direction less the mean, its azimuth taken to the
+    nearest image.
 
     Args:
         gaussians: Of each link.

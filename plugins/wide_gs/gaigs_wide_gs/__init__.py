@@ -1,4 +1,6 @@
-"""WideGS (Li et al., arXiv 2505.20714): splatting whose networks see the carrier, as conf/model/wide_gs.yaml has it."""
+"""WideGS (Li et al., arXiv 2505.20714): splatting whose networks see the carrier, as
+conf/model/wide_gs.yaml has it.
+"""
 
 from gaigs.model.gaigs import GaussianSplatting
 

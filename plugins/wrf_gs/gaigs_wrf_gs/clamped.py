@@ -37,7 +37,10 @@ class Clamped(SpectrumPooling):
     """
 
     def forward(
-        self, image: Float[Tensor, "b c rows columns"], query: Query, directions: Directions | None = None
+        self,
+        image: Float[Tensor, "b c rows columns"],
+        query: Query,
+        directions: Directions | None = None,
     ) -> Float[Tensor, "b rows columns"]:
         """The predicted spectrum."""
         spectrum = image[:, 0] if self.channels == 1 else super().forward(image, query, directions)

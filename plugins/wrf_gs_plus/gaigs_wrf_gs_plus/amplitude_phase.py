@@ -13,10 +13,11 @@ from gaigs.splatting.gaussians import Placed, Tokens
 class AmplitudePhase(Deformation):
     """Change by a transmitter of every Gaussian's rotation, scale and signal.
 
-    Network: u = [E(P_x), E(P_TX), CLS] -> layers of one width with ReLU, u is fed into the middle one again.
-    Linear heads from its end: rotation and scale, 0 at the start; amplitude a and phase phi of each wave. A wave is a
-    pair of channels, real and imaginary part, and its residual a exp(j phi); of a map with an odd number of channels,
-    which are real, the real part of each wave counts.
+    Network: u = [E(P_x), E(P_TX), CLS] -> layers of one width with ReLU, u is fed into the middle
+    one again. Linear heads from its end: rotation and scale, 0 at the start; amplitude a and phase
+    phi of each wave. A wave is a pair of channels, real and imaginary part, and its residual a
+    exp(j phi); of a map with an odd number of channels, which are real, the real part of each wave
+    counts.
 
     Published is |a exp(j phi)|, in which the phase cancels.
 
@@ -32,7 +33,9 @@ class AmplitudePhase(Deformation):
     Source: WRF-GS+ (IEEE TWC 2025).
     """
 
-    def __init__(self, channels: int, tokenizer_widths: tuple[int, int, int], width: int, layers: int):
+    def __init__(
+        self, channels: int, tokenizer_widths: tuple[int, int, int], width: int, layers: int
+    ):
         super().__init__()
         for option, count, least in (("width", width, 1), ("layers", layers, 2)):
             if count < least:
@@ -42,7 +45,9 @@ class AmplitudePhase(Deformation):
         self.first = TokenLinear(tokenizer_widths, width)
         self.before = nn.ModuleList(nn.Linear(width, width) for _ in range(layers // 2 - 1))
         self.again = TokenLinear(tokenizer_widths, width, hidden=width)
-        self.behind = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - layers // 2 - 1))
+        self.behind = nn.ModuleList(
+            nn.Linear(width, width) for _ in range(layers - layers // 2 - 1)
+        )
         self.rotation, self.scale = nn.Linear(width, 4), nn.Linear(width, 3)
         self.amplitude, self.phase = nn.Linear(width, waves), nn.Linear(width, waves)
         for head in (self.rotation, self.scale):

@@ -9,7 +9,9 @@ SIZE = 7.0, 5.0, 3.0
 
 @pytest.fixture
 def mirrored():
-    """Mirrored Gaussians whose planes are the faces of the built-in room, of a carrier of 6.4896 GHz."""
+    """Mirrored Gaussians whose planes are the faces of the built-in room, of a carrier of 6.4896
+    GHz.
+    """
     torch.manual_seed(0)
     scene = gaigs.links("synthetic_csi", transmitters=10, order=0).scene
     model = MirroredSplatting(scene, {"name": "mirrored", "obstacles": 0})

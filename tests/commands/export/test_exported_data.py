@@ -30,7 +30,9 @@ def on_map(rssi):
     model, _ = rssi
     inside = model.scene
     first, *others = inside.receivers
-    model.scene = replace(inside, frame=CORNER, receivers=(replace(first, name="Küche & Flur"), *others))
+    model.scene = replace(
+        inside, frame=CORNER, receivers=(replace(first, name="Küche & Flur"), *others)
+    )
     yield model
     model.scene = inside
 
@@ -47,7 +49,11 @@ def test_a_geotiff_has_each_value_at_its_place(on_map, tmp_path):
     floor = gaigs.radio_map(on_map, pitch=0.5)
     gaigs.export(on_map, tmp_path / "floor.tif", pitch=0.5)
     with tifffile.TiffFile(tmp_path / "floor.tif") as file:
-        bands, tags, names = file.asarray(), file.geotiff_metadata, file.pages[0].tags["GDAL_METADATA"].value
+        bands, tags, names = (
+            file.asarray(),
+            file.geotiff_metadata,
+            file.pages[0].tags["GDAL_METADATA"].value,
+        )
     (width, height, _), (*_, left, top, _) = tags["ModelPixelScale"], tags["ModelTiepoint"]
     assert tags["ProjectedCSTypeGeoKey"] == 32632
     assert names.count("<Item") == len(bands) == 2 * len(floor.receivers)
@@ -68,9 +74,13 @@ def test_geojson_is_in_longitude_and_latitude(on_map, tmp_path):
     point = features[row * len(floor.x) + column]
     assert point["geometry"]["coordinates"] == pytest.approx([9.0, 0.0], abs=1e-8)
     assert point["properties"]["south"] == pytest.approx(floor.values[1, row, column], abs=1e-3)
-    assert point["properties"]["south deviation"] == pytest.approx(floor.deviations[1, row, column], abs=1e-3)
+    assert point["properties"]["south deviation"] == pytest.approx(
+        floor.deviations[1, row, column], abs=1e-3
+    )
     north = features[(row + 2) * len(floor.x) + column]["geometry"]["coordinates"]
-    assert north == pytest.approx([9.0, 1.0 / 110_574 / 0.9996], abs=1e-8)  # a metre of a meridian, scaled by UTM
+    assert north == pytest.approx(
+        [9.0, 1.0 / 110_574 / 0.9996], abs=1e-8
+    )  # a metre of a meridian, scaled by UTM
 
 
 def test_geojson_has_a_key_for_each_value_of_each_receiver(rssi, tmp_path):
@@ -78,7 +88,8 @@ def test_geojson_has_a_key_for_each_value_of_each_receiver(rssi, tmp_path):
     inside = model.scene
     names = ["ap", "ap deviation", "ap deviation deviation", "ap value"]
     model.scene = replace(
-        inside, receivers=tuple(map(lambda one, name: replace(one, name=name), inside.receivers, names))
+        inside,
+        receivers=tuple(map(lambda one, name: replace(one, name=name), inside.receivers, names)),
     )
     gaigs.export(model, tmp_path / "floor.geojson", pitch=1.0)
     floor = gaigs.radio_map(model, pitch=1.0)
@@ -86,8 +97,12 @@ def test_geojson_has_a_key_for_each_value_of_each_receiver(rssi, tmp_path):
     (first, *_) = json.loads((tmp_path / "floor.geojson").read_text())["features"]
     assert len(first["properties"]) == 8
     for number, name in enumerate(names):
-        assert first["properties"][f"{name} value"] == pytest.approx(floor.values[number, 0, 0], abs=1e-3)
-        assert first["properties"][f"{name} deviation"] == pytest.approx(floor.deviations[number, 0, 0], abs=1e-3)
+        assert first["properties"][f"{name} value"] == pytest.approx(
+            floor.values[number, 0, 0], abs=1e-3
+        )
+        assert first["properties"][f"{name} deviation"] == pytest.approx(
+            floor.deviations[number, 0, 0], abs=1e-3
+        )
 
 
 def test_netcdf_has_axes_units_and_the_coordinate_system(on_map, tmp_path):
@@ -136,7 +151,11 @@ def test_places_are_heard_by_each_receiver(rssi, tmp_path):
     model, _ = rssi
     gaigs.export(model, tmp_path / "places.csv", [[1.0, 2.0, 1.5], [2.0, 1.0, 0.5]], interval=0.5)
     table = rows(tmp_path / "places.csv")
-    assert [(row["x"], row["receiver"]) for row in table[3:6]] == [("1", "north"), ("2", "west"), ("2", "south")]
+    assert [(row["x"], row["receiver"]) for row in table[3:6]] == [
+        ("1", "north"),
+        ("2", "west"),
+        ("2", "south"),
+    ]
     found = model.predict([2.0, 1.0, 0.5], "south", interval=0.5)
     for name, value in (("value", found.value), ("deviation", found.std), ("upper", found.upper)):
         assert float(table[5][name]) == pytest.approx(value.item(), rel=1e-5)
@@ -172,7 +191,9 @@ def test_channels_of_test_links_stand_beside_their_labels(tmp_path, caplog):
     row = table[1 * 16 * 3 + 5 * 3 + 2]
     assert (row["element"], float(row["subcarrier"])) == ("5", links.task.frequencies[2].item())
     for name, whole in (("value", values), ("measured", labels)):
-        assert complex(float(row[f"{name}_real"]), float(row[f"{name}_imag"])) == pytest.approx(whole[1, 5, 2].item())
+        assert complex(float(row[f"{name}_real"]), float(row[f"{name}_imag"])) == pytest.approx(
+            whole[1, 5, 2].item()
+        )
     with netcdf_file(tmp_path / "test.nc", mmap=False) as file:
         found = file.variables
         assert found["value_imag"].dimensions == ("link", "element", "subcarrier")
@@ -208,7 +229,11 @@ def test_spectra_have_axes_in_degrees(tmp_path):
         ("test.csv", {}, r"predictions take places: positions \[m\], a query, or links"),
         ("test.csv", {"places": torch.zeros(0, 3)}, "predictions take one place or more"),
         ("test.csv", {"places": [[1.0, 2.0]]}, r"places must be \(\.\.\., 3\) positions"),
-        ("test.nc", {"places": [[1.0, 2.0, 1.0]], "interval": 1.0}, "interval must be a probability between 0 and 1"),
+        (
+            "test.nc",
+            {"places": [[1.0, 2.0, 1.0]], "interval": 1.0},
+            "interval must be a probability between 0 and 1",
+        ),
         ("room.glb", {}, "a learnt room takes a model 'mirrored', got 'path_loss'"),
     ],
 )
@@ -219,19 +244,34 @@ def test_impossible_exports_are_refused(file, options, message, rssi, tmp_path):
 
 
 def test_the_command_exports_a_run(tmp_path, capsys):
-    words = ("+experiment=rssi", "model=path_loss", "data.transmitters=30", "data.order=0", "baselines=[]")
+    words = (
+        "+experiment=rssi",
+        "model=path_loss",
+        "data.transmitters=30",
+        "data.order=0",
+        "baselines=[]",
+    )
     gaigs.run(gaigs.compose(*words), tmp_path / "run")
     command = ("command=export", f"folder={tmp_path / 'run'}", "export.pitch=1")
     for chosen in (["csv"], ["nc"], ["nc", "export.places=[[1,2,1.5]]"]):
-        gaigs.run(gaigs.compose(*command, f"export.format={chosen[0]}", *chosen[1:]), tmp_path / "out")
+        gaigs.run(
+            gaigs.compose(*command, f"export.format={chosen[0]}", *chosen[1:]), tmp_path / "out"
+        )
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {"predictions.csv", "radio_map.nc", "predictions.nc"}
     with np.load(tmp_path / "run/predictions.npz") as run:
         table = rows(tmp_path / "out/predictions.csv")
-        np.testing.assert_allclose([float(row["value"]) for row in table], run["prediction"], rtol=1e-5)
-        np.testing.assert_allclose([float(row["measured"]) for row in table], run["labels"], rtol=1e-5)
+        np.testing.assert_allclose(
+            [float(row["value"]) for row in table], run["prediction"], rtol=1e-5
+        )
+        np.testing.assert_allclose(
+            [float(row["measured"]) for row in table], run["labels"], rtol=1e-5
+        )
     assert "results: " in capsys.readouterr().out
-    for wrong, message in (([], "needs export.format"), (["export.format=dxf"], "must end with one of")):
+    for wrong, message in (
+        ([], "needs export.format"),
+        (["export.format=dxf"], "must end with one of"),
+    ):
         with pytest.raises(ValueError, match=message):
             gaigs.run(gaigs.compose(*command, *wrong), tmp_path / "out")
     with pytest.raises(ValueError, match="needs the folder of a finished run"):
@@ -240,7 +280,9 @@ def test_the_command_exports_a_run(tmp_path, capsys):
 
 def test_channels_have_no_rows_of_elements_that_an_array_lacks(tmp_path):
     pose = gaigs.Pose.from_xyzw([0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])
-    receivers = [gaigs.Receiver(f"a{k}", pose, gaigs.Array.planar(1, k, pitch=0.06)) for k in (1, 2)]
+    receivers = [
+        gaigs.Receiver(f"a{k}", pose, gaigs.Array.planar(1, k, pitch=0.06)) for k in (1, 2)
+    ]
     channels = np.ones((20, 2, 2, 3)) + 1j
     channels[:, 0, 1] = 0
     places = np.random.default_rng(0).uniform(1, 4, (20, 3))

@@ -23,7 +23,12 @@ from gaigs.planes.sheets import Sheet
 from gaigs.splatting.placement.mirrored.obstacles import Obstacles
 
 SIZE = 7.0, 5.0, 3.0
-WALL = Mesh("wall", "", ((0.0, 4.0, -9.0), (9.0, 4.0, -9.0), (9.0, 4.0, 9.0), (0.0, 4.0, 9.0)), ((0, 1, 2, 3),))
+WALL = Mesh(
+    "wall",
+    "",
+    ((0.0, 4.0, -9.0), (9.0, 4.0, -9.0), (9.0, 4.0, 9.0), (0.0, 4.0, 9.0)),
+    ((0, 1, 2, 3),),
+)
 
 
 def chunks(data):
@@ -32,7 +37,13 @@ def chunks(data):
     assert (magic, version, length) == (b"glTF", 2, len(data))
     size, kind = struct.unpack_from("<I4s", data, 12)
     rest, other = struct.unpack_from("<I4s", data, 20 + size)
-    assert (kind, other, 28 + size + rest, size % 4, rest % 4) == (b"JSON", b"BIN\0", len(data), 0, 0)
+    assert (kind, other, 28 + size + rest, size % 4, rest % 4) == (
+        b"JSON",
+        b"BIN\0",
+        len(data),
+        0,
+        0,
+    )
     return json.loads(data[20 : 20 + size]), data[28 + size :]
 
 
@@ -48,11 +59,25 @@ def test_gltf_has_the_room_with_y_up(mirrored, tmp_path):
     corners = []
     for node in nodes:
         (primitive,) = content["meshes"][node["mesh"]]["primitives"]
-        accessor, faces = (content["accessors"][k] for k in (primitive["attributes"]["POSITION"], primitive["indices"]))
+        accessor, faces = (
+            content["accessors"][k]
+            for k in (primitive["attributes"]["POSITION"], primitive["indices"])
+        )
         view, drawn = (content["bufferViews"][part["bufferView"]] for part in (accessor, faces))
-        points = np.frombuffer(buffer, "<f4", 3 * accessor["count"], view["byteOffset"]).reshape(-1, 3)
-        assert np.frombuffer(buffer, "<u4", faces["count"], drawn["byteOffset"]).tolist() == [0, 1, 2, 0, 2, 3]
-        np.testing.assert_allclose([accessor["min"], accessor["max"]], [points.min(0), points.max(0)])
+        points = np.frombuffer(buffer, "<f4", 3 * accessor["count"], view["byteOffset"]).reshape(
+            -1, 3
+        )
+        assert np.frombuffer(buffer, "<u4", faces["count"], drawn["byteOffset"]).tolist() == [
+            0,
+            1,
+            2,
+            0,
+            2,
+            3,
+        ]
+        np.testing.assert_allclose(
+            [accessor["min"], accessor["max"]], [points.min(0), points.max(0)]
+        )
         corners.append(points)
     turn = np.array([[1, 0, 0], [0, 1 - 2 * x * x, -2 * x * w], [0, 2 * x * w, 1 - 2 * x * x]])
     corners = np.concatenate(corners) @ turn.T
@@ -69,7 +94,10 @@ def test_a_kriged_ensemble_has_the_room_of_its_first_member(mirrored):
 def test_a_scene_has_a_material_and_a_mesh_for_each_plane(mirrored, tmp_path):
     file, *meshes = gaigs.export(mirrored, tmp_path / "room.xml")
     root = ElementTree.parse(file).getroot()
-    shapes = {shape.find("string").get("value"): shape.find("ref").get("id") for shape in root.findall("shape")}
+    shapes = {
+        shape.find("string").get("value"): shape.find("ref").get("id")
+        for shape in root.findall("shape")
+    }
     assert [*shapes] == [path.relative_to(tmp_path).as_posix() for path in meshes]
     materials = {one.get("id"): one for one in root.findall("bsdf")}
     assert {*shapes.values()} == materials.keys()
@@ -84,7 +112,8 @@ def test_a_carrier_outside_the_tables_has_numbers(tmp_path):
     assert material.get("type") == "radio-material"
     numbers = {one.get("name"): float(one.get("value")) for one in material}
     assert numbers == pytest.approx(
-        {"thickness": 0.2, "relative_permittivity": 5.24, "conductivity": 0.0462 * 0.92**0.7822}, rel=1e-5
+        {"thickness": 0.2, "relative_permittivity": 5.24, "conductivity": 0.0462 * 0.92**0.7822},
+        rel=1e-5,
     )
 
 
@@ -103,11 +132,20 @@ def test_a_scene_that_is_read_while_another_replaces_it_keeps_its_meshes(tmp_pat
 
 @pytest.mark.parametrize("frequency", [0.92e9, 6e9])
 def test_the_ray_tracer_reflects_at_the_material(frequency, tracer, tmp_path):
-    file, _ = write_scene(tmp_path / "room.xml", [WALL], [itu_bsdf(Material("concrete", 1.0), frequency)])
+    file, _ = write_scene(
+        tmp_path / "room.xml", [WALL], [itu_bsdf(Material("concrete", 1.0), frequency)]
+    )
     scene = tracer.open_scene(frequency, file)
-    paths = tracer.trace_scene(scene, torch.tensor([5.0, 0.0, 0.0]), torch.tensor([[3.0, 0.0, 0.0]]), depth=1)
-    gains = {round(image[1].item()): gain for image, gain in zip(paths.images[0], paths.gains[0], strict=True)}
-    permittivity = complex(5.24, -0.0462 * (frequency / 1e9) ** 0.7822 / (2 * np.pi * 8.8542e-12 * frequency))
+    paths = tracer.trace_scene(
+        scene, torch.tensor([5.0, 0.0, 0.0]), torch.tensor([[3.0, 0.0, 0.0]]), depth=1
+    )
+    gains = {
+        round(image[1].item()): gain
+        for image, gain in zip(paths.images[0], paths.gains[0], strict=True)
+    }
+    permittivity = complex(
+        5.24, -0.0462 * (frequency / 1e9) ** 0.7822 / (2 * np.pi * 8.8542e-12 * frequency)
+    )
     cosine = 8 / np.hypot(8, 2)
     root = np.sqrt(permittivity - (1 - cosine**2))
     assert gains[0].item() == pytest.approx(1, abs=1e-2)
@@ -116,11 +154,19 @@ def test_the_ray_tracer_reflects_at_the_material(frequency, tracer, tmp_path):
 
 @pytest.mark.parametrize("frequency", [1e9, 30e9])
 def test_the_ray_tracer_passes_a_sheet_without_a_turn_or_a_reflection(frequency, tracer, tmp_path):
-    file, _ = write_scene(tmp_path / "room.xml", [WALL], [sheet_bsdf(Sheet(3.0, np.zeros((0, 3)), np.zeros((0, 3))))])
+    file, _ = write_scene(
+        tmp_path / "room.xml", [WALL], [sheet_bsdf(Sheet(3.0, np.zeros((0, 3)), np.zeros((0, 3))))]
+    )
     scene, receiver = tracer.open_scene(frequency, file), torch.tensor([5.0, 3.0, 0.0])
-    through = tracer.trace_scene(scene, receiver, torch.tensor([[3.0, 5.0, 0.0]]), depth=1, reflections=1)
-    assert through.gains[0].tolist() == pytest.approx([1 / (1 + 1.5 * 2**0.5)], abs=3e-2)  # TE at 45 degrees
-    beside = tracer.trace_scene(scene, receiver, torch.tensor([[3.0, 3.0, 0.0]]), depth=1, reflections=1)
+    through = tracer.trace_scene(
+        scene, receiver, torch.tensor([[3.0, 5.0, 0.0]]), depth=1, reflections=1
+    )
+    assert through.gains[0].tolist() == pytest.approx(
+        [1 / (1 + 1.5 * 2**0.5)], abs=3e-2
+    )  # TE at 45 degrees
+    beside = tracer.trace_scene(
+        scene, receiver, torch.tensor([[3.0, 3.0, 0.0]]), depth=1, reflections=1
+    )
     assert beside.gains[0].abs().tolist() == pytest.approx([1.0], abs=1e-3)
 
 
@@ -148,7 +194,9 @@ def test_obstacles_are_surfaces_and_the_gain_of_channels_is_told(mirrored, tmp_p
 
 def test_obj_and_kriging_on_top(mirrored, tmp_path):
     links = gaigs.links("synthetic_csi", transmitters=10, order=0)
-    kriging = gaigs.registries["model"].build({"name": "kriging", "trend": mirrored}, scene=links.scene)
+    kriging = gaigs.registries["model"].build(
+        {"name": "kriging", "trend": mirrored}, scene=links.scene
+    )
     gaigs.export(kriging, tmp_path / "room.obj")
     vertices, faces = read_obj(tmp_path / "room.obj")
     assert len(faces) == 6
@@ -156,7 +204,9 @@ def test_obj_and_kriging_on_top(mirrored, tmp_path):
 
 
 def test_materials_need_a_carrier(tmp_path):
-    scene = replace(gaigs.links("synthetic_rssi", transmitters=10, order=0).scene, frequencies=torch.zeros(0))
+    scene = replace(
+        gaigs.links("synthetic_rssi", transmitters=10, order=0).scene, frequencies=torch.zeros(0)
+    )
     options = {"name": "mirrored", "placement": {"name": "mirrored", "obstacles": 0}}
     rssi = gaigs.registries["model"].build(options, scene=scene)
     with pytest.raises(ValueError, match="materials depend on the carrier"):

@@ -55,7 +55,9 @@ def pixels(image):
 
 def content(page):
     packed = re.search(r'<script id="content"[^>]*>([^<]*)<', page)[1]
-    return json.loads(gzip.decompress(base64.b64decode(packed)), parse_constant=lambda name: pytest.fail(name))
+    return json.loads(
+        gzip.decompress(base64.b64decode(packed)), parse_constant=lambda name: pytest.fail(name)
+    )
 
 
 def test_a_spectrum_and_its_paths_are_the_models(mirrored):
@@ -69,7 +71,9 @@ def test_a_spectrum_and_its_paths_are_the_models(mirrored):
     assert all(-30 <= path["power"] <= 0 for path in others)
     receiver = mirrored.scene.receivers[0].pose.position
     for path in answer["paths"]:
-        np.testing.assert_allclose([path["points"][0], path["points"][-1]], [place, receiver.tolist()], atol=1e-3)
+        np.testing.assert_allclose(
+            [path["points"][0], path["points"][-1]], [place, receiver.tolist()], atol=1e-3
+        )
 
 
 def test_an_ensemble_shows_the_room_of_its_first_member(mirrored):
@@ -89,7 +93,9 @@ def test_levels_deviations_and_map_are_the_models(levels):
     x, y, values = (np.array(floor[name]) for name in ("x", "y", "values"))
     row, column = 2, len(x) - 1
     asked = [[x[column], y[row], 0.7]]
-    assert values[row * len(x) + column] == pytest.approx(levels.predict(asked, names[1]).item(), abs=0.05)
+    assert values[row * len(x) + column] == pytest.approx(
+        levels.predict(asked, names[1]).item(), abs=0.05
+    )
 
 
 def test_one_thread_at_a_time_uses_the_model(mirrored, monkeypatch):
@@ -97,7 +103,9 @@ def test_one_thread_at_a_time_uses_the_model(mirrored, monkeypatch):
     shown = Contents(mirrored, links)
     for name in ("learnt_room", "learnt_paths", "evaluate"):
         own = getattr(type(mirrored), name)
-        watched = lambda *given, own=own, name=name: uses.append((name, shown.lock.locked())) or own(*given)
+        watched = lambda *given, own=own, name=name: (
+            uses.append((name, shown.lock.locked())) or own(*given)
+        )
         monkeypatch.setattr(type(mirrored), name, watched)
     shown.answer([1.0, 1.2, 1.1], 0)
     shown.facts()
@@ -108,7 +116,9 @@ def test_a_channels_impulse_response_peaks_at_the_direct_path(links):
     model = gaigs.train("friis", links["csi"])
     place, receiver = torch.tensor([1.0, 1.2, 1.1]), model.scene.receivers[0].pose.position
     curve = Contents(model).answer(place.tolist(), 0)["curves"]["predicted"]
-    spacing = 1e9 / (len(model.scene.task.frequencies) * np.diff(model.scene.task.frequencies).min())
+    spacing = 1e9 / (
+        len(model.scene.task.frequencies) * np.diff(model.scene.task.frequencies).min()
+    )
     delay = 1e9 * (place - receiver).norm().item() / 299792458
     assert curve["x"][int(np.argmax(curve["y"]))] == pytest.approx(delay, abs=spacing)
 
@@ -153,11 +163,22 @@ def test_the_server_answers_to_names_of_this_machine_alone(levels):
     with serving(View([Contents(levels)])) as url:
         for host in ("localhost", "LOCALHOST:80", "127.0.0.1:8080", "[::1]:8080"):
             assert urlopen(Request(url, headers={"Host": host})).status == 200
-        for host in ("evil.example", "localhost.evil.example:8080", "127.0.0.1.evil.example", "[", ""):
+        for host in (
+            "evil.example",
+            "localhost.evil.example:8080",
+            "127.0.0.1.evil.example",
+            "[",
+            "",
+        ):
             with pytest.raises(HTTPError) as error:
-                urlopen(Request(f"{url}answer?run=0&place=1,1,1&receiver=0", headers={"Host": host}))
+                urlopen(
+                    Request(f"{url}answer?run=0&place=1,1,1&receiver=0", headers={"Host": host})
+                )
             assert error.value.code == 403
-            assert error.value.read() == b"this server answers to the names localhost and 127.0.0.1 alone\n"
+            assert (
+                error.value.read()
+                == b"this server answers to the names localhost and 127.0.0.1 alone\n"
+            )
 
 
 def test_a_port_in_use_is_named(levels):
@@ -188,7 +209,11 @@ def test_the_example_predicts(mirrored):
 
 def test_the_command_writes_a_file(levels, tmp_path):
     levels.save(tmp_path / "levels.ckpt")
-    options = {"view.out": str(tmp_path / "levels.html"), "folder": str(tmp_path / "levels.ckpt"), "threads": 1}
+    options = {
+        "view.out": str(tmp_path / "levels.html"),
+        "folder": str(tmp_path / "levels.ckpt"),
+        "threads": 1,
+    }
     gaigs.run(gaigs.compose("command=view", **options), tmp_path)
     assert content((tmp_path / "levels.html").read_text())["runs"][0]["title"] == "levels"
 
@@ -228,8 +253,13 @@ def test_a_drag_changes_the_picture(is_served, browser, links, levels, tmp_path)
             view.save(tmp_path / "room.html")
             url = (tmp_path / "room.html").as_uri()
         browser.open(url)
-        browser.wait("window.viewer && viewer.ready && viewer.runs[0].drawing.layers.get('map').numbers.length")
-        pictures, before = browser.run("return viewer.pictures"), browser.run("return viewer.state.place")
+        browser.wait(
+            "window.viewer && viewer.ready && viewer.runs[0].drawing.layers.get('map').numbers.length"
+        )
+        pictures, before = (
+            browser.run("return viewer.pictures"),
+            browser.run("return viewer.state.place"),
+        )
         canvases = "viewer.runs[0].canvas, document.querySelector('.results canvas')"
         shown = f"viewer.runs[0].drawFrame(); return [{canvases}].map(canvas => canvas.toDataURL())"
         scene, plot = browser.run(shown)

@@ -1,4 +1,6 @@
-"""Complex channels: SNR against the plain formula in numpy, and the phase that is removed against a search for it."""
+"""Complex channels: SNR against the plain formula in numpy, and the phase that is removed against a
+search for it.
+"""
 
 import numpy as np
 import pytest
@@ -14,7 +16,9 @@ SCORES = ["snr_db", "snr_aligned_db", "sinad_db", "error_power", "label_power"]
 
 def snr(labels, values):
     """-10 log10(|h - h'|² / |h|²) of each link, in complex128."""
-    h, guess = (part.numpy().astype(np.complex128).reshape(len(part), -1) for part in (labels, values))
+    h, guess = (
+        part.numpy().astype(np.complex128).reshape(len(part), -1) for part in (labels, values)
+    )
     return -10 * np.log10((abs(h - guess) ** 2).sum(1) / (abs(h) ** 2).sum(1))
 
 
@@ -32,16 +36,23 @@ def test_scores_equal_their_formulas(pairs, dtype):
     assert [*scores] == SCORES
     assert scores["snr_db"].dtype == torch.float64
     np.testing.assert_allclose(scores["snr_db"], snr(labels, values), rtol=1e-12)
-    power, error = ((abs(part.numpy().astype(np.complex128)) ** 2).sum((1, 2)) for part in (labels, labels - values))
+    power, error = (
+        (abs(part.numpy().astype(np.complex128)) ** 2).sum((1, 2))
+        for part in (labels, labels - values)
+    )
     np.testing.assert_allclose(scores["label_power"], power, rtol=1e-6)
     np.testing.assert_allclose(scores["error_power"], error, rtol=1e-6)
-    np.testing.assert_allclose(scores["sinad_db"], 10 * np.log10((power + error) / error), rtol=1e-6)
+    np.testing.assert_allclose(
+        scores["sinad_db"], 10 * np.log10((power + error) / error), rtol=1e-6
+    )
 
 
 def test_the_phase_removed_is_the_best_there_is(pairs):
     """Found here by trying 20,000 of them."""
     labels, values = pairs
-    turns = torch.polar(torch.ones(20_000, dtype=torch.float64), torch.linspace(0, 2 * np.pi, 20_000).double())
+    turns = torch.polar(
+        torch.ones(20_000, dtype=torch.float64), torch.linspace(0, 2 * np.pi, 20_000).double()
+    )
     found = TASK.scores(labels, values)["snr_aligned_db"]
     for k in range(len(labels)):
         turned = turns[:, None, None] * values[k].to(torch.complex128)
@@ -56,7 +67,9 @@ def test_the_unit_of_amplitudes_does_not_matter(pairs):
         there = TASK.scores(*(scale * part for part in pairs))
         for name in SCORES[:3]:
             torch.testing.assert_close(there[name], here[name], rtol=1e-5, atol=1e-4)
-        assert TASK.summarise(there)["nmse_db"] == pytest.approx(TASK.summarise(here)["nmse_db"], abs=1e-4)
+        assert TASK.summarise(there)["nmse_db"] == pytest.approx(
+            TASK.summarise(here)["nmse_db"], abs=1e-4
+        )
 
 
 def test_a_perfect_channel_has_the_highest_snr(pairs):
@@ -102,7 +115,10 @@ def test_the_summary_is_that_of_numpy(pairs):
         expected |= {f"{name}_{what}": number for what, number in numbers.items()}
     labels, values = (part.numpy().astype(np.complex128) for part in pairs)
     error, power = (abs(labels - values) ** 2).sum(), (abs(labels) ** 2).sum()
-    expected |= {"sinad_db_mean": scores["sinad_db"].mean().item(), "nmse_db": 10 * np.log10(error / power)}
+    expected |= {
+        "sinad_db_mean": scores["sinad_db"].mean().item(),
+        "nmse_db": 10 * np.log10(error / power),
+    }
     summary = TASK.summarise(scores)
     assert [*summary] == [*expected] == [*Csi.metrics()]
     assert summary == pytest.approx(expected, rel=1e-6)
@@ -113,9 +129,17 @@ def test_the_summary_is_that_of_numpy(pairs):
     [
         (torch.ones(2, 6, 3), torch.ones(2, 6, 3), r"must both be \('k', 3, 6\), got \(2, 6, 3\)"),
         (torch.ones(2, 3, 6), torch.ones(1, 3, 6), r"got \(2, 3, 6\) and \(1, 3, 6\)"),
-        (torch.ones(2, 3, 6), torch.full((2, 3, 6), torch.nan), "predictions must be finite, .* 2 of 2 channels"),
+        (
+            torch.ones(2, 3, 6),
+            torch.full((2, 3, 6), torch.nan),
+            "predictions must be finite, .* 2 of 2 channels",
+        ),
         (torch.full((1, 3, 6), torch.inf), torch.ones(1, 3, 6), "labels must be finite"),
-        (torch.zeros(2, 3, 6), torch.ones(2, 3, 6), "not be zero throughout, got 2 such channels; leave them out"),
+        (
+            torch.zeros(2, 3, 6),
+            torch.ones(2, 3, 6),
+            "not be zero throughout, got 2 such channels; leave them out",
+        ),
     ],
 )
 def test_unusable_channels_are_refused(labels, values, message):
@@ -177,7 +201,9 @@ def as_measured(task, channels, seed=1):
 def best_likeness(task, h, guess):
     """|<h', h>| / (|h| |h'|) of one link at the best of many phases and delays."""
     offsets = FREQUENCIES.numpy() - FREQUENCIES.numpy().mean()
-    delays = np.linspace(-1.6e-6, 1.6e-6, 40_001) if task.phase == "per_link_and_delay" else np.zeros(1)
+    delays = (
+        np.linspace(-1.6e-6, 1.6e-6, 40_001) if task.phase == "per_link_and_delay" else np.zeros(1)
+    )
     cross = (h.conj() * guess).sum(0) @ np.exp(2j * np.pi * np.outer(offsets, delays))
     return abs(cross).max() / np.linalg.norm(h) / np.linalg.norm(guess)
 
@@ -188,7 +214,9 @@ def test_labels_are_aligned_as_well_as_a_search_can(task, pairs):
     turned = task.align(labels, values)
     scores = task.scores(labels, values)
     assert "snr_db" not in scores
-    for k, (h, guess, found) in enumerate(zip(*(part.numpy() for part in (labels, values, turned)), strict=True)):
+    for k, (h, guess, found) in enumerate(
+        zip(*(part.numpy() for part in (labels, values, turned)), strict=True)
+    ):
         best = best_likeness(task, h, guess)
         sizes = np.linalg.norm(found), np.linalg.norm(guess)
         likeness = np.vdot(found, guess) / sizes[0] / sizes[1]
@@ -213,19 +241,25 @@ def test_what_is_unknown_of_a_link_changes_no_score(task, pairs):
     assert next(iter(numbers)) == "snr_aligned_db_median"
     assert not any(name.startswith("snr_db") for name in numbers)
     torch.testing.assert_close(
-        task.scores(as_measured(task, values), values)["snr_aligned_db"], torch.full((7,), HIGHEST).double()
+        task.scores(as_measured(task, values), values)["snr_aligned_db"],
+        torch.full((7,), HIGHEST).double(),
     )
 
 
 def test_subcarriers_in_any_order_and_unevenly_spaced_have_one_delay():
     frequencies = torch.tensor([5.18e9, 5.2e9, 5.1801e9, 5.19e9, 5.1903e9, 5.185e9, 5.1951e9])
     task = Csi(1, frequencies, "per_link_and_delay")
-    channel = torch.randn(4, 1, 7, dtype=torch.complex128, generator=torch.Generator().manual_seed(0))
+    channel = torch.randn(
+        4, 1, 7, dtype=torch.complex128, generator=torch.Generator().manual_seed(0)
+    )
     delays = torch.tensor([-40e-9, -3e-9, 0, 33e-9], dtype=torch.float64)
     turns = torch.exp(2j * torch.pi * (task.frequencies - 5.2e9) * delays[:, None])[:, None]
     torch.testing.assert_close(task.align(turns * channel, channel), channel, rtol=1e-6, atol=1e-6)
 
 
 def test_a_misspelt_phase_is_refused():
-    with pytest.raises(ValueError, match=r"data\.phase must be known or per_link or per_link_and_delay, got 'perlink'"):
+    with pytest.raises(
+        ValueError,
+        match=r"data\.phase must be known or per_link or per_link_and_delay, got 'perlink'",
+    ):
         Csi(1, FREQUENCIES, "perlink")

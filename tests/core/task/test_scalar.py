@@ -13,12 +13,24 @@ class Delay(Scalar):
 
 
 def test_rssi_is_scored_in_db():
-    labels, values = torch.tensor([-50.0, -60.0, -70.0, -80.0]), torch.tensor([-49.0, -62.0, -70.0, -75.0])
+    labels, values = (
+        torch.tensor([-50.0, -60.0, -70.0, -80.0]),
+        torch.tensor([-49.0, -62.0, -70.0, -75.0]),
+    )
     scores = Rssi().scores(labels, values)
     assert scores["mae_db"].tolist() == [1, 2, 0, 5]
-    assert Rssi().summarise(scores) == {"mae_db": 2, "median_ae_db": 1.5, "rmse_db": pytest.approx(7.5**0.5)}
+    assert Rssi().summarise(scores) == {
+        "mae_db": 2,
+        "median_ae_db": 1.5,
+        "rmse_db": pytest.approx(7.5**0.5),
+    }
     assert [*Rssi.metrics()] == ["mae_db", "median_ae_db", "rmse_db"]
-    assert (Rssi().shape, Rssi().unit, Rssi().normalisation, Rssi().directions) == ((), "dBm", "dBm", None)
+    assert (Rssi().shape, Rssi().unit, Rssi().normalisation, Rssi().directions) == (
+        (),
+        "dBm",
+        "dBm",
+        None,
+    )
     assert Rssi().is_noisy
 
 
@@ -26,7 +38,11 @@ def test_rssi_is_scored_in_db():
 def test_the_summary_is_that_of_numpy(dtype):
     labels, values = torch.randn(2, 41, generator=torch.Generator().manual_seed(0)).to(dtype)
     errors = np.abs(values.double().numpy() - labels.double().numpy())
-    expected = {"mae_db": errors.mean(), "median_ae_db": np.median(errors), "rmse_db": np.sqrt((errors**2).mean())}
+    expected = {
+        "mae_db": errors.mean(),
+        "median_ae_db": np.median(errors),
+        "rmse_db": np.sqrt((errors**2).mean()),
+    }
     scores = Rssi().scores(labels, values)
     assert scores["mae_db"].dtype == torch.float64
     assert Rssi().summarise(scores) == pytest.approx(expected, rel=1e-12)
@@ -34,7 +50,11 @@ def test_the_summary_is_that_of_numpy(dtype):
 
 def test_another_quantity_has_names_of_its_own_unit():
     task = Delay()
-    assert [metric.title for metric in Delay.metrics().values()] == ["MAE [ns]", "median AE [ns]", "RMSE [ns]"]
+    assert [metric.title for metric in Delay.metrics().values()] == [
+        "MAE [ns]",
+        "median AE [ns]",
+        "RMSE [ns]",
+    ]
     scores = task.scores(torch.zeros(3), torch.ones(3))
     assert [*scores] == [task.monitor] == ["mae_ns"]
     assert task.summarise(scores) == {"mae_ns": 1, "median_ae_ns": 1, "rmse_ns": 1}
@@ -53,7 +73,11 @@ def test_the_signed_error_is_stored():
         (torch.zeros(3), torch.zeros(4), r"must both be \('k',\), got \(3,\) and \(4,\)"),
         (torch.zeros(3, 1), torch.zeros(3, 1), r"must both be \('k',\)"),
         (torch.tensor(0.0), torch.tensor(0.0), r"must both be \('k',\), got \(\) and \(\)"),
-        (torch.zeros(3), torch.tensor([0, torch.nan, 0]), "predictions must be finite, got NaN or infinity in 1 of 3"),
+        (
+            torch.zeros(3),
+            torch.tensor([0, torch.nan, 0]),
+            "predictions must be finite, got NaN or infinity in 1 of 3",
+        ),
         (
             torch.tensor([0, 0, torch.inf]),
             torch.zeros(3),

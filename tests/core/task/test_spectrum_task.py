@@ -20,10 +20,14 @@ def pairs():
     return labels, labels + 0.2 * torch.randn(5, *TASK.shape, generator=generator)
 
 
-@pytest.mark.parametrize("shape", [(90, 360), (128, 512), (256, 256), (511, 256), (73, 360), (361, 181), (9, 8)])
+@pytest.mark.parametrize(
+    "shape", [(90, 360), (128, 512), (256, 256), (511, 256), (73, 360), (361, 181), (9, 8)]
+)
 def test_fingerprints_are_of_many_rows_and_columns(shape):
     rows, columns = shape
-    row, column = np.divmod(TASK.fingerprint(torch.arange(rows * columns).view(1, *shape))[0].numpy(), columns)
+    row, column = np.divmod(
+        TASK.fingerprint(torch.arange(rows * columns).view(1, *shape))[0].numpy(), columns
+    )
     assert 0.8 * min(512, rows * columns) <= len(row) <= 512
     assert len(np.unique(row)) >= min(rows, 64)
     assert len(np.unique(column)) >= columns / 8
@@ -54,16 +58,26 @@ def test_summary_is_that_of_numpy():
     }
     assert list(summary) == list(expected) == list(Spectrum.metrics())
     assert summary == pytest.approx(expected, rel=1e-12)
-    assert [metric.higher_is_better for metric in Spectrum.metrics().values()] == [True] * 4 + [False]
+    assert [metric.higher_is_better for metric in Spectrum.metrics().values()] == [True] * 4 + [
+        False
+    ]
 
 
 @pytest.mark.parametrize(
     ("labels", "values", "message"),
     [
         (torch.zeros(9, 24), torch.zeros(9, 24), r"must both be \('k', 9, 24\), got \(9, 24\)"),
-        (torch.zeros(2, 24, 9), torch.zeros(2, 24, 9), r"must both be \('k', 9, 24\), got \(2, 24, 9\)"),
+        (
+            torch.zeros(2, 24, 9),
+            torch.zeros(2, 24, 9),
+            r"must both be \('k', 9, 24\), got \(2, 24, 9\)",
+        ),
         (torch.zeros(2, 9, 24), torch.zeros(1, 9, 24), r"got \(2, 9, 24\) and \(1, 9, 24\)"),
-        (torch.zeros(3, 9, 24), torch.zeros(3, 9, 24).index_fill(0, torch.tensor([1]), torch.nan), "in number 1"),
+        (
+            torch.zeros(3, 9, 24),
+            torch.zeros(3, 9, 24).index_fill(0, torch.tensor([1]), torch.nan),
+            "in number 1",
+        ),
         (torch.full((1, 9, 24), torch.inf), torch.zeros(1, 9, 24), "labels must be finite"),
     ],
 )
@@ -83,7 +97,9 @@ def test_axes_are_arrays_in_radians():
     directions = Spectrum(*axes, "none").directions
     assert torch.equal(directions.elevations, GRID.elevations)
     assert torch.equal(directions.azimuths, GRID.azimuths)
-    with pytest.raises(ValueError, match=r"elevations must be a list of angles .* rad, got 5; Grid.degrees takes"):
+    with pytest.raises(
+        ValueError, match=r"elevations must be a list of angles .* rad, got 5; Grid.degrees takes"
+    ):
         Spectrum(np.rad2deg(axes[0]), axes[1], "none")
 
 
@@ -157,7 +173,10 @@ def test_links_and_shares_stay():
     ("options", "message"),
     [
         ({"stride": 0}, r"training\.thinning\.stride must be at least 1, got 0"),
-        ({"rays": 0}, r"training\.thinning\.rays must be in 1\.\.216 with stride=1, got 0, stride 1"),
+        (
+            {"rays": 0},
+            r"training\.thinning\.rays must be in 1\.\.216 with stride=1, got 0, stride 1",
+        ),
         ({"rays": 217}, r"rays must be in 1\.\.216"),
         ({"rays": 20, "stride": 2}, "with stride=1, got 20, stride 2"),
     ],

@@ -30,7 +30,9 @@ class Room:
     h: np.ndarray = field(default_factory=lambda: np.zeros(0))  # (n, k, e, s)
 
     def lengths(self):
-        """Lengths of the direct path and of those by four walls (paths, n, k, e) [m], with their reflections."""
+        """Lengths of the direct path and of those by four walls (paths, n, k, e) [m], with their
+        reflections.
+        """
         turn = Rotation.from_quat(self.quaternions).as_matrix()
         places = self.rx[:, None] + np.einsum("kwa,ea->kew", turn, self.elements)
         images = [self.tx]
@@ -46,10 +48,21 @@ class Room:
         poses = [Pose.from_xyzw(*parts) for parts in zip(self.rx, self.quaternions, strict=True)]
         receivers = [Receiver(f"rx{k}", pose, array) for k, pose in enumerate(poses)]
         task = Csi(len(array), self.frequencies, phase)
-        return gaigs.links(task=task, transmitters=self.tx, receivers=receivers, labels=self.h.copy(), **options)
+        return gaigs.links(
+            task=task, transmitters=self.tx, receivers=receivers, labels=self.h.copy(), **options
+        )
 
 
-def room(elements=4, subcarriers=16, receivers=1, count=110, seed=0, reflection=-0.6, noise=0.05, turned=False) -> Room:
+def room(
+    elements=4,
+    subcarriers=16,
+    receivers=1,
+    count=110,
+    seed=0,
+    reflection=-0.6,
+    noise=0.05,
+    turned=False,
+) -> Room:
     """A random room; elements stand half a wavelength apart, sixteen of them in a square."""
     rng = np.random.default_rng(seed)
     tx = rng.uniform([0.5, 0.5, 0.8], SIZE - [0.5, 0.5, 0.8], (count, 3))

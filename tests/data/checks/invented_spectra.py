@@ -11,7 +11,9 @@ from gaigs.core.geometry import Grid, Pose
 from gaigs.core.task.spectrum import Spectrum
 
 SIZE = np.array([8.0, 6.0, 3.0])
-QUATERNION = np.array([-0.15403, 0.87354, 0.23087, 0.39989])  # x, y, z, w: from a corner down into the room
+QUATERNION = np.array(
+    [-0.15403, 0.87354, 0.23087, 0.39989]
+)  # x, y, z, w: from a corner down into the room
 
 
 @dataclass
@@ -28,7 +30,11 @@ class Room:
         grid = Grid.degrees(range(2, 91, 2), range(0, 360, 4))
         task = Spectrum(grid.elevations, grid.azimuths)
         return gaigs.links(
-            task=task, transmitters=self.transmitters, receivers=Receiver("array", pose), labels=self.spectra, **options
+            task=task,
+            transmitters=self.transmitters,
+            receivers=Receiver("array", pose),
+            labels=self.spectra,
+            **options,
         )
 
 
@@ -57,7 +63,10 @@ def room(count=100, seed=0, blocked=0.3, edge=4, noise=0.1) -> Room:
         towards = local.inv().apply(ways / lengths[:, None])[:, :2]
         phases = np.exp(2j * np.pi * rng.random(7))
         fields = (gains / lengths * phases) @ np.exp(2j * np.pi * towards @ elements.T)
-        fields = fields + noise * np.abs(fields).mean() * rng.normal(size=(2, len(fields))).T @ [1, 1j]
+        fields = fields + noise * np.abs(fields).mean() * rng.normal(size=(2, len(fields))).T @ [
+            1,
+            1j,
+        ]
         power = np.abs(steering @ fields).reshape(45, 90)
         spectra.append((power - power.min()) / np.ptp(power))
     return Room(places, position, QUATERNION.copy(), np.array(spectra, np.float32))

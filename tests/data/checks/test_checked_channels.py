@@ -1,4 +1,6 @@
-"""Faults of channels: units, axes, orders, signs, and subcarriers that are none; each is named with what mends it."""
+"""Faults of channels: units, axes, orders, signs, and subcarriers that are none; each is named with
+what mends it.
+"""
 
 import re
 from dataclasses import replace
@@ -79,13 +81,17 @@ FAULTS = {
     "subcarriers": (moved("h", lambda h: h[..., ::-1]), "subcarriers are in reversed order", (1, 16, 1)),
     "coefficients": (moved("h", lambda h: h.conj()[..., ::-1]), "path coefficients are conjugate", (1, 16, 1)),
 }  # fmt: skip
-"""Of each fault: how it changes the arrays, what is said, and fewest elements, subcarriers and receivers."""
+"""Of each fault: how it changes the arrays, what is said, and fewest elements, subcarriers and
+receivers.
+"""
 
 
 def cases():
     for fault, (*_, least) in FAULTS.items():
         for size in SIZES:
-            if all(a >= b for a, b in zip(size, least, strict=True)) and not (least[0] == 4 and size[2] == 3):
+            if all(a >= b for a, b in zip(size, least, strict=True)) and not (
+                least[0] == 4 and size[2] == 3
+            ):
                 yield pytest.param(fault, size, id=f"{fault} {size}")
 
 
@@ -93,7 +99,10 @@ def cases():
 def test_the_convention_that_fits_is_named(fault, size):
     change, words, _ = FAULTS[fault]
     remarks = change(room(*size, seed=sum(size))).links().remarks
-    assert re.search(f"the direct wave explains [0-9]+% of the channels in place of [0-9]+% if .*{words}", remarks)
+    assert re.search(
+        f"the direct wave explains [0-9]+% of the channels in place of [0-9]+% if .*{words}",
+        remarks,
+    )
 
 
 @pytest.mark.parametrize("size", SIZES)
@@ -134,11 +143,15 @@ def test_conventions_show_within_links_of_unknown_phase_and_in_levels():
     own = room(4, 16, 3)
     own.h = own.h * np.exp(2j * np.pi * rng.random((*own.h.shape[:2], 1, 1)))
     swapped = replace(own, rx=own.rx[[1, 0, 2]]).links("per_link").remarks
-    assert re.search(r"explains \d+% of each channel in place of \d+% if rows of rx are exchanged", swapped)
+    assert re.search(
+        r"explains \d+% of each channel in place of \d+% if rows of rx are exchanged", swapped
+    )
     single = room(1, 1, 3, reflection=-0.1)
     single.h = single.h * np.exp(2j * np.pi * rng.random((*single.h.shape[:2], 1, 1)))
     remarks = replace(single, tx=100 * single.tx).links("per_link").remarks
-    assert re.search(r"distance explains \d+% of the levels' spread in place of \d+% if tx are in cm", remarks)
+    assert re.search(
+        r"distance explains \d+% of the levels' spread in place of \d+% if tx are in cm", remarks
+    )
 
 
 @pytest.mark.parametrize("count", [16, 17, 64])
@@ -149,11 +162,15 @@ def test_the_fft_order_is_named(count, phase):
     assert re.search(r"FFT order\?; h = np.fft.fftshift\(h, axes=-1\)", fft)
     other = replace(own, frequencies=np.fft.ifftshift(own.frequencies)).links(phase).remarks
     assert re.search(r"FFT order\?; frequencies = np.sort\(frequencies\)", other)
-    both = replace(own, h=np.fft.ifftshift(own.h, axes=-1), frequencies=np.fft.ifftshift(own.frequencies))
+    both = replace(
+        own, h=np.fft.ifftshift(own.h, axes=-1), frequencies=np.fft.ifftshift(own.frequencies)
+    )
     assert "FFT order" not in both.links(phase).remarks
 
 
-@pytest.mark.parametrize("change", [lambda h: h.real + 0j, lambda h: np.abs(h) + 1j * np.angle(h) / np.pi])
+@pytest.mark.parametrize(
+    "change", [lambda h: h.real + 0j, lambda h: np.abs(h) + 1j * np.angle(h) / np.pi]
+)
 def test_channels_without_their_parts_are_named(change):
     own = room(1, 16, 3)
     remarks = replace(own, h=change(own.h)).links().remarks
@@ -170,7 +187,9 @@ def test_transmitters_in_the_frame_of_their_receiver_are_named():
 @pytest.mark.parametrize("factor", [1e-3, 1e3])
 def test_noise_in_guard_subcarriers_is_named(factor):
     own = room(4, 16, 2)
-    own.h[..., :2] *= factor * np.exp(2j * np.pi * np.random.default_rng(0).random(own.h[..., :2].shape))
+    own.h[..., :2] *= factor * np.exp(
+        2j * np.pi * np.random.default_rng(0).random(own.h[..., :2].shape)
+    )
     words = "2 of 16 subcarriers are 30 dB or more from the usual one in power: 3.46, 3.465 GHz; leave them out if"
     assert words in own.links().remarks
 
@@ -201,13 +220,17 @@ def test_null_subcarriers_of_arrays_of_several_sizes_and_of_held_out_bands():
     labels[..., 3] = 2.0
     labels[1::2, 2:] = 0
     labels[4, :, [0, 1, 2, 4]] = 0  # silent but for the null subcarrier
-    held_out = replace(links, labels=links.labels[..., :3].clone(), task=Csi(4, links.task.frequencies[:3] + 1e8))
+    held_out = replace(
+        links, labels=links.labels[..., :3].clone(), task=Csi(4, links.task.frequencies[:3] + 1e8)
+    )
     held_out.labels[..., 1] = 0
     links = replace(links, receivers=(links.receivers[0], small), labels=labels, held_out=held_out)
     divided = divide(links, {"name": "official"})
     assert divided.labels.shape == (23, 4, 4)
     assert divided.held_out.labels.shape == (23, 4, 2)
-    torch.testing.assert_close(divided.query.transmitters, links.query.transmitters[torch.arange(24) != 4])
+    torch.testing.assert_close(
+        divided.query.transmitters, links.query.transmitters[torch.arange(24) != 4]
+    )
     assert divided.split.test.tolist() == [19, 20, 21, 22]
     assert "1 of 5 subcarriers have one value in every link" in divided.remarks
     assert "1 of 3 subcarriers have one value in every link" in divided.remarks

@@ -1,4 +1,6 @@
-"""Checks of levels by the law of distance: each fault is named with its numbers, and sound surveys have none."""
+"""Checks of levels by the law of distance: each fault is named with its numbers, and sound surveys
+have none.
+"""
 
 import re
 
@@ -29,8 +31,12 @@ LEVELS = levels_of(PLACES, GATEWAYS)
 
 def links_of(places=PLACES, gateways=GATEWAYS, levels=LEVELS, frequency=None, uncertainties=None):
     rows, columns = np.nonzero(~np.isnan(levels))
-    receivers = tuple(gateway(f"ap{k}", torch.tensor(place).float()) for k, place in enumerate(gateways))
-    carriers = None if frequency is None else torch.full((len(rows),), frequency, dtype=torch.float64)
+    receivers = tuple(
+        gateway(f"ap{k}", torch.tensor(place).float()) for k, place in enumerate(gateways)
+    )
+    carriers = (
+        None if frequency is None else torch.full((len(rows),), frequency, dtype=torch.float64)
+    )
     return Links(
         query=Query(torch.tensor(places).float()[rows], torch.tensor(columns), carriers),
         receivers=receivers,
@@ -55,12 +61,30 @@ POWERS = 10 ** (LEVELS / 10)
 UNITS = {
     "watts": (1e-3 * POWERS, "are they watts.; levels = 10 . np.log10.levels / 1e-3., or .* of mW"),
     "milliwatts": (1e4 * POWERS, "are they mW.; levels = 10 . np.log10.levels.$"),
-    "microwatts": (1e7 * POWERS, "are they microwatts or less.; levels = 10 . np.log10.levels . 1e-3. of microwatts"),
-    "volts": (10 ** ((LEVELS - 13) / 20), "are they volts.; levels = 20 . np.log10.levels. . 13 at 50 ohm"),
-    "watts, 0 for silence": (np.where(LEVELS < -70, 0, 1e-3 * POWERS), "are they watts.; levels = 10"),
-    "sign": (-LEVELS, "480 levels are above 0 dBm, .* to 8.*; was a sign lost, or are they path losses. levels = -l"),
-    "dBuV": (LEVELS + 107, "480 levels are above 0 dBm, .*, and fall with the distance; percent, .* dBuV"),
-    "signs of a row": (np.where(np.arange(120)[:, None] == 7, -LEVELS, LEVELS), "^4 levels are above 0 dBm, and usual"),
+    "microwatts": (
+        1e7 * POWERS,
+        "are they microwatts or less.; levels = 10 . np.log10.levels . 1e-3. of microwatts",
+    ),
+    "volts": (
+        10 ** ((LEVELS - 13) / 20),
+        "are they volts.; levels = 20 . np.log10.levels. . 13 at 50 ohm",
+    ),
+    "watts, 0 for silence": (
+        np.where(LEVELS < -70, 0, 1e-3 * POWERS),
+        "are they watts.; levels = 10",
+    ),
+    "sign": (
+        -LEVELS,
+        "480 levels are above 0 dBm, .* to 8.*; was a sign lost, or are they path losses. levels = -l",
+    ),
+    "dBuV": (
+        LEVELS + 107,
+        "480 levels are above 0 dBm, .*, and fall with the distance; percent, .* dBuV",
+    ),
+    "signs of a row": (
+        np.where(np.arange(120)[:, None] == 7, -LEVELS, LEVELS),
+        "^4 levels are above 0 dBm, and usual",
+    ),
 }
 
 
@@ -71,7 +95,9 @@ def test_another_unit_of_levels_is_named(unit):
     assert re.search(words, found[0]), found
 
 
-@pytest.mark.parametrize(("value", "is_named"), [(12.0, True), (-20.0, False), (-165.0, True), (-100.0, False)])
+@pytest.mark.parametrize(
+    ("value", "is_named"), [(12.0, True), (-20.0, False), (-165.0, True), (-100.0, False)]
+)
 def test_a_level_far_from_those_of_near_places_is_named_by_its_row(value, is_named):
     place = int(np.argsort(LEVELS[:, 3])[40])
     found = found_in(levels=changed(place, 3, value))
@@ -106,13 +132,18 @@ def test_another_convention_of_places_is_named_by_one_receiver_too(convention, c
     gateways = GATEWAYS[1 : count + 1]
     moved = gateways[:, change] if isinstance(change, list) else change * gateways
     found = found_in(places=factor * PLACES, gateways=moved, levels=LEVELS[:, 1 : count + 1])
-    assert any(re.search(rf"distance to 2.* dB instead of .* dB if {words}", one) for one in found), found
+    assert any(
+        re.search(rf"distance to 2.* dB instead of .* dB if {words}", one) for one in found
+    ), found
 
 
 @pytest.mark.parametrize(
     ("gateways", "words"),
     [
-        (GATEWAYS - [9, 5.5, 0], r"the origin of rx is the middle of tx; rx\[:, :2\] \+= \(\(tx.min\(0\) \+ tx.max"),
+        (
+            GATEWAYS - [9, 5.5, 0],
+            r"the origin of rx is the middle of tx; rx\[:, :2\] \+= \(\(tx.min\(0\) \+ tx.max",
+        ),
         (GATEWAYS * [1, -1, 1], "if rx have y negated; rx = rx . .1, -1, 1."),
         (
             GATEWAYS * [1, -1, 1] + [0, 11, 0],
@@ -122,10 +153,16 @@ def test_another_convention_of_places_is_named_by_one_receiver_too(convention, c
             np.add(GATEWAYS, [9, 5, 0]),
             r"if all receivers stand \(-[89].*, -[45].*\) m elsewhere; rx = rx \+ \[",
         ),
-        (GATEWAYS[[1, 0, 2, 3]], "levels of ap0, ap1 follow .* from the places of ap1, ap0; are names or places exch"),
+        (
+            GATEWAYS[[1, 0, 2, 3]],
+            "levels of ap0, ap1 follow .* from the places of ap1, ap0; are names or places exch",
+        ),
         (np.roll(GATEWAYS, 1, 0), r"are receivers counted from 1. rx = np.roll\(rx, -1, axis=0\)"),
         (np.roll(GATEWAYS, -1, 0), r"are receivers counted from 1. rx = np.roll\(rx, 1, axis=0\)"),
-        (np.vstack((GATEWAYS[:3], [[2.0, 10.0, 2.0]])), r"levels of ap3 follow .* from \(1.*, .*\) m, 1\d.* m off its"),
+        (
+            np.vstack((GATEWAYS[:3], [[2.0, 10.0, 2.0]])),
+            r"levels of ap3 follow .* from \(1.*, .*\) m, 1\d.* m off its",
+        ),
     ],
 )
 def test_receivers_at_places_that_levels_contradict_are_named(gateways, words):
@@ -135,7 +172,9 @@ def test_receivers_at_places_that_levels_contradict_are_named(gateways, words):
 
 def test_rows_of_places_in_another_order_are_doubted():
     found = found_in(places=RANDOM.permutation(PLACES))
-    assert any("near places do not agree; are places and levels in the same order" in one for one in found), found
+    assert any(
+        "near places do not agree; are places and levels in the same order" in one for one in found
+    ), found
 
 
 @pytest.mark.parametrize(
@@ -148,20 +187,29 @@ def test_rows_of_places_in_another_order_are_doubted():
 )
 def test_a_unit_of_all_places_is_doubted_by_what_free_space_allows(factor, shift, words):
     frequency = None if shift == 0 else 2.4e9
-    found = found_in(places=factor * PLACES, gateways=factor * GATEWAYS, levels=LEVELS + shift, frequency=frequency)
+    found = found_in(
+        places=factor * PLACES,
+        gateways=factor * GATEWAYS,
+        levels=LEVELS + shift,
+        frequency=frequency,
+    )
     assert any(re.search(words, one) for one in found), found
 
 
 def test_places_that_were_scaled_are_doubted():
     size = np.array([18.0, 11.0, 3.0])
     (found,) = found_in(places=PLACES / size, gateways=GATEWAYS / size)
-    assert re.match("places span 0.98.* m, as if scaled to 0..1 along each axis; give them in metres", found)
+    assert re.match(
+        "places span 0.98.* m, as if scaled to 0..1 along each axis; give them in metres", found
+    )
 
 
 def test_degrees_in_place_of_metres_are_named():
     scale, origin = [1e-5, 1e-5, 1], [8.5, 47.3, 0]
     found = found_in(places=PLACES * scale + origin, gateways=GATEWAYS * scale + origin)
-    assert found[0].startswith("x and y of places span 0.00018 m around (8.500097, 47.30006); are they degrees?")
+    assert found[0].startswith(
+        "x and y of places span 0.00018 m around (8.500097, 47.30006); are they degrees?"
+    )
 
 
 @pytest.mark.parametrize("kind", ["open", "walls", "sectors"])
@@ -171,9 +219,15 @@ def test_sound_surveys_from_10_m_to_10_km_have_no_remark(kind, span, count):
     for seed in range(3):
         random = np.random.default_rng(seed)
         places = random.uniform(0, span, (150, 3)) * [1, 0.7, 0] + [0, 0, 1.5]
-        gateways = random.uniform(0, span, (count, 3)) * [1, 0.7, 0] + [0, 0, 2.5 if span < 100 else 20]
+        gateways = random.uniform(0, span, (count, 3)) * [1, 0.7, 0] + [
+            0,
+            0,
+            2.5 if span < 100 else 20,
+        ]
         offsets = places[:, None] - gateways
-        levels = -10 - 32 * np.log10(np.linalg.norm(offsets, axis=2)) + random.normal(0, 6, (150, count))
+        levels = (
+            -10 - 32 * np.log10(np.linalg.norm(offsets, axis=2)) + random.normal(0, 6, (150, count))
+        )
         if kind == "walls":
             levels -= 12 * ((places[:, None, 0] > span / 2) != (gateways[:, 0] > span / 2))
         if kind == "sectors":

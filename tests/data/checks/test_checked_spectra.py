@@ -1,4 +1,6 @@
-"""Bright directions tell the convention of positions, orientations and pixels; sound spectra have no remark."""
+"""Bright directions tell the convention of positions, orientations and pixels; sound spectra have
+no remark.
+"""
 
 import functools
 from dataclasses import replace
@@ -39,19 +41,33 @@ FAULTS = {
     "tx have x and y exchanged": lambda own: {"transmitters": own.transmitters[:, [1, 0, 2]]},
     "tx have y and z exchanged": lambda own: {"transmitters": own.transmitters[:, [0, 2, 1]]},
     "quaternions have the order w, x, y, z": lambda own: {"quaternion": np.roll(own.quaternion, 1)},
-    "rotations lead from the world to the array": lambda own: {"quaternion": own.quaternion * [-1, -1, -1, 1]},
+    "rotations lead from the world to the array": lambda own: {
+        "quaternion": own.quaternion * [-1, -1, -1, 1]
+    },
     "rows are upside down": lambda own: {"spectra": own.spectra[:, ::-1].copy()},
-    "the first column is at azimuth -180 degrees": lambda own: {"spectra": np.roll(own.spectra, 45, 2)},
+    "the first column is at azimuth -180 degrees": lambda own: {
+        "spectra": np.roll(own.spectra, 45, 2)
+    },
     "azimuths run clockwise": lambda own: {"spectra": own.spectra[:, :, -np.arange(90)]},
-    "azimuths run clockwise from the y axis": lambda own: {"spectra": own.spectra[:, :, 22 - np.arange(90)]},
+    "azimuths run clockwise from the y axis": lambda own: {
+        "spectra": own.spectra[:, :, 22 - np.arange(90)]
+    },
     "tx are relative to rx": lambda own: {"transmitters": own.transmitters - own.position},
     "rx are in mm": lambda own: {"position": 1000 * own.position},
-    "tx are scaled to -0.5..0.5 along each axis": lambda own: {"transmitters": own.transmitters / SIZE - 0.5},
-    "tx are standardised along each axis": lambda own: {"transmitters": standardised(own.transmitters)},
+    "tx are scaled to -0.5..0.5 along each axis": lambda own: {
+        "transmitters": own.transmitters / SIZE - 0.5
+    },
+    "tx are standardised along each axis": lambda own: {
+        "transmitters": standardised(own.transmitters)
+    },
     "amplitudes are inverted": lambda own: {"spectra": 1 - own.spectra},
-    "spectra are sorted by name (0, 10": lambda own: {"spectra": own.spectra[np.argsort([*map(str, range(120))])]},
+    "spectra are sorted by name (0, 10": lambda own: {
+        "spectra": own.spectra[np.argsort([*map(str, range(120))])]
+    },
     "spectra are one row late": lambda own: {"spectra": np.roll(own.spectra, 1, 0)},
-    "spectra are sorted by name": lambda own: {"spectra": own.spectra[np.argsort([*map(str, range(1, 121))])]},
+    "spectra are sorted by name": lambda own: {
+        "spectra": own.spectra[np.argsort([*map(str, range(1, 121))])]
+    },
     "tx are in cm and quaternions have the order w, x, y, z": lambda own: {
         "transmitters": 100 * own.transmitters,
         "quaternion": np.roll(own.quaternion, 1),
@@ -65,7 +81,9 @@ FAULTS = {
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_convention_of_spectra_is_named(fault):
     made = replace(sound(), **FAULTS[fault](sound()))
-    (finding,) = (one for one in gaigs.describe(made.links()).findings if one.fault == "directions of spectra")
+    (finding,) = (
+        one for one in gaigs.describe(made.links()).findings if one.fault == "directions of spectra"
+    )
     assert fault in finding.text
     assert finding.fits > finding.read + 0.08
     assert finding.mend
@@ -97,11 +115,15 @@ def test_the_line_that_mends_clockwise_azimuths_mirrors_them(azimuths):
 def test_spectra_in_no_order_are_doubted():
     made = replace(sound(), spectra=np.random.default_rng(0).permutation(sound().spectra))
     (found,) = gaigs.describe(made.links()).suspicious
-    assert found.startswith("spectra are not bright towards their transmitters, and near places have a correlation of ")
+    assert found.startswith(
+        "spectra are not bright towards their transmitters, and near places have a correlation of "
+    )
     assert found.endswith("are places and spectra in the same order?")
 
 
-@pytest.mark.parametrize("options", [{}, {"blocked": 0.0}, {"blocked": 1.0}, {"count": 40}, {"edge": 2}])
+@pytest.mark.parametrize(
+    "options", [{}, {"blocked": 0.0}, {"blocked": 1.0}, {"count": 40}, {"edge": 2}]
+)
 def test_sound_spectra_have_no_remark(options):
     assert gaigs.describe(room(**options).links()).findings == ()
 

@@ -6,24 +6,37 @@ import pytest
 import torch
 
 from gaigs.core.query import Query
-from gaigs.splatting.deformation.two_branch import HEADS, INITIAL_ATTENUATION, LEAST_ATTENUATION, TokenLinear, TwoBranch
+from gaigs.splatting.deformation.two_branch import (
+    HEADS,
+    INITIAL_ATTENUATION,
+    LEAST_ATTENUATION,
+    TokenLinear,
+    TwoBranch,
+)
 from gaigs.splatting.gaussians import Placed, Tokens
 
 B, N, CHANNELS, WIDTH = 3, 7, 2, 8
 WIDTHS = (5, 4, 6)
-SUBSETS = [list(subset) for subset in chain.from_iterable(combinations(HEADS, size) for size in range(6))]
+SUBSETS = [
+    list(subset) for subset in chain.from_iterable(combinations(HEADS, size) for size in range(6))
+]
 SHAPES = dict(zip(HEADS, ((B, N, 4), (B, N, 3), (B, N, CHANNELS, 1), (B, N), (B, N)), strict=True))
 
 
 def make_tokens(widths=WIDTHS, b=B, n=N, scale=1.0):
     scene, gaussian, transmitter = widths
     return Tokens(
-        *(scale * torch.randn(count, width) for count, width in ((b, scene), (n, gaussian), (b, transmitter)))
+        *(
+            scale * torch.randn(count, width)
+            for count, width in ((b, scene), (n, gaussian), (b, transmitter))
+        )
     )
 
 
 def make_network(heads, widths=WIDTHS):
-    return TwoBranch(widths, CHANNELS, width=WIDTH, attenuation_layers=2, signal_layers=1, heads=heads)
+    return TwoBranch(
+        widths, CHANNELS, width=WIDTH, attenuation_layers=2, signal_layers=1, heads=heads
+    )
 
 
 def residuals_of(network, tokens):
@@ -52,7 +65,9 @@ def test_a_head_left_out_does_not_exist_and_costs_nothing(heads):
     if heads:
         total = sum(r.square().sum() for r in residuals_of(network, make_tokens()) if r is not None)
         total.backward()
-    assert all(parameter.grad is not None and parameter.grad.any() for parameter in parameters.values())
+    assert all(
+        parameter.grad is not None and parameter.grad.any() for parameter in parameters.values()
+    )
     assert bool(parameters) == bool(heads)
 
 
@@ -62,7 +77,10 @@ def test_the_number_of_parameters_is_that_of_the_papers_layers():
     attenuation = linear(scene + gaussian + transmitter, WIDTH) + 2 * linear(WIDTH, WIDTH)
     signal = linear(scene + gaussian + transmitter + WIDTH, WIDTH) + linear(WIDTH, WIDTH)
     heads = {name: linear(WIDTH, 1) for name in ("opacity", "attenuation")}
-    heads |= {name: linear(2 * WIDTH, size) for name, size in (("rotation", 4), ("scale", 3), ("signal", CHANNELS))}
+    heads |= {
+        name: linear(2 * WIDTH, size)
+        for name, size in (("rotation", 4), ("scale", 3), ("signal", CHANNELS))
+    }
     for chosen in SUBSETS:
         expected = sum(heads[name] for name in chosen) + attenuation * bool(chosen)
         expected += signal * any(name in chosen for name in ("rotation", "scale", "signal"))
@@ -74,7 +92,9 @@ def test_residuals_start_at_zero_and_the_attenuation_nearly_clear():
     for residual in (residuals.delta_quats, residuals.delta_scales, residuals.delta_opacities):
         assert not residual.any()
     torch.testing.assert_close(residuals.attenuations, torch.full((B, N), INITIAL_ATTENUATION))
-    assert residuals.delta_signal.any()  # the signal is where transmitters differ from the first step on
+    assert (
+        residuals.delta_signal.any()
+    )  # the signal is where transmitters differ from the first step on
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -101,9 +121,19 @@ def test_the_attenuation_lies_in_0_1_however_large_the_activations(dtype, scale)
 def test_the_layer_is_one_linear_layer_on_the_concatenation(widths, hidden):
     layer, tokens = TokenLinear(widths, WIDTH, hidden), make_tokens(widths)
     inner = torch.randn(B, N, hidden) if hidden else None
-    scene, gaussians, transmitters = tokens.scene[:, None], tokens.gaussians[None], tokens.transmitters[:, None]
-    parts = [part.expand(B, N, -1) for part in (scene, transmitters, gaussians)] + [inner] * bool(hidden)
-    weights = [linear.weight for linear in (layer.links, layer.gaussians, layer.hidden) if linear is not None]
+    scene, gaussians, transmitters = (
+        tokens.scene[:, None],
+        tokens.gaussians[None],
+        tokens.transmitters[:, None],
+    )
+    parts = [part.expand(B, N, -1) for part in (scene, transmitters, gaussians)] + [inner] * bool(
+        hidden
+    )
+    weights = [
+        linear.weight
+        for linear in (layer.links, layer.gaussians, layer.hidden)
+        if linear is not None
+    ]
     weight = torch.cat(weights, 1) if weights else torch.zeros(WIDTH, 0)
     whole = torch.nn.functional.linear(torch.cat(parts, -1), weight, layer.bias)
     torch.testing.assert_close(layer(tokens, inner), whole)
@@ -121,7 +151,10 @@ def test_tokens_of_gaussians_may_differ_between_queries(hidden):
     layer, tokens = TokenLinear(WIDTHS, WIDTH, hidden), make_tokens()
     own = tokens._replace(gaussians=torch.randn(B, N, WIDTHS[1]))
     inner = torch.randn(B, N, hidden) if hidden else None
-    alone = [Tokens(own.scene[i : i + 1], own.gaussians[i], own.transmitters[i : i + 1]) for i in range(B)]
+    alone = [
+        Tokens(own.scene[i : i + 1], own.gaussians[i], own.transmitters[i : i + 1])
+        for i in range(B)
+    ]
     each = [layer(part, inner[i : i + 1] if hidden else None) for i, part in enumerate(alone)]
     torch.testing.assert_close(layer(own, inner), torch.cat(each))
     shared = own._replace(gaussians=tokens.gaussians.expand(B, -1, -1))

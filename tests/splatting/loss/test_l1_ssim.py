@@ -18,7 +18,9 @@ TASK = Spectrum(GRID.elevations, GRID.azimuths, "none")
 def pair():
     generator = torch.Generator().manual_seed(0)
     labels = torch.rand(4, *GRID.shape, generator=generator, dtype=torch.float64)
-    return labels + 0.3 * torch.randn(4, *GRID.shape, generator=generator, dtype=torch.float64), labels
+    return labels + 0.3 * torch.randn(
+        4, *GRID.shape, generator=generator, dtype=torch.float64
+    ), labels
 
 
 def loss_of(values, labels, directions=GRID, task=TASK, ssim=0.2):
@@ -34,7 +36,10 @@ def as_arrays(pair):
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-12), (torch.float32, 1e-5)])
 @pytest.mark.parametrize("window", [3, 7, 11])
 def test_ssim_is_scikit_images(pair, window, dtype, tolerance):
-    expected = [skimage_ssim(*both, data_range=1.0, win_size=window) for both in zip(*as_arrays(pair), strict=True)]
+    expected = [
+        skimage_ssim(*both, data_range=1.0, win_size=window)
+        for both in zip(*as_arrays(pair), strict=True)
+    ]
     values, labels = (part.to(dtype) for part in pair)
     similarity = structural_similarity(values, labels, window)
     assert similarity.item() == pytest.approx(sum(expected) / 4, abs=tolerance)
@@ -59,13 +64,16 @@ def test_the_window_spans_the_same_angle_on_a_thinned_grid(pair, step, window, f
 
 
 @pytest.mark.parametrize(
-    ("rows", "stride", "window"), [(7, 2, 3), (9, 2, 3), (11, 2, 5), (5, 1, 5), (4, 1, 3), (3, 1, 3)]
+    ("rows", "stride", "window"),
+    [(7, 2, 3), (9, 2, 3), (11, 2, 5), (5, 1, 5), (4, 1, 3), (3, 1, 3)],
 )
 def test_the_window_is_at_most_the_thinned_grid(rows, stride, window):
     """The last row and column on, which leaves the fewest."""
     grid = Grid.degrees(range(rows), range(40))
     part = slice(stride - 1, None, stride)
-    values, labels = torch.rand(2, 3, rows, 40, generator=torch.Generator().manual_seed(0))[:, :, part, part]
+    values, labels = torch.rand(2, 3, rows, 40, generator=torch.Generator().manual_seed(0))[
+        :, :, part, part
+    ]
     task = Spectrum(grid.elevations, grid.azimuths, "none")
     _, terms = loss_of(values, labels, grid.thin(part, part), task)
     assert terms["ssim"] == 1 - structural_similarity(values, labels, window)
@@ -93,7 +101,9 @@ def test_constant_images_have_finite_gradients(value, label):
 
 def test_single_directions_are_refused(pair):
     rays = [values.flatten(1)[:, :50] for values in pair]
-    with pytest.raises(ValueError, match=r"needs rows and columns; with training\.thinning\.rays set loss=absolute"):
+    with pytest.raises(
+        ValueError, match=r"needs rows and columns; with training\.thinning\.rays set loss=absolute"
+    ):
         loss_of(*rays, GRID.flatten()[:50])
 
 
@@ -106,14 +116,22 @@ def test_fewer_rows_than_a_window_are_refused(pair, rows):
 
 @pytest.mark.parametrize(
     ("shape", "window"),
-    [((2, 3, 9, 14), 3), ((1, 1, 7, 7), 7), ((3, 2, 8, 7), 5), ((0, 2, 6, 5), 3), ((2, 1, 4, 6), 1)],
+    [
+        ((2, 3, 9, 14), 3),
+        ((1, 1, 7, 7), 7),
+        ((3, 2, 8, 7), 5),
+        ((0, 2, 6, 5), 3),
+        ((2, 1, 4, 6), 1),
+    ],
 )
 @pytest.mark.parametrize("transposed", [False, True])
 def test_window_means_and_gradients_equal_mean_pooling(shape, window, transposed):
     torch.manual_seed(0)
     images = torch.randn(shape, dtype=torch.float64, requires_grad=True)
     seen = images.mT if transposed else images
-    expected = avg_pool2d(seen, window, stride=1) if len(images) else seen[..., window - 1 :, window - 1 :]
+    expected = (
+        avg_pool2d(seen, window, stride=1) if len(images) else seen[..., window - 1 :, window - 1 :]
+    )
     before, found = images.detach().clone(), window_means(seen, window)
     torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-13)
     assert torch.equal(images, before)

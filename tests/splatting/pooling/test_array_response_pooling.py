@@ -1,4 +1,6 @@
-"""Spectra of an array, from a map and from paths, against beamforming in numpy and the simulated room."""
+"""Spectra of an array, from a map and from paths, against beamforming in numpy and the simulated
+room.
+"""
 
 import math
 from dataclasses import replace
@@ -30,7 +32,9 @@ def scene():
 
 
 def ask(count, carrier=CARRIER):
-    return Query(torch.zeros(count, 3), torch.zeros(count, dtype=torch.long), torch.full((count,), carrier))
+    return Query(
+        torch.zeros(count, 3), torch.zeros(count, dtype=torch.long), torch.full((count,), carrier)
+    )
 
 
 def draw(scene, count=3, seed=0):
@@ -45,7 +49,9 @@ def lags_of(responses, array):
     """Mean products of pairs of elements, of (b, elements, frequencies)."""
     _, pairs, counts = array.lags
     covariances = (responses @ responses.mH / responses.shape[-1]).flatten(1)
-    return covariances.new_zeros(len(responses), len(counts)).index_add(1, pairs, covariances) / counts
+    return (
+        covariances.new_zeros(len(responses), len(counts)).index_add(1, pairs, covariances) / counts
+    )
 
 
 def beamformed(fields, array, directions, carrier=CARRIER):
@@ -87,7 +93,9 @@ def test_the_labels_of_the_simulated_room_follow_from_its_paths(spectrum):
 
 
 def test_a_map_is_summed_into_the_elements(scene):
-    """A map with two bright pixels is two plane waves, each as strong as the pixel's solid angle and pattern say."""
+    """A map with two bright pixels is two plane waves, each as strong as the pixel's solid angle
+    and pattern say.
+    """
     pooling = ArrayResponsePooling(scene, GRID)
     array, grid = scene.receivers[0].array, pooling.grid
     image = torch.zeros(1, 2, 8, 16).double()
@@ -97,7 +105,9 @@ def test_a_map_is_summed_into_the_elements(scene):
     for row, column, wave in ((6, 3, 1 + 0.5j), (5, 11, -0.2 + 0.7j)):
         vector = vectors[row, column]
         phases = 2 * math.pi * CARRIER / speed_of_light * array.elements.double() @ vector
-        strength = grid.solid_angles[row, column].double() * vector[2]  # a patch hears as the cosine
+        strength = (
+            grid.solid_angles[row, column].double() * vector[2]
+        )  # a patch hears as the cosine
         fields += wave * strength * torch.polar(torch.ones_like(phases), phases)
     expected = min_max(beamformed(fields, array, scene.task.directions))
     np.testing.assert_allclose(pooling(image, ask(1)).flatten(1).numpy(), expected, atol=2e-3)
@@ -109,12 +119,19 @@ def test_behind_patches_nothing_is_heard(scene):
     image = torch.randn(1, 2, 8, 16, generator=torch.Generator().manual_seed(0))
     above = image * (pooling.grid.elevations > 0)[:, None]
     torch.testing.assert_close(pooling(image, ask(1)), pooling(above, ask(1)))
-    isotropic = tuple(replace(r, array=replace(r.array, pattern="isotropic")) for r in scene.receivers)
-    assert ArrayResponsePooling(replace(scene, receivers=isotropic), GRID).zone == (-math.pi / 2, math.pi / 2)
+    isotropic = tuple(
+        replace(r, array=replace(r.array, pattern="isotropic")) for r in scene.receivers
+    )
+    assert ArrayResponsePooling(replace(scene, receivers=isotropic), GRID).zone == (
+        -math.pi / 2,
+        math.pi / 2,
+    )
 
 
 def test_thinned_directions_have_the_values_of_the_whole():
-    """A label of 90 x 360 pixels, whose extremes are those of the wanted directions and of coarse ones."""
+    """A label of 90 x 360 pixels, whose extremes are those of the wanted directions and of coarse
+    ones.
+    """
     links = example_links("spectrum", CARRIER)
     grid = Grid.degrees()
     array = Array.planar(4, 4, 0.03, "cosine")
@@ -131,7 +148,9 @@ def test_thinned_directions_have_the_values_of_the_whole():
     ):
         found = pooling.read(lags, ask(20), asked)
         assert found.shape == expected.shape
-        assert (found - expected).abs().max() < 0.05  # the deepest null lies between the coarse ones
+        assert (
+            found - expected
+        ).abs().max() < 0.05  # the deepest null lies between the coarse ones
         assert (found - expected).abs().mean() < 0.01
 
 
@@ -154,7 +173,9 @@ def test_each_link_is_seen_at_its_own_carrier(scene):
     query = replace(ask(4), frequencies=torch.tensor([CARRIER, 4.2e9, CARRIER, 5.5e9]))
     found = PathSpectrum(scene).read(lags, query)
     for k, carrier in enumerate(query.frequencies.tolist()):
-        expected = min_max(beamformed(fields[k : k + 1], scene.receivers[0].array, scene.task.directions, carrier))
+        expected = min_max(
+            beamformed(fields[k : k + 1], scene.receivers[0].array, scene.task.directions, carrier)
+        )
         np.testing.assert_allclose(found[k].flatten()[None].numpy(), expected, atol=2e-3)
 
 

@@ -20,24 +20,35 @@ from gaigs.splatting.pooling.path_csi import PathCsi
 from gaigs.testing import example_links
 
 FREQUENCIES = torch.tensor([2.40e9, 2.44e9, 2.48e9], dtype=torch.float64)
-POSES = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)), Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0))
+POSES = (
+    Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)),
+    Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0)),
+)
 ROWS, COLUMNS = 6, 12
 
 
 def make(pattern="isotropic", conjugated=False, gain=1.0, random_phases=False):
     """Direct waves to two turned receivers; an array whose elements are in no plane."""
     elements = torch.tensor([[0.05, 0, 0], [0, 0.07, 0], [0, 0, 0.03], [-0.04, 0.02, 0.01]])
-    places = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 4.0, 2.0])
+    places = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [6.0, 4.0, 2.0]
+    )
     links = Links(
         query=Query(places, torch.arange(60) % 2),
-        receivers=tuple(Receiver(f"gateway{i}", pose, Array(elements, pattern)) for i, pose in enumerate(POSES)),
+        receivers=tuple(
+            Receiver(f"gateway{i}", pose, Array(elements, pattern)) for i, pose in enumerate(POSES)
+        ),
         labels=torch.zeros(60, 4, 3, dtype=torch.complex64),
         task=Csi(4, FREQUENCIES),
         split=Split("all but the last", torch.arange(50), torch.arange(0), torch.arange(50, 60)),
     )
     waves = gain * direct_waves(links.scene, links.query, FREQUENCIES, 1 if conjugated else -1)
     if random_phases:
-        phases = 2 * math.pi * torch.rand(60, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        phases = (
+            2
+            * math.pi
+            * torch.rand(60, 1, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+        )
         waves = waves * torch.polar(torch.ones_like(phases), phases)
     return replace(links, labels=waves.to(torch.complex64))
 
@@ -52,7 +63,10 @@ def bright(pooling, row, column, amplitudes):
     """A map with one bright direction and a complex amplitude for each subcarrier."""
     image = torch.zeros(1, pooling.channels, *pooling.grid.shape)
     for s, amplitude in enumerate(amplitudes):
-        image[0, s, row, column], image[0, len(amplitudes) + s, row, column] = amplitude.real, amplitude.imag
+        image[0, s, row, column], image[0, len(amplitudes) + s, row, column] = (
+            amplitude.real,
+            amplitude.imag,
+        )
     return image
 
 
@@ -79,7 +93,9 @@ def test_a_bright_direction_is_a_plane_wave_from_there(pattern, conjugated, rece
     element = max(0.0, ray[2].item()) if pattern == "cosine" else 1.0
     unit = 7.0 * middle * share
     expected = unit * element * torch.tensor(amplitudes) * arriving
-    torch.testing.assert_close(found, expected.to(found.dtype), rtol=0, atol=1e-4 * unit.abs().max().item())
+    torch.testing.assert_close(
+        found, expected.to(found.dtype), rtol=0, atol=1e-4 * unit.abs().max().item()
+    )
     if element:
         assert (arriving[0] - arriving[1]).abs().min() > 0.1
 
@@ -112,7 +128,9 @@ def test_without_a_common_clock_the_amplitude_is_left_and_the_arrays_sign(conjug
     image = torch.randn(1, 6, ROWS, COLUMNS, generator=torch.Generator().manual_seed(0))
     query = Query(torch.tensor([[1.0, 2.0, 0.5]]), torch.tensor([0]))
     distance = (query.transmitters[0] - POSES[0].position).double().norm()
-    turned = torch.polar(torch.ones(3, dtype=torch.float64), 2 * math.pi / speed_of_light * FREQUENCIES * distance)
+    turned = torch.polar(
+        torch.ones(3, dtype=torch.float64), 2 * math.pi / speed_of_light * FREQUENCIES * distance
+    )
     turned = turned.conj() if conjugated else turned
     expected = clocked(image, query) * turned.to(torch.complex64)
     scale = expected.abs().max().item()
@@ -141,7 +159,9 @@ def test_other_labels_and_arrays_are_refused():
 
 
 def direct_fields(links, index):
-    """Fields of the direct path at planar elements, over 1 / distance, as plane waves of each subcarrier."""
+    """Fields of the direct path at planar elements, over 1 / distance, as plane waves of each
+    subcarrier.
+    """
     query, array = links.query[index], links.receivers[0].array
     pose = links.receivers[0].pose
     local = (query.transmitters.double() - pose.position.double()) @ pose.rotation.double()
@@ -158,12 +178,17 @@ def test_a_single_path_is_heard_as_free_space(conjugated, random_phases, gain):
     """On links of some hundred metres, where waves are plane."""
     links = make(conjugated=conjugated, gain=gain, random_phases=random_phases)
     pooling = fitted(links, of_paths=True)
-    far = replace(links, query=replace(links.query, transmitters=100 * links.query.transmitters + 100))
+    far = replace(
+        links, query=replace(links.query, transmitters=100 * links.query.transmitters + 100)
+    )
     index = (links.query.receivers == 0).nonzero()[:, 0]
     heard = pooling.read(direct_fields(far, index), far.query[index])
     sign = 1 if conjugated else -1
     expected = gain * direct_waves(far.scene, far.query[index], FREQUENCIES, sign)
     if random_phases:
-        expected = expected / direct_waves(far.scene, far.query[index], FREQUENCIES, sign, at_elements=False).sgn()
+        expected = (
+            expected
+            / direct_waves(far.scene, far.query[index], FREQUENCIES, sign, at_elements=False).sgn()
+        )
     scale = expected.abs().amax((1, 2), keepdim=True)
     assert ((heard - expected).abs() / scale).max() < 2e-3

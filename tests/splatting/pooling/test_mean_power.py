@@ -20,7 +20,10 @@ def mean_power(channels, floor_db, shape=SHAPE):
 
 
 def pool(pooling, image):
-    return pooling(image, Query(torch.full((len(image), 3), torch.nan), torch.zeros(len(image), dtype=torch.long)))
+    return pooling(
+        image,
+        Query(torch.full((len(image), 3), torch.nan), torch.zeros(len(image), dtype=torch.long)),
+    )
 
 
 def formula(image, floor_db):
@@ -60,14 +63,18 @@ def test_a_beam_brings_its_share_of_the_sphere():
 @pytest.mark.parametrize("dtype", [torch.float16, torch.float32, torch.float64])
 def test_silence_is_the_floor_with_a_gradient_of_zero(channels, dtype):
     for floor_db in (0, -60, -300):
-        label, gradient = graded(mean_power(channels, floor_db), torch.zeros(2, channels, *SHAPE, dtype=dtype))
+        label, gradient = graded(
+            mean_power(channels, floor_db), torch.zeros(2, channels, *SHAPE, dtype=dtype)
+        )
         assert label.tolist() == pytest.approx([floor_db] * 2, abs=1e-4)
         assert torch.equal(gradient, torch.zeros_like(gradient))
 
 
 def test_the_floor_adds_as_power():
     levels = torch.tensor([1.0, 1e-3, 1e-5]).reshape(3, 1, 1, 1).expand(-1, -1, *SHAPE)
-    assert pool(mean_power(1, -60), levels).tolist() == pytest.approx([0, -60 + 10 * math.log10(2), -60], abs=1e-3)
+    assert pool(mean_power(1, -60), levels).tolist() == pytest.approx(
+        [0, -60 + 10 * math.log10(2), -60], abs=1e-3
+    )
 
 
 @CHANNELS
@@ -92,7 +99,9 @@ def test_options_out_of_range_and_maps_of_another_size_are_refused():
     with pytest.raises(ValueError, match="1 real or 2 complex channels, got channels=3"):
         mean_power(3, -60)
     for floor_db in (10, -math.inf, math.nan):
-        with pytest.raises(ValueError, match=f"floor_db must lie between -300 and 0 dB, got {floor_db}"):
+        with pytest.raises(
+            ValueError, match=f"floor_db must lie between -300 and 0 dB, got {floor_db}"
+        ):
             mean_power(1, floor_db)
 
 

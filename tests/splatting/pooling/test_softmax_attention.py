@@ -24,7 +24,10 @@ def attention(temperature, prior, learn=False):
 
 
 def pool(pooling, image):
-    return pooling(image, Query(torch.full((len(image), 3), torch.nan), torch.zeros(len(image), dtype=torch.long)))
+    return pooling(
+        image,
+        Query(torch.full((len(image), 3), torch.nan), torch.zeros(len(image), dtype=torch.long)),
+    )
 
 
 def graded(pooling, image):
@@ -55,7 +58,9 @@ def test_it_is_the_formula_of_the_paper(image, temperature, prior, learn):
     if learn and prior == 0:
         prior = 1e-3
     pooling = attention(temperature, prior, learn)
-    torch.testing.assert_close(pool(pooling, image).double(), paper(image, temperature, prior), rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        pool(pooling, image).double(), paper(image, temperature, prior), rtol=1e-5, atol=1e-5
+    )
 
 
 def test_limits(image):
@@ -88,7 +93,9 @@ def test_gradients_are_the_derivatives(image, learn):
 def test_one_deep_hole_does_not_blur_the_attention():
     image = torch.tensor([0.0, 1.0, 2.0, -1e9]).reshape(1, 1, 2, 2)
     label, _ = graded(attention(0.434, 0), image)
-    torch.testing.assert_close(label, pool(attention(0.434, 0), image[..., :3].flatten()[None, None, None, :3]))
+    torch.testing.assert_close(
+        label, pool(attention(0.434, 0), image[..., :3].flatten()[None, None, None, :3])
+    )
 
 
 @pytest.mark.parametrize("target", [-100.0, 100.0])
@@ -104,7 +111,11 @@ def test_training_moves_temperature_and_prior_within_their_ranges(target, rate):
         optimizer.step()
         assert 0 < pooling.temperature < torch.inf
         assert 0 <= pooling.prior <= 1
-    label, temperature, prior = pool(pooling, image).item(), pooling.temperature.item(), pooling.prior.item()
+    label, temperature, prior = (
+        pool(pooling, image).item(),
+        pooling.temperature.item(),
+        pooling.prior.item(),
+    )
     louder = target > before[0]
     assert [label > before[0], temperature < before[1], prior < before[2]] == [louder] * 3
 

@@ -25,16 +25,22 @@ def test_it_is_the_papers_logarithm_scaled_to_the_limit(limit):
 def test_the_plane_is_as_high_as_it_is_wide(limit):
     elevations = torch.tensor([-90, -limit, 0, limit, 90], dtype=torch.float64).deg2rad()
     plane = Mercator(0.01, limit).plane(Grid(elevations, torch.zeros(1)))
-    torch.testing.assert_close(plane.v.flatten(), torch.tensor([-1, -1, 0, 1, 1], dtype=torch.float64) * math.pi)
+    torch.testing.assert_close(
+        plane.v.flatten(), torch.tensor([-1, -1, 0, 1, 1], dtype=torch.float64) * math.pi
+    )
     assert plane.period == 2 * math.pi
 
 
 def test_a_small_round_gaussian_stays_round_anywhere():
-    """At the default limit, where alpha is 1; its width grows as 1 / cos(elevation) up to the limit."""
+    """At the default limit, where alpha is 1; its width grows as 1 / cos(elevation) up to the
+    limit.
+    """
     assert Mercator(0.01).alpha == pytest.approx(1, abs=1e-12)
     azimuths, elevations = torch.meshgrid(
         torch.linspace(-math.pi, math.pi, 13, dtype=torch.float64),
-        torch.tensor([-90, -89.9, -70, -1, 0, 30, 60, 85, 85.1, 87, 89.99, 90], dtype=torch.float64).deg2rad(),
+        torch.tensor(
+            [-90, -89.9, -70, -1, 0, 30, 60, 85, 85.1, 87, 89.99, 90], dtype=torch.float64
+        ).deg2rad(),
         indexing="ij",
     )
     points = (5 * from_spherical(azimuths, elevations)).flatten(0, 1)
@@ -42,4 +48,6 @@ def test_a_small_round_gaussian_stays_round_anywhere():
     footprints = Mercator(1e-9).project(points, semi_axes, HERE).covariances2d[0]
     least = math.cos(math.atan(math.sinh(math.pi)))
     widths = 0.01 / 5 / elevations.cos().clamp_min(least).flatten()
-    torch.testing.assert_close(footprints, widths.square()[:, None, None] * torch.eye(2, dtype=torch.float64))
+    torch.testing.assert_close(
+        footprints, widths.square()[:, None, None] * torch.eye(2, dtype=torch.float64)
+    )

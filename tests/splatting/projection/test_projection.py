@@ -39,8 +39,12 @@ def draw(projection, means, semi_axes, pose=HERE, grid=None):
 
 
 @every
-@pytest.mark.parametrize(("azimuth", "elevation"), [(0, 45), (37, 12), (180, 60), (251, 80), (359, 30)])
-def test_a_gaussian_peaks_at_the_pixel_of_its_direction_in_the_receivers_frame(kind, azimuth, elevation):
+@pytest.mark.parametrize(
+    ("azimuth", "elevation"), [(0, 45), (37, 12), (180, 60), (251, 80), (359, 30)]
+)
+def test_a_gaussian_peaks_at_the_pixel_of_its_direction_in_the_receivers_frame(
+    kind, azimuth, elevation
+):
     turn = Rotation.from_euler("zyx", [110, -35, 70], degrees=True)
     pose = Pose.from_xyzw((3.0, -1.0, 2.0), turn.as_quat())
     seen = torch.from_numpy(turn.apply(direction(azimuth, elevation, torch.float64))).float()
@@ -85,13 +89,17 @@ def test_footprints_are_the_covariances_of_projected_samples(kind, place):
         off[:, 0] = (off[:, 0] + math.pi).remainder(math.tau) - math.pi
     expected = off.mT @ off / len(off)
     footprint = splats.covariances2d[0, 0]
-    torch.testing.assert_close(footprint, expected, rtol=0, atol=0.02 * expected.diagonal().max().item())
+    torch.testing.assert_close(
+        footprint, expected, rtol=0, atol=0.02 * expected.diagonal().max().item()
+    )
 
 
 @every
 def test_a_pixels_variance_is_added(kind):
     means, semi_axes = 3 * torch.randn(9, 3, dtype=torch.float64), ball(9, 0.1, torch.float64)
-    narrow, wide = (kind(pixel).project(means, semi_axes, HERE).covariances2d for pixel in (1e-9, 0.3))
+    narrow, wide = (
+        kind(pixel).project(means, semi_axes, HERE).covariances2d for pixel in (1e-9, 0.3)
+    )
     square = torch.full((1, 9, 2, 2), 0.3**2 / 12, dtype=torch.float64) * torch.eye(2)
     torch.testing.assert_close(wide - narrow, square)
 
@@ -122,8 +130,12 @@ def test_a_centre_that_is_nan_is_not_hidden(kind):
 @every
 def test_gradients_of_a_projected_gaussian_are_those_of_finite_differences(kind):
     pose = replace(HERE, position=torch.tensor([0.1, 0.2, 0.3]))
-    means = torch.tensor([[1.0, 2, 3], [-2, 0.1, 0.5], [-0.3, -2, 2]], dtype=torch.float64, requires_grad=True)
-    half = torch.randn(2, 3, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    means = torch.tensor(
+        [[1.0, 2, 3], [-2, 0.1, 0.5], [-0.3, -2, 2]], dtype=torch.float64, requires_grad=True
+    )
+    half = torch.randn(
+        2, 3, 3, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    ).requires_grad_()
 
     def project(means, half):
         splats = kind(PIXEL).project(means, half, pose)

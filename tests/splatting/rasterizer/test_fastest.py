@@ -16,8 +16,19 @@ pytestmark = pytest.mark.usefixtures("opencl_works")
 def scene(n=12, dtype=torch.float32, channels=2, attenuations=None):
     generator = torch.Generator().manual_seed(0)
     random = lambda *shape: torch.rand(*shape, generator=generator).to(dtype)
-    splats = Splats(random(n, 2), 0.1 * torch.tensor([1, 0, 1]).to(dtype).expand(1, n, 3), random(n), random(n) < 2)
-    return splats, random(3, n, channels), random(3, n), attenuations, Plane(random(1, 9), random(7, 1), None)
+    splats = Splats(
+        random(n, 2),
+        0.1 * torch.tensor([1, 0, 1]).to(dtype).expand(1, n, 3),
+        random(n),
+        random(n) < 2,
+    )
+    return (
+        splats,
+        random(3, n, channels),
+        random(3, n),
+        attenuations,
+        Plane(random(1, 9), random(7, 1), None),
+    )
 
 
 @pytest.mark.parametrize("channels", [1, 9, 40])
@@ -27,7 +38,9 @@ def test_opencl_draws_float32_maps_of_any_number_of_channels(channels):
     image, _ = fastest(*scene(channels=channels))
     assert fastest.used == f"opencl on {found_devices.default_device()}"
     assert torch.equal(image, opencl.OpenCLRasterizer()(*scene(channels=channels))[0])
-    torch.testing.assert_close(image, TorchRasterizer()(*scene(channels=channels))[0], rtol=0, atol=1e-5)
+    torch.testing.assert_close(
+        image, TorchRasterizer()(*scene(channels=channels))[0], rtol=0, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(
@@ -72,7 +85,9 @@ def test_a_forked_process_renders_by_torch_though_drivers_have_their_threads_els
     if child == 0:
         signal.alarm(120)
         try:
-            with pytest.raises(RuntimeError, match="forked from one that has used it\nstart processes by"):
+            with pytest.raises(
+                RuntimeError, match="forked from one that has used it\nstart processes by"
+            ):
                 own(*scene())
             torch.rand(10**6).exp()
             torch.testing.assert_close(fastest(*scene())[0], expected, rtol=0, atol=1e-5)

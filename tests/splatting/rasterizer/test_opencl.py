@@ -1,4 +1,6 @@
-"""The OpenCL rasterizer against the dense float64 one on scenes that its kernels treat in special ways."""
+"""The OpenCL rasterizer against the dense float64 one on scenes that its kernels treat in special
+ways.
+"""
 
 import math
 from dataclasses import replace
@@ -11,7 +13,12 @@ from gaigs.splatting.projection import Plane, Splats
 from gaigs.splatting.projection.direction_cosine import DirectionCosine
 from gaigs.splatting.projection.mercator import Mercator
 from gaigs.splatting.rasterizer.torch import TorchRasterizer
-from gaigs.testing.rasterizer import cast_scene, distance_to_jumps, rasterize_densely, render_with_gradients
+from gaigs.testing.rasterizer import (
+    cast_scene,
+    distance_to_jumps,
+    rasterize_densely,
+    render_with_gradients,
+)
 
 opencl = pytest.importorskip("gaigs.splatting.rasterizer.opencl", exc_type=ImportError)
 pytestmark = pytest.mark.usefixtures("opencl_works")
@@ -30,7 +37,9 @@ def one_thread():
 
 
 def grid(projection, rows=37, columns=60) -> Plane:
-    return projection.plane(Grid(torch.linspace(0.02, 1.45, rows), torch.arange(columns) * (2 * math.pi / columns)))
+    return projection.plane(
+        Grid(torch.linspace(0.02, 1.45, rows), torch.arange(columns) * (2 * math.pi / columns))
+    )
 
 
 def scattered(projection, rays=70) -> Plane:
@@ -39,17 +48,31 @@ def scattered(projection, rays=70) -> Plane:
 
 
 def random_scene(
-    n=60, b=3, c=2, own=False, attenuations=None, plane=None, spread=(0.05, 0.6), opacities=(0.0, 0.95), seed=0
+    n=60,
+    b=3,
+    c=2,
+    own=False,
+    attenuations=None,
+    plane=None,
+    spread=(0.05, 0.6),
+    opacities=(0.0, 0.95),
+    seed=0,
 ):
-    """Splats all over the plane; ``spread`` bounds the standard deviations, log-uniform, along two random axes."""
+    """Splats all over the plane; ``spread`` bounds the standard deviations, log-uniform, along two
+    random axes.
+    """
     generator = torch.Generator().manual_seed(seed)
     uniform = lambda low, high, *shape: low + (high - low) * torch.rand(*shape, generator=generator)
     plane = plane or grid(Mercator(0.1))
     u = uniform(plane.u.min(), plane.u.max(), n)
     if plane.period is not None:
-        u = (u + math.pi).remainder(plane.period) - math.pi  # as atan2 gives azimuths, whatever the grid counts from
+        u = (u + math.pi).remainder(
+            plane.period
+        ) - math.pi  # as atan2 gives azimuths, whatever the grid counts from
     angles = uniform(0, math.pi, b if own else 1, n)
-    axes = torch.stack((angles.cos(), -angles.sin(), angles.sin(), angles.cos()), -1).unflatten(-1, (2, 2))
+    axes = torch.stack((angles.cos(), -angles.sin(), angles.sin(), angles.cos()), -1).unflatten(
+        -1, (2, 2)
+    )
     half = axes * uniform(*map(math.log, spread), len(angles), n, 2).exp()[..., None, :]
     splats = Splats(
         torch.stack((u, uniform(plane.v.min(), plane.v.max(), n)), -1),
@@ -58,12 +81,20 @@ def random_scene(
         uniform(0, 1, n) > 0.05,
     )
     signal = torch.randn(b, n, c, generator=generator)
-    return splats, signal, uniform(*opacities, b, n), attenuations and uniform(*attenuations, b, n), plane
+    return (
+        splats,
+        signal,
+        uniform(*opacities, b, n),
+        attenuations and uniform(*attenuations, b, n),
+        plane,
+    )
 
 
 def at_the_seam():
     splats, *others, plane = random_scene(spread=(0.02, 0.3))
-    splats.means2d[:, 0] = torch.linspace(-0.3, 0.3, 60).sub(math.pi).remainder(2 * math.pi).sub(math.pi)
+    splats.means2d[:, 0] = (
+        torch.linspace(-0.3, 0.3, 60).sub(math.pi).remainder(2 * math.pi).sub(math.pi)
+    )
     return splats, *others, Plane(plane.u - math.pi, plane.v, plane.period)
 
 
@@ -98,7 +129,9 @@ def loud_behind_walls():
 
 
 def dark_in_half():
-    """Light is used up at low v long before it is at high v: rows of one tile end at different depths."""
+    """Light is used up at low v long before it is at high v: rows of one tile end at different
+    depths.
+    """
     scene = random_scene(n=300, b=1, spread=(0.2, 0.6), opacities=(0.3, 0.9))
     low = scene[-1].v.min()
     scene[0].means2d[:, 1] = low + 0.4 * (scene[0].means2d[:, 1] - low)
@@ -108,7 +141,10 @@ def dark_in_half():
 def unsorted_plane():
     plane = grid(Mercator(0.1))
     shuffle = torch.Generator().manual_seed(0)
-    u, v = plane.u[:, torch.randperm(60, generator=shuffle)], plane.v[torch.randperm(37, generator=shuffle)]
+    u, v = (
+        plane.u[:, torch.randperm(60, generator=shuffle)],
+        plane.v[torch.randperm(37, generator=shuffle)],
+    )
     return random_scene(plane=Plane(u, v, plane.period))
 
 
@@ -122,7 +158,9 @@ SCENES = {
     "random": random_scene,
     "own covariances": lambda: random_scene(own=True),
     "no period": lambda: random_scene(plane=replace(grid(Mercator(0.1)), period=None)),
-    "direction cosines, own": lambda: random_scene(plane=grid(DirectionCosine(0.1)), own=True, attenuations=(0.1, 1)),
+    "direction cosines, own": lambda: random_scene(
+        plane=grid(DirectionCosine(0.1)), own=True, attenuations=(0.1, 1)
+    ),
     "strong attenuation": lambda: random_scene(attenuations=(1e-6, 1e-2)),
     "eight channels": lambda: random_scene(c=8),
     "nine channels": lambda: random_scene(c=9, attenuations=(0.3, 1.0)),
@@ -134,7 +172,9 @@ SCENES = {
     "wider than the plane": lambda: random_scene(n=120, spread=(3.0, 30.0), opacities=(0.1, 0.3)),
     "needles": needles,
     "narrow and wide": lambda: random_scene(spread=(0.02, 2.0), seed=2),
-    "nearly opaque": lambda: random_scene(n=120, spread=(0.3, 2.0), opacities=(0.8, 0.99), attenuations=(0.1, 1.0)),
+    "nearly opaque": lambda: random_scene(
+        n=120, spread=(0.3, 2.0), opacities=(0.8, 0.99), attenuations=(0.1, 1.0)
+    ),
     "loud behind walls": loud_behind_walls,
     "dark in half": dark_in_half,
     "at the seam": at_the_seam,
@@ -147,7 +187,9 @@ SCENES = {
 
 
 def render(rasterizer, scene):
-    """Map, transmittance and gradients away from jumps, where a G meets one of its bounds to within rounding."""
+    """Map, transmittance and gradients away from jumps, where a G meets one of its bounds to within
+    rounding.
+    """
     pixels = distance_to_jumps(*scene) > 1e-5
     assert pixels.double().mean() > 0.99 or not pixels.numel()
     return render_with_gradients(rasterizer, scene, pixels)
@@ -159,12 +201,17 @@ def largest(tensor: torch.Tensor) -> float:
 
 @pytest.mark.parametrize("name", SCENES)
 def test_values_and_gradients_are_those_of_the_dense_float64_rasterizer(name):
-    found, true = (render(rasterizer, SCENES[name]()) for rasterizer in (opencl.OpenCLRasterizer(), rasterize_densely))
+    found, true = (
+        render(rasterizer, SCENES[name]())
+        for rasterizer in (opencl.OpenCLRasterizer(), rasterize_densely)
+    )
     assert found["map"].dtype == found["transmittance"].dtype == torch.float32
     for part, value in found.items():
         bound = 1 if part == "transmittance" else largest(true[part])
         tolerance = bound * (GRADIENTS if part.startswith("gradient") else VALUES)
-        torch.testing.assert_close(value, true[part].float(), rtol=0, atol=tolerance, msg=lambda m, p=part: f"{p}: {m}")
+        torch.testing.assert_close(
+            value, true[part].float(), rtol=0, atol=tolerance, msg=lambda m, p=part: f"{p}: {m}"
+        )
 
 
 def test_an_attenuation_of_0_has_the_gradient_of_the_float64_rasterizer():
@@ -190,7 +237,12 @@ def test_tensors_may_have_any_layout():
     pixels = torch.ones(3, *plane.shape, dtype=torch.bool)
     strided = lambda tensor: tensor.mT.contiguous().mT
     depths = splats.depths.repeat_interleave(2)[::2]
-    other = replace(splats, means2d=strided(splats.means2d), depths=depths), strided(signal), strided(opacities), None
+    other = (
+        replace(splats, means2d=strided(splats.means2d), depths=depths),
+        strided(signal),
+        strided(opacities),
+        None,
+    )
     there = Plane(strided(plane.u), strided(plane.v), plane.period)
     expected, found = (
         render_with_gradients(opencl.OpenCLRasterizer(), arguments, pixels)
@@ -210,21 +262,35 @@ def test_a_plane_changed_in_place_is_another_plane(name):
 
 def test_kernels_that_do_not_build_are_an_error_that_names_the_device(monkeypatch):
     monkeypatch.setattr(opencl, "_literal", lambda value: "(")
-    with pytest.raises(RuntimeError, match=r"cannot build the kernels \(.*error: .*\); use rasterizer=torch"):
+    with pytest.raises(
+        RuntimeError, match=r"cannot build the kernels \(.*error: .*\); use rasterizer=torch"
+    ):
         opencl.OpenCLRasterizer()(*random_scene())
 
 
 def test_tensors_it_cannot_read_are_errors_that_say_what_to_do(monkeypatch):
     splats, signal, opacities, _, plane = random_scene()
     bad = {
-        "takes signal as torch.float32 on the CPU, got torch.float64": (splats, signal.double(), opacities),
+        "takes signal as torch.float32 on the CPU, got torch.float64": (
+            splats,
+            signal.double(),
+            opacities,
+        ),
         "takes opacities as torch.float32 on the CPU, got torch.float32 on meta": (
             splats,
             signal,
             opacities.to("meta"),
         ),
-        r"opacities must be \(3, 60\) where signal is \(3, 60, 2\), got \(3, 59\)": (splats, signal, opacities[:, 1:]),
-        "at least 1 channel and fewer than 2.24 splats, got 0": (splats, signal[..., :0], opacities),
+        r"opacities must be \(3, 60\) where signal is \(3, 60, 2\), got \(3, 59\)": (
+            splats,
+            signal,
+            opacities[:, 1:],
+        ),
+        "at least 1 channel and fewer than 2.24 splats, got 0": (
+            splats,
+            signal[..., :0],
+            opacities,
+        ),
     }
     for message, arguments in bad.items():
         with pytest.raises((TypeError, ValueError), match=message):

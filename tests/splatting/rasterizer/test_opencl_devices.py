@@ -34,7 +34,11 @@ def test_a_device_is_chosen_by_any_part_of_its_name(monkeypatch):
     name = found_devices.devices()[0]
     opencl.OpenCLRasterizer(device=name[3:-3].upper())
     monkeypatch.setenv("GAIGS_OPENCL_DEVICE", name)
-    assert opencl.OpenCLRasterizer().used == f"opencl on {found_devices.default_device()}" == f"opencl on {name}"
+    assert (
+        opencl.OpenCLRasterizer().used
+        == f"opencl on {found_devices.default_device()}"
+        == f"opencl on {name}"
+    )
 
 
 def test_the_first_processor_is_the_default(monkeypatch):
@@ -75,15 +79,22 @@ def broken(message):
 
 
 def test_a_broken_driver_is_an_error_that_names_it_only_if_no_other_works(monkeypatch):
-    good, bad = found_devices.cl.get_platforms()[0], SimpleNamespace(name="Wreck", get_devices=broken("OUT_OF_MEMORY"))
+    good, bad = (
+        found_devices.cl.get_platforms()[0],
+        SimpleNamespace(name="Wreck", get_devices=broken("OUT_OF_MEMORY")),
+    )
     names = found_devices.devices()
     monkeypatch.setattr(found_devices.cl, "get_platforms", lambda: [bad, good])
     assert set(found_devices.devices()) <= set(names)
     monkeypatch.setattr(found_devices.cl, "get_platforms", lambda: [bad])
-    with pytest.raises(RuntimeError, match=r"needs an OpenCL driver.*; Wreck lists no devices \(OUT_OF_MEMORY\)"):
+    with pytest.raises(
+        RuntimeError, match=r"needs an OpenCL driver.*; Wreck lists no devices \(OUT_OF_MEMORY\)"
+    ):
         opencl.OpenCLRasterizer(device="another")
     monkeypatch.setattr(found_devices.cl, "get_platforms", broken("PLATFORM_NOT_FOUND_KHR"))
-    with pytest.raises(RuntimeError, match=r"needs an OpenCL driver: pip install 'pyopencl\[pocl\]'"):
+    with pytest.raises(
+        RuntimeError, match=r"needs an OpenCL driver: pip install 'pyopencl\[pocl\]'"
+    ):
         found_devices.devices()
 
 
@@ -91,7 +102,10 @@ def test_a_broken_driver_is_an_error_that_names_it_only_if_no_other_works(monkey
 def test_a_device_that_cannot_be_opened_is_an_error_that_names_it(function, monkeypatch, caplog):
     found_devices._open.cache_clear()
     monkeypatch.setattr(found_devices.cl, function, broken("OUT_OF_RESOURCES"))
-    with pytest.raises(RuntimeError, match=r"PU\) cannot be opened \(OUT_OF_RESOURCES\)\n.* or use rasterizer=torch"):
+    with pytest.raises(
+        RuntimeError,
+        match=r"PU\) cannot be opened \(OUT_OF_RESOURCES\)\n.* or use rasterizer=torch",
+    ):
         opencl.OpenCLRasterizer()
     with caplog.at_level(logging.INFO):
         assert FastestRasterizer().opencl is None
@@ -104,7 +118,9 @@ def test_a_driver_that_does_not_know_the_processor_is_an_error_and_is_probed_onc
     program = lambda context, source: builds.append(source) or SimpleNamespace(build=broken(LOG))
     monkeypatch.setattr(found_devices.cl, "Program", program)
     for _ in range(2):
-        with pytest.raises(RuntimeError, match=r"PU\) cannot build kernels \(error: unknown target CPU 'generic'\)"):
+        with pytest.raises(
+            RuntimeError, match=r"PU\) cannot build kernels \(error: unknown target CPU 'generic'\)"
+        ):
             opencl.OpenCLRasterizer()
     assert len(builds) == 1
 
@@ -113,7 +129,10 @@ def test_a_driver_that_does_not_know_the_processor_is_an_error_and_is_probed_onc
     ("log", "cause"),
     [
         (LOG, "error: unknown target CPU 'generic'"),
-        ("clBuildProgram failed\n\n<kernel>:3:5: error: no type\n1 error.\n", "<kernel>:3:5: error: no type"),
+        (
+            "clBuildProgram failed\n\n<kernel>:3:5: error: no type\n1 error.\n",
+            "<kernel>:3:5: error: no type",
+        ),
         ("clBuildProgram failed\n\nthe linker crashed\n\n(options: -w)", "the linker crashed"),
         ("clBuildProgram failed: OUT_OF_HOST_MEMORY", "clBuildProgram failed: OUT_OF_HOST_MEMORY"),
     ],

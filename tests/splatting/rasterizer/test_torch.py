@@ -1,6 +1,7 @@
 """The torch rasterizer at the seam, in any chunks, in depth order, and its memory.
 
-``gaigs.testing.check_rasterizer``, which tests/test_contracts.py runs, compares it with the formula.
+``gaigs.testing.check_rasterizer``, which tests/test_contracts.py runs, compares it with the
+formula.
 """
 
 import math
@@ -32,7 +33,10 @@ def scene(projection="mercator", n=40, own=False, attenuations=True, size=0.3):
     projection = PROJECTIONS[projection](GRID.pitch)
     means = from_spherical(uniform(0, math.tau, n), uniform(-0.5, 1.57, n)) * uniform(0.5, 4, n, 1)
     half = size * torch.randn(2 if own else 1, n, 3, 3, generator=generator)
-    splats, signal = projection.project(means, half, HERE), torch.randn(2, n, 2, generator=generator)
+    splats, signal = (
+        projection.project(means, half, HERE),
+        torch.randn(2, n, 2, generator=generator),
+    )
     lets = uniform(0.2, 1, 2, n) if attenuations else None
     return splats, signal, uniform(0, 1, 2, n), lets, projection.plane(GRID)
 
@@ -44,7 +48,10 @@ def test_offsets_are_exact_at_the_seam(dtype):
     ends = seam[torch.randint(3, (2, 300), generator=generator)]
     beyond = 10 ** -(1 + 5 * torch.rand(2, 300, generator=generator, dtype=torch.float64))
     a, b = (ends + beyond).to(dtype)
-    a, b = torch.cat((a, a.new_tensor([0.5, -2.0, math.pi]))), torch.cat((b, b.new_tensor([0.25, 2.0, -math.pi])))
+    a, b = (
+        torch.cat((a, a.new_tensor([0.5, -2.0, math.pi]))),
+        torch.cat((b, b.new_tensor([0.25, 2.0, -math.pi]))),
+    )
     period = torch.tensor(math.tau, dtype=dtype).item()
     found, eps = module._nearest(a, b, (period, math.tau - period)), torch.finfo(dtype).eps
     for x, y, offset in zip(a.tolist(), b.tolist(), found.tolist(), strict=True):
@@ -59,7 +66,9 @@ def test_narrow_splats_at_the_seam_are_as_good_as_elsewhere():
     errors = []
     for centre in (math.pi, 0.0):
         u = centre + width * torch.linspace(-2, 2, 9)[None]
-        means = torch.stack((centre + width * torch.randn(n, generator=generator), torch.zeros(n)), -1)
+        means = torch.stack(
+            (centre + width * torch.randn(n, generator=generator), torch.zeros(n)), -1
+        )
         means[::2, 0] -= math.tau * bool(centre)  # the same places, a turn away
         factors = (width * torch.tensor([1.0, 0, 1])).expand(1, n, 3)
         splats = Splats(means, factors, torch.arange(1.0 * n), torch.ones(n).bool())
@@ -73,7 +82,9 @@ def test_narrow_splats_at_the_seam_are_as_good_as_elsewhere():
 @pytest.mark.parametrize("projection", ["mercator", "direction_cosine"])
 @pytest.mark.parametrize("own", [False, True])
 def test_gradients_are_those_of_finite_differences(projection, own):
-    splats, signal, opacities, attenuations, plane = scene(n=6, own=own, projection=projection, size=0.5)
+    splats, signal, opacities, attenuations, plane = scene(
+        n=6, own=own, projection=projection, size=0.5
+    )
     plane = Plane(plane.u[::7, ::9], plane.v[::7, ::9], plane.period)
 
     def rasterize_with(means, factors, *others):
@@ -97,15 +108,27 @@ def test_chunks_of_tiles_of_any_size_give_the_same_map(monkeypatch, chunk, proje
 
 @pytest.mark.parametrize(
     ("depths", "order"),
-    [((1, 2, 3), (0, 1, 2)), ((3, 1, 2), (1, 2, 0)), ((2, 2, 1), (2, 0, 1)), ((2, math.inf, 2), (0, 2, 1))],
+    [
+        ((1, 2, 3), (0, 1, 2)),
+        ((3, 1, 2), (1, 2, 0)),
+        ((2, 2, 1), (2, 0, 1)),
+        ((2, math.inf, 2), (0, 2, 1)),
+    ],
 )
 def test_depth_decides_and_among_equals_the_index(depths, order):
     splats = Splats(
-        torch.zeros(3, 2), torch.tensor([1.0, 0, 1]).expand(1, 3, 3), torch.tensor(depths).float(), torch.ones(3).bool()
+        torch.zeros(3, 2),
+        torch.tensor([1.0, 0, 1]).expand(1, 3, 3),
+        torch.tensor(depths).float(),
+        torch.ones(3).bool(),
     )
     signal = torch.tensor([[[1.0], [10.0], [100.0]]])
-    image, left = TorchRasterizer()(splats, signal, torch.full((1, 3), 0.9), None, Plane(*torch.zeros(2, 1, 1), None))
-    assert image.item() == pytest.approx(sum(0.9 * 0.1**k * 10**i for k, i in enumerate(order)), rel=1e-5)
+    image, left = TorchRasterizer()(
+        splats, signal, torch.full((1, 3), 0.9), None, Plane(*torch.zeros(2, 1, 1), None)
+    )
+    assert image.item() == pytest.approx(
+        sum(0.9 * 0.1**k * 10**i for k, i in enumerate(order)), rel=1e-5
+    )
     assert left.item() == pytest.approx(1e-3, rel=1e-5)
 
 
@@ -137,8 +160,12 @@ print(peak() - before)
 """
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems count the peak memory in other units, or not")
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="other systems count the peak memory in other units, or not"
+)
 def test_memory_does_not_grow_with_pairs_of_splats_and_pixels():
     done = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert int(done.stdout) < 2**29  # a float32 for each pair of 10,000 splats and 32,400 pixels would be 1.2 GiB
+    assert (
+        int(done.stdout) < 2**29
+    )  # a float32 for each pair of 10,000 splats and 32,400 pixels would be 1.2 GiB

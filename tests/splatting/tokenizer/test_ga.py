@@ -1,4 +1,6 @@
-"""The scene token: most opaque Gaussians, invariances, gradients, and the short cut of the last block."""
+"""The scene token: most opaque Gaussians, invariances, gradients, and the short cut of the last
+block.
+"""
 
 import pytest
 import torch
@@ -46,7 +48,9 @@ def test_only_the_most_opaque_gaussians_count(room, algebra):
     for moved, counts in ((ranks[5:], False), (ranks[4], True)):
         other = means.clone()
         other[moved] += 1
-        assert torch.equal(tokens_of(tokenizer, other, opacities, transmitters).scene, scene) != counts
+        assert (
+            torch.equal(tokens_of(tokenizer, other, opacities, transmitters).scene, scene) != counts
+        )
     raised = opacities.clone()
     raised[ranks[20]] = 2  # chosen anew at every call
     assert not torch.allclose(tokens_of(tokenizer, means, raised, transmitters).scene, scene)
@@ -92,7 +96,9 @@ def plain_scene(tokenizer, means, opacities, transmitters):
     """CLS where all tokens of all transmitters go through all of each block."""
     b, m = len(transmitters), min(tokenizer.anchors, len(means))
     anchors = means[opacities.topk(m).indices].expand(b, m, 3)
-    tx, anchors = ((positions - tokenizer.middle) / tokenizer.scale for positions in (transmitters, anchors))
+    tx, anchors = (
+        (positions - tokenizer.middle) / tokenizer.scale for positions in (transmitters, anchors)
+    )
     points = tokenizer.embed(torch.cat((tokenizer.cls.expand(b, 1, 3), tx[:, None], anchors), 1))
     types = torch.cat((tokenizer.types[:2], tokenizer.types[2:].expand(m, 2))).expand(b, -1, -1)
     tokens = tokenizer.first(points[..., None, :], types)
@@ -110,6 +116,9 @@ def test_the_last_blocks_short_cut_changes_neither_values_nor_gradients(algebra,
     inputs = 3 * torch.randn(n, 3).double(), torch.rand(n).double(), 4 * torch.rand(b, 3).double()
     found, expected = tokens_of(tokenizer, *inputs).scene, plain_scene(tokenizer, *inputs)
     weights = torch.randn_like(expected)
-    gradients = [torch.autograd.grad(scene, [*tokenizer.parameters()], weights) for scene in (found, expected)]
+    gradients = [
+        torch.autograd.grad(scene, [*tokenizer.parameters()], weights)
+        for scene in (found, expected)
+    ]
     for one, other in zip((found, *gradients[0]), (expected, *gradients[1]), strict=True):
         torch.testing.assert_close(one, other, rtol=1e-9, atol=1e-11)

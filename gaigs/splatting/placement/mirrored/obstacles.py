@@ -10,14 +10,16 @@ from torch import Tensor, nn
 class Obstacles(nn.Module):
     """Gaussians of matter: along a segment the field is multiplied by exp(-depth).
 
-    depth = sum_i rho_i integral exp(-|S_i^-1 (x - c_i)|² / 2) dx along the segment, S_i = diag(widths), a closed form:
-    with the ray a + t (b - a) in units of the widths, A = |ray|², B = ray . offset, C = |offset|²,
+    depth = sum_i rho_i integral exp(-|S_i^-1 (x - c_i)|² / 2) dx along the segment, S_i =
+    diag(widths), a closed form: with the ray a + t (b - a) in units of the widths, A = |ray|², B =
+    ray . offset, C = |offset|²,
 
-        depth = rho length sqrt(pi / (2 A)) exp(-(C - B²/A) / 2) (erf((A + B) / sqrt(2 A)) - erf(B / sqrt(2 A)))
+        depth = rho length sqrt(pi / (2 A)) exp(-(C - B²/A) / 2) (erf((A + B) / sqrt(2 A)) - erf(B /
+        sqrt(2 A)))
 
-    Matter also slows waves. With ``has_phases`` each obstacle has a learnt ratio of phase lag to attenuation, its turn
-    at all frequencies, and the depth is complex. ``lower`` and ``upper`` are corners of the box around transmitters and
-    receivers [m].
+    Matter also slows waves. With ``has_phases`` each obstacle has a learnt ratio of phase lag to
+    attenuation, its turn at all frequencies, and the depth is complex. ``lower`` and ``upper`` are
+    corners of the box around transmitters and receivers [m].
 
     Source: Wilson and Patwari, Radio Tomographic Imaging, 2010, for the idea.
     """
@@ -25,13 +27,21 @@ class Obstacles(nn.Module):
     origin: Tensor
     unit: Tensor
 
-    def __init__(self, count: int, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"], has_phases: bool = False):
+    def __init__(
+        self,
+        count: int,
+        lower: Float[Tensor, "3"],
+        upper: Float[Tensor, "3"],
+        has_phases: bool = False,
+    ):
         super().__init__()
         edges = upper - lower
         diagonal = float(edges.norm())
         low, high = lower - 0.05 * edges, upper + 0.05 * edges
         self.register_buffer("origin", (low + high) / 2)
-        self.register_buffer("unit", torch.tensor(diagonal * 0.12))  # so that learning rates suit rooms of any size
+        self.register_buffer(
+            "unit", torch.tensor(diagonal * 0.12)
+        )  # so that learning rates suit rooms of any size
         self.places = nn.Parameter((torch.rand(count, 3) - 0.5) * (high - low) / self.unit)
         # As large as furniture; a path through one is attenuated by a fraction of a decibel.
         self.log_widths = nn.Parameter(torch.full((count, 3), math.log(0.05 * diagonal)))
@@ -55,26 +65,40 @@ class Obstacles(nn.Module):
         """At the centres [Np/m]."""
         return self.log_densities.exp()
 
-    def forward(self, start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]) -> Inexact[Tensor, "*batch"]:
+    def forward(
+        self, start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]
+    ) -> Inexact[Tensor, "*batch"]:
         """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad]."""
         legs = start.reshape(-1, 3), end.reshape(-1, 3)
         size = max(1, PAIRS // len(self)) if start.device.type == "cpu" else len(legs[0]) or 1
-        columns = [self.densities] if self.turns is None else [self.densities, self.densities * self.turns]
+        columns = (
+            [self.densities]
+            if self.turns is None
+            else [self.densities, self.densities * self.turns]
+        )
         own = self.centres, self.log_widths, torch.stack(columns, 1)
-        parts = [_Depth.apply(*part, *own) for part in zip(*(ends.split(size) for ends in legs), strict=True)]
+        parts = [
+            _Depth.apply(*part, *own)
+            for part in zip(*(ends.split(size) for ends in legs), strict=True)
+        ]
         depths = torch.cat(parts)
-        return (depths[:, 0] if self.turns is None else torch.view_as_complex(depths)).view(start.shape[:-1])
+        return (depths[:, 0] if self.turns is None else torch.view_as_complex(depths)).view(
+            start.shape[:-1]
+        )
 
 
 PAIRS = 2**16
-"""Pairs of a segment and an obstacle at a time: a CPU keeps them in its cache, and asks for no fresh memory."""
+"""Pairs of a segment and an obstacle at a time: a CPU keeps them in its cache, and asks for no
+fresh memory.
+"""
 
 
 class _Depth(torch.autograd.Function):
     """The depth with its gradient in closed form, in half of autograd's time.
 
-    With r = sqrt(1 / (2 A)), g = exp(-(C - B²/A) / 2), E = erf((A + B) r) - erf(B r), depth = rho l sqrt(pi) r g E, and
-    d E = 2 / sqrt(pi) (e1 d((A + B) r) - e0 d(B r)) with e1 = exp(-((A + B) r)²), e0 = exp(-(B r)²).
+    With r = sqrt(1 / (2 A)), g = exp(-(C - B²/A) / 2), E = erf((A + B) r) - erf(B r), depth = rho l
+    sqrt(pi) r g E, and d E = 2 / sqrt(pi) (e1 d((A + B) r) - e0 d(B r)) with e1 = exp(-((A + B)
+    r)²), e0 = exp(-(B r)²).
     """
 
     @staticmethod
@@ -87,7 +111,9 @@ class _Depth(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
-        start, end, centres, log_widths, densities, a, b, r, near, inside, length = ctx.saved_tensors
+        start, end, centres, log_widths, densities, a, b, r, near, inside, length = (
+            ctx.saved_tensors
+        )
         gradient = gradient * (math.sqrt(math.pi) * length)[:, None]
         # In place where it can be: fresh memory costs more than the sums.
         rate = near * r  # of E
@@ -106,10 +132,12 @@ class _Depth(torch.autograd.Function):
         d_c = -0.5 * each
         widths = (-2 * log_widths).exp()  # inverse squares
         ray = end - start
-        # A = sum ray² w, B = sum ray (start - c) w, C = sum (start - c)² w: sums are products of matrices. With the
-        # narrow one on the left they take a CPU a third to a sixth of the time.
+        # A = sum ray² w, B = sum ray (start - c) w, C = sum (start - c)² w: sums are products of
+        # matrices. With the narrow one on the left they take a CPU a third to a sixth of the time.
         narrow = torch.cat((widths, centres * widths), 1).T
-        rows, columns = zip(*((narrow @ part.T).T.split(3, 1) for part in (d_a, d_b, d_c)), strict=True)
+        rows, columns = zip(
+            *((narrow @ part.T).T.split(3, 1) for part in (d_a, d_b, d_c)), strict=True
+        )
         d_ray = 2 * ray * rows[0] + start * rows[1] - columns[1]
         d_offset = ray * rows[1] + 2 * (start * rows[2] - columns[2])
         unit = ray / length.clamp_min(1e-30)[:, None]  # 0 for a leg of length 0
@@ -128,7 +156,9 @@ SHORTEST = 1e-8
 """Smallest squared length of a ray [squared widths]: within 1e-4 of a width nothing changes."""
 
 FAINTEST = -80.0
-"""Smallest exponent: exp(-80) is negligible, and float32's exponential takes four times as long at an underflow."""
+"""Smallest exponent: exp(-80) is negligible, and float32's exponential takes four times as long at
+an underflow.
+"""
 
 
 def _parts(start, end, centres, log_widths):
@@ -136,8 +166,11 @@ def _parts(start, end, centres, log_widths):
     # Contiguous columns: an outer product of others takes a CPU four times as long.
     columns = lambda values: values.T.contiguous()
     ray = end - start
-    inverse, places, starts, ways = (columns(values) for values in ((-log_widths).exp(), centres, start, ray))
-    # C - B²/A is the squared distance of a line from a centre: small differences of large numbers unless about centres.
+    inverse, places, starts, ways = (
+        columns(values) for values in ((-log_widths).exp(), centres, start, ray)
+    )
+    # C - B²/A is the squared distance of a line from a centre: small differences of large numbers
+    # unless about centres.
     offsets = [(starts[axis, :, None] - places[axis]).mul_(inverse[axis]) for axis in range(3)]
     rays = [ways[axis, :, None] * inverse[axis] for axis in range(3)]
     a = (ray.square() @ inverse.square()).clamp_min_(SHORTEST)

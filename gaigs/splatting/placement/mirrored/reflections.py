@@ -13,8 +13,8 @@ from torch.nn import functional
 class Folded(NamedTuple):
     """Paths through the room; a leg is a straight piece from one bounce to the next.
 
-    Legs that start at the last bounces of all sequences come first, then those at the last but one, and so on, and at
-    last those from the transmitter.
+    Legs that start at the last bounces of all sequences come first, then those at the last but one,
+    and so on, and at last those from the transmitter.
 
     Attributes:
         start, end: Ends of all legs [m].
@@ -48,9 +48,17 @@ class Folded(NamedTuple):
             strengths = torch.cat((strengths[:, :first], strengths[:, first:] * part), 1)
         return strengths
 
-    def parts(self, values: Inexact[Tensor, "b w *s"]) -> Iterator[tuple[int, Inexact[Tensor, "b k *s"]]]:
-        """Values of the last bounces, of the last but one, and so on, each with the first sequence that has one."""
-        return zip(self.firsts, values.split([self.exists.shape[1] - first for first in self.firsts], 1), strict=True)
+    def parts(
+        self, values: Inexact[Tensor, "b w *s"]
+    ) -> Iterator[tuple[int, Inexact[Tensor, "b k *s"]]]:
+        """Values of the last bounces, of the last but one, and so on, each with the first sequence
+        that has one.
+        """
+        return zip(
+            self.firsts,
+            values.split([self.exists.shape[1] - first for first in self.firsts], 1),
+            strict=True,
+        )
 
 
 def seen_from(planes: Float[Tensor, "*w 4"], origin: Float[Tensor, "3"]) -> Float[Tensor, "*w 4"]:
@@ -68,7 +76,8 @@ def largest_order(planes: int, most: int) -> int:
 
 
 def all_sequences(planes: int, order: int) -> Int[Tensor, "n order"]:
-    """All sequences of at most ``order`` planes as a wave meets them, no plane twice in a row; shorter ones first.
+    """All sequences of at most ``order`` planes as a wave meets them, no plane twice in a row;
+    shorter ones first.
 
     Shorter ones have -1 in front.
     """
@@ -81,9 +90,13 @@ def all_sequences(planes: int, order: int) -> Int[Tensor, "n order"]:
 
 
 def reflect(
-    points: Float[Tensor, "*#batch 3"], normals: Float[Tensor, "*#batch 3"], offsets: Float[Tensor, "*#batch"]
+    points: Float[Tensor, "*#batch 3"],
+    normals: Float[Tensor, "*#batch 3"],
+    offsets: Float[Tensor, "*#batch"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Images of points [m] in planes n . x = d: the closed form of the sandwich product with a plane's vector."""
+    """Images of points [m] in planes n . x = d: the closed form of the sandwich product with a
+    plane's vector.
+    """
     return points - 2 * ((points * normals).sum(-1) - offsets)[..., None] * normals
 
 
@@ -93,7 +106,8 @@ def images(
     normals: Float[Tensor, "w 3"],
     offsets: Float[Tensor, "*#b w"],
 ) -> list[Float[Tensor, "b n 3"]]:
-    """Images of transmitters [m] in the first 0, 1, ..., order planes of each sequence of ``all_sequences``.
+    """Images of transmitters [m] in the first 0, 1, ..., order planes of each sequence of
+    ``all_sequences``.
 
     Each transmitter may have offsets of its own.
     """
@@ -117,10 +131,12 @@ def fold(
     normals: Float[Tensor, "w 3"],
     offsets: Float[Tensor, " w"],
 ) -> Folded:
-    """Folds straight lines from the receivers to the last of ``images`` back into the room, plane by plane.
+    """Folds straight lines from the receivers to the last of ``images`` back into the room, plane
+    by plane.
 
-    A line that does not cross its plane is bent at the end nearer to it; such a path does not exist. Nor does a path
-    with an end on the plane, so no path meets two coincident planes in a row.
+    A line that does not cross its plane is bent at the end nearer to it; such a path does not
+    exist. Nor does a path with an end on the plane, so no path meets two coincident planes in a
+    row.
     """
     here = receivers[:, None].expand(-1, len(sequences), -1)
     numbers = torch.arange(len(sequences), device=here.device)
@@ -135,10 +151,15 @@ def fold(
         height, rise, length = (begin * n).sum(-1) - d, (way * n).sum(-1), way.norm(dim=-1)
         with torch.no_grad():
             beyond = height + rise
-            # An end within 4 roundings of the distances of both ends and of the plane is on the plane.
+            # An end within 4 roundings of the distances of both ends and of the plane is on the
+            # plane.
             least = 4 * rounding * (begin.norm(dim=-1) + length + d.abs())
-            exists[:, first:] &= (height * beyond < 0) & (height.abs() > least) & (beyond.abs() > least)
-        share = -height / torch.where(rise.abs() > 1e-9, rise, -1e-9)  # [m]; a line along the plane does not meet it
+            exists[:, first:] &= (
+                (height * beyond < 0) & (height.abs() > least) & (beyond.abs() > least)
+            )
+        share = -height / torch.where(
+            rise.abs() > 1e-9, rise, -1e-9
+        )  # [m]; a line along the plane does not meet it
         at = begin + share.clamp(0, 1)[..., None] * way
         cosines.append(rise.abs() / length.clamp_min(torch.finfo(length.dtype).tiny))
         planes.append(plane)
@@ -148,7 +169,16 @@ def fold(
         here = torch.cat((here[:, :first], at), 1)
     start, end = torch.cat((*starts, seen[0]), 1), torch.cat((*ends, here), 1)
     plane = torch.cat(planes)
-    return Folded(start, end, torch.cat((*path, numbers)), firsts, plane, normals[plane], torch.cat(cosines, 1), exists)
+    return Folded(
+        start,
+        end,
+        torch.cat((*path, numbers)),
+        firsts,
+        plane,
+        normals[plane],
+        torch.cat(cosines, 1),
+        exists,
+    )
 
 
 def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "3"]]:
@@ -161,13 +191,16 @@ def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, 
 
 
 def square_normals(normals: Float[Tensor, "w 3"], plane: int) -> list[Float[Tensor, "3"]]:
-    """A plane's normal, and those within 18 degrees that are level, upright, or square to another plane.
+    """A plane's normal, and those within 18 degrees that are level, upright, or square to another
+    plane.
 
     Powers locate planes to some degrees, and phases of a tilted plane match at few places.
     """
     up, own = normals.new_tensor([0.0, 0.0, 1.0]), normals[plane]
     others = normals[torch.arange(len(normals)) != plane]
-    square = torch.cat((up[None], own[None] * (1 - up), others, torch.linalg.cross(others, up.expand_as(others))))
+    square = torch.cat(
+        (up[None], own[None] * (1 - up), others, torch.linalg.cross(others, up.expand_as(others)))
+    )
     square = functional.normalize(square[square.norm(dim=1) > 0.5], dim=1)
     square = square * (square @ own).sign()[:, None]
     return distinct(torch.cat((own[None], square[square @ own > 0.95])), 2e-5)
@@ -184,10 +217,14 @@ def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tens
 def reflection_points(
     starts: Float[Tensor, "b 3"], ends: Float[Tensor, "b 3"], planes: Float[Tensor, "w 4"]
 ) -> Float[Tensor, "b w 3"]:
-    """Points at which planes reflect waves from starts to ends [m]; of ends on two sides, as if they were on one."""
+    """Points at which planes reflect waves from starts to ends [m]; of ends on two sides, as if
+    they were on one.
+    """
     normals, offsets = planes[:, :3], planes[:, 3]
     own, other = (point @ normals.T - offsets for point in (starts, ends))
-    feet = [p[:, None] - height[..., None] * normals for p, height in ((starts, own), (ends, other))]
+    feet = [
+        p[:, None] - height[..., None] * normals for p, height in ((starts, own), (ends, other))
+    ]
     own, other = (height.abs().clamp_min(1e-6)[..., None] for height in (own, other))
     return (feet[0] * other + feet[1] * own) / (own + other)
 
@@ -195,6 +232,8 @@ def reflection_points(
 def polarised(
     normals: Float[Tensor, "*#n 3"], te: Complex[Tensor, "*n"], tm: Complex[Tensor, "*n"]
 ) -> Complex[Tensor, "*n"]:
-    """Reflection coefficients for vertical polarisation: TE at upright planes, TM at level ones, a mean in between."""
+    """Reflection coefficients for vertical polarisation: TE at upright planes, TM at level ones, a
+    mean in between.
+    """
     level = normals[..., 2].square()
     return (1 - level) * te + level * tm

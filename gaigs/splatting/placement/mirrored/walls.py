@@ -21,17 +21,21 @@ SHORTEST = 1e-3
 """Least length of a wall and of the edges of a face [m]."""
 
 
-def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]) -> Float[Tensor, "k 4"]:
+def read_planes(
+    file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
+) -> Float[Tensor, "k 4"]:
     """Planes of a room as rows (normal, offset [m]), the largest area first.
 
     Args:
-        file: ``.csv`` with consecutive vertices x,y of a floor plan [m], whose walls are upright, or ``.obj`` with the
-            faces of a mesh [m].
-        lower, upper: Corners of the box of transmitters and receivers, with floor and ceiling of a floor plan unless
-            all stand at one height.
+        file: ``.csv`` with consecutive vertices x,y of a floor plan [m], whose walls are upright,
+            or ``.obj`` with the faces of a mesh [m].
+        lower, upper: Corners of the box of transmitters and receivers, with floor and ceiling of a
+            floor plan unless all stand at one height.
     """
     if not file.is_file():
-        raise FileNotFoundError(f"no walls at {file}; set placement.walls to a .csv or .obj, or to null")
+        raise FileNotFoundError(
+            f"no walls at {file}; set placement.walls to a .csv or .obj, or to null"
+        )
     if file.suffix.lower() == ".csv":
         ends = read_walls(file)
         points = ends.flatten(0, 1)
@@ -41,7 +45,9 @@ def read_planes(file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
         level = torch.tensor([[0.0, 0.0, 1.0, upper[2]], [0.0, 0.0, -1.0, -lower[2]]])
         if upper[2] - lower[2] < 0.01:  # [m]; floor and ceiling would hold all places
             level = level[:0]
-        walls = _merged(normals[lengths > SHORTEST], ends[lengths > SHORTEST, 0], lengths[lengths > SHORTEST])
+        walls = _merged(
+            normals[lengths > SHORTEST], ends[lengths > SHORTEST, 0], lengths[lengths > SHORTEST]
+        )
         # A room has floor and ceiling before a fifth wall.
         planes = torch.cat((walls[:4], level, walls[4:])) if len(walls) else walls
     elif file.suffix.lower() == ".obj":
@@ -71,7 +77,9 @@ def _faces(
 def _merged(
     normals: Float[Tensor, "f 3"], points: Float[Tensor, "f 3"], sizes: Float[Tensor, " f"]
 ) -> Float[Tensor, "k 4"]:
-    """Coplanar faces (within 0.02 rad and 0.02 m) as the plane of the largest of them, largest total area first."""
+    """Coplanar faces (within 0.02 rad and 0.02 m) as the plane of the largest of them, largest
+    total area first.
+    """
     sizes, order = sizes.sort(descending=True, stable=True)
     normals = functional.normalize(normals[order], dim=1)
     offsets = (normals * points[order]).sum(1)
@@ -79,9 +87,13 @@ def _merged(
     totals: list[float] = []
     while len(sizes):
         cosines = normals @ normals[0]
-        near = (cosines.abs() > math.cos(0.02)) & ((offsets * cosines.sign() - offsets[0]).abs() < 0.02)
+        near = (cosines.abs() > math.cos(0.02)) & (
+            (offsets * cosines.sign() - offsets[0]).abs() < 0.02
+        )
         rows.append([*normals[0].tolist(), offsets[0].item()])
         totals.append(sizes[near].sum().item())
         far = slice(1, None) if near.sum() == 1 else ~near  # a slice is no copy
         normals, offsets, sizes = normals[far], offsets[far], sizes[far]
-    return torch.tensor(rows).reshape(-1, 4)[torch.tensor(totals).argsort(descending=True, stable=True)]
+    return torch.tensor(rows).reshape(-1, 4)[
+        torch.tensor(totals).argsort(descending=True, stable=True)
+    ]

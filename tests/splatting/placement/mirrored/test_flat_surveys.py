@@ -44,7 +44,10 @@ def test_no_side_from_places_on_a_line(tmp_path):
     line = torch.stack((torch.linspace(0, 8, 60), torch.full((60,), 3.0), torch.zeros(60)), 1)
     facts, _ = started(survey(1.0, [[-1.0, 3.0, 1.0], [9.0, 3.0, 1.0]], line), tmp_path)
     assert not across(facts, 1) + across(facts, 2)
-    assert facts["unseen"] == ["y not seen: all places at 3.00 m", "height not seen: all places at 1.00 m"]
+    assert facts["unseen"] == [
+        "y not seen: all places at 3.00 m",
+        "height not seen: all places at 1.00 m",
+    ]
 
 
 def test_a_floor_may_be_a_ceiling_where_receivers_stand_at_another_height(tmp_path):

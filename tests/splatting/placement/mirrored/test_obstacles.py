@@ -60,7 +60,9 @@ def test_pieces_of_a_segment_add_up_and_its_direction_does_not_matter(obstacles)
     torch.testing.assert_close(obstacles(starts, middles) + obstacles(middles, ends), whole)
     torch.testing.assert_close(obstacles(ends, starts), whole)
     assert obstacles(starts[0], ends[0]).shape == ()
-    torch.testing.assert_close(obstacles(starts.view(4, 5, 3), ends.view(4, 5, 3)), whole.view(4, 5))
+    torch.testing.assert_close(
+        obstacles(starts.view(4, 5, 3), ends.view(4, 5, 3)), whole.view(4, 5)
+    )
 
 
 def test_segments_taken_in_parts_have_the_same_depths_and_gradients(obstacles, monkeypatch):
@@ -69,7 +71,9 @@ def test_segments_taken_in_parts_have_the_same_depths_and_gradients(obstacles, m
     for pairs in (1000, 15, 1):
         monkeypatch.setattr(module, "PAIRS", pairs)
         depths = obstacles(starts, ends)
-        results.append((depths, *torch.autograd.grad(depths.abs().square().sum(), [*obstacles.parameters()])))
+        results.append(
+            (depths, *torch.autograd.grad(depths.abs().square().sum(), [*obstacles.parameters()]))
+        )
     for other in results[1:]:
         torch.testing.assert_close(other, results[0])
 
@@ -79,7 +83,9 @@ def test_gradients_are_the_derivatives(obstacles):
     names, leaves = zip(*obstacles.named_parameters(), strict=True)
 
     def depth(start, end, *values):
-        return torch.func.functional_call(obstacles, dict(zip(names, values, strict=True)), (start, end))
+        return torch.func.functional_call(
+            obstacles, dict(zip(names, values, strict=True)), (start, end)
+        )
 
     assert torch.autograd.gradcheck(depth, [starts, ends, *leaves])
 
@@ -96,7 +102,9 @@ def test_a_segment_of_no_length_has_no_depth(obstacles):
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_depths_vanish_far_away(obstacles, dtype):
     obstacles.to(dtype)
-    start = torch.tensor([[100.0, 0, 0], [0, 1e4, 0], [1e6, 1e6, 1e6]], dtype=dtype, requires_grad=True)
+    start = torch.tensor(
+        [[100.0, 0, 0], [0, 1e4, 0], [1e6, 1e6, 1e6]], dtype=dtype, requires_grad=True
+    )
     depth = obstacles(start, start.detach() + torch.tensor([0, 0, 50.0], dtype=dtype))
     assert (depth.abs() < 1e-20).all()
     parts = torch.view_as_real(depth) if depth.is_complex() else depth
@@ -112,10 +120,14 @@ def test_single_precision_is_near_double(obstacles):
     exact = torch.autograd.grad((true * weights).abs().sum(), [*obstacles.parameters()])
     obstacles.float()
     found = obstacles(starts.float(), ends.float())
-    gradients = torch.autograd.grad((found * weights.float()).abs().sum(), [*obstacles.parameters()])
+    gradients = torch.autograd.grad(
+        (found * weights.float()).abs().sum(), [*obstacles.parameters()]
+    )
     torch.testing.assert_close(found.to(true), true, rtol=1e-4, atol=1e-5)
     for gradient, expected in zip(gradients, exact, strict=True):
-        torch.testing.assert_close(gradient.double(), expected, rtol=0, atol=1e-4 * expected.abs().max().item())
+        torch.testing.assert_close(
+            gradient.double(), expected, rtol=0, atol=1e-4 * expected.abs().max().item()
+        )
 
 
 @pytest.mark.parametrize("width", [1e-4, 1.0, 1e5])

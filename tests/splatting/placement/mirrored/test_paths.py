@@ -24,14 +24,22 @@ from gaigs.testing import check_placement, example_links
 from gaigs.testing.placement import example_gaussians
 
 FREQUENCY = 6.4896e9
-ROOM = Room((7.0, 5.0, 3.0), ("concrete", "glass", "wood", "brick", "plasterboard", "ceiling_board"))
+ROOM = Room(
+    (7.0, 5.0, 3.0), ("concrete", "glass", "wood", "brick", "plasterboard", "ceiling_board")
+)
 LOWER, UPPER = torch.tensor(REGION)
 
 
 def scene(pattern="cosine", bandwidth=5e8, task=None):
     array = Array.planar(4, 4, 0.02, pattern)
     return Scene(
-        (Receiver("gateway", POSE, array),), LOWER, UPPER, 0.3, task or Rssi(), torch.tensor([FREQUENCY]), bandwidth
+        (Receiver("gateway", POSE, array),),
+        LOWER,
+        UPPER,
+        0.3,
+        task or Rssi(),
+        torch.tensor([FREQUENCY]),
+        bandwidth,
     )
 
 
@@ -56,7 +64,9 @@ def walled(placement):
 
 
 def ask(count=40, seed=0):
-    places = torch.lerp(LOWER, UPPER, torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)))
+    places = torch.lerp(
+        LOWER, UPPER, torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
+    )
     return Query(places, torch.zeros(count, dtype=torch.long), torch.full((count,), FREQUENCY))
 
 
@@ -71,7 +81,9 @@ def simulated(query, order, pattern):
     return paths.images, gains, lengths
 
 
-@pytest.mark.parametrize(("order", "pattern"), [(0, "isotropic"), (1, "cosine"), (3, "isotropic"), (2, "cosine")])
+@pytest.mark.parametrize(
+    ("order", "pattern"), [(0, "isotropic"), (1, "cosine"), (3, "isotropic"), (2, "cosine")]
+)
 def test_with_the_rooms_walls_it_is_the_simulator(order, pattern):
     """Each path of the simulator is a Gaussian with the same field; other Gaussians are silent."""
     query = ask()
@@ -90,7 +102,9 @@ def test_with_the_rooms_walls_it_is_the_simulator(order, pattern):
             (which,) = found.nonzero()[:, 0].tolist()
             # The planes' buffers are float32.
             assert placed.gains[i, which].item() == pytest.approx(true_gains[i, k].item(), rel=1e-4)
-            assert placed.lengths[i, which].item() == pytest.approx(true_lengths[i, k].item(), abs=1e-5)
+            assert placed.lengths[i, which].item() == pytest.approx(
+                true_lengths[i, k].item(), abs=1e-5
+            )
         assert exists.sum() == (true_gains[i].abs() > 0).sum()
 
 
@@ -122,7 +136,10 @@ def test_gradients_of_phases_are_those_of_lengths_in_wavelengths():
     placed = placement(None, query)
     wall = 2  # its sequence is the third after the direct path
     phase = placed.gains[0, wall].angle()
-    for leaf, of_length in ((placement.shifts, placed.lengths[0, wall]), (placement.path_phases, None)):
+    for leaf, of_length in (
+        (placement.shifts, placed.lengths[0, wall]),
+        (placement.path_phases, None),
+    ):
         (by_phase,) = torch.autograd.grad(phase, leaf, retain_graph=True)
         if of_length is None:
             assert by_phase[wall] == pytest.approx(1)
@@ -135,11 +152,16 @@ def test_gradients_of_phases_are_those_of_lengths_in_wavelengths():
 def test_initial_planes_lie_beyond_the_faces_of_the_box():
     placement = make(planes=9)
     assert placement.used.tolist() == [0, 1, 2, 3, 4, 5]
-    corners = torch.stack((torch.minimum(LOWER, POSE.position), torch.maximum(UPPER, POSE.position)))
+    corners = torch.stack(
+        (torch.minimum(LOWER, POSE.position), torch.maximum(UPPER, POSE.position))
+    )
     for plane in range(6):
         axis, sign = plane % 3, 1 if plane < 3 else -1
         assert placement.normals[plane, axis] * sign > 0.95
-        beyond = placement.offsets[plane] - sign * (corners[0 if sign < 0 else 1] - placement.middle)[axis]
+        beyond = (
+            placement.offsets[plane]
+            - sign * (corners[0 if sign < 0 else 1] - placement.middle)[axis]
+        )
         assert 0 < beyond < 0.1 * placement.diagonal
 
 
@@ -161,7 +183,9 @@ def test_the_first_faces_turn_as_the_places_lie(edges, expected):
 
 def test_turned_faces_hold_all_places():
     links = gaigs.links("synthetic_rssi", transmitters=60, order=0)
-    room = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([6.0, 4.0, 2.0])
+    room = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(
+        [6.0, 4.0, 2.0]
+    )
     places = (room @ TURNED.mT)[links.rows]
     links = replace(links, query=replace(links.query, transmitters=places))
     links = replace(links, split=Split("all", torch.arange(len(links)), *torch.zeros(2, 0).long()))
@@ -175,12 +199,17 @@ def test_turned_faces_hold_all_places():
         model.placement.shifts.normal_()
     learnt = model.placement.planes
     model.placement.fit(links)
-    torch.testing.assert_close(model.placement.planes, learnt, rtol=0, atol=0, msg="a second fit turned them")
+    torch.testing.assert_close(
+        model.placement.planes, learnt, rtol=0, atol=0, msg="a second fit turned them"
+    )
     torch.testing.assert_close(model._start(), learnt[:6])
 
 
 def test_few_places_turn_no_face():
-    turned = [upright_turn(torch.rand(8, 3, generator=torch.Generator().manual_seed(seed))) for seed in range(20)]
+    turned = [
+        upright_turn(torch.rand(8, 3, generator=torch.Generator().manual_seed(seed)))
+        for seed in range(20)
+    ]
     assert all(torch.equal(turn, torch.eye(3)) for turn in turned)
 
 
@@ -209,7 +238,9 @@ def test_enabling_phases_moves_no_plane_and_makes_steps_small():
     torch.testing.assert_close(placement.offsets, offsets)
     with torch.no_grad():
         placement.shifts[:, 3] += 0.01
-    turned = 4 * math.pi * (placement.offsets - offsets).abs() / 0.05  # phase of a reflected path in a usual step
+    turned = (
+        4 * math.pi * (placement.offsets - offsets).abs() / 0.05
+    )  # phase of a reflected path in a usual step
     assert ((turned > 0.03) & (turned < 0.4)).all()
 
 
@@ -323,7 +354,9 @@ def test_it_keeps_the_contract_of_placements(sharp, carrier):
 
 def test_the_initial_band_is_that_of_the_data_or_of_the_rooms_size():
     assert make().log_bandwidth.exp().item() == pytest.approx(5e8)
-    assert make(bandwidth=None).log_bandwidth.exp().item() == pytest.approx(speed_of_light / make().diagonal)
+    assert make(bandwidth=None).log_bandwidth.exp().item() == pytest.approx(
+        speed_of_light / make().diagonal
+    )
     for placement in (make(bandwidth=0.0), make(task=Csi(16, torch.tensor([FREQUENCY])))):
         assert placement.log_bandwidth is None
         assert placement(None, ask(1)).bandwidth is None
@@ -334,7 +367,10 @@ def test_the_initial_band_is_that_of_the_data_or_of_the_rooms_size():
     [
         ({"planes": 5}, "placement.planes must be at least 6, got 5"),
         ({"order": -1}, "placement.order must be at least 0, got -1"),
-        ({"order": 9}, r"order=9 gives more than 100,000 sequences of 6 planes, .*\n.*placement.order=6 or less"),
+        (
+            {"order": 9},
+            r"order=9 gives more than 100,000 sequences of 6 planes, .*\n.*placement.order=6 or less",
+        ),
         ({"planes": 10, "order": 10**9}, "set placement.order=5 or less"),
         ({"obstacles": -2}, "placement.obstacles must be at least 0, got -2"),
         ({"channels": 10}, "'mirrored' has 1 or 2 channels, amplitude or complex, got 10"),

@@ -7,22 +7,36 @@ import pytest
 import torch
 
 from gaigs.data.synthetic.image_source import cells, mirror
-from gaigs.splatting.placement.mirrored.reflections import all_sequences, fold, images, largest_order
+from gaigs.splatting.placement.mirrored.reflections import (
+    all_sequences,
+    fold,
+    images,
+    largest_order,
+)
 
 SIZE = torch.tensor([7.0, 5.0, 3.0], dtype=torch.float64)
-BOX = torch.cat((torch.eye(3), -torch.eye(3))).double(), torch.cat((SIZE, torch.zeros(3, dtype=torch.float64)))
+BOX = (
+    torch.cat((torch.eye(3), -torch.eye(3))).double(),
+    torch.cat((SIZE, torch.zeros(3, dtype=torch.float64))),
+)
 """Planes of a box room with a corner at the origin, normals outwards."""
 
 
 def places(count, seed=0):
-    return 0.1 + (SIZE - 0.2) * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)).double()
+    return (
+        0.1
+        + (SIZE - 0.2)
+        * torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)).double()
+    )
 
 
 def slanted(count, seed=0):
     """Planes all over the place."""
     generator = torch.Generator().manual_seed(seed)
     normals = torch.randn(count, 3, generator=generator, dtype=torch.float64)
-    return torch.nn.functional.normalize(normals, dim=1), torch.randn(count, generator=generator, dtype=torch.float64)
+    return torch.nn.functional.normalize(normals, dim=1), torch.randn(
+        count, generator=generator, dtype=torch.float64
+    )
 
 
 def folded(order, planes=BOX, count=20):
@@ -115,7 +129,8 @@ def test_planes_mirror_at_the_angle_of_incidence():
     expected = ((arriving * paths.normals[:36]).sum(-1) / arriving.norm(dim=-1)).abs()
     exists = paths.exists[:, 1:]
     torch.testing.assert_close(paths.cosines[:, :36][exists], expected[exists])
-    # At the bounce before, the wave comes from the transmitter and leaves for the next point at the same angle.
+    # At the bounce before, the wave comes from the transmitter and leaves for the next point at the
+    # same angle.
     for ray in (places(20)[:, None] - first, last[:, 6:] - first):
         expected = ((ray * paths.normals[36:]).sum(-1) / ray.norm(dim=-1)).abs()
         exists = paths.exists[:, 7:]
@@ -130,7 +145,11 @@ def test_a_plane_behind_both_ends_mirrors_nothing():
     for name, (there, here) in ends.items():
         transmitters, receivers = torch.tensor([[there, 0, 0]]), torch.tensor([[here, 1.0, 0]])
         exists[name] = fold(
-            images(transmitters, sequences, normals, offsets), receivers, sequences, normals, offsets
+            images(transmitters, sequences, normals, offsets),
+            receivers,
+            sequences,
+            normals,
+            offsets,
         ).exists
     assert exists["both in front"].tolist() == [[True, True]]
     assert exists["both behind"].tolist() == [[True, True]]  # a plane has no back
@@ -141,7 +160,9 @@ def test_a_ray_along_a_plane_meets_it_nowhere_and_has_gradients():
     normals = torch.tensor([[0.0, 0, 1]], requires_grad=True)
     offsets = torch.tensor([1.0], requires_grad=True)
     sequences = all_sequences(1, 1)
-    transmitters = torch.tensor([[1.0, 2, 1]], requires_grad=True)  # in the plane, and so is the receiver
+    transmitters = torch.tensor(
+        [[1.0, 2, 1]], requires_grad=True
+    )  # in the plane, and so is the receiver
     seen = images(transmitters, sequences, normals, offsets)
     paths = fold(seen, torch.tensor([[3.0, 2, 1]]), sequences, normals, offsets)
     assert paths.exists.tolist() == [[True, False]]
@@ -152,12 +173,19 @@ def test_a_ray_along_a_plane_meets_it_nowhere_and_has_gradients():
 
 def test_where_a_path_meets_its_planes_is_differentiable():
     sequences = all_sequences(3, 2)
-    normals, offsets = torch.eye(3, dtype=torch.float64), torch.tensor([4.0, 5.0, 3.0], dtype=torch.float64)
+    normals, offsets = (
+        torch.eye(3, dtype=torch.float64),
+        torch.tensor([4.0, 5.0, 3.0], dtype=torch.float64),
+    )
     transmitter, receiver = places(1) * 0.5, places(1, seed=1) * 0.5
 
     def legs(transmitter, normals, offsets):
-        paths = fold(images(transmitter, sequences, normals, offsets), receiver, sequences, normals, offsets)
-        return paths.start[:, paths.exists[0][paths.path]], paths.end[:, paths.exists[0][paths.path]]
+        paths = fold(
+            images(transmitter, sequences, normals, offsets), receiver, sequences, normals, offsets
+        )
+        return paths.start[:, paths.exists[0][paths.path]], paths.end[
+            :, paths.exists[0][paths.path]
+        ]
 
     leaves = [leaf.requires_grad_() for leaf in (transmitter, normals, offsets)]
     assert torch.autograd.gradcheck(legs, leaves)
