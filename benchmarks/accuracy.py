@@ -79,7 +79,8 @@ class Accuracy(Trainings):
             ).items():
                 if axis not in (SYSTEMS, LOOK_UPS):
                     parts.append(
-                        f"**{axis}**: `{key}` of `{of or 'the command line'}`; the default is {default}\n"
+                        f"**{axis}**: `{key}` of `{of or 'the command line'}`; the default is "
+                        f"{default}\n"
                     )
                     parts.append(_table(values, levels, score))
         return "\n".join(parts)

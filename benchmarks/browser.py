@@ -97,7 +97,7 @@ class Browser:
             time.sleep(0.05)
 
     def drag(self, *places: tuple[float, float], pause: int = 0) -> None:
-        """Presses the mouse at the first place [pixels], moves it to the others, and releases it."""
+        """Presses the mouse at the first place [pixels], moves it on, and releases it."""
         moves = [
             {"type": "pointerMove", "duration": pause, "x": round(x), "y": round(y)}
             for x, y in places

@@ -100,9 +100,10 @@ def _smallest(rows: Sequence[Row], tolerance: float, score: Score) -> list[str]:
     smallest = smallest_within(rows, tolerance, score)
     scores = ", ".join(f"{row['value']}: {number(row['validation'])}" for row in rows)
     default = next((row for row in rows if row["value"] == row["default"]), None)
-    pair = lambda key: ", ".join(
-        number(row[key]) if row else "not measured" for row in (smallest, default)
-    )
+
+    def pair(key):
+        return ", ".join(number(row[key]) if row else "not measured" for row in (smallest, default))
+
     remark = ", the largest tried" if smallest is rows[-1] else ""
     return [
         scores,
@@ -122,7 +123,10 @@ def _scatter(rows: Sequence[Row], tolerance: float, unit: str) -> str:
         for parts in ([r["value"] for r in rows], [number(r["validation"]) for r in rows])
     )
     side = "within" if spread <= tolerance else "beyond"
-    return f"Seeds {seeds} score {texts}: they scatter by {number(spread)}{unit}, {side} the tolerance."
+    return (
+        f"Seeds {seeds} score {texts}: they scatter by {number(spread)}{unit}, {side} the "
+        "tolerance."
+    )
 
 
 def main(words: Sequence[str] | None = None) -> None:

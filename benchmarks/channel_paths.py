@@ -70,9 +70,10 @@ def main(rooms: list[str]) -> None:
     for room in rooms:
         parts = parts_of(room)
         whole = sum(parts)
-        ratio = lambda some, whole=whole: (
-            some.abs().square().sum((1, 2)) / whole.abs().square().sum((1, 2))
-        )
+
+        def ratio(some, whole=whole):
+            return some.abs().square().sum((1, 2)) / whole.abs().square().sum((1, 2))
+
         known = torch.zeros_like(whole)
         for kind, part in zip(KINDS, parts, strict=True):
             known = known + part

@@ -103,7 +103,10 @@ class Benchmark:
     def _measure_missing(self, file: Path) -> list[Row]:
         end = time.monotonic() + 60 * self.options.minutes
         columns = (*self.keys, *self.values, "status")
-        identity = lambda row: tuple(row[key] for key in self.keys)
+
+        def identity(row):
+            return tuple(row[key] for key in self.keys)
+
         rows = {identity(row): row for row in read_rows(file, columns)}
         left = []
         for device in self.options.devices:

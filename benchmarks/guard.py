@@ -85,6 +85,11 @@ def ratios(repeats: int) -> dict[str, float]:
                 time_of((name, scene, "compositing"), composite)
                 for way in WAYS:
                     time_of(("ceiling", scene, way), lambda c=ceiling, w=way: c.measure(w, 60))
+    return _relative(least, list(turns))
+
+
+def _relative(least: dict, turns: list) -> dict[str, float]:
+    """Speeds relative to what the processor can do, from the least times [s]."""
     found = {}
     for name, scene in turns:
         there, back = least[name, scene, "forward"], least[name, scene, "backward"]

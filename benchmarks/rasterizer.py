@@ -108,7 +108,9 @@ class Rasterizers(Benchmark):
         return [*rows.values()]
 
     def tables(self, rows: Sequence[Row]) -> str:
-        size = lambda row: (int(row["gaussians"]), [int(edge) for edge in row["grid"].split(" x ")])
+        def size(row):
+            return (int(row["gaussians"]), [int(edge) for edge in row["grid"].split(" x ")])
+
         groups = sorted(grouped(rows, "scene", "device").items())
         shown = {key.replace("_", " "): key for key in (*self.keys[2:], *self.values)}
         titles = (

@@ -21,7 +21,8 @@ CARRIER, SUBCARRIERS, SIZE = 6.4896e9, 9, (7.0, 5.0, 3.0)
 
 def main() -> None:
     print(
-        "| receiver | band [MHz] | NMSE [dB] | with amplitudes as 1 / frequency [dB] |\n|---|---|---|---|"
+        "| receiver | band [MHz] | NMSE [dB] | with amplitudes as 1 / frequency [dB] "
+        "|\n|---|---|---|---|"
     )
     for rows, columns, bandwidth in ((1, 1, 20e6), (1, 1, 499.2e6), (4, 4, 20e6), (1, 8, 20e6)):
         links = gaigs.links(

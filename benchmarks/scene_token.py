@@ -294,7 +294,10 @@ def of_an_anchor(model: Model, query: Query) -> float:
 
 def linear_prediction(features: Tensor, values: Tensor, asked: Tensor) -> Tensor:
     """Least squares with an offset."""
-    ones = lambda x: torch.cat((x, torch.ones_like(x[:, :1])), 1).double()
+
+    def ones(x):
+        return torch.cat((x, torch.ones_like(x[:, :1])), 1).double()
+
     return (
         ones(asked) @ torch.linalg.lstsq(ones(features), values.double(), driver="gelsd").solution
     ).float()

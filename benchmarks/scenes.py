@@ -99,7 +99,10 @@ def passes(
 ) -> Callable[[], tuple]:
     """A function that draws and differentiates a scene, and returns the seconds of both."""
     splats, *others, plane = cast_scene(scene, device, dtype)
-    leaf = lambda tensor: None if tensor is None else tensor.detach().clone().requires_grad_()
+
+    def leaf(tensor):
+        return None if tensor is None else tensor.detach().clone().requires_grad_()
+
     splats = replace(splats, means2d=leaf(splats.means2d), factors=leaf(splats.factors))
     arguments = splats, *map(leaf, others), plane
 

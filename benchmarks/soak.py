@@ -332,7 +332,10 @@ class Soak:
             "weights": weights,
             "curves": logs,
         }.items():
-            same = lambda name, a=mine, b=other: np.array_equal(a[name], b[name], equal_nan=True)
+
+            def same(name, a=mine, b=other):
+                return np.array_equal(a[name], b[name], equal_nan=True)
+
             if mine.keys() != other.keys() or not all(map(same, mine)):
                 wrong.append(f"other {part}")
         return wrong
@@ -449,7 +452,7 @@ FAULTS = {
 """
 
 
-def shared_files(seconds: float, top: Path) -> int:
+def shared_files(seconds: float, top: Path) -> int:  # noqa: C901, two processes in one story
     """Two processes export, save and load the same files of two models; the number of those that
     were mixed or failed.
 

@@ -65,10 +65,14 @@ class Step(Benchmark):
         parts = [INTRODUCTION]
         for (overrides, device), own in grouped(rows, "overrides", "device").items():
             command = f"python benchmarks/step.py {overrides}".rstrip()
-            about = "{rasterizer}, {gaussians} Gaussians, {places} places a step, medians of {repeats} steps"
+            about = (
+                "{rasterizer}, {gaussians} Gaussians, {places} places a step, medians of {repeats} "
+                "steps"
+            )
             columns = {"part": "part", "ms": "ms", "spread": "spread_ms", "share": "share"}
             parts.append(
-                f"```\n{command}\n```\n\n{device}; {about.format(**own[0])}:\n\n{table(own, columns)}"
+                f"```\n{command}\n```\n\n{device}; "
+                f"{about.format(**own[0])}:\n\n{table(own, columns)}"
             )
         return "\n".join(parts)
 
@@ -153,7 +157,8 @@ def train(config: dict, repeats: int, device: str) -> tuple[dict[str, list[float
     """
     if not config["model"].get("rasterizer") or "deformation" not in config["model"]:
         raise ValueError(
-            f"a step needs a model with a deformation and a rasterizer, got model={config['model']['name']}; "
+            "a step needs a model with a deformation and a rasterizer, got "
+            f"model={config['model']['name']}; "
             "take model=gaigs, or for mirrored Gaussians add rasterizer=fastest projection=mercator"
         )
     lightning.seed_everything(config["seed"], verbose=False)

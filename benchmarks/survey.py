@@ -63,7 +63,8 @@ def main():
     if arguments.flat:
         sets["ble-flat"] = gaigs.links("nerf2_rssi", root=arguments.flat)
     print(
-        "| data | places | planned at once | anew at 40 and 60 | as many random | 1.4 times as many random |"
+        "| data | places | planned at once | anew at 40 and 60 | as many random | 1.4 times as "
+        "many random |"
     )
     print("|---|---|---|---|---|---|")
     for name, links in sets.items():

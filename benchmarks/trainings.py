@@ -83,7 +83,10 @@ class Trainings(Benchmark):
 
     def __init__(self, options: argparse.Namespace):
         super().__init__(options)
-        key_of = lambda word: word.lstrip("+~").partition("=")[0]
+
+        def key_of(word):
+            return word.lstrip("+~").partition("=")[0]
+
         given = {key_of(word): word for word in options.overrides}
         own = {key: word for key, word in given.items() if key.startswith("trainer.")}
         self.scene = [word for word in options.overrides if key_of(word) not in own]

@@ -56,6 +56,7 @@ def on_page_markdown(markdown, page, **_):
     if page.file.generated_by:
         return markdown
     if page.file.src_uri == "docs/view.md":
-        frame = '<iframe src="room.html" title="The built-in room" style="width: 100%; height: 40rem"></iframe>'
+        style = 'style="width: 100%; height: 40rem"'
+        frame = f'<iframe src="room.html" title="The built-in room" {style}></iframe>'
         markdown = re.sub(r"!\[[^]]*\]\(figures/view.png\)", frame, markdown, count=1)
     return re.sub(r"(\]\([^)\s]+)\.ipynb\)", r"\1.md)", markdown)

@@ -48,7 +48,8 @@ class Array:
             )
         if self.elements.ndim != 2 or self.elements.shape[1] != 3 or not len(self.elements):
             raise ValueError(
-                f"an array's elements must be (e, 3) positions [m], got {tuple(self.elements.shape)}"
+                "an array's elements must be (e, 3) positions [m], got "
+                f"{tuple(self.elements.shape)}"
             )
 
     @classmethod
@@ -66,9 +67,13 @@ class Array:
         """
         if rows < 1 or columns < 1 or not 0 < pitch < math.inf:
             raise ValueError(
-                f"an array must have at least 1 x 1 elements at a positive pitch, got {rows} x {columns} at {pitch} m"
+                f"an array must have at least 1 x 1 elements at a positive pitch, got {rows} x "
+                f"{columns} at {pitch} m"
             )
-        steps = lambda count: (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * pitch
+
+        def steps(count):
+            return (torch.arange(count, dtype=torch.float64) - (count - 1) / 2) * pitch
+
         x, y = torch.meshgrid(steps(columns), steps(rows), indexing="ij")
         return cls(torch.stack((x, y, 0 * x), -1).flatten(0, 1), pattern)
 

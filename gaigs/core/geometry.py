@@ -44,7 +44,10 @@ class Frame:
     y: float
 
     def __post_init__(self) -> None:
-        remedy = "gaigs.data.maps.to_utm converts degrees and feet into metres of UTM, and gives its code"
+        remedy = (
+            "gaigs.data.maps.to_utm converts degrees and feet into metres of UTM, and gives its "
+            "code"
+        )
         is_number = (
             isinstance(self.epsg, Integral)
             and isinstance(self.x, Real)
@@ -52,7 +55,8 @@ class Frame:
         )
         if not is_number or not math.isfinite(self.x + self.y) or self._is_elsewhere():
             raise ValueError(
-                f"a frame must be an EPSG code with an easting and a northing [m], got {self}\n{remedy}"
+                "a frame must be an EPSG code with an easting and a northing [m], got "
+                f"{self}\n{remedy}"
             )
         if is_utm(self.epsg) or find_spec("pyproj") is None:
             return
@@ -104,9 +108,12 @@ class Pose:
         """A pose from a scalar-last quaternion of unit length (to 1e-3), as in scipy and the NeRF²
         files.
         """
-        plain = lambda values: (
-            values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, float))
-        )
+
+        def plain(values):
+            return (
+                values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, float))
+            )
+
         position, quaternion = plain(position).double(), plain(quaternion).double()
         if position.shape != (3,) or quaternion.shape != (4,) or not position.isfinite().all():
             raise ValueError(
@@ -318,9 +325,10 @@ class Grid:
     @classmethod
     def degrees(cls, elevations=range(1, 91), azimuths=range(360)) -> "Grid":
         """A grid of whole degrees; the default is that of the NeRF² spectra, 90 x 360."""
-        as_radians = lambda values: torch.tensor(
-            [float(v) for v in values], dtype=torch.float32
-        ).deg2rad()
+
+        def as_radians(values):
+            return torch.tensor([float(v) for v in values], dtype=torch.float32).deg2rad()
+
         return cls(as_radians(elevations), as_radians(azimuths))
 
     @classmethod
@@ -330,7 +338,8 @@ class Grid:
         """
         if rows < 2 or columns < 3:
             raise ValueError(
-                f"a grid over the sphere takes at least 2 rows and 3 columns, got {rows} x {columns}"
+                f"a grid over the sphere takes at least 2 rows and 3 columns, got {rows} x "
+                f"{columns}"
             )
         sines = (2 * torch.arange(rows, dtype=torch.float64) + 1 - rows) / rows
         azimuths = 2 * math.pi / columns * (torch.arange(columns, dtype=torch.float64) + 0.5)
@@ -399,7 +408,10 @@ def even_places(
     """About so many evenly spaced places in a box; an edge shorter than their distance has one.
     With the heights of ``floors`` they are on these."""
     if len(floors):
-        at = lambda end, floor: torch.cat((end[:2], end.new_tensor([floor])))
+
+        def at(end, floor):
+            return torch.cat((end[:2], end.new_tensor([floor])))
+
         each = max(1, count // len(floors))
         return torch.cat(
             [even_places(at(lower, floor), at(upper, floor), each) for floor in floors]

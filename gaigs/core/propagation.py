@@ -74,7 +74,8 @@ def bartlett(
     check_carrier("frequency", frequency)
     if not responses.is_complex() or responses.ndim < 2 or responses.shape[-2] != len(array):
         raise ValueError(
-            f"responses must be complex (..., elements, frequencies) of {len(array)} elements, got {responses.dtype} "
+            f"responses must be complex (..., elements, frequencies) of {len(array)} elements, got "
+            f"{responses.dtype} "
             f"{tuple(responses.shape)}"
         )
     batch, responses = (

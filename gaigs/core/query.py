@@ -169,7 +169,8 @@ def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, 
         if len(known) > 1:
             span = f"{known[0]:.7g} to {known[-1]:.7g} Hz"
             raise ValueError(
-                f"the training links have {len(known)} carriers, {span}; choose one with frequency=..."
+                f"the training links have {len(known)} carriers, {span}; choose one with "
+                "frequency=..."
             )
         return known[0] if len(known) else None
     frequencies = as_numbers("a frequency", values, "a carrier in Hz")
@@ -198,7 +199,8 @@ def as_subcarriers(values: object) -> Float[Tensor, " s"]:
         or len(subcarriers.unique()) < len(subcarriers)
     ):
         raise ValueError(
-            f"frequencies must be {expected}, got shape {tuple(exact.shape)}: {reprlib.repr(values)}"
+            f"frequencies must be {expected}, got shape {tuple(exact.shape)}: "
+            f"{reprlib.repr(values)}"
         )
     check_carrier("frequencies", subcarriers)
     return subcarriers
@@ -232,7 +234,8 @@ def as_directions(directions: Directions | None, own: Grid | None, task: str) ->
     rows, columns = map(len, angles.values())
     if rows != columns:
         raise ValueError(
-            f"rays must have as many elevations as azimuths, got {rows} and {columns}; Grid has rows"
+            f"rays must have as many elevations as azimuths, got {rows} and {columns}; Grid has "
+            "rows"
         )
     return Rays(**angles)
 
@@ -284,7 +287,8 @@ class Query:
         if isinstance(positions, Query):
             if frequency is not None or receiver is not None:
                 raise ValueError(
-                    "a query has its own receivers and frequencies; leave receiver and frequency out"
+                    "a query has its own receivers and frequencies; leave receiver and frequency "
+                    "out"
                 )
             receiver, frequency, positions = (
                 positions.receivers,

@@ -66,7 +66,8 @@ class RadioMap:
             f"{axis} {p[0]:.2f} to {p[-1]:.2f}" for axis, p in zip("xy", corners, strict=True)
         )
         return (
-            f"<radio map of {name}: {', '.join(self.receivers[:5])}{', ...' * (len(self.receivers) > 5)}; "
+            f"<radio map of {name}: "
+            f"{', '.join(self.receivers[:5])}{', ...' * (len(self.receivers) > 5)}; "
             f"{rows} x {columns} points, {spans}, z {self.height:.2f} m>"
         )
 
@@ -162,12 +163,14 @@ def radio_map(
     """
     if not hasattr(model, "scene"):
         raise TypeError(
-            f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint first"
+            f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint "
+            "first"
         )
     scene = model.scene
     if not scene.task.is_scalar:
         raise ValueError(
-            f"a radio map takes a model of one real number a link, got one of task {scene.task.name!r}, whose labels "
+            "a radio map takes a model of one real number a link, got one of task "
+            f"{scene.task.name!r}, whose labels "
             f"are {tuple(scene.task.shape)} of {scene.task.dtype}; use model.predict"
         )
     known = [receiver.name for receiver in scene.receivers]
@@ -181,12 +184,16 @@ def radio_map(
     pitch, margin = None if pitch is None else float(pitch), float(margin)
     if height is None and len(scene.floors):
         others = ", ".join(f"{floor:.2f}" for floor in sorted(scene.floors[1:].tolist()))
-        words = "radio map at z = %.2f m, the floor with most training places; others are at %s m: set height"
+        words = (
+            "radio map at z = %.2f m, the floor with most training places; others are at %s m: set "
+            "height"
+        )
         log.info(words, scene.height, others)
     height = scene.height if height is None else float(height)
     if not np.isfinite(height) or not 0 <= margin < np.inf:
         raise ValueError(
-            f"height must be finite and margin at least 0 [m], got height {height} and margin {margin}"
+            f"height must be finite and margin at least 0 [m], got height {height} and margin "
+            f"{margin}"
         )
     corners = np.stack(
         (lower, upper, *(receiver.pose.position.numpy() for receiver in scene.receivers))
@@ -196,7 +203,10 @@ def radio_map(
     away = max(scene.lower[2].item() - height, height - scene.upper[2].item())
     for name, size, most in (("height", away, scene.extent), ("margin", margin, 20 * scene.extent)):
         if size > most:
-            message = f"{name} puts transmitters {size:.4g} m outside the box of the training transmitters, which with "
+            message = (
+                f"{name} puts transmitters {size:.4g} m outside the box of the training "
+                "transmitters, which with "
+            )
             message += f"the receivers is {scene.extent:.3g} m across; is it in m?"
             warnings.warn(
                 message, ExtrapolationWarning, stacklevel=3
@@ -205,7 +215,8 @@ def radio_map(
         0 < pitch <= longest and math.prod(((upper - lower) / pitch).tolist()) <= 1e8
     ):
         raise ValueError(
-            f"pitch must be above 0, at most {longest:.3g} m, the longer side of the map, and give at most 1e+08 "
+            f"pitch must be above 0, at most {longest:.3g} m, the longer side of the map, and give "
+            "at most 1e+08 "
             f"points, got {pitch} m; is it in m?"
         )
     # All receivers of a point in one batch, so that a transmitter's excitation is computed once.

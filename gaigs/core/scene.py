@@ -42,7 +42,8 @@ class FlatAxis(NamedTuple):
             return f"{name} not seen: all places at {self.transmitters:.2f} m"
         both = self.transmitters + self.receivers
         return (
-            f"{name} seen from either side: places at {self.transmitters:.2f} m, receivers at {self.receivers:.2f} m; "
+            f"{name} seen from either side: places at {self.transmitters:.2f} m, receivers at "
+            f"{self.receivers:.2f} m; "
             f"a plane across it at h may stand at {both:.2f} m - h"
         )
 
@@ -206,7 +207,8 @@ def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
         return query.frequencies
     if len(scene.frequencies) != 1:
         raise ValueError(
-            f"each link must have a frequency [Hz], as the data have {len(scene.frequencies)} carriers"
+            f"each link must have a frequency [Hz], as the data have {len(scene.frequencies)} "
+            "carriers"
         )
     return scene.frequencies.to(query.transmitters).expand(len(query))
 

@@ -208,6 +208,8 @@ def check_values(labels: Tensor, values: Tensor, shape: tuple[int, ...], samples
         broken = ~tensor.isfinite()[..., None].flatten(1).all(1)
         if broken.any():
             raise ValueError(
-                f"{name} must be finite, got NaN or infinity in {int(broken.sum())} of {len(tensor)} {samples}, first "
-                f"in number {int(broken.int().argmax())}; the training diverged or the file is damaged"
+                f"{name} must be finite, got NaN or infinity in {int(broken.sum())} of "
+                f"{len(tensor)} {samples}, first "
+                f"in number {int(broken.int().argmax())}; the training diverged or the file is "
+                "damaged"
             )

@@ -70,7 +70,8 @@ class Csi(Task):
             raise ValueError(f"a channel needs at least one element, got {elements}")
         if not len(frequencies) or not ((frequencies > 0) & frequencies.isfinite()).all():
             raise ValueError(
-                f"subcarriers must have positive, finite frequencies [Hz], got {frequencies.tolist()[:3]}"
+                "subcarriers must have positive, finite frequencies [Hz], got "
+                f"{frequencies.tolist()[:3]}"
             )
         if len(frequencies.unique()) < len(frequencies):
             raise ValueError(

@@ -133,7 +133,8 @@ class Spectrum(Task):
         if rays is not None and not (1 <= rays <= rows * columns and stride == 1):
             most = rows * columns
             raise ValueError(
-                f"training.thinning.rays must be in 1..{most} with stride=1, got {rays}, stride {stride}"
+                f"training.thinning.rays must be in 1..{most} with stride=1, got {rays}, stride "
+                f"{stride}"
             )
 
         def grid(batch: Batch, generator: torch.Generator) -> Batch:

@@ -59,16 +59,19 @@ class ArrayResponse(Model):
         super().__init__(scene)
         if scene.task.name != "spectrum":
             raise ValueError(
-                f"model 'array_response' predicts spectra, not labels of task {scene.task.name!r}; use another model"
+                f"model 'array_response' predicts spectra, not labels of task {scene.task.name!r}; "
+                "use another model"
             )
         if scene.has_band:
             raise ValueError(
-                f"model 'array_response' measures its array in wavelengths, of one carrier, and these links have "
+                "model 'array_response' measures its array in wavelengths, of one carrier, and "
+                "these links have "
                 f"{len(scene.frequencies)}; use another model"
             )
         if rows < 1 or columns < 1 or rows * columns < 2:
             raise ValueError(
-                f"an array must have at least 2 elements, got model.rows={rows}, model.columns={columns}"
+                f"an array must have at least 2 elements, got model.rows={rows}, "
+                f"model.columns={columns}"
             )
         if not 0 < pitch < math.inf:
             raise ValueError(f"model.pitch must be positive [wavelengths], got {pitch}")

@@ -67,24 +67,28 @@ class Gsrf(Model):
         super().__init__(scene)
         if scene.has_band:
             raise ValueError(
-                f"model 'gsrf' is of one carrier, and these links have {len(scene.frequencies)}; use another model"
+                f"model 'gsrf' is of one carrier, and these links have {len(scene.frequencies)}; "
+                "use another model"
             )
         if not 0 < radius < math.inf:
             raise ValueError(f"model.radius must be positive [m], got {radius}")
         if pooling is None:
             raise ValueError(
-                f"model 'gsrf' has no pooling for labels of task {scene.task.name!r}; use another model"
+                f"model 'gsrf' has no pooling for labels of task {scene.task.name!r}; use another "
+                "model"
             )
         self.pooling, self.radius = registry("pooling").build(pooling, scene=scene), radius
         if self.pooling.channels % 2:
             raise ValueError(
-                f"model 'gsrf' renders complex maps, and pooling {pooling['name']!r} takes {self.pooling.channels} "
+                f"model 'gsrf' renders complex maps, and pooling {pooling['name']!r} takes "
+                f"{self.pooling.channels} "
                 "real channel; take one that takes two"
             )
         grid = self.pooling.grid or scene.task.directions
         if grid is None:
             raise ValueError(
-                f"labels of task {scene.task.name!r} have no directions, so the pooling must have a grid of its own, "
+                f"labels of task {scene.task.name!r} have no directions, so the pooling must have "
+                "a grid of its own, "
                 f"and {pooling['name']} has none; take the task's own pooling"
             )
         zone = self.pooling.zone

@@ -74,14 +74,17 @@ class ComplexGaussians(Gaussians):
             raise ValueError(f"model.count must be at least 1, got {count}")
         if not zone[0] < zone[1]:
             raise ValueError(
-                f"model 'gsrf' needs labels of two elevations or more, got them from {zone[0]:.6g} to {zone[1]:.6g} "
+                f"model 'gsrf' needs labels of two elevations or more, got them from {zone[0]:.6g} "
+                f"to {zone[1]:.6g} "
                 "rad; take another model"
             )
         means = heard(cubic_grid(scene, count, pitch, margin), scene, zone)
         if len(means) < len(scene.receivers):
             raise ValueError(
-                f"the grid of Gaussians must have a point for each of the {len(scene.receivers)} receivers, got "
-                f"{len(means)} that are heard; raise model.count, or lower model.pitch or model.margin"
+                f"the grid of Gaussians must have a point for each of the {len(scene.receivers)} "
+                "receivers, got "
+                f"{len(means)} that are heard; raise model.count, or lower model.pitch or "
+                "model.margin"
             )
         options = {
             "near": 1.0,

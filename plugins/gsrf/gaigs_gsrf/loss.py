@@ -35,7 +35,8 @@ class GsrfLoss:
     def __init__(self, task: Task):
         if task.dtype.is_complex:
             raise ValueError(
-                "loss 'gsrf' takes spectra or levels, got complex labels; take loss=log_relative_error"
+                "loss 'gsrf' takes spectra or levels, got complex labels; take "
+                "loss=log_relative_error"
             )
         self.directions = task.directions
 

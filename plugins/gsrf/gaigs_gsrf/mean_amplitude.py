@@ -38,7 +38,8 @@ class MeanAmplitude(Pooling):
         least = links.labels[links.split.train].min().item()
         if least <= -RANGE:
             raise ValueError(
-                f"pooling 'mean_amplitude' gives levels above -100 dBm, and a training label is {least:.6g} dBm; leave "
+                "pooling 'mean_amplitude' gives levels above -100 dBm, and a training label is "
+                f"{least:.6g} dBm; leave "
                 "such readings out, or take another pooling"
             )
 

@@ -63,7 +63,7 @@ def weights(
 ) -> Complex[Tensor, "k rays"]:
     """alpha_i T_i of each Gaussian on each ray.
 
-        w_i = exp(-d' Sigma_i^-1 d / 2)      d = radius (u - u_i), from the centre's projection to the ray's point
+        w_i = exp(-d' Sigma_i^-1 d / 2)      d = radius (u - u_i), from projection to ray
         alpha_i = min(0.99, o_i w_i)         T_i = prod_{j<i} (1 - alpha_j) exp(j phi_j w_j)
 
     The covariance Sigma is that of the Gaussian in space: how far away it is does not change its

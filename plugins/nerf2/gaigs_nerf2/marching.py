@@ -201,7 +201,7 @@ class RayMarching(Model):
 
     @torch.no_grad()
     def evaluate(self, batch: Batch) -> Tensor:
-        """Values of a batch, of at most ``chunk`` links at a time; ``march`` splits them further."""
+        """Values of a batch, at most ``chunk`` links at a time; ``march`` splits further."""
         parts = batch.query.parts(self.chunk)
         return torch.cat([self(Batch(part, batch.directions)).value for part in parts])
 

@@ -91,7 +91,8 @@ class Level(Reading):
         least = links.labels[links.split.train].min().item()
         if least <= -100:
             raise ValueError(
-                f"a radiance field gives levels above -100 dBm, and a training label is {least:.6g} dBm; leave such "
+                "a radiance field gives levels above -100 dBm, and a training label is "
+                f"{least:.6g} dBm; leave such "
                 "readings out, or take another model"
             )
 
@@ -177,7 +178,8 @@ def make_reading(scene: Scene, rays: list[int], frequency: float) -> Reading:
     task = scene.task
     if scene.has_band:
         raise ValueError(
-            f"a radiance field is of one carrier, and these links have {len(scene.frequencies)}; take another model"
+            f"a radiance field is of one carrier, and these links have {len(scene.frequencies)}; "
+            "take another model"
         )
     if len(rays) != 2:
         raise ValueError(f"model.rays must be [rows, columns], got {rays}")
@@ -193,6 +195,7 @@ def make_reading(scene: Scene, rays: list[int], frequency: float) -> Reading:
         case "csi":
             return Channel(Grid.sphere(*rays), scene)
     raise ValueError(
-        f"a radiance field is marched for spectrum, rssi and csi, and these labels are of task {task.name!r}; take "
+        "a radiance field is marched for spectrum, rssi and csi, and these labels are of task "
+        f"{task.name!r}; take "
         "another model"
     )

@@ -63,7 +63,8 @@ class NerfApt(RayMarching):
             or rays[1] % DIVISOR
         ):
             raise ValueError(
-                f"model.samples and the columns of model.rays must be multiples of {DIVISOR}, of at least 2 rows, got "
+                f"model.samples and the columns of model.rays must be multiples of {DIVISOR}, of "
+                "at least 2 rows, got "
                 f"{samples} and {rays}"
             )
         if len(widths) != 3 or min(widths) < 2:

@@ -1,1 +1,1 @@
-"""Networks that map a link to its whole label, without rays or Gaussians: MLP, FIRE, DCGAN, WRF-KAN."""
+"""Networks that map a link to its label without rays or Gaussians: MLP, FIRE, DCGAN, WRF-KAN."""

@@ -59,7 +59,8 @@ class Adversarial(Descent):
             raise ValueError("adversarial training takes one process; set trainer.devices=1")
         if getattr(self.trainer.precision_plugin, "scaler", None) is not None:
             raise ValueError(
-                "adversarial training does not scale gradients; set trainer.precision to bf16-mixed or 32"
+                "adversarial training does not scale gradients; set trainer.precision to "
+                "bf16-mixed or 32"
             )
 
     def training_step(self, batch: Batch, _: int) -> Tensor:

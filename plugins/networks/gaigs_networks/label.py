@@ -114,7 +114,8 @@ class LabelImage(nn.Module):
         """
         if self.grid is not None and not isinstance(directions, Grid):
             raise ValueError(
-                "a network that looks at labels needs rows and columns, and training.thinning.rays draws single "
+                "a network that looks at labels needs rows and columns, and training.thinning.rays "
+                "draws single "
                 "directions; set training.thinning.rays=null"
             )
         channels, rows, columns = self.shape if self.grid is None else (1, *directions.shape)
@@ -158,7 +159,7 @@ def interpolate(
 def shares(
     known: Float[Tensor, " n"], asked: Float[Tensor, " k"], period: float | None = None
 ) -> Float[Tensor, "k n"]:
-    """Which share each of some known angles has in the value at an angle asked for [rad], float64."""
+    """Weights of known angles in the value at an angle asked for [rad], float64."""
     count = len(known)
     known, order = known.double().sort()
     asked = asked.to(known)

@@ -145,12 +145,14 @@ class NeWrf(Model):
         check_elements("model 'newrf'", scene)
         if len(scene.task.frequencies) < 2:
             raise ValueError(
-                "model 'newrf' estimates arrivals from delays, which a single subcarrier does not tell; take another "
+                "model 'newrf' estimates arrivals from delays, which a single subcarrier does not "
+                "tell; take another "
                 "model"
             )
         if scene.has_band:
             raise ValueError(
-                f"the field of model 'newrf' is of one carrier, and these links have {len(scene.frequencies)}; take "
+                "the field of model 'newrf' is of one carrier, and these links have "
+                f"{len(scene.frequencies)}; take "
                 "another model"
             )
         least = {

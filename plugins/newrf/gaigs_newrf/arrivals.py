@@ -125,7 +125,7 @@ def _refined(
 def _profile(
     channels: Complex[Tensor, "k e s"], frequencies: Float[Tensor, " s"], far: float
 ) -> tuple[Tensor, float]:
-    """Power of each link by distance, from 0 to ``far`` (k, d), and the step between distances [m]."""
+    """Power of each link by distance up to ``far`` (k, d), and the step of distances [m]."""
     step = speed_of_light / (OVERSAMPLING * (frequencies.max() - frequencies.min()).item())
     distances = step * torch.arange(math.ceil(far / step) + 1, dtype=torch.float64)
     return (channels @ _waves(distances, frequencies).mH).abs().square().sum(1), step

@@ -25,8 +25,10 @@ ATTENUATION = -5.0
 class NGrf(Model):
     """Channel = sum over Gaussians of weight x complex strength x wave to the antenna that moves.
 
-        h_e(p, f) = g sum_i w_i(p) s_i 2 sigmoid(a_i) exp(j phi_i - alpha_i d_i) G_m(r_ie) G_f(d_i) / G_m(d_i)
-        w_i(p) = exp(-(p - mu_i)' Sigma_i^-1 (p - mu_i) / 2)    d_i = |p - mu_i|    r_ie = |p - mu_i - Q_i x_e|
+        h_e(p, f) = g sum_i w_i(p) s_i 2 sigmoid(a_i) exp(j phi_i - alpha_i d_i)
+                        G_m(r_ie) G_f(d_i) / G_m(d_i)
+        w_i(p) = exp(-(p - mu_i)' Sigma_i^-1 (p - mu_i) / 2)
+        d_i = |p - mu_i|    r_ie = |p - mu_i - Q_i x_e|
 
     with the wave of free space G, at the middle m of the band from element to element: an array
     must be small against the speed of light over the bandwidth. Amplitude a, phase phi and
@@ -72,7 +74,8 @@ class NGrf(Model):
         check_elements("model 'ngrf'", scene)
         if scene.has_band:
             raise ValueError(
-                f"model 'ngrf' is of one carrier, and these links have {len(scene.frequencies)}; use another model"
+                f"model 'ngrf' is of one carrier, and these links have {len(scene.frequencies)}; "
+                "use another model"
             )
         for option, number in (("count", count), ("width", width), ("layers", layers)):
             if number < 1:

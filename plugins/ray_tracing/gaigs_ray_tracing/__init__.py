@@ -44,8 +44,9 @@ class RayTracing(Model):
     and its conductivity s b, with e and s as tabulated and a, b learnt, 1 at the start. Diffracted
     paths keep the gain that they have at the start.
 
-        channels    h = g sum_p h_p at each element and subcarrier, one complex gain g for each receiver
-        RSSI        10 log10 of the mean of |h|^2 over the data's band; where that is unknown, the paths' powers add
+        channels    h = g sum_p h_p at each element and subcarrier, one complex gain g a receiver
+        RSSI        10 log10 of the mean of |h|^2 over the data's band; the paths' powers add where
+                    the band is unknown
         spectra     the conventional beamformer's amplitude over the band, scaled as the labels are
 
     ``fit`` takes each receiver's gain from the training links, their median: transmit power, cables

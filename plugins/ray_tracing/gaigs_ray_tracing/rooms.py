@@ -34,7 +34,8 @@ def check_room(room: str) -> None:
     """Raises a ``ValueError`` unless a room of that name is known."""
     if room not in BUILT_IN and room not in ROOMS:
         raise ValueError(
-            f"model 'ray_tracing' must know the room: one of built_in, {', '.join(ROOMS)}, got {room!r}; set "
+            f"model 'ray_tracing' must know the room: one of built_in, {', '.join(ROOMS)}, got "
+            f"{room!r}; set "
             "model.room, or model.mesh to a file of its surfaces"
         )
 
@@ -82,7 +83,8 @@ def known_materials(meshes: Sequence[Mesh], chosen: Mapping[str, str]) -> dict[s
         found[name] = chosen.get(name, FURNITURE.get(name, plain))
         if found[name] not in THICKNESS:
             raise ValueError(
-                f"material {name!r} must be one of {', '.join(THICKNESS)}, got {found[name]!r}; say which it is like: "
+                f"material {name!r} must be one of {', '.join(THICKNESS)}, got {found[name]!r}; "
+                "say which it is like: "
                 f"+model.materials.{name}=concrete"
             )
     return found
@@ -153,7 +155,8 @@ def _read_scene(file: Path) -> list[Mesh]:
             "vertex_positions" not in parameters
         ):  # as of a rectangle, which has no vertices of its own
             raise ValueError(
-                f"{file}, shape {name!r}, must be a mesh of type ply or obj; export it as one, as Blender does"
+                f"{file}, shape {name!r}, must be a mesh of type ply or obj; export it as one, as "
+                "Blender does"
             )
         points = parameters["vertex_positions"].numpy().reshape(-1, 3).astype(float)
         faces = [tuple(face) for face in parameters["faces"].numpy().reshape(-1, 3).tolist()]

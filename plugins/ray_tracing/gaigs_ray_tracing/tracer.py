@@ -180,7 +180,10 @@ class Tracer:
                 tracing.without_weakest(fields[receiver, place] * valid[receiver, place]),
             ] = True
         receivers, transmitters, _ = there.nonzero()
-        pick = lambda tensor: np.moveaxis(tensor.numpy(), 0, 3)[there]
+
+        def pick(tensor):
+            return np.moveaxis(tensor.numpy(), 0, 3)[there]
+
         types, objects, faces, points = map(
             pick, (paths.interactions, paths.objects, paths.primitives, paths.vertices)
         )

@@ -52,7 +52,8 @@ class Rf3dgs(GaussianSplatting):
     def __init__(self, scene: Scene, geometry: str | None, first_stage: float, **options):
         if scene.task.directions is None:
             raise ValueError(
-                f"model 'rf_3dgs' learns from spectra, not labels of task {scene.task.name!r}; use another model"
+                f"model 'rf_3dgs' learns from spectra, not labels of task {scene.task.name!r}; use "
+                "another model"
             )
         if not 0 < first_stage < 1:
             raise ValueError(f"model.first_stage must lie between 0 and 1, got {first_stage}")
@@ -70,7 +71,8 @@ class Rf3dgs(GaussianSplatting):
         """
         if self.training and distributed.is_available() and distributed.is_initialized():
             raise ValueError(
-                "model 'rf_3dgs' freezes its geometry within the training, which one process can do, not "
+                "model 'rf_3dgs' freezes its geometry within the training, which one process can "
+                "do, not "
                 f"{distributed.get_world_size()}; set trainer.devices=1"
             )
         return super().forward(batch)
@@ -101,7 +103,10 @@ class Rf3dgs(GaussianSplatting):
         self.stage.fill_(2)
         self._enter()
         self._reset()
-        return f"geometry of {len(self.gaussians)} Gaussians frozen; harmonics of degree {self.degree} from here on"
+        return (
+            f"geometry of {len(self.gaussians)} Gaussians frozen; harmonics of degree "
+            f"{self.degree} from here on"
+        )
 
     def facts(self) -> dict[str, object]:
         """Beside the rasterizer: the stage that the model is of, and where its geometry is from."""

@@ -78,7 +78,8 @@ def read_geometry(file: Path, most: int) -> Geometry:
     if len(points) <= NEIGHBOURS or most <= NEIGHBOURS:
         count = min(len(points), most)
         raise ValueError(
-            f"{file} must give at least {NEIGHBOURS + 1} Gaussians, got {count} of gaussians.count={most}"
+            f"{file} must give at least {NEIGHBOURS + 1} Gaussians, got {count} of "
+            f"gaussians.count={most}"
         )
     chosen = torch.randperm(len(points))[:most]
     means = torch.from_numpy(points)[chosen].float()
@@ -117,7 +118,10 @@ def _read_obj(file: Path) -> tuple[np.ndarray, np.ndarray, dict]:
 
 def _read_ply(file: Path) -> tuple[np.ndarray, np.ndarray, dict]:
     vertices, faces = read_ply(file)
-    columns = lambda names: np.stack([vertices[name] for name in names], -1)
+
+    def columns(names):
+        return np.stack([vertices[name] for name in names], -1)
+
     if all(column in vertices.dtype.names for own in SPLATS.values() for column in own):
         return columns("xyz"), _triangles(()), {name: columns(own) for name, own in SPLATS.items()}
     return columns("xyz"), _triangles(faces), {}

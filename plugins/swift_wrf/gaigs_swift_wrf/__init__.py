@@ -1,4 +1,4 @@
-"""SwiftWRF: 2-D Gaussians in the plane of a spectrum, which a network deforms for each transmitter."""
+"""SwiftWRF: 2-D Gaussians in a spectrum's plane, which a network deforms for each transmitter."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -36,7 +36,7 @@ class SwiftWrf(Model):
     """Transmitter position -> 2-D Gaussians in the plane of azimuth and elevation -> their plain
     sum.
 
-        s(u) = sum_i a_i exp(-(u - m_i)' C_i^-1 (u - m_i) / 2)        C_i = L_i L_i' + pixel variance
+        s(u) = sum_i a_i exp(-(u - m_i)' C_i^-1 (u - m_i) / 2)    C_i = L_i L_i' + pixel variance
 
     without opacity, depth or order. Each receiver has Gaussians of its own: means m, lower
     triangular factors L and amplitudes a. A network adds to all three for each transmitter: [PE(m),
@@ -71,12 +71,14 @@ class SwiftWrf(Model):
         grid = scene.task.directions
         if grid is None:
             raise ValueError(
-                f"model 'swift_wrf' lays its Gaussians in the plane of a spectrum, and labels of task "
+                "model 'swift_wrf' lays its Gaussians in the plane of a spectrum, and labels of "
+                "task "
                 f"{scene.task.name!r} have no directions; take another model"
             )
         if not grid.pitch > 0:
             raise ValueError(
-                f"model 'swift_wrf' needs labels of two elevations or more, got {tuple(grid.shape)} directions; take "
+                "model 'swift_wrf' needs labels of two elevations or more, got "
+                f"{tuple(grid.shape)} directions; take "
                 "another model"
             )
         for option, number in (("count", count), ("width", width), ("layers", layers)):
