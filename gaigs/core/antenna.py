@@ -12,16 +12,12 @@ from torch import Tensor
 from gaigs.core.geometry import Pose
 
 PATTERNS = ("isotropic", "cosine")
-"""Field patterns of an element; as of a patch, the cosine of the angle to the array's normal, and 0
-behind it.
-"""
+"""Field patterns of an element; ``cosine``, of the angle to the array's normal, is 0 behind it."""
 
 
 def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"]]:
-    """The distinct vectors between places, rounded to nine decimals, and the index of each pair's
-    vector.
-    """
-    apart = (places[:, None] - places).flatten(0, 1).round(decimals=9)
+    """The distinct vectors between places, to nine decimals, and the index of each pair's vector."""
+    apart = (places[:, None] - places).flatten(0, 1).round(decimals=9)  # (e x e, 3)
     return torch.unique(apart, dim=0, return_inverse=True)
 
 
@@ -87,8 +83,7 @@ class Array:
 
     @functools.cached_property
     def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"], Float[Tensor, " l"]]:
-        """The distinct vectors between elements [m], the index of each pair's vector, and the pairs
-        of each; float64.
+        """The distinct vectors between elements [m], each pair's index, the pairs of each; float64.
 
         The covariance of a field depends on them only: 49 for a 4 x 4 array.
         """

@@ -1,6 +1,4 @@
-"""Poses, quaternions, coordinates, harmonics, and grids of directions; conventions:
-docs/conventions.md.
-"""
+"""Poses, quaternions, coordinates, harmonics and grids of directions (docs/conventions.md)."""
 
 import math
 from collections.abc import Sequence
@@ -24,17 +22,19 @@ class ExtrapolationWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Frame:
-    """The place of the world frame on a map: its origin (x, y) in the projected system of an EPSG
-    code [m].
+    """Place of the world frame on a map: its origin (x, y) [m] in a projected system (EPSG code).
 
     Raises:
         ValueError: There is no such system, it has other units than metres, or the origin is not
             within it. Without pyproj systems other than UTM are not checked.
 
     Example:
-        >>> places, levels = [[10.0, 20.0, 1.5], [30.0, 5.0, 1.5], [0.0, 9.0, 1.5]], [-50.0, -60.0, -55.0]
+        >>> places = [[10.0, 20.0, 1.5], [30.0, 5.0, 1.5], [0.0, 9.0, 1.5]]
         >>> frame = gaigs.Frame(32632, 450000.0, 5400000.0)  # UTM less this easting and northing
-        >>> links = gaigs.links(task="rssi", transmitters=places, receivers=[0, 0, 9], labels=levels, frame=frame)
+        >>> links = gaigs.links(
+        ...     task="rssi", transmitters=places, receivers=[0, 0, 9], labels=[-50.0, -60.0, -55.0],
+        ...     frame=frame,
+        ... )
         >>> links.frame.epsg
         32632
     """
@@ -68,15 +68,14 @@ class Frame:
             raise ValueError(f"there is no coordinate system EPSG:{self.epsg}\n{remedy}") from None
         units = [axis.unit_name for axis in system.axis_info[:2]]
         if not system.is_projected or units != ["metre", "metre"]:
-            found = f"EPSG:{self.epsg}, {system.name} in {units[0]}"
-            raise ValueError(f"a frame must be a projected system in metres, got {found}\n{remedy}")
+            given = f"EPSG:{self.epsg}, {system.name} in {units[0]}"
+            raise ValueError(f"a frame must be a projected system in metres, got {given}\n{remedy}")
 
     def _is_elsewhere(self) -> bool:
-        """True if the origin is in degrees, or beyond all of UTM: Norway has eastings of -80 to
-        1120 km in zone 33.
-        """
+        """True if the origin is in degrees or beyond all of UTM."""
         is_small = abs(self.x) <= 180 and abs(self.y) <= 90
         if is_utm(self.epsg):
+            # Norway has eastings of -80 to 1120 km in zone 33.
             return is_small or not (-2e5 <= self.x <= 1.3e6 and -1e5 <= self.y <= 1.01e7)
         return is_small and (self.x, self.y) != (0, 0)
 
@@ -95,7 +94,7 @@ class Pose:
         rotation: The array's axes in the world frame as columns (3, 3).
 
     Example:
-        >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])  # scipy's order: looks along the axes
+        >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])  # along the axes
         >>> pose.local(torch.tensor([3.0, 0.0, 2.0]))
         tensor([2., 0., 0.])
     """
@@ -105,16 +104,15 @@ class Pose:
 
     @classmethod
     def from_xyzw(cls, position, quaternion) -> "Pose":
-        """A pose from a scalar-last quaternion of unit length (to 1e-3), as in scipy and the NeRF²
-        files.
-        """
+        """A pose from a scalar-last quaternion (scipy's order) of length 1 to within 1e-3."""
 
-        def plain(values):
-            return (
-                values if isinstance(values, Tensor) else torch.from_numpy(np.array(values, float))
-            )
+        def as_double(values):
+            if not isinstance(values, Tensor):
+                values = torch.from_numpy(np.array(values, float))
+            return values.double()
 
-        position, quaternion = plain(position).double(), plain(quaternion).double()
+        position = as_double(position)
+        quaternion = as_double(quaternion)
         if position.shape != (3,) or quaternion.shape != (4,) or not position.isfinite().all():
             raise ValueError(
                 "a pose needs 3 finite coordinates [m] and a quaternion (x, y, z, w), got "
@@ -162,7 +160,7 @@ def unit_quaternions(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 
 
 
 def _of_moderate_length(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Quaternions scaled to a largest component of 1, so that squares neither overflow nor vanish."""
+    """Quaternions with a largest component of 1, so that squares neither overflow nor vanish."""
     largest = quats.detach().abs().amax(-1, keepdim=True)
     return quats / torch.where(largest == 0, 1, largest)
 
@@ -170,15 +168,12 @@ def _of_moderate_length(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*bat
 def semi_axes(
     quats: Float[Tensor, "*#batch 4"], scales: Float[Tensor, "*#batch 3"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """Semi-axes R diag(scales) of Gaussians as columns, from quaternions (w, x, y, z) and standard
-    deviations [m].
-    """
+    """Semi-axes R diag(scales) as columns, from quaternions (w, x, y, z) and scales [m]."""
     return quaternions_to_rotations(quats) * scales[..., None, :]
 
 
 def to_spherical(points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Azimuth in [-pi, pi] [rad], elevation in [-pi/2, pi/2] [rad] and distance [m] of points in
-    the array's frame.
+    """Azimuth in [-pi, pi], elevation in [-pi/2, pi/2] [rad], and distance [m], in the array's frame.
 
     At the zenith, where azimuth is undefined, it is 0. Gradients are finite everywhere but at the
     origin.
@@ -189,7 +184,8 @@ def to_spherical(points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Ten
     # at azimuth 0.
     least = torch.finfo(points.dtype).eps * distances.detach()
     axial = torch.hypot(x, y) <= least
-    x, y = torch.where(axial, least, x), torch.where(axial, 0.0, y)
+    x = torch.where(axial, least, x)
+    y = torch.where(axial, 0.0, y)
     return torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y)), distances
 
 
@@ -207,14 +203,12 @@ def from_spherical(
 def polar(
     amplitudes: Float[Tensor, "*batch"], phases: Float[Tensor, "*batch"]
 ) -> Complex[Tensor, "*batch"]:
-    """``torch.polar`` with value and gradient 0 below ``FAINTEST``, where its own gradient is NaN."""
+    """``torch.polar`` with value and gradient 0 below ``FAINTEST``, where torch's is NaN."""
     return torch.polar(amplitudes.masked_fill(amplitudes < FAINTEST, 0), phases)
 
 
 def magnitudes(waves: Complex[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """Magnitudes of complex waves; value and gradient are 0 where both parts are below
-    ``FAINTEST``.
-    """
+    """Magnitudes of waves; value and gradient are 0 where both parts are below ``FAINTEST``."""
     largest = torch.maximum(waves.real.detach().abs(), waves.imag.detach().abs())
     return waves.masked_fill(largest < FAINTEST, 0).abs()
 
@@ -224,15 +218,16 @@ class _Sinc(torch.autograd.Function):
     def forward(ctx, values):
         # Added to 0 so that 0 / 0 is 1; to all other numbers it adds nothing.
         angles = torch.add(values.new_tensor(FAINTEST), values, alpha=math.pi)
-        found = angles.sin().div_(angles)
-        ctx.save_for_backward(angles, found)
-        return found
+        result = angles.sin().div_(angles)
+        ctx.save_for_backward(angles, result)
+        return result
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
-        angles, found = ctx.saved_tensors
-        return angles.cos().sub_(found).div_(angles).mul_(gradient).mul_(math.pi)
+        angles, result = ctx.saved_tensors
+        # d sin(a) / a = (cos(a) - sin(a) / a) / a da, and a = pi x
+        return angles.cos().sub_(result).div_(angles).mul_(gradient).mul_(math.pi)
 
 
 def sinc(values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
@@ -254,17 +249,18 @@ def spherical_harmonics(
     Source: Holmes and Featherstone, A unified approach to the Clenshaw summation, 2002, section 3.
     """
     x, y, z = vectors.unbind(-1)
-    cosines, sines = (
-        torch.ones_like(z),
-        torch.zeros_like(z),
-    )  # of m az, times sin^m of the polar angle
+    # Cosine and sine of m az, times sin^m of the polar angle.
+    cosines = torch.ones_like(z)
+    sines = torch.zeros_like(z)
     harmonics = [z] * (degree + 1) ** 2
     first = 0.5 / math.sqrt(math.pi)
     for m in range(degree + 1):
         if m:
             first *= -math.sqrt((2 * m + 1) / (2 * m))
-            cosines, sines = x * cosines - y * sines, x * sines + y * cosines
-        last, legendre = torch.zeros_like(z), torch.full_like(z, first)
+            cosines, sines = x * cosines - y * sines, x * sines + y * cosines  # one angle on
+        # The recurrence over n (equation 11) starts at P_m^m.
+        last = torch.zeros_like(z)
+        legendre = torch.full_like(z, first)
         for n in range(m, degree + 1):
             if n > m:
                 step = math.sqrt((4 * n**2 - 1) / (n**2 - m**2))
@@ -284,7 +280,8 @@ class Rays:
     """A list of directions in the array's frame [rad].
 
     Example:
-        >>> gaigs.Rays(elevations=torch.tensor([0.0, 0.5]), azimuths=torch.tensor([0.0, 3.0])).vectors().shape
+        >>> angles = torch.tensor([0.0, 0.5])
+        >>> gaigs.Rays(elevations=angles, azimuths=2 * angles).vectors().shape
         torch.Size([2, 3])
     """
 
@@ -311,11 +308,11 @@ class Rays:
 
 @dataclass
 class Grid:
-    """Directions of a spectrum's pixel centres in the array's frame, an elevation a row and an
-    azimuth a column [rad].
+    """Directions of a spectrum's pixels in the array's frame: elevations by azimuths [rad].
 
     Example:
-        >>> gaigs.Grid.degrees().shape, gaigs.Grid.degrees(elevations=range(-30, 31, 10), azimuths=range(8)).shape
+        >>> coarse = gaigs.Grid.degrees(elevations=range(-30, 31, 10), azimuths=range(8))
+        >>> gaigs.Grid.degrees().shape, coarse.shape
         ((90, 360), (7, 8))
     """
 
@@ -333,14 +330,13 @@ class Grid:
 
     @classmethod
     def sphere(cls, rows: int, columns: int) -> "Grid":
-        """The full sphere in at least 2 x 3 pixels of equal solid angle: the rows' sines are evenly
-        spaced.
-        """
+        """The full sphere in at least 2 x 3 pixels of equal solid angle."""
         if rows < 2 or columns < 3:
             raise ValueError(
                 f"a grid over the sphere takes at least 2 rows and 3 columns, got {rows} x "
                 f"{columns}"
             )
+        # A zone's area is 2 pi times the difference of sines, so these are evenly spaced.
         sines = (2 * torch.arange(rows, dtype=torch.float64) + 1 - rows) / rows
         azimuths = 2 * math.pi / columns * (torch.arange(columns, dtype=torch.float64) + 0.5)
         return cls(sines.asin().float(), azimuths.float())
@@ -352,29 +348,29 @@ class Grid:
     @property
     def pitch(self) -> float:
         """Mean distance between neighbouring rows [rad]."""
-        return (
-            ((self.elevations[-1] - self.elevations[0]) / max(len(self.elevations) - 1, 1))
-            .abs()
-            .item()
-        )
+        span = self.elevations[-1] - self.elevations[0]
+        return (span / max(len(self.elevations) - 1, 1)).abs().item()
 
     @property
     def solid_angles(self) -> Float[Tensor, "rows columns"]:
-        """Shares of the pixels in the grid's; rows meet where the sine of the elevation is halfway
-        between theirs.
+        """Shares of the pixels in the grid's solid angle.
+
+        Rows meet where the sine of the elevation is halfway between theirs.
         """
         if len(self.elevations) < 2:
             raise ValueError(
                 f"solid angles take at least 2 rows, got {len(self.elevations)}; use a finer grid"
             )
         sines = self.elevations.double().sin()
-        first, last = (3 * sines[:1] - sines[1:2]) / 2, (3 * sines[-1:] - sines[-2:-1]) / 2
-        bounds = torch.cat((first, (sines[1:] + sines[:-1]) / 2, last)).clamp(-1, 1)
+        first = (3 * sines[:1] - sines[1:2]) / 2
+        middles = (sines[1:] + sines[:-1]) / 2
+        last = (3 * sines[-1:] - sines[-2:-1]) / 2
+        bounds = torch.cat((first, middles, last)).clamp(-1, 1)  # (rows + 1,)
         shares = bounds.diff().abs()[:, None].expand(self.shape)
         return (shares / shares.sum()).float()
 
     def thin(self, rows: slice, columns: slice) -> "Grid":
-        """The grid of some of the rows and columns."""
+        """The grid of the given rows and columns."""
         return Grid(self.elevations[rows], self.azimuths[columns])
 
     def matches(self, other: "Directions") -> bool:
@@ -405,26 +401,28 @@ def even_places(
     count: int,
     floors: Sequence[float] | Tensor = (),
 ) -> Float[Tensor, "g 3"]:
-    """About so many evenly spaced places in a box; an edge shorter than their distance has one.
-    With the heights of ``floors`` they are on these."""
+    """About ``count`` evenly spaced places in a box [m]; an edge below their distance has one.
+
+    With the heights of ``floors`` [m] the places are on these.
+    """
     if len(floors):
-
-        def at(end, floor):
-            return torch.cat((end[:2], end.new_tensor([floor])))
-
         each = max(1, count // len(floors))
-        return torch.cat(
-            [even_places(at(lower, floor), at(upper, floor), each) for floor in floors]
-        )
+        places = []
+        for floor in floors:
+            height = lower.new_tensor([floor])
+            ends = torch.cat((lower[:2], height)), torch.cat((upper[:2], height))
+            places.append(even_places(*ends, each))
+        return torch.cat(places)
     lower, edges = torch.minimum(lower, upper), (upper - lower).abs()
-    longest, pitch = edges.double().sort(descending=True).values, 0.0
-    for dimensions in (3, 2, 1):  # an edge below the pitch has no part in it
+    longest = edges.double().sort(descending=True).values
+    pitch = 0.0
+    # An edge below the pitch does not count: the box is then a rectangle or a line.
+    for dimensions in (3, 2, 1):
         pitch = float(longest[:dimensions].prod() / count) ** (1 / dimensions)
         if 0 < pitch <= longest[dimensions - 1]:
             break
     counts = [max(1, round(edge / (pitch or 1.0))) for edge in edges.tolist()]
-    axes = [
-        low + edge * (torch.arange(n) + 0.5) / n
-        for low, edge, n in zip(lower, edges, counts, strict=True)
-    ]
+    axes = []
+    for low, edge, number in zip(lower, edges, counts, strict=True):
+        axes.append(low + edge * (torch.arange(number) + 0.5) / number)
     return torch.cartesian_prod(*axes)

@@ -1,8 +1,7 @@
-"""Phases of measured channels: their sign, their alignment to waves, and whether links have one in
-common.
-"""
+"""Phases of measured channels: their sign, alignment to waves, and what links have in common."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Complex, Float, Int
@@ -12,18 +11,24 @@ TELLING = 5
 """Fewest links of a receiver that show a sign of the phases; with fewer, chance decides."""
 
 MANY = 30
-"""Fewest links a receiver that tell random phases, and phases that geometry does not explain, from
-chance.
-"""
+"""Fewest links of a receiver that show random phases, or phases that geometry does not explain."""
 
 LEAST = 0.01
-"""Least share of the power that the direct wave keeps in a mean over links, beside that of chance.
-"""
+"""Least share of power that the direct wave keeps in a mean over links, beside chance."""
 
 ALIKE = 0.7
-"""Least share of a mean response that elements or subcarriers have in common; of calibrated arrays
-it is 0.99.
-"""
+"""Least share of a response that elements or subcarriers share; calibrated arrays have 0.99."""
+
+
+class StrangeParts(NamedTuple):
+    """Parts of a receiver whose fixed phases or strengths geometry does not explain.
+
+    ``delay`` [s] explains the subcarriers; None if none does.
+    """
+
+    elements: bool
+    subcarriers: bool
+    delay: float | None
 
 
 def phase_sign(
@@ -31,25 +36,24 @@ def phase_sign(
     waves: Complex[Tensor, "k e s"],
     receivers: Int[Tensor, " k"],
 ) -> int:
-    """The sign with which the phases of channels follow the direct distance: -1 or 1; 0 for
-    neither.
+    """Sign with which the phases of channels follow the direct distance, -1 or 1; 0 for neither.
 
     Divided by free space, a direct path alone is the same number at all links of a receiver. For
     each sign, the mean over links keeps a share of the power, by chance about 1 / links. The larger
     share wins if it exceeds 0.01 plus four times that of chance: never with fewer than ``TELLING``
     links a receiver. ``waves`` are ``direct_waves`` of the same links with the sign -1.
     """
-    kept, heard = {}, max(1, int((channels.abs().amax((1, 2)) > 0).sum()))
+    received = max(1, int((channels.abs().amax((1, 2)) > 0).sum()))  # links with a signal
+    shares = {}
     for sign in (-1, 1):
-        responses = common_responses(channels, waves, receivers, sign)
-        powers = [
-            (receivers == k).sum() * response.abs().square().mean()
-            for k, response in responses.items()
-        ]
-        kept[sign] = float(sum(powers)) / heard
-    best = max(kept, key=kept.__getitem__)
+        powers = []
+        for receiver, response in common_responses(channels, waves, receivers, sign).items():
+            links = (receivers == receiver).sum()
+            powers.append(links * response.abs().square().mean())
+        shares[sign] = float(sum(powers)) / received
+    best = max(shares, key=shares.__getitem__)
     chance = len(receivers.unique()) / len(receivers)
-    return best if kept[best] > LEAST + 4 * chance else 0
+    return best if shares[best] > LEAST + 4 * chance else 0
 
 
 def common_responses(
@@ -58,17 +62,16 @@ def common_responses(
     receivers: Int[Tensor, " k"],
     sign: int,
 ) -> dict[int, Complex[Tensor, "e s"]]:
-    """Mean of each receiver's channels over free space, by its number; arguments are as for
-    ``phase_sign``.
+    """Mean of each receiver's channels over free space, by the receiver's number.
 
-    It is one number for all elements and subcarriers, as far as their places and frequencies are
-    true.
+    All elements and subcarriers have the same number if their places and frequencies are true.
+    Arguments are as for ``phase_sign``.
     """
-    relative, phases = _relative(channels, waves), waves.angle()
-    still = relative * torch.polar(torch.ones_like(phases), sign * phases)
-    return {
-        receiver: still[receivers == receiver].mean(0) for receiver in receivers.unique().tolist()
-    }
+    still = _without_phases_of(waves, _relative(channels, waves), sign)
+    responses = {}
+    for receiver in receivers.unique().tolist():
+        responses[receiver] = still[receivers == receiver].mean(0)  # (e, s)
+    return responses
 
 
 def strange_parts(
@@ -77,42 +80,45 @@ def strange_parts(
     receivers: Int[Tensor, " k"],
     frequencies: Float[Tensor, " s"],
     sign: int,
-) -> dict[int, tuple[bool, bool, float | None]]:
-    """Receivers at which the direct wave has fixed phases or strengths that geometry does not
-    explain.
+) -> dict[int, StrangeParts]:
+    """Receivers at which geometry does not explain fixed phases or strengths of the direct wave.
 
-    Of each the result says whether elements have them, whether subcarriers do, and the delay [s]
-    that explains the latter if one does. A receiver counts with ``MANY`` links or more that have a
-    direct wave, its elements if the waves come from directions that they tell apart: from one
-    direction, reflections look the same. Other arguments are as for ``phase_sign``.
+    A receiver counts with ``MANY`` links or more that have a direct wave. Its elements count if
+    they resolve the directions of the waves: from one direction, reflections look the same. Other
+    arguments are as for ``phase_sign``.
     """
-    found = {}
+    strange = {}
     for receiver, response in common_responses(channels, waves, receivers, sign).items():
-        own, shown = receivers == receiver, response.abs().square().mean().item()
-        count, heard = int(own.sum()), (waves[receivers == receiver] != 0).any(2).any(0)
-        if count < MANY or shown < LEAST + 4 / count:
+        at_receiver = receivers == receiver
+        links = int(at_receiver.sum())
+        share = response.abs().square().mean().item()
+        if links < MANY or share < LEAST + 4 / links:
             continue
-        response, turns = response[heard], waves[own][:, heard].sgn()
-        power = response.abs().square().mean() * (
-            1 - (1 - shown) / count / shown
-        )  # without that of chance
+        has_element = (waves[at_receiver] != 0).any(2).any(0)  # (e,)
+        response = response[has_element]
+        turns = waves[at_receiver][:, has_element].sgn()  # (links, e, s)
+        # The power of the mean response without the part that chance leaves in it.
+        by_chance = (1 - share) / links / share
+        power = response.abs().square().mean() * (1 - by_chance)
         if response.mean().abs().square() > ALIKE * power:
             continue
-        by_element, by_subcarrier = (
-            response.mean(axis).abs().square().mean() < ALIKE * power for axis in (0, 1)
-        )
-        aside = (turns * turns.mean(1, keepdim=True).sgn().conj()).mean(0).abs().square().mean()
-        elements, subcarriers, delay = bool(by_element and aside < 0.5), bool(by_subcarrier), None
+        over_subcarriers = response.mean(1).abs().square().mean()
+        over_elements = response.mean(0).abs().square().mean()
+        # Elements resolve directions if the waves' phases between them differ from link to link.
+        relative_turns = turns * turns.mean(1, keepdim=True).sgn().conj()
+        alike = relative_turns.mean(0).abs().square().mean()
+        elements = bool(over_elements < ALIKE * power and alike < 0.5)
+        subcarriers = bool(over_subcarriers < ALIKE * power)
+        delay = None
         if subcarriers:
             rates = 2 * math.pi * (frequencies - frequencies.mean())
             late = _best_delays(response.sum(0), rates)
-            if (
-                response * torch.polar(torch.ones_like(rates), late * rates)
-            ).mean().abs().square() > ALIKE * power:
+            aligned = response * torch.polar(torch.ones_like(rates), late * rates)
+            if aligned.mean().abs().square() > ALIKE * power:
                 delay = -sign * late.item()
         if elements or subcarriers:
-            found[receiver] = elements, subcarriers, delay
-    return found
+            strange[receiver] = StrangeParts(elements, subcarriers, delay)
+    return strange
 
 
 def array_sign(
@@ -120,25 +126,19 @@ def array_sign(
     waves: Complex[Tensor, "k e s"],
     frequencies: Float[Tensor, " s"] | None = None,
 ) -> int:
-    """The sign with which phases follow the direct distance from one element or subcarrier of a
-    link to another.
+    """Sign with which phases follow the distance from element to element, or over subcarriers.
 
-    It shows even where each link has a random phase in common; with ``frequencies`` [Hz], a random
-    delay too. The sign, -1 or 1, keeps more power in the mean over elements and subcarriers; -1
-    where neither does. Other arguments are as for ``phase_sign``.
+    It shows even where each link has a random phase; with ``frequencies`` [Hz], a random delay too.
+    The sign, -1 or 1, keeps more power in the mean over elements and subcarriers; it is -1 where
+    neither does. Other arguments are as for ``phase_sign``.
     """
-    relative, phases = _relative(channels, waves), waves.angle()
-    kept = []
+    relative = _relative(channels, waves)
+    powers = []
     for sign in (-1, 1):
-        still = relative * torch.polar(torch.ones_like(phases), sign * phases)
-        kept.append(
-            (still * alignment(still, torch.ones_like(still), frequencies))
-            .mean((1, 2))
-            .abs()
-            .square()
-            .sum()
-        )
-    return 1 if kept[1] > kept[0] else -1
+        still = _without_phases_of(waves, relative, sign)
+        aligned = still * alignment(still, torch.ones_like(still), frequencies)
+        powers.append(aligned.mean((1, 2)).abs().square().sum())
+    return 1 if powers[1] > powers[0] else -1
 
 
 def alignment(
@@ -146,12 +146,11 @@ def alignment(
     waves: Complex[Tensor, "*#k e s"],
     frequencies: Float[Tensor, " s"] | None = None,
 ) -> Complex[Tensor, "*k 1 s"]:
-    """Factors of magnitude 1 that turn channels onto waves by the best phase in common; complex128,
-    without gradients.
+    """Factors of magnitude 1 that turn channels onto waves by the best common phase.
 
-    With ``frequencies`` [Hz] they are those of the best phase and delay: exp(j (phi + 2 pi f tau)).
-    Delays repeat with one over the median spacing of the subcarriers; the least is within half of
-    that period.
+    With ``frequencies`` [Hz] the factors are exp(j (phi + 2 pi f tau)), with the best delay tau.
+    Delays repeat with one over the median spacing of the subcarriers; tau is within half of that
+    period. The result is complex128 and has no gradient.
     """
     with torch.no_grad():
         cross = (channels.to(torch.complex128) * waves.to(torch.complex128).conj()).sum(-2)
@@ -164,19 +163,22 @@ def alignment(
 
 
 def _best_delays(cross: Complex[Tensor, "*k s"], rates: Float[Tensor, " s"]) -> Float[Tensor, "*k"]:
-    """Delays t [s] with the largest |sum over s of cross exp(j rates t)|, by a grid and Newton's
-    method.
-    """
+    """Delays t [s] with the largest |sum over s of cross exp(j rates t)|."""
     ordered = rates.sort().values
-    span, spacing = (ordered[-1] - ordered[0]).item(), ordered.diff().median().item()
+    span = (ordered[-1] - ordered[0]).item()
+    spacing = ordered.diff().median().item()
+    # A grid of a quarter of the resolution, over one period of the delay.
     step = math.pi / 2 / (span + spacing)
     count = min(4 * math.ceil(span / spacing + 1), 2**16)
     grid = step * (torch.arange(count, device=rates.device) - count // 2).to(rates)
-    steering = torch.polar(torch.ones_like(rates[:, None] * grid), rates[:, None] * grid)
+    angles = rates[:, None] * grid  # (s, grid)
+    steering = torch.polar(torch.ones_like(angles), angles)
     delays = grid[(cross @ steering).abs().argmax(-1)]
-    for _ in range(4):
+    for _ in range(4):  # Newton's method on half the square of the magnitude
         turned = cross * torch.polar(torch.ones_like(cross.real), delays[..., None] * rates)
-        value, slope, bend = (((1j * rates) ** power * turned).sum(-1) for power in range(3))
+        value = turned.sum(-1)
+        slope = (1j * rates * turned).sum(-1)
+        bend = ((1j * rates) ** 2 * turned).sum(-1)
         first = (value.conj() * slope).real
         second = slope.abs().square() + (value.conj() * bend).real
         delays = delays - torch.where(second < 0, first / second, 0).clamp(-step, step)
@@ -190,8 +192,7 @@ def unknown_phase(
     frequencies: Float[Tensor, " s"],
     declared: str = "known",
 ) -> str | None:
-    """The ``data.phase`` of channels that resemble the direct wave within each link, but by no
-    phase in common.
+    """The ``data.phase`` of channels that resemble the direct wave without a common phase.
 
     A link's likeness is the share of its power that the direct wave explains after the best phase,
     at chance one over the numbers of a channel. If its mean is at least a half, 3 dB, and the
@@ -216,11 +217,10 @@ def unknown_phase(
         likeness, agreement = [], []
         for wave in (_normalised(waves), _normalised(waves.conj())):
             turns = alignment(normalised, wave, rates)
-            likeness.append(
-                (wave.conj() * normalised * turns).mean((1, 2)).abs().square().mean().item()
-            )
-            plain = (wave.conj() * normalised).mean((1, 2))
-            sums = [plain[own].sum().abs() for own in (receivers == k for k in receivers.unique())]
+            aligned = (wave.conj() * normalised * turns).mean((1, 2))  # (k,)
+            likeness.append(aligned.abs().square().mean().item())
+            plain = (wave.conj() * normalised).mean((1, 2))  # (k,)
+            sums = [plain[receivers == receiver].sum().abs() for receiver in receivers.unique()]
             agreement.append((sum(sums) / plain.abs().sum()).item())
         if max(agreement) > 3 * math.sqrt(chance):
             return None
@@ -232,10 +232,18 @@ def unknown_phase(
     return None
 
 
+def _without_phases_of(
+    waves: Complex[Tensor, "k e s"], channels: Complex[Tensor, "k e s"], sign: int
+) -> Complex[Tensor, "k e s"]:
+    """Channels turned back by the phases of waves; ``sign`` is the channels', and the waves' is -1."""
+    phases = waves.angle()
+    return channels * torch.polar(torch.ones_like(phases), sign * phases)
+
+
 def _relative(
     channels: Complex[Tensor, "k e s"], waves: Complex[Tensor, "k e s"]
 ) -> Complex[Tensor, "k e s"]:
-    """Channels over the waves' magnitudes, of a mean power of 1 each; 0 at elements without a wave."""
+    """Channels over the waves' magnitudes, with a mean power of 1; 0 where a wave is 0."""
     strengths = waves.abs()
     return _normalised(channels * (strengths > 0) / torch.where(strengths > 0, strengths, 1))
 

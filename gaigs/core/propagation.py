@@ -18,8 +18,7 @@ NEAREST = 1e-2
 def free_space(
     distances: Float[Tensor, "*#batch"], frequencies: Float[Tensor, "*#batch"], sign: int = -1
 ) -> Complex[Tensor, "*batch"]:
-    """lambda / (4 pi d) exp(sign j 2 pi f d / c): unit power between isotropic antennas, computed
-    in float64.
+    """Free space, lambda / (4 pi d) exp(sign j 2 pi f d / c), in float64.
 
     Args:
         distances, frequencies: [m] and [Hz], broadcast against each other.
@@ -28,11 +27,8 @@ def free_space(
 
     Source: Friis, A note on a simple transmission formula, 1946.
     """
-    phases = (
-        distances.double().clamp(min=NEAREST)
-        * (2 * math.pi / speed_of_light)
-        * frequencies.double()
-    )
+    per_metre = 2 * math.pi / speed_of_light
+    phases = distances.double().clamp(min=NEAREST) * per_metre * frequencies.double()
     return torch.polar(0.5 / phases, sign * phases)
 
 
@@ -42,8 +38,7 @@ def bartlett(
     array: Array,
     frequency: float,
 ) -> Float[Tensor, "..."]:
-    """Amplitudes of the conventional (Bartlett) beamformer of element signals, root mean square
-    over the frequencies.
+    """Amplitudes of the conventional (Bartlett) beamformer, root mean square over frequencies.
 
     At one frequency it is |sum_n y_n exp(-j 2 pi / lambda (r_n . u))| for element n at r_n and the
     direction u. Its square depends on the y_n through sums over pairs of elements a lag apart: a 4
@@ -68,31 +63,29 @@ def bartlett(
         >>> array, grid = gaigs.Array.planar(4, 4, pitch=0.16), gaigs.Grid.degrees()
         >>> waves = torch.ones(1, 16, 1, dtype=torch.complex64)  # a wave from straight ahead
         >>> spectrum = bartlett(waves, grid, array, frequency=920e6)[0]
-        >>> spectrum.shape, round(spectrum[-1, 0].item(), 3)  # elevation 90 degrees: all sixteen add up
+        >>> spectrum.shape, round(spectrum[-1, 0].item(), 3)  # at the zenith all sixteen add up
         (torch.Size([90, 360]), 16.0)
     """
     check_carrier("frequency", frequency)
     if not responses.is_complex() or responses.ndim < 2 or responses.shape[-2] != len(array):
         raise ValueError(
             f"responses must be complex (..., elements, frequencies) of {len(array)} elements, got "
-            f"{responses.dtype} "
-            f"{tuple(responses.shape)}"
+            f"{responses.dtype} {tuple(responses.shape)}"
         )
-    batch, responses = (
-        responses.shape[:-2],
-        responses.flatten(0, -3) if responses.ndim > 2 else responses[None],
-    )
-    covariances = responses @ responses.mH / responses.shape[-1]
+    batch = responses.shape[:-2]
+    responses = responses.flatten(0, -3) if responses.ndim > 2 else responses[None]  # (b, e, f)
+    covariances = responses @ responses.mH / responses.shape[-1]  # (b, e, e)
     places = array.elements.double() * (2 * frequency / speed_of_light)  # in half wavelengths
     steps, pair = differences(places)
     pair = pair.to(responses.device)
-    lags = covariances.new_zeros(len(responses), len(steps)).index_add(
-        1, pair, covariances.flatten(1)
-    )
-    directions = grid.to(torch.float64).flatten().vectors().to(steps)
-    phases = math.pi * steps @ directions.T
-    cosines, sines = (part.to(lags.real) for part in (torch.cos(phases), torch.sin(phases)))
-    power = lags.real @ cosines + lags.imag @ sines
+    # Pairs of elements with the same lag add up: the power depends on their sums alone.
+    lags = covariances.new_zeros(len(responses), len(steps))
+    lags = lags.index_add(1, pair, covariances.flatten(1))  # (b, lags)
+    directions = grid.to(torch.float64).flatten().vectors().to(steps)  # (k, 3)
+    phases = math.pi * steps @ directions.T  # (lags, k)
+    cosines = torch.cos(phases).to(lags.real)
+    sines = torch.sin(phases).to(lags.real)
+    power = lags.real @ cosines + lags.imag @ sines  # (b, k)
     # In a null rounding may leave the power a little below zero.
     power = torch.where(power > 0, power, 1).sqrt() * (power > 0)
     return power.reshape(*batch, *grid.shape)
@@ -100,15 +93,15 @@ def bartlett(
 
 def min_max(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b rows columns"]:
     """Each spectrum scaled to [0, 1], as NeRF² labels are."""
-    low, high = spectra.amin((1, 2), keepdim=True), spectra.amax((1, 2), keepdim=True)
+    low = spectra.amin((1, 2), keepdim=True)
+    high = spectra.amax((1, 2), keepdim=True)
     return (spectra - low) / (high - low)
 
 
 def fresnel(
     permittivity: complex | Complex[Tensor, "*#batch"], cosines: Float[Tensor, "*#batch"]
 ) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
-    """Fresnel reflection coefficients of a half-space, electric field across (TE) and in (TM) the
-    plane of incidence.
+    """Fresnel reflection coefficients of a half-space: field across (TE) and in (TM) its plane.
 
     Args:
         permittivity: Complex relative permittivity, for the time dependence exp(+j omega t).
@@ -127,18 +120,17 @@ def slab(
     cosines: Float[Tensor, "*#batch"],
     thickness: float | Float[Tensor, "*#batch"],
 ) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
-    """Reflection coefficients TE and TM of a slab in air, as ``fresnel``; a thick slab with losses
-    is a half-space.
+    """Reflection coefficients TE and TM of a slab in air, as ``fresnel``.
 
-    ``thickness`` is in wavelengths of air.
+    ``thickness`` is in wavelengths of air. A thick slab with losses reflects as a half-space.
 
     Source: ITU-R P.2040-3, section 2.2.2.2.
     """
     turns = torch.exp(-4j * math.pi * thickness * torch.sqrt(permittivity - (1 - cosines.square())))
     te, tm = fresnel(permittivity, cosines)
-    return te * (1 - turns) / (1 - te.square() * turns), tm * (1 - turns) / (
-        1 - tm.square() * turns
-    )
+    slab_te = te * (1 - turns) / (1 - te.square() * turns)
+    slab_tm = tm * (1 - turns) / (1 - tm.square() * turns)
+    return slab_te, slab_tm
 
 
 def fit_gain(
@@ -150,13 +142,15 @@ def fit_gain(
     (|w| |h|). So each link counts once, weak or strong. Links with h = 0 or w = 0 do not count;
     without any other the gain is 0.
     """
-    h, w = (part.to(torch.complex128).flatten(1) for part in (channels, waves))
-    sizes, strengths = h.norm(dim=1), w.norm(dim=1)
-    heard = (sizes > 0) & (strengths > 0)
-    if not heard.any():
+    h = channels.to(torch.complex128).flatten(1)  # (k, numbers)
+    w = waves.to(torch.complex128).flatten(1)
+    sizes = h.norm(dim=1)
+    strengths = w.norm(dim=1)
+    counts = (sizes > 0) & (strengths > 0)
+    if not counts.any():
         return torch.zeros((), dtype=torch.complex128, device=h.device)
-    alike = (w.conj() * h).sum(1)[heard] / (sizes * strengths)[heard]
-    return (sizes / strengths)[heard].quantile(0.5) * alike.sum().sgn()
+    alike = (w.conj() * h).sum(1)[counts] / (sizes * strengths)[counts]
+    return (sizes / strengths)[counts].quantile(0.5) * alike.sum().sgn()
 
 
 def strength(
@@ -164,14 +158,14 @@ def strength(
     waves: Complex[Tensor, "k e s"],
     receivers: Int[Tensor, " k"],
 ) -> float:
-    """Amplitude of channels over waves: the median over a receiver's links, the geometric mean over
-    receivers.
+    """Amplitude of channels over waves: geometric mean over receivers of the medians over links.
 
     It is 1 where all channels are 0.
     """
-    gains = [
-        fit_gain(channels[own], waves[own]).abs()
-        for own in (receivers == k for k in receivers.unique())
-    ]
-    heard = [gain.log() for gain in gains if gain > 0]
-    return torch.stack(heard).mean().exp().item() if heard else 1.0
+    logs = []
+    for receiver in receivers.unique():
+        at_receiver = receivers == receiver
+        gain = fit_gain(channels[at_receiver], waves[at_receiver]).abs()
+        if gain > 0:
+            logs.append(gain.log())
+    return torch.stack(logs).mean().exp().item() if logs else 1.0

@@ -1,4 +1,4 @@
-"""Queries: links between transmitters and receivers; batches: queries with directions and labels."""
+"""Queries, links of transmitters and receivers; batches, queries with directions and labels."""
 
 import math
 import reprlib
@@ -18,20 +18,16 @@ CARRIERS = 1e4, 3e11
 """Lowest and highest carrier [Hz]; another number is in another unit."""
 
 ROUNDING = 1e-6
-"""Relative difference below which two carriers are equal: float32 and seven printed digits round by
-less.
-"""
+"""Relative difference below which two carriers are equal; float32 rounds by less."""
 
 
 def unit_hint(number: float) -> str:
-    """The end of an error, such as ``; in MHz?``, if a number would be a carrier in that unit; else
-    empty.
-    """
-    units = {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}
+    """End of an error, such as ``; in MHz?``, if a number is a carrier in that unit; else empty."""
     low, high = CARRIERS
-    return next(
-        (f"; in {unit}?" for unit, size in units.items() if low / size <= number <= high / size), ""
-    )
+    for unit, size in {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}.items():
+        if low / size <= number <= high / size:
+            return f"; in {unit}?"
+    return ""
 
 
 def check_carrier(name: str, frequencies: float | Tensor) -> None:
@@ -51,28 +47,31 @@ def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
 
 
 def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped[Tensor, "k m"]:
-    """At most so many numbers of each label, evenly spread over its rows and columns: arrays
-    resolve fewer.
-    """
-    numbers, columns = labels[..., None].flatten(1), labels.shape[-1] if labels.ndim > 1 else 1
+    """At most ``most`` numbers of each label, evenly spread over its rows and columns."""
+    numbers = labels[..., None].flatten(1)  # (k, rows x columns)
+    columns = labels.shape[-1] if labels.ndim > 1 else 1
     index = evenly(torch.arange(numbers.shape[1]), most)
-    while (
-        len((index % columns).unique()) < min(columns, most) / 8
-    ):  # a step that divides the columns meets few
+    # A step that divides the number of columns meets few of them.
+    while len((index % columns).unique()) < min(columns, most) / 8:
         most -= 1
         index = evenly(torch.arange(numbers.shape[1]), most)
     return numbers[:, index]
 
 
 def as_tensor(name: str, values: object, expected: str) -> Tensor:
-    """Numbers of any kind as a tensor of their own type; raises a ``ValueError`` for anything else."""
+    """Numbers of any kind as a tensor of their own type.
+
+    Raises:
+        ValueError: The values are not numbers, or lists of different lengths.
+    """
     if isinstance(values, Tensor):
         if values.is_meta or values.layout is not torch.strided:
             kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
             raise ValueError(
                 f"{name} must be {expected}, got a {kind} tensor; give a dense tensor with values"
             )
-        return values.clone() if values.is_inference() else values  # which a training could not use
+        # A training cannot use tensors of inference mode.
+        return values.clone() if values.is_inference() else values
     if isinstance(values, list | tuple) and any(isinstance(value, Tensor) for value in values):
         parts = [as_tensor(name, value, expected) for value in values]
         if len({part.shape for part in parts}) == 1:
@@ -81,13 +80,8 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
         if np.ma.is_masked(values):
             raise TypeError("masked")
         array: Any = np.array(values)  # a copy, since torch warns of arrays that are read-only
-        if (
-            array.dtype == object and array.ndim
-        ):  # of numbers, such as a column of pandas; None and NA are NaN
-            is_missing = np.frompyfunc(
-                lambda value: value is None or type(value).__name__ == "NAType", 1, 1
-            )
-            array[is_missing(array).astype(bool)] = np.nan
+        if array.dtype == object and array.ndim:  # such as a column of pandas
+            array[np.frompyfunc(_is_missing, 1, 1)(array).astype(bool)] = np.nan
             array = np.array(array.tolist())
         # Torch takes no negative strides and no other byte order.
         return torch.from_numpy(
@@ -95,6 +89,11 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
         )
     except (TypeError, ValueError, RuntimeError, OverflowError):  # of words and ragged lists
         raise ValueError(f"{name} must be {expected}, got {reprlib.repr(values)}") from None
+
+
+def _is_missing(value: object) -> bool:
+    """True for None and the missing value of pandas."""
+    return value is None or type(value).__name__ == "NAType"
 
 
 def as_numbers(name: str, values: object, expected: str) -> Tensor:
@@ -107,8 +106,10 @@ def as_numbers(name: str, values: object, expected: str) -> Tensor:
 
 
 def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
-    """Positions of any kind as a float32 tensor [m]; raises a ``ValueError`` unless all are finite
-    and in range.
+    """Positions of any kind as a float32 tensor [m].
+
+    Raises:
+        ValueError: The shape is wrong, or a coordinate is not finite or out of range.
     """
     positions = as_numbers(name, values, "(..., 3) positions [m]")
     if positions.shape == (0,):  # an empty list
@@ -126,8 +127,10 @@ def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
 
 
 def as_receivers(values: Any, names: Sequence[str]) -> Int[Tensor, "*points"]:
-    """Indices of receivers, given by names or indices; raises a ``ValueError`` for an unknown
-    receiver.
+    """Indices of receivers, given by names or indices.
+
+    Raises:
+        ValueError: A receiver is unknown.
     """
     expected = f"one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
     if isinstance(values, KeysView | ValuesView) or hasattr(values, "to_numpy"):
@@ -135,9 +138,11 @@ def as_receivers(values: Any, names: Sequence[str]) -> Int[Tensor, "*points"]:
     elif isinstance(values, np.ndarray) and values.dtype.kind in "UO":
         values = values.tolist()
     if _is_text(values):
-        words, numbers = np.array(values), {name: number for number, name in enumerate(names)}
-        if unknown := [word for word in words.ravel().tolist() if word not in numbers]:
-            raise ValueError(f"receiver must be {expected}, got {unknown[0]!r}")
+        words = np.array(values)
+        numbers = {name: number for number, name in enumerate(names)}
+        for word in words.ravel().tolist():
+            if word not in numbers:
+                raise ValueError(f"receiver must be {expected}, got {word!r}")
         values = np.array([numbers[word] for word in words.ravel().tolist()]).reshape(words.shape)
     indices = as_tensor("receiver", values, expected)
     if indices.dtype not in (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8):
@@ -158,8 +163,7 @@ def _is_text(values: object) -> bool:
 
 
 def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, "*points"] | None:
-    """Carriers that a user asks for [Hz]; for None the only known one, or None if no carrier is
-    known.
+    """Carriers that a user asks for [Hz]; for None the known one, or None if none is known.
 
     Raises:
         ValueError: A carrier is out of range, differs from the only known one, or is missing beside
@@ -186,8 +190,10 @@ def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, 
 
 
 def as_subcarriers(values: object) -> Float[Tensor, " s"]:
-    """Subcarriers that a user asks for [Hz], one or several, in float64; raises a ``ValueError``
-    for anything else.
+    """Subcarriers that a user asks for [Hz], one or several, in float64.
+
+    Raises:
+        ValueError: They are not a list of different carriers in range.
     """
     expected = "different subcarriers (s,) in Hz"
     as_numbers("frequencies", values, expected)
@@ -290,11 +296,9 @@ class Query:
                     "a query has its own receivers and frequencies; leave receiver and frequency "
                     "out"
                 )
-            receiver, frequency, positions = (
-                positions.receivers,
-                positions.frequencies,
-                positions.transmitters,
-            )
+            receiver = positions.receivers
+            frequency = positions.frequencies
+            positions = positions.transmitters
         points = as_positions("transmitters", positions)
         shape = points.shape[:-1]
 
@@ -305,13 +309,12 @@ class Query:
             return values.expand(shape).reshape(-1)
 
         points = points.reshape(-1, 3)
-        receivers = spread(
-            "receivers", as_receivers(0 if receiver is None else receiver, names)
-        ).to(points.device)
+        indices = as_receivers(0 if receiver is None else receiver, names)
+        receivers = spread("receivers", indices).to(points.device)
         frequencies = as_frequencies(frequency, known.cpu().float())
-        query = cls(
-            points, receivers, None if frequencies is None else spread("frequencies", frequencies)
-        )
+        if frequencies is not None:
+            frequencies = spread("frequencies", frequencies)
+        query = cls(points, receivers, frequencies)
         if receiver is not None:
             return query, shape
         query = query[torch.arange(len(points)).repeat_interleave(len(names))]
@@ -330,53 +333,44 @@ class Query:
         return Query(self.transmitters.to(device), self.receivers.to(device), frequencies)
 
     def parts(self, size: int) -> Iterator["Query"]:
-        """The links in their order, at most ``size`` at a time; a query without links is one part."""
+        """The links in order, at most ``size`` at a time; an empty query is one part."""
         return (self[start : start + size] for start in range(0, max(len(self), 1), size))
 
     @property
     def place_keys(self) -> Int[Tensor, " b"]:
         """A number for each transmitter's position, the same for the same one."""
-        x, y, z = (
-            (self.transmitters.detach().cpu().float() + 0.0)
-            .contiguous()
-            .view(torch.int32)
-            .long()
-            .unbind(1)
-        )
-        return (
-            x * 1_000_003 + y
-        ) * 1_000_003 + z  # past 64 bits it wraps; + 0.0 makes -0 the same as 0
+        # + 0.0 makes -0 the same as 0.
+        places = (self.transmitters.detach().cpu().float() + 0.0).contiguous()
+        x, y, z = places.view(torch.int32).long().unbind(1)
+        # A hash of the bits; past 64 bits it wraps.
+        return (x * 1_000_003 + y) * 1_000_003 + z
 
     @property
     def votes(self) -> Float[Tensor, " b"]:
-        """1 over the number of links of the same place, receiver and carrier: repeated readings
-        have one vote.
-        """
+        """Weights with which repeated readings of a place, receiver and carrier have one vote."""
         _, which = self.unique(with_receivers=True)
         return which.bincount().double().reciprocal()[which]
 
     def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, " b"]]:
-        """The different links, sorted by position, frequency and receiver; and the index of each
-        link among them.
+        """The different links, sorted by position, frequency and receiver, and each link's index.
 
-        Without receivers links to two of them are equal, and each place has any one of its
-        receivers.
+        Without receivers, links to two of them are equal, and each place has any one of them.
         """
         others = [self.frequencies] if self.frequencies is not None else []
         others += [self.receivers] if with_receivers else []
-        # Double holds float32, float64 and indices exactly. Of a thousand links this takes a tenth
-        # of torch's unique.
-        columns = [
-            part.detach().double().cpu().numpy() for part in (*self.transmitters.unbind(1), *others)
-        ]
+        # Double holds float32, float64 and indices exactly. With a thousand links this takes a
+        # tenth of the time of torch.unique.
+        columns = []
+        for part in (*self.transmitters.unbind(1), *others):
+            columns.append(part.detach().double().cpu().numpy())
         order = np.lexsort(columns[::-1])
         is_new = np.ones(len(order), dtype=bool)
         is_new[1:] = np.any([column[order[1:]] != column[order[:-1]] for column in columns], axis=0)
         numbers = np.empty_like(order)
         numbers[order] = is_new.cumsum() - 1
-        first, which = (
-            torch.from_numpy(part).to(self.transmitters.device) for part in (order[is_new], numbers)
-        )
+        device = self.transmitters.device
+        first = torch.from_numpy(order[is_new]).to(device)
+        which = torch.from_numpy(numbers).to(device)
         return self[first], which
 
 

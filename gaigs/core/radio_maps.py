@@ -15,18 +15,10 @@ from numpy import ndarray
 from gaigs.core import stages
 from gaigs.core.geometry import ExtrapolationWarning
 from gaigs.core.query import as_receivers
+from gaigs.core.scene import Scene
 from gaigs.io.files import atomic_write
 
 log = logging.getLogger(__name__)
-
-POINTS = 128
-"""Approximate limit of points along the longer side of a map of no given pitch; points predicted at
-a time.
-"""
-
-SECONDS, FEWEST = 60.0, 200
-"""Approximate limit of the time of a map of no given pitch, unless it has fewer points than these.
-"""
 
 
 @dataclass(frozen=True, repr=False)
@@ -58,18 +50,14 @@ class RadioMap:
 
     def __repr__(self) -> str:
         rows, columns = self.values.shape[1:]
-        name, corners = (
-            f"{self.quantity} [{self.unit}]" if self.unit else self.quantity,
-            (self.x, self.y),
-        )
-        spans = " and ".join(
-            f"{axis} {p[0]:.2f} to {p[-1]:.2f}" for axis, p in zip("xy", corners, strict=True)
-        )
-        return (
-            f"<radio map of {name}: "
-            f"{', '.join(self.receivers[:5])}{', ...' * (len(self.receivers) > 5)}; "
-            f"{rows} x {columns} points, {spans}, z {self.height:.2f} m>"
-        )
+        name = f"{self.quantity} [{self.unit}]" if self.unit else self.quantity
+        names = ", ".join(self.receivers[:5])
+        if len(self.receivers) > 5:
+            names += ", ..."
+        x = f"x {self.x[0]:.2f} to {self.x[-1]:.2f}"
+        y = f"y {self.y[0]:.2f} to {self.y[-1]:.2f}"
+        grid = f"{rows} x {columns} points, {x} and {y}, z {self.height:.2f} m"
+        return f"<radio map of {name}: {names}; {grid}>"
 
     def only(self, index: Int[ndarray, " k"]) -> "RadioMap":
         """The maps of some receivers."""
@@ -85,15 +73,12 @@ class RadioMap:
         """
         arrays = {_key(self.unit): self.values, "x": self.x, "y": self.y, "height": self.height}
         arrays |= {"receivers": self.receivers, "quantity": self.quantity, "unit": self.unit}
-        arrays |= {
-            name: getattr(self, name)
-            for name in ("frequency", "deviations")
-            if getattr(self, name) is not None
-        }
-        with (
-            atomic_write(path) as part,
-            open(part, "wb") as file,
-        ):  # given a name, numpy would append .npz
+        for name in ("frequency", "deviations"):
+            value = getattr(self, name)
+            if value is not None:
+                arrays[name] = value
+        # Given a name, numpy would append .npz; given a file, it writes there.
+        with atomic_write(path) as part, open(part, "wb") as file:
             np.savez_compressed(file, **arrays)
 
     @classmethod
@@ -101,22 +86,23 @@ class RadioMap:
         """The inverse of ``save``; raises a ValueError for another or a damaged file."""
         try:
             with np.load(path) as file:
-                quantity, unit = str(file["quantity"]), str(file["unit"])
-                frequency = float(file["frequency"]) if "frequency" in file.files else None
-                axes = (
-                    file["x"],
-                    file["y"],
-                    float(file["height"]),
-                    tuple(file["receivers"].tolist()),
+                unit = str(file["unit"])
+                return cls(
+                    values=file[_key(unit)],
+                    x=file["x"],
+                    y=file["y"],
+                    height=float(file["height"]),
+                    receivers=tuple(file["receivers"].tolist()),
+                    quantity=str(file["quantity"]),
+                    unit=unit,
+                    frequency=float(file["frequency"]) if "frequency" in file.files else None,
+                    deviations=file["deviations"] if "deviations" in file.files else None,
                 )
-                deviations = file["deviations"] if "deviations" in file.files else None
-                return cls(file[_key(unit)], *axes, quantity, unit, frequency, deviations)
         except FileNotFoundError:
             raise
         except Exception as error:  # numpy raises many types for a file of another format
-            raise ValueError(
-                f"{path} is damaged or not a file of RadioMap.save: {error}"
-            ) from error
+            problem = f"{path} is damaged or not a file of RadioMap.save: {error}"
+            raise ValueError(problem) from error
 
 
 def _key(unit: str) -> str:
@@ -161,110 +147,177 @@ def radio_map(
         >>> floor.values.shape == (len(floor.receivers), len(floor.y), len(floor.x)), floor.unit
         (True, 'dBm')
     """
+    scene = _scene_of(model)
+    known = [receiver.name for receiver in scene.receivers]
+    chosen = np.arange(len(known))
+    if receivers is not None:
+        chosen = as_receivers(receivers, known).reshape(-1).numpy()
+    if height is None:
+        height = _usual_height(scene)
+    lower, upper = _rectangle(scene, float(height), float(margin))
+    if frequency is None:
+        frequency = scene.middle_frequency
+    predict = _Predictions(model, chosen, frequency)
+    if pitch is None:
+        pitch = _affordable_pitch(predict, lower, upper, float(height))
+    else:
+        _check_pitch(pitch, lower, upper)
+    x, y = _axes(lower, upper, float(pitch))
+    heights = np.full((len(y), len(x)), float(height))
+    places = np.stack((*np.meshgrid(x, y), heights), -1)  # (rows, columns, 3)
+    maps = predict(places)  # (1 or 2, rows, columns, receivers)
+    maps = np.ascontiguousarray(np.moveaxis(maps, -1, 1))  # (1 or 2, receivers, rows, columns)
+    return RadioMap(
+        values=maps[0],
+        x=x,
+        y=y,
+        height=float(height),
+        receivers=tuple(known[number] for number in chosen),
+        quantity=scene.task.quantity,
+        unit=scene.task.unit,
+        frequency=frequency,
+        deviations=maps[1] if len(maps) > 1 else None,
+    )
+
+
+def _scene_of(model) -> Scene:
+    """The scene of a model whose labels are one real number each."""
     if not hasattr(model, "scene"):
         raise TypeError(
             f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint "
             "first"
         )
-    scene = model.scene
-    if not scene.task.is_scalar:
+    task = model.scene.task
+    if not task.is_scalar:
         raise ValueError(
-            "a radio map takes a model of one real number a link, got one of task "
-            f"{scene.task.name!r}, whose labels "
-            f"are {tuple(scene.task.shape)} of {scene.task.dtype}; use model.predict"
+            f"a radio map takes a model of one real number a link, got one of task {task.name!r}, "
+            f"whose labels are {tuple(task.shape)} of {task.dtype}; use model.predict"
         )
-    known = [receiver.name for receiver in scene.receivers]
-    heard = (
-        np.arange(len(known))
-        if receivers is None
-        else as_receivers(receivers, known).reshape(-1).numpy()
-    )
-    names = tuple(known[number] for number in heard)
-    lower, upper = scene.lower.double().numpy(), scene.upper.double().numpy()
-    pitch, margin = None if pitch is None else float(pitch), float(margin)
-    if height is None and len(scene.floors):
+    return model.scene
+
+
+def _usual_height(scene: Scene) -> float:
+    """The scene's height [m]; a log line names the other floors."""
+    if len(scene.floors):
         others = ", ".join(f"{floor:.2f}" for floor in sorted(scene.floors[1:].tolist()))
-        words = (
-            "radio map at z = %.2f m, the floor with most training places; others are at %s m: set "
-            "height"
+        log.info(
+            "radio map at z = %.2f m, the floor with most training places; others are at %s m: "
+            "set height",
+            scene.height,
+            others,
         )
-        log.info(words, scene.height, others)
-    height = scene.height if height is None else float(height)
+    return scene.height
+
+
+def _rectangle(scene: Scene, height: float, margin: float) -> tuple[ndarray, ndarray]:
+    """Lower and upper corner (2,) [m] of the training transmitters and receivers, widened."""
     if not np.isfinite(height) or not 0 <= margin < np.inf:
         raise ValueError(
             f"height must be finite and margin at least 0 [m], got height {height} and margin "
             f"{margin}"
         )
-    corners = np.stack(
-        (lower, upper, *(receiver.pose.position.numpy() for receiver in scene.receivers))
-    )[:, :2]
-    lower, upper = corners.min(0) - margin, corners.max(0) + margin
+    beyond = max(scene.lower[2].item() - height, height - scene.upper[2].item())
+    _warn_if_far("height", beyond, scene.extent, scene)
+    _warn_if_far("margin", margin, 20 * scene.extent, scene)
+    receivers = [receiver.pose.position.numpy() for receiver in scene.receivers]
+    ends = scene.lower.double().numpy(), scene.upper.double().numpy()
+    corners = np.stack((*ends, *receivers))[:, :2]
+    return corners.min(0) - margin, corners.max(0) + margin
+
+
+def _warn_if_far(name: str, distance: float, most: float, scene: Scene) -> None:
+    """Warns if an option puts transmitters more than ``most`` [m] outside the training box."""
+    if distance <= most:
+        return
+    message = (
+        f"{name} puts transmitters {distance:.4g} m outside the box of the training transmitters, "
+        f"which with the receivers is {scene.extent:.3g} m across; is it in m?"
+    )
+    # The caller of the public function, which a decorator wraps, is five frames up.
+    warnings.warn(message, ExtrapolationWarning, stacklevel=5)
+
+
+def _check_pitch(pitch: float, lower: ndarray, upper: ndarray) -> None:
+    """Raises a ``ValueError`` if the map would have one point or more than 1e8."""
     longest = float((upper - lower).max())
-    away = max(scene.lower[2].item() - height, height - scene.upper[2].item())
-    for name, size, most in (("height", away, scene.extent), ("margin", margin, 20 * scene.extent)):
-        if size > most:
-            message = (
-                f"{name} puts transmitters {size:.4g} m outside the box of the training "
-                "transmitters, which with "
-            )
-            message += f"the receivers is {scene.extent:.3g} m across; is it in m?"
-            warnings.warn(
-                message, ExtrapolationWarning, stacklevel=3
-            )  # behind the decorator of its public name
-    if pitch is not None and not (
-        0 < pitch <= longest and math.prod(((upper - lower) / pitch).tolist()) <= 1e8
-    ):
-        raise ValueError(
-            f"pitch must be above 0, at most {longest:.3g} m, the longer side of the map, and give "
-            "at most 1e+08 "
-            f"points, got {pitch} m; is it in m?"
-        )
-    # All receivers of a point in one batch, so that a transmitter's excitation is computed once.
-    frequency = scene.middle_frequency if frequency is None else frequency
+    if 0 < pitch <= longest and math.prod(((upper - lower) / pitch).tolist()) <= 1e8:
+        return
+    raise ValueError(
+        f"pitch must be above 0, at most {longest:.3g} m, the longer side of the map, and give at "
+        f"most 1e+08 points, got {pitch} m; is it in m?"
+    )
 
-    level = 0.5 if model.calibration is not None and model.calibration.gives(0.5) else None
 
-    def predict(points: ndarray) -> ndarray:
-        shape = (*points.shape[:-1], len(names))
-        links = torch.from_numpy(
-            np.broadcast_to(points[..., None, :], (*shape, 3)).astype(np.float32)
-        )
-        index = torch.from_numpy(np.broadcast_to(heard, shape).copy())
+class _Predictions:
+    """Predictions at places for several receivers.
+
+    Args:
+        model: The model of a real number a link.
+        receivers: Indices of the receivers.
+        frequency: Carrier [Hz]; None if unknown.
+    """
+
+    def __init__(self, model, receivers: Int[ndarray, " k"], frequency: float | None):
+        self.model = model
+        self.receivers = receivers
+        self.frequency = frequency
+        # An interval brings the standard deviation, whatever its level.
+        has_intervals = model.calibration is not None and model.calibration.gives(0.5)
+        self.level = 0.5 if has_intervals else None
+
+    def __call__(self, points: Float[ndarray, "*points 3"]) -> Float[ndarray, "m *points k"]:
+        """Values, and their standard deviations if the model has intervals."""
+        shape = (*points.shape[:-1], len(self.receivers))
+        places = np.broadcast_to(points[..., None, :], (*shape, 3))  # (..., k, 3)
+        index = np.broadcast_to(self.receivers, shape)  # (..., k)
         with warnings.catch_warnings():
             warnings.filterwarnings(
                 "ignore", r"\d+ of \d+ positions are up to", ExtrapolationWarning
             )
-            found = model.predict(
-                links, index, frequency=frequency, batch_size=POINTS * len(names), interval=level
+            # All receivers of a place are in one batch: its excitation is computed once.
+            prediction = self.model.predict(
+                torch.from_numpy(places.astype(np.float32)),
+                torch.from_numpy(index.copy()),
+                frequency=self.frequency,
+                batch_size=128 * len(self.receivers),
+                interval=self.level,
             )
-            return torch.stack([part.cpu() for part in (found[:2] if level else (found,))]).numpy()
+        parts = prediction[:2] if self.level else (prediction,)
+        return torch.stack([part.cpu() for part in parts]).numpy()
 
-    if pitch is None:
-        pitch = max(0.1, longest / POINTS)
-        some = np.column_stack((np.linspace(lower, upper, POINTS), np.full(POINTS, height)))
-        with warnings.catch_warnings(
-            action="ignore", category=ExtrapolationWarning
-        ):  # the whole map says it again
-            predict(some[:1])  # the first prediction compiles and loads
-            start = time.perf_counter()
-            predict(some)
-        # Points in a minute, or in half of the time left: figures follow.
-        most = POINTS * min(SECONDS, stages.left() / 2) / (time.perf_counter() - start)
-        while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, FEWEST):
-            pitch *= 2
-    x, y = _axes(lower, upper, pitch)
-    values = predict(np.stack((*np.meshgrid(x, y), np.full((len(y), len(x)), height)), -1))
-    values, *deviations = (np.ascontiguousarray(np.moveaxis(part, -1, 0)) for part in values)
-    return RadioMap(
-        values, x, y, height, names, scene.task.quantity, scene.task.unit, frequency, *deviations
-    )
+
+def _affordable_pitch(
+    predict: _Predictions,
+    lower: ndarray,
+    upper: ndarray,
+    height: float,
+    seconds: float = 60.0,
+    points: int = 128,
+    fewest: int = 200,
+) -> float:
+    """A pitch [m] with which the map takes about ``seconds``, or has at most ``fewest`` points.
+
+    The longer side has about ``points`` points, unless the model is slow.
+    """
+    pitch = max(0.1, float((upper - lower).max()) / points)
+    line = np.linspace(lower, upper, points)
+    places = np.column_stack((line, np.full(points, height)))
+    # The whole map repeats the warnings.
+    with warnings.catch_warnings(action="ignore", category=ExtrapolationWarning):
+        predict(places[:1])  # the first prediction compiles and loads
+        start = time.perf_counter()
+        predict(places)
+        elapsed = time.perf_counter() - start
+    # Half of the time left at most: figures follow.
+    most = points * min(seconds, stages.left() / 2) / elapsed
+    while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, fewest):
+        pitch *= 2
+    return pitch
 
 
 def _axes(lower: ndarray, upper: ndarray, pitch: float) -> list[ndarray]:
-    """Multiples of a pitch along x and along y, over a rectangle and as far as the next one beyond
-    it.
-    """
-    return [
-        pitch * np.arange(np.floor(a / pitch), np.floor(b / pitch) + 2)
-        for a, b in zip(lower, upper, strict=True)
-    ]
+    """Multiples of a pitch along x and along y that cover a rectangle."""
+    axes = []
+    for start, end in zip(lower, upper, strict=True):
+        axes.append(pitch * np.arange(np.floor(start / pitch), np.floor(end / pitch) + 2))
+    return axes

@@ -1,6 +1,4 @@
-"""The scene of a model: receivers with their arrays, the box of the training transmitters, the
-task.
-"""
+"""The scene of a model: receivers and arrays, box of the training transmitters, task."""
 
 import functools
 import logging
@@ -24,8 +22,7 @@ log = logging.getLogger(__name__)
 
 
 class FlatAxis(NamedTuple):
-    """A world axis, 0 to 2, along which all transmitters have one coordinate [m], and all
-    receivers' elements one.
+    """A world axis, 0 to 2, on which transmitters share one coordinate [m], and receivers one.
 
     A plane across it and its mirror image half-way between the two reflect paths of the same
     length. ``is_common`` is true if both stand at the same coordinate.
@@ -43,8 +40,7 @@ class FlatAxis(NamedTuple):
         both = self.transmitters + self.receivers
         return (
             f"{name} seen from either side: places at {self.transmitters:.2f} m, receivers at "
-            f"{self.receivers:.2f} m; "
-            f"a plane across it at h may stand at {both:.2f} m - h"
+            f"{self.receivers:.2f} m; a plane across it at h may stand at {both:.2f} m - h"
         )
 
 
@@ -87,9 +83,7 @@ class Scene:
 
     @property
     def box(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-        """Lower and upper corner of the box that holds the training transmitters and all receivers
-        [m].
-        """
+        """Lower and upper corner of the box of training transmitters and all receivers [m]."""
         ends = torch.cat((torch.stack((self.lower, self.upper)), self.positions(self.lower)))
         return ends.amin(0), ends.amax(0)
 
@@ -101,41 +95,36 @@ class Scene:
 
     @functools.cached_property
     def flat_axes(self) -> list[FlatAxis]:
-        """World axes along which all training transmitters, and all elements, stand within a
-        centimetre.
-        """
+        """World axes on which training transmitters, and elements, stand within a centimetre."""
         elements = []
         for receiver in self.receivers:
-            elements.append(
-                receiver.pose.to(self.lower).world(receiver.array.elements.to(self.lower))
-            )
+            pose = receiver.pose.to(self.lower)
+            elements.append(pose.world(receiver.array.elements.to(self.lower)))
+        transmitters = torch.stack((self.lower, self.upper))
+        receivers = torch.cat(elements)
         least = 0.01  # [m]; tripods are set up no better
-        transmitters, receivers = torch.stack((self.lower, self.upper)), torch.cat(elements)
-        found = []
+        axes = []
         for axis in range(3):
-            own, other = transmitters[:, axis], receivers[:, axis]
-            if own.max() - own.min() < least and other.max() - other.min() < least:
-                middles = own.mean().item(), other.mean().item()
-                found.append(FlatAxis(axis, *middles, abs(middles[0] - middles[1]) < least))
-        return found
+            sent = transmitters[:, axis]
+            received = receivers[:, axis]
+            if sent.max() - sent.min() < least and received.max() - received.min() < least:
+                middles = sent.mean().item(), received.mean().item()
+                axes.append(FlatAxis(axis, *middles, abs(middles[0] - middles[1]) < least))
+        return axes
 
     @property
     def height(self) -> float:
-        """Height of the floor with most training places; of one floor half-way between lowest and
-        highest [m].
-        """
-        return float(
-            self.floors[0]
-            if len(self.floors)
-            else (self.lower[2].double() + self.upper[2].double()) / 2
-        )
+        """Height of the floor with most training places, or half-way up a single floor [m]."""
+        if len(self.floors):
+            return float(self.floors[0])
+        return float((self.lower[2].double() + self.upper[2].double()) / 2)
 
     @property
     def middle_frequency(self) -> float | None:
         """The middle one of the training links' carriers [Hz]; None if they have none."""
-        return (
-            float(self.frequencies[len(self.frequencies) // 2]) if len(self.frequencies) else None
-        )
+        if not len(self.frequencies):
+            return None
+        return float(self.frequencies[len(self.frequencies) // 2])
 
     @property
     def has_band(self) -> bool:
@@ -143,22 +132,20 @@ class Scene:
         return len(self.frequencies) > 1
 
     def band_positions(self, query: Query) -> Float[Tensor, " b"]:
-        """Positions of carriers in the training links' band, by the logarithm: -1 at the lowest, 1
-        at the highest.
-        """
+        """Log-positions of carriers in the training links' band, from -1 to 1."""
         if query.frequencies is None:
             raise ValueError(
                 f"a frequency must be given, as the data have {len(self.frequencies)} carriers"
             )
         low, high = self.frequencies.double().log()[[0, -1]].tolist()
-        return ((2 * query.frequencies.double().log() - low - high) / (high - low)).to(
-            query.transmitters.dtype
-        )
+        positions = (2 * query.frequencies.double().log() - low - high) / (high - low)
+        return positions.to(query.transmitters.dtype)
 
     def state(self) -> dict:
         """The scene in plain tensors, lists and strings, for a checkpoint."""
-        return {
-            "receivers": [
+        receivers = []
+        for receiver in self.receivers:
+            receivers.append(
                 {
                     "name": receiver.name,
                     "position": receiver.pose.position,
@@ -166,37 +153,34 @@ class Scene:
                     "elements": receiver.array.elements,
                     "pattern": receiver.array.pattern,
                 }
-                for receiver in self.receivers
-            ],
-            "task": self.task.state(),
-            **{
-                name: getattr(self, name)
-                for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors")
-            },
-            "frame": self.frame
-            and (int(self.frame.epsg), float(self.frame.x), float(self.frame.y)),
-        }
+            )
+        state = {"receivers": receivers, "task": self.task.state()}
+        for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors"):
+            state[name] = getattr(self, name)
+        state["frame"] = None
+        if self.frame is not None:
+            state["frame"] = int(self.frame.epsg), float(self.frame.x), float(self.frame.y)
+        return state
 
     @classmethod
     def from_state(cls, state: dict) -> "Scene":
         """The inverse of ``state``."""
-        receivers = tuple(
-            Receiver(
-                r["name"], Pose(r["position"], r["rotation"]), Array(r["elements"], r["pattern"])
-            )
-            for r in state["receivers"]
-        )
-        task, frame = registry("task").build(state["task"]), None
+        receivers = []
+        for entry in state["receivers"]:
+            pose = Pose(entry["position"], entry["rotation"])
+            array = Array(entry["elements"], entry["pattern"])
+            receivers.append(Receiver(entry["name"], pose, array))
+        frame = None
         try:
             frame = state.get("frame") and Frame(*state["frame"])
-        except ValueError as error:  # of a checkpoint from before frames were checked
+        except ValueError as error:  # a checkpoint from before frames were checked
             log.warning("predictions have no place on a map: %s", error)
-        return cls(**state | {"receivers": receivers, "task": task, "frame": frame})
+        task = registry("task").build(state["task"])
+        return cls(**state | {"receivers": tuple(receivers), "task": task, "frame": frame})
 
 
 def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
-    """The frequency of each link [Hz]: the query's, else the data's only one; for channels the
-    middle of their band.
+    """Frequency of each link [Hz]: the query's, the data's only one, or a channel's middle one.
 
     Raises:
         ValueError: The query has no frequency, and the data do not have exactly one.
@@ -214,11 +198,10 @@ def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
 
 
 def check_elements(owner: str, scene: Scene, pads: bool = False) -> Csi:
-    """The task of channels with as many elements as each receiver's array; ``owner`` names a
-    component in errors.
+    """The task of channels with as many elements as each receiver's array.
 
-    A component that ``pads`` takes smaller arrays too: it predicts 0 at the elements that they
-    lack.
+    ``owner`` names a component in errors. One that ``pads`` takes smaller arrays too, and predicts
+    0 at the elements that they lack.
 
     Raises:
         ValueError: Labels are not channels, or an array has another number of elements.
@@ -231,9 +214,9 @@ def check_elements(owner: str, scene: Scene, pads: bool = False) -> Csi:
     largest = max(scene.receivers, key=lambda receiver: len(receiver.array))
     for receiver in [largest] if pads else scene.receivers:
         if len(receiver.array) != task.elements:
-            own = f"the array of {receiver.name} {len(receiver.array)}"
+            array = f"the array of {receiver.name} {len(receiver.array)}"
             raise ValueError(
-                f"the labels have {task.elements} elements, and {own}; give the data's elements"
+                f"the labels have {task.elements} elements, and {array}; give the data's elements"
             )
     return task
 
@@ -245,42 +228,39 @@ def direct_waves(
     sign: int = -1,
     at_elements: bool = True,
 ) -> Complex[Tensor, "b e s"]:
-    """Free space from each transmitter to the elements of its receiver, or to its middle alone (e =
-    1).
+    """Free space from each transmitter to its receiver's elements, or to its middle (e = 1).
 
-    It is 0 at elements that other receivers' arrays have alone. The sign is that of the phases, as
-    for ``free_space``.
+    It is 0 at elements that other receivers' arrays have alone. ``sign`` is as for ``free_space``.
     """
-    # In float64: some metres from the origin float32 would round an element's place by 1e-6 m, at 6
-    # GHz 1e-4 rad.
-    own = []
+    # Some metres from the origin float32 would round an element's place by 1e-6 m, at 6 GHz by
+    # 1e-4 rad.
+    double = torch.zeros((), dtype=torch.float64)
+    positions = []
     for receiver in scene.receivers:
-        pose, elements = (
-            receiver.pose.to(torch.zeros((), dtype=torch.float64)),
-            receiver.array.elements.double().cpu(),
-        )
-        own.append(pose.world(elements) if at_elements else pose.position[None])
-    counts = torch.tensor([*map(len, own)], device=query.transmitters.device)[query.receivers]
-    places = pad_sequence(own, batch_first=True).to(counts.device)[query.receivers]
-    distances = (query.transmitters.double()[:, None] - places).norm(dim=-1)
-    waves = free_space(distances[..., None], frequencies.to(distances.device), sign)
-    return (
-        waves * (torch.arange(places.shape[1], device=counts.device) < counts[:, None])[..., None]
-    )
+        pose = receiver.pose.to(double)
+        elements = receiver.array.elements.double().cpu()
+        positions.append(pose.world(elements) if at_elements else pose.position[None])
+    device = query.transmitters.device
+    counts = torch.tensor([*map(len, positions)], device=device)[query.receivers]  # (b,)
+    places = pad_sequence(positions, batch_first=True).to(device)[query.receivers]  # (b, e, 3)
+    distances = (query.transmitters.double()[:, None] - places).norm(dim=-1)  # (b, e)
+    waves = free_space(distances[..., None], frequencies.to(device), sign)  # (b, e, s)
+    exists = torch.arange(places.shape[1], device=device) < counts[:, None]  # (b, e)
+    return waves * exists[..., None]
 
 
 def direct_gains(scene: Scene, query: Query) -> Float[Tensor, " b"]:
-    """Field gain of each receiver's elements towards the transmitter, from the middle of the array;
-    float64.
+    """Field gain of each receiver's elements towards the transmitter, in float64.
 
-    A transmitter in the middle itself gets the gain along the array's normal.
+    A transmitter in the middle of the array gets the gain along the array's normal.
     """
     gains = torch.ones(len(query), dtype=torch.float64, device=query.transmitters.device)
     for receiver in query.receivers.unique().tolist():
-        own, antenna = query.receivers == receiver, scene.receivers[receiver]
-        points = antenna.pose.to(gains).local(query.transmitters[own].double())
+        at_receiver = query.receivers == receiver
+        antenna = scene.receivers[receiver]
+        points = antenna.pose.to(gains).local(query.transmitters[at_receiver].double())
         lengths = points.norm(dim=-1, keepdim=True)
-        gains[own] = antenna.array.gain(
-            torch.where(lengths > 0, points / lengths, points.new_tensor([0.0, 0.0, 1.0]))
-        )
+        normal = points.new_tensor([0.0, 0.0, 1.0])
+        directions = torch.where(lengths > 0, points / lengths, normal)
+        gains[at_receiver] = antenna.array.gain(directions)
     return gains

@@ -1,4 +1,4 @@
-"""Stages of a run: a bar with the time left of each long one, and the time limit of the whole run."""
+"""Stages of a run: a bar with the time left of each, and the time limit of the whole run."""
 
 import contextlib
 import logging
@@ -16,12 +16,12 @@ log = logging.getLogger(__name__)
 
 
 class Timekeeper:
-    """The clock of a run with a ``limit`` [s], its open stages, their bars if ``shown``, and what
-    it has left out.
-    """
+    """The clock of a run with a ``limit`` [s]; its stages have bars if ``shown``."""
 
     def __init__(self, limit: float = math.inf, shown: bool = True):
-        self.limit, self.shown, self.began = limit, shown, time.monotonic()
+        self.limit = limit
+        self.shown = shown
+        self.began = time.monotonic()
         self.stages: list[Stage] = []
         self.left_out: list[str] = []
         self.bars: Progress | None = None
@@ -36,14 +36,13 @@ class Stage:
     """A part of a run; arguments are those of ``stage``."""
 
     def __init__(self, keeper: Timekeeper, name: str, total: int, until: float, is_fixed: bool):
-        self.keeper, self.name, self.total, self.until, self.is_fixed = (
-            keeper,
-            name,
-            total,
-            until,
-            is_fixed,
-        )
-        self.done, self.began = 0, time.monotonic()
+        self.keeper = keeper
+        self.name = name
+        self.total = total
+        self.until = until
+        self.is_fixed = is_fixed
+        self.done = 0
+        self.began = time.monotonic()
         self.row: TaskID | None = None
         self.owns_bars = False
 
@@ -113,49 +112,48 @@ def stage(
     """A stage of the current run.
 
     Args:
-        name: Stands before the bar, which a terminal shows after a second; without a name there is
-            none.
+        name: Text before the bar, which a terminal shows after a second; empty: no bar.
         total: Number of its steps.
         until: Share of the run's limit at which it has to end.
-        is_fixed: True if it cannot end early, which is logged after its first step where the time
-            does not suffice.
+        is_fixed: True if it cannot end early; after its first step the log says if the time does
+            not suffice.
     """
-    own = Stage(current(), name, total, until, is_fixed)
-    timer = threading.Timer(1.0, own.show)
+    opened = Stage(current(), name, total, until, is_fixed)
+    timer = threading.Timer(1.0, opened.show)
     timer.daemon = True
-    own.keeper.stages.append(own)
+    opened.keeper.stages.append(opened)
     is_main = threading.current_thread() is threading.main_thread()
-    if name and total > 1 and own.keeper.shown and is_main and rich.get_console().is_terminal:
+    if name and total > 1 and opened.keeper.shown and is_main and rich.get_console().is_terminal:
         timer.start()
     try:
-        yield own
+        yield opened
     finally:
         timer.cancel()
-        own.close()
+        opened.close()
 
 
 def track(
     items: Iterable, name: str = "", total: int | None = None, is_fixed: bool = False
 ) -> Iterator[Any]:
-    """Goes through items, each a step of a stage; ``total`` is their number if they have no length."""
+    """Goes through items, each a step of a stage; ``total`` is needed if they have no length."""
     if total is None:
         total = len(items) if isinstance(items, Sized) else 1
-    with stage(name, total, is_fixed=is_fixed) as own:
+    with stage(name, total, is_fixed=is_fixed) as opened:
         for item in items:
             yield item
-            own.advance()
+            opened.advance()
 
 
 def advance() -> None:
     """Ends a step of the innermost stage, if there is one."""
-    for own in current().stages[-1:]:
-        own.advance()
+    for innermost in current().stages[-1:]:
+        innermost.advance()
 
 
 def left() -> float:
     """Time until the open stages and the run have to end [s]; infinite without a limit."""
     keeper = current()
-    return keeper.left(min([1.0, *(own.until for own in keeper.stages)]))
+    return keeper.left(min([1.0, *(opened.until for opened in keeper.stages)]))
 
 
 def is_up() -> bool:
