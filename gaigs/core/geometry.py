@@ -141,7 +141,7 @@ class Pose:
 
 
 def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
-    """Rotation matrices of quaternions (w, x, y, z) of any length; length zero means no rotation."""
+    """Rotation matrices of quaternions (w, x, y, z) of any length; length 0 means no rotation."""
     quats = _of_moderate_length(quats)
     w, x, y, z = quats.unbind(-1)
     squares = (quats * quats).sum(-1)
@@ -173,7 +173,7 @@ def semi_axes(
 
 
 def to_spherical(points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
-    """Azimuth in [-pi, pi], elevation in [-pi/2, pi/2] [rad], and distance [m], in the array's frame.
+    """Azimuth in [-pi, pi], elevation in [-pi/2, pi/2] [rad] and distance [m] of points.
 
     At the zenith, where azimuth is undefined, it is 0. Gradients are finite everywhere but at the
     origin.

@@ -235,7 +235,7 @@ def unknown_phase(
 def _without_phases_of(
     waves: Complex[Tensor, "k e s"], channels: Complex[Tensor, "k e s"], sign: int
 ) -> Complex[Tensor, "k e s"]:
-    """Channels turned back by the phases of waves; ``sign`` is the channels', and the waves' is -1."""
+    """Channels turned back by the phases of waves, whose sign is -1; ``sign`` is the channels'."""
     phases = waves.angle()
     return channels * torch.polar(torch.ones_like(phases), sign * phases)
 

@@ -256,7 +256,8 @@ class Query:
         frequencies: Carriers (b,) [Hz], from 10 kHz to 300 GHz; None if unknown.
 
     Example:
-        >>> query = gaigs.Query(torch.tensor([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]), torch.tensor([0, 0]))
+        >>> places = torch.tensor([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]])
+        >>> query = gaigs.Query(places, torch.tensor([0, 0]))
         >>> len(query), query[:1].transmitters
         (2, tensor([[1.0000, 2.0000, 1.5000]]))
     """

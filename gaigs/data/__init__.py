@@ -132,7 +132,10 @@ class Links:
             counts = ", ".join(f"{len(part)} {name}" for name, part in self.split.parts().items())
             parts = f"split {self.split.name}: {counts}"
         count = len(self.receivers)
-        return f"<{len(self)} links of task {self.task.name!r} to {count} receiver{'s' * (count != 1)}; {parts}>"
+        return (
+            f"<{len(self)} links of task {self.task.name!r} to {count} "
+            f"receiver{'s' * (count != 1)}; {parts}>"
+        )
 
     def __len__(self) -> int:
         return len(self.query)
@@ -161,7 +164,8 @@ class Links:
         train = training.transmitters.unique(dim=0)
         if len(train) < 2:
             raise ValueError(
-                f"training takes transmitters at two points or more, got {len(train)}; check the split"
+                f"training takes transmitters at two points or more, got {len(train)}; check the "
+                "split"
             )
         frequencies = (
             torch.zeros(0) if training.frequencies is None else training.frequencies.unique()
@@ -244,7 +248,8 @@ def divide(links: Links, split: Mapping) -> Links:
         or len(numbers.unique()) < len(numbers)
     ):
         raise ValueError(
-            f"split {parts.name!r} must give int64 numbers of links, no masks, and none in two parts"
+            f"split {parts.name!r} must give int64 numbers of links, no masks, and none in two "
+            "parts"
         )
     if links.held_out is not None:
         tasks: Any = links.task, links.held_out.task
@@ -284,8 +289,10 @@ def check_elements(links: Links) -> None:
         ).any():
             link, element = beyond.nonzero()[0].tolist()
             raise ValueError(
-                f"labels must be 0 at elements that an array lacks; that of link {int(part[link])} is not at element "
-                f"{element}, and {links.receivers[int(own[link])].name} has {sizes[int(own[link])]} elements"
+                f"labels must be 0 at elements that an array lacks; that of link {int(part[link])} "
+                "is not at element "
+                f"{element}, and {links.receivers[int(own[link])].name} has "
+                f"{sizes[int(own[link])]} elements"
             )
 
 
@@ -304,7 +311,8 @@ def without_constant(links: Links) -> Links:
         constant = constant_subcarriers(part)
         if constant.all() and part is not links:
             raise ValueError(
-                "all subcarriers to test on have one value in every link; choose another data.band_test"
+                "all subcarriers to test on have one value in every link; choose another "
+                "data.band_test"
             )
         if constant.any() and not constant.all():
             task: Any = part.task
@@ -354,20 +362,27 @@ def only_trained(links: Links) -> Links:
         0, trained, torch.arange(len(trained))
     )
     kept = (number[links.query.receivers] >= 0).nonzero()[:, 0]
-    some = lambda values: None if values is None else values[kept]
+
+    def some(values):
+        return None if values is None else values[kept]
+
     parts = {
         name: torch.isin(kept, part).nonzero()[:, 0] for name, part in links.split.parts().items()
     }
     if len(links.split.test) and not len(parts["test"]) and len(links) < 1.5 * len(links.receivers):
         each = f"{len(links.receivers)} receivers have {len(links)} links"
         raise ValueError(
-            f"{each}, and those with test links none to train on: models are learnt for each receiver\n"
+            f"{each}, and those with test links none to train on: models are learnt for each "
+            "receiver\n"
             "give a fixed receiver one place for all its links, and the moving end as transmitters"
         )
     names = [
         receiver.name for receiver, new in zip(links.receivers, number, strict=True) if new < 0
     ]
-    remark = f"receivers without a training link are left out, with {len(links) - len(kept)} links: {shortened(names)}"
+    remark = (
+        f"receivers without a training link are left out, with {len(links) - len(kept)} links: "
+        f"{shortened(names)}"
+    )
     return replace(
         links,
         query=replace(links.query[kept], receivers=number[links.query.receivers[kept]]),
@@ -397,7 +412,8 @@ def with_places(links: Links) -> Links:
         deviations[number] = deviation
         named.append(f"{receiver.name} {deviation:.2g}")
     remark = (
-        f"places of {len(named)} receivers are estimated from the training links, with a median standard deviation of "
+        f"places of {len(named)} receivers are estimated from the training links, with a median "
+        "standard deviation of "
         f"{deviations[deviations > 0].median().item():.2g} m: {shortened(named)}"
     )
     return replace(

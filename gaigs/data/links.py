@@ -55,7 +55,8 @@ def links(reader: str | None = None, /, **options: Any) -> Links:
         needed = ("task", "transmitters", "receivers", "labels")
         if missing := ", ".join(key for key in needed if key not in options):
             raise ValueError(
-                f"links takes a reader's name first, or arrays: {', '.join(needed)}; missing: {missing}"
+                f"links takes a reader's name first, or arrays: {', '.join(needed)}; missing: "
+                f"{missing}"
             )
         return from_arrays(**options)
     if "test_rows" in options or "train_rows" in options:
@@ -123,7 +124,8 @@ def from_arrays(
         if unknown := [key for key in options if key.rpartition(".")[2] not in has]:
             near, known = suggest(unknown[0], [*fields, *has]), ", ".join(fields)
             raise ValueError(
-                f"arrays have no option {near}; they have: {known}; split {split!r}: {', '.join(has)}"
+                f"arrays have no option {near}; they have: {known}; split {split!r}: "
+                f"{', '.join(has)}"
             )
     config = configuration.composed([], {"split": split, **options}, ("split",))["split"]
     if has_parts and (test_rows is None or config["name"] != "official"):
@@ -153,7 +155,8 @@ def from_arrays(
         antenna = Array(torch.zeros(elements, 3))
         if elements > 1:
             remarks.append(
-                f"positions of the {elements} elements are unknown: all count as standing at their receiver's"
+                f"positions of the {elements} elements are unknown: all count as standing at their "
+                "receiver's"
             )
         receivers = [
             Receiver(f"rx{k}", Pose(place, torch.eye(3)), antenna) for k, place in enumerate(stands)
@@ -163,13 +166,15 @@ def from_arrays(
         raise ValueError(f"receivers must have different names, got {twice[0]!r} more than once")
     if np.ma.is_masked(labels):
         raise ValueError(
-            "labels must be plain numbers, got a masked array; fill it with nan where nothing was heard"
+            "labels must be plain numbers, got a masked array; fill it with nan where nothing was "
+            "heard"
         )
     convert = as_tensor if task.dtype.is_complex else as_numbers
     labels = convert("labels", labels, f"those of task {task.name!r}").detach()
     if task.dtype.is_complex and not labels.is_complex():
         raise ValueError(
-            f"labels of task {task.name!r} must be complex, got {labels.dtype}; magnitudes have no phase"
+            f"labels of task {task.name!r} must be complex, got {labels.dtype}; magnitudes have no "
+            "phase"
         )
     labels = labels.to(task.dtype)
     if labels.is_complex():
@@ -184,13 +189,16 @@ def from_arrays(
         index = index if index.ndim else index.expand(count)
     else:
         raise ValueError(
-            f"labels of task {task.name!r} must be {(count, *shape)} with the receiver of each link in index, or "
-            f"{(count, most, *shape)}, one for each transmitter and receiver, got {tuple(labels.shape)}"
+            f"labels of task {task.name!r} must be {(count, *shape)} with the receiver of each "
+            "link in index, or "
+            f"{(count, most, *shape)}, one for each transmitter and receiver, got "
+            f"{tuple(labels.shape)}"
         )
     is_whole = not (index.is_floating_point() or index.is_complex() or index.dtype == torch.bool)
     if not is_whole or index.shape != (len(rows),) or not ((index >= 0) & (index < most)).all():
         raise ValueError(
-            f"index must be {count} whole numbers from 0 to {most - 1}, got {index.tolist()[:5]} ..."
+            f"index must be {count} whole numbers from 0 to {most - 1}, got {index.tolist()[:5]} "
+            "..."
         )
     flat = labels.reshape(len(rows), -1)
     heard = ~flat.isnan().all(1) & ((flat != 0).any(1) | (not task.dtype.is_complex))
@@ -198,7 +206,8 @@ def from_arrays(
     if not heard.any() or broken.any():
         where = f"; link {int(broken.int().argmax())} is not" if broken.any() else ""
         raise ValueError(
-            f"labels must be finite where something was heard, and something must have been heard{where}"
+            "labels must be finite where something was heard, and something must have been "
+            f"heard{where}"
         )
     if not heard.all():
         remarks.append(f"{int((~heard).sum())} links were not heard and are left out")
@@ -220,7 +229,8 @@ def from_arrays(
         carriers = as_numbers("frequency", frequency, "a carrier in Hz")
         if carriers.ndim and carriers.shape != (count,):
             raise ValueError(
-                f"frequency must be one number, or {count}, one for each transmitter, got {len(carriers)}"
+                f"frequency must be one number, or {count}, one for each transmitter, got "
+                f"{len(carriers)}"
             )
         carriers = carriers.expand(count)[rows][heard]
         for carrier in carriers.unique().tolist():
@@ -258,7 +268,8 @@ def from_arrays(
         if len(distinct) > 1 or most == 1:
             raise
         raise ValueError(
-            "transmitters all stand at one place; if receivers move, give their places as transmitters, and the fixed "
+            "transmitters all stand at one place; if receivers move, give their places as "
+            "transmitters, and the fixed "
             "end as receiver: a channel is the same both ways"
         ) from None
     if left := [
@@ -282,10 +293,12 @@ def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
         is_whole and rows.ndim == 1 and len(rows) and ((numbers >= 0) & (numbers < count)).all()
     ):
         raise ValueError(
-            f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got {given}"
+            f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got "
+            f"{given}"
         )
     if len(numbers.unique()) < len(numbers):
         raise ValueError(
-            f"{name} must hold each row once, got {given}; a mask must be boolean, of True and False"
+            f"{name} must hold each row once, got {given}; a mask must be boolean, of True and "
+            "False"
         )
     return numbers.sort().values

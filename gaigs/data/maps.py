@@ -70,7 +70,8 @@ def check_metres(
     if are_degrees(points):
         x, y = points[0, :2].tolist()
         raise ValueError(
-            f"{where}: expected metres, got such as ({x:.7g}, {y:.7g}), which look like degrees\n{mend}"
+            f"{where}: expected metres, got such as ({x:.7g}, {y:.7g}), which look like "
+            f"degrees\n{mend}"
         )
 
 

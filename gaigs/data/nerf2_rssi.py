@@ -54,7 +54,8 @@ def read(root: str | Path, frequency: float | None = None) -> Links:
     names, readings = _read_readings(root / "gateway_rssi.csv", [*gateways])
     if len(positions) != len(readings):
         raise ValueError(
-            f"{root}: tx_pos.csv has {len(positions)} positions, gateway_rssi.csv {len(readings)} rows"
+            f"{root}: tx_pos.csv has {len(positions)} positions, gateway_rssi.csv {len(readings)} "
+            "rows"
         )
     layout = root / "layout.csv"
     walls = tables.read_walls(layout) if tables.has_file(layout) else torch.zeros(0, 2, 3)
@@ -108,7 +109,8 @@ def _read_readings(file: Path, gateways: Sequence[str]) -> tuple[list[str], list
     readings = to_dbm(file, rows, names, NOT_HEARD, [NOT_HEARD], f"write {NOT_HEARD:g}")
     if all(value == NOT_HEARD for row in readings for value in row):
         raise ValueError(
-            f"{file}: expected readings above {NOT_HEARD:g} dBm, got none; no gateway heard anything"
+            f"{file}: expected readings above {NOT_HEARD:g} dBm, got none; no gateway heard "
+            "anything"
         )
     return names, readings
 

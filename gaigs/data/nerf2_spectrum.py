@@ -71,7 +71,8 @@ def read(
         is_pair and all(isinstance(count, int) and count > 0 for count in elements)
     ):
         raise ValueError(
-            f"elements must be the array's rows and columns, such as [4, 4], or null, got {elements!r}"
+            "elements must be the array's rows and columns, such as [4, 4], or null, got "
+            f"{elements!r}"
         )
     root = tables.find_folder(root)
     positions = tables.read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one spectrum a line")
@@ -129,13 +130,15 @@ def write(folder: str | Path, links: Links) -> None:
         or links.task.shape != SHAPE
     ):
         raise ValueError(
-            f"the layout holds spectra of {SHAPE[0]} x {SHAPE[1]} directions at one receiver, got labels of "
+            f"the layout holds spectra of {SHAPE[0]} x {SHAPE[1]} directions at one receiver, got "
+            "labels of "
             f"{links.task.name} {links.task.shape} at {len(links.receivers)}"
         )
     split, query = links.split, links.query
     if split is None:
         raise ValueError(
-            "the layout's index files hold a split, got links without one; make them by gaigs.data.load"
+            "the layout's index files hold a split, got links without one; make them by "
+            "gaigs.data.load"
         )
     (folder / "spectrum").mkdir(parents=True)
     for k in range(len(links)):
@@ -210,7 +213,8 @@ def _find_images(root: Path, count: int) -> list[Path]:
     surplus = sorted([*unknown, *(name for name in names if len(found.get(name, [])) > 1)])
     if missing or surplus:
         raise ValueError(
-            f"{folder}: expected an image of each of the {count} rows of tx_pos.csv, got {len(missing)} too few and "
+            f"{folder}: expected an image of each of the {count} rows of tx_pos.csv, got "
+            f"{len(missing)} too few and "
             f"{len(surplus)} too many, the first {(missing or surplus)[0]}"
         )
     return [found[name][0] for name in names]

@@ -45,8 +45,14 @@ def to_dbm(
     ``mend`` says in the error what to do with other marks of "not heard".
     """
     cells = {line: [re.sub(r"(?i)\s*dbm$", "", cell) for cell in own] for line, own in rows.items()}
-    holds = lambda value: value in not_heard or lowest <= value <= LOUDEST
-    expected = f"an RSSI from {lowest:g} to {LOUDEST:g} dBm ({and_list(not_heard)} where nothing was heard)"
+
+    def holds(value):
+        return value in not_heard or lowest <= value <= LOUDEST
+
+    expected = (
+        f"an RSSI from {lowest:g} to {LOUDEST:g} dBm ({and_list(not_heard)} where nothing was "
+        "heard)"
+    )
     try:
         return to_numbers(file, cells, names, holds, expected)
     except ValueError as error:
@@ -66,7 +72,10 @@ def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
     """The known name of each name: the same, or the only one that differs in case, blanks, ``_``,
     ``-`` and ``:``.
     """
-    plain = lambda name: re.sub(r"[\s_:-]", "", name.casefold())
+
+    def plain(name):
+        return re.sub(r"[\s_:-]", "", name.casefold())
+
     spelt, alike = Counter(map(plain, names)), Counter(map(plain, known))
     same, last = {*known}, {plain(name): name for name in known}
     found = {}

@@ -63,7 +63,8 @@ def read(
     marks = marks_given(not_heard)
     if not marks or not all(map(math.isfinite, marks)):
         raise ValueError(
-            f"not_heard must be finite numbers [dBm], got {not_heard!r}; write such numbers in the file"
+            f"not_heard must be finite numbers [dBm], got {not_heard!r}; write such numbers in the "
+            "file"
         )
     points, dbm, ignored = _read_table(file, marks)
     walls = torch.zeros(0, 2, 3) if layout is None else tables.read_walls(Path(layout).expanduser())
@@ -76,7 +77,8 @@ def read(
     present, receivers = at[heard].unique(return_inverse=True)
     transmitters = torch.tensor(points[moving])[heard]
     remarks = (
-        f"{len(transmitters)} readings of a moving {ENDS[moving]} at {len(present)} places of a fixed {ENDS[fixed]}; "
+        f"{len(transmitters)} readings of a moving {ENDS[moving]} at {len(present)} places of a "
+        f"fixed {ENDS[fixed]}; "
         f"{int((~heard).sum())} of {and_list(marks)} dBm were not heard and are left out"
     )
     silent = [f"{fixed}{k + 1}" for k in range(len(places)) if k not in present]
@@ -119,13 +121,15 @@ def _read_table(file: Path, marks: list[float]) -> tuple[dict[str, list], list[f
     names = [name.lower() for name in written]
     if not any(name in COLUMNS for name in names):
         raise ValueError(
-            f"{file}, line 1: expected columns {','.join(COLUMNS)}, got {tables.quote(lines[0])}; a table with a place "
+            f"{file}, line 1: expected columns {','.join(COLUMNS)}, got {tables.quote(lines[0])}; "
+            "a table with a place "
             "a row and a gateway a column takes data=rssi_wide"
         )
     for name in COLUMNS:
         if (count := names.count(name)) != 1:
             raise ValueError(
-                f"{file}, line 1: expected one column {name}, got {count} in {tables.quote(lines[0])}"
+                f"{file}, line 1: expected one column {name}, got {count} in "
+                f"{tables.quote(lines[0])}"
             )
     at = [names.index(name) for name in COLUMNS]
     everything = tables.split_rows(file, lines, names, 1, delimiter)

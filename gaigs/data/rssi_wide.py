@@ -131,7 +131,8 @@ def read(
     )
     if {"tx_x", "rx_x"} <= {name.lower() for name in table.names}:
         raise ValueError(
-            f"{table.file}, line 1: a table of a reading a line, with tx_x and rx_x; take data=rssi_csv"
+            f"{table.file}, line 1: a table of a reading a line, with tx_x and rx_x; take "
+            "data=rssi_csv"
         )
     axes = _find_axes(table, coordinates)
     points = _read_points(table, axes, height, storey, epsg)
@@ -190,7 +191,8 @@ def read(
     empty = len(places) - some
     remarks = [
         f"{len(rows)} readings of {some} places at {len(names)} gateways",
-        f"{int((~heard).sum())} cells were not heard: {marks or 'empty ones'}{marks and ', or empty'}",
+        f"{int((~heard).sum())} cells were not heard: "
+        f"{marks or 'empty ones'}{marks and ', or empty'}",
         repeats
         and f"repeated readings of one place, of {len(levels)} rows, are averaged, and scatter by {scatter:.2g} dB",
         empty and f"{empty} places hear nothing, and are left out",
@@ -250,8 +252,10 @@ def _units(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
         if metres is None or abs(unit - metres) > 1e-5:
             kind = "degrees" if metres is None else f"units of {metres:.6g} m"
             raise ValueError(
-                f"{table.file}, line 1: column {table.names[columns[k]]} is in units of {unit:g} m, "
-                f"and data.epsg={epsg} in {kind}\nmend the heading, or name the system of these coordinates"
+                f"{table.file}, line 1: column {table.names[columns[k]]} is in units of {unit:g} "
+                "m, "
+                f"and data.epsg={epsg} in {kind}\nmend the heading, or name the system of these "
+                "coordinates"
             )
         found[k] = 1.0
     if axes.is_floor:
@@ -278,7 +282,10 @@ def _find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) ->
             plain[z] in FLOORS and z >= 0,
             plain[x] in PAIRS[2][0] and not _plain(table.names[x])[1],
         )
-    found = lambda names: [k for k, name in enumerate(plain) if name in names]
+
+    def found(names):
+        return [k for k, name in enumerate(plain) if name in names]
+
     for pair in PAIRS:
         x, y = map(found, pair)
         heights = found(HEIGHTS) or found(FLOORS)
@@ -288,7 +295,8 @@ def _find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) ->
             if len(columns) > 1:
                 doubled = ", ".join(table.names[k] for k in columns)
                 raise ValueError(
-                    f"{here}: several columns of one coordinate, {doubled}; choose by data.coordinates"
+                    f"{here}: several columns of one coordinate, {doubled}; choose by "
+                    "data.coordinates"
                 )
         z = heights[0] if heights else -1
         is_global = pair is PAIRS[2] and not _plain(table.names[x[0]])[1]
@@ -347,7 +355,8 @@ def _read_gateways(
         column = next((k for k, name in enumerate(plain) if name in NAMES), None)
         if column is None:
             raise ValueError(
-                f"{file}, line 1: expected a column name, got {tables.quote(', '.join(other.names))}"
+                f"{file}, line 1: expected a column name, got "
+                f"{tables.quote(', '.join(other.names))}"
             )
         points = _read_points(other, own, height, storey, epsg)
         missing = {row + 2: "none" for row in np.isnan(points).any(1).nonzero()[0].tolist()}
@@ -362,7 +371,8 @@ def _read_gateways(
     matched = match_names(found, columns)
     if not matched:
         raise ValueError(
-            f"{file}: none of its gateways is a column of {table.file.name}: {tables.shortened([*found])}\n"
+            f"{file}: none of its gateways is a column of {table.file.name}: "
+            f"{tables.shortened([*found])}\n"
             f"the columns are {tables.shortened(columns)}"
         )
     placed = {own: found[name] for name, own in matched.items()}
@@ -431,18 +441,21 @@ def _find_gateways(
             if levels and QUIETEST <= min(levels) <= max(levels) <= WEAK:
                 cell = table.cell(row, k)
                 raise ValueError(
-                    f"{table.file}, line {row + 2}: expected one level [dBm] a cell, got {cell}, or set data.ignore"
+                    f"{table.file}, line {row + 2}: expected one level [dBm] a cell, got {cell}, "
+                    "or set data.ignore"
                 )
     powers = [table.names[k] for k in ignored_columns if _are_powers(table.numbers[:, k])]
     if not gateways and powers:
         raise ValueError(
-            f"{table.file}: expected levels [dBm], got powers in W or mW in {tables.shortened(powers)}\n"
+            f"{table.file}: expected levels [dBm], got powers in W or mW in "
+            f"{tables.shortened(powers)}\n"
             "write 10 log10(P / 1 mW)"
         )
     if not gateways:
         raise ValueError(
             f"{table.file}: expected columns of levels [dBm], a gateway each, got none in "
-            f"{tables.quote(', '.join(table.names))}; write levels with their sign, or name gateways by data.gateways"
+            f"{tables.quote(', '.join(table.names))}; write levels with their sign, or name "
+            "gateways by data.gateways"
         )
     own = table.numbers[:, gateways]
     wrong = ~(np.isnan(own) | np.isin(own, marks) | ((own >= QUIETEST) & (own <= LOUDEST)))
@@ -488,8 +501,10 @@ def _to_world(
         if largest[1] > 90:
             row = int(np.abs(points[:count, 1]).argmax())
             raise ValueError(
-                f"{table.file}: expected latitudes within 90 degrees in column {names[1]}, got {points[row, 1]:g}; if "
-                "longitudes are there, set data.coordinates; if metres are, name the columns x and y"
+                f"{table.file}: expected latitudes within 90 degrees in column {names[1]}, got "
+                f"{points[row, 1]:g}; if "
+                "longitudes are there, set data.coordinates; if metres are, name the columns x and "
+                "y"
             )
         epsg = 4326
     if epsg == 4326:
@@ -497,7 +512,8 @@ def _to_world(
         spans = np.ptp(around), np.ptp(points[:count, 1])
         if spans[0] > 10 or spans[1] > 1:  # 100 km are 0.9 degrees of latitude
             raise ValueError(
-                f"{table.file}: columns {names[0]} and {names[1]} span {spans[0]:.3g} and {spans[1]:.3g} degrees, "
+                f"{table.file}: columns {names[0]} and {names[1]} span {spans[0]:.3g} and "
+                f"{spans[1]:.3g} degrees, "
                 "beyond 100 km; if they are metres, name them x and y, without data.epsg"
             )
     if epsg is None or is_utm(epsg):
@@ -517,6 +533,7 @@ def _to_world(
         file = table.file if far[:count].any() else gateways
         found = ", ".join(f"{x:g}" for x in points[far][0])
         raise ValueError(
-            f"{file}: expected places within 100 km of each other, got one at ({found}) m; in mm or cm?"
+            f"{file}: expected places within 100 km of each other, got one at ({found}) m; in mm "
+            "or cm?"
         )
     return points, Frame(utm, *origin.tolist()) if utm else None, remark

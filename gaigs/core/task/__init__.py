@@ -184,7 +184,7 @@ def need_samples(scores: Tensor) -> None:
 
 
 def check_range(task: Task, labels: Tensor, name: str) -> None:
-    """Raises a ``ValueError`` unless real labels (k, *shape) are within the task's limits, or NaN."""
+    """Raises a ``ValueError`` unless real labels are NaN or within the task's limits."""
     if task.dtype.is_complex:
         return
     flat, (lowest, highest) = labels.reshape(len(labels), -1), task.limits

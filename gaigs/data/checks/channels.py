@@ -73,7 +73,10 @@ def check_signs(sample: Sample) -> Iterator[Finding]:
             continue
         what = "0 or more" if part.any() else "0"
         text = f"{name} parts are {what} at all links, elements and subcarriers"
-        mend = "of amplitudes a and phases p [rad] give a * np.exp(1j * p); amplitudes or one part alone are no channel"
+        mend = (
+            "of amplitudes a and phases p [rad] give a * np.exp(1j * p); amplitudes or one part "
+            "alone are no channel"
+        )
         yield Finding("parts of channels", text, mend)
 
 
@@ -135,7 +138,8 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
         yield Finding(
             "phases without geometry",
             "phases of the channels do not follow the direct distance",
-            "unless walls block most direct waves, check units and order of tx, rx, elements and h, and the "
+            "unless walls block most direct waves, check units and order of tx, rx, elements and "
+            "h, and the "
             "frequencies, or set data.phase=per_link if each packet has a phase of its own",
         )
     for receiver, (elements, subcarriers, delay) in strange.items():
@@ -149,7 +153,10 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
         if subcarriers:
             late = "check their order"
             if delay is not None:
-                late = f"take a delay of {1e9 * delay:.3g} ns off h, or set data.phase=per_link_and_delay"
+                late = (
+                    f"take a delay of {1e9 * delay:.3g} ns off h, or set "
+                    "data.phase=per_link_and_delay"
+                )
             yield Finding(
                 "phases of subcarriers",
                 f"the subcarriers of {links.receivers[receiver].name} {unexplained}",

@@ -68,7 +68,10 @@ def of_arrays(sample: Sample) -> Iterator[Hypothesis]:
     count = sample.labels.shape[1]
     for rows in range(2, count // 2 + 1):
         if count % rows == 0:
-            mend = f"h = h.reshape(len(h), {rows}, {count // rows}, -1).swapaxes(1, 2).reshape(h.shape)"
+            mend = (
+                f"h = h.reshape(len(h), {rows}, {count // rows}, -1).swapaxes(1, "
+                "2).reshape(h.shape)"
+            )
             name = "elements are in another order of rows and columns"
             yield changing(name, ["labels"], partial(_transposed, rows=rows), mend)
     wavelength = speed_of_light / sample.frequencies.mean().item()
@@ -174,7 +177,10 @@ def of_plans(sample: Sample) -> Iterator[Hypothesis]:
     low, high = sample.transmitters.amin(0), sample.transmitters.amax(0)
     for name, axes in {"x": [0], "y": [1], "x and y": [0, 1]}.items():
         move = partial(_mirrored, ends=low + high, axes=axes)
-        mend = f"rx[:, {axes}] = (tx.min(0) + tx.max(0) - rx)[:, {axes}], as rows of a picture run downwards"
+        mend = (
+            f"rx[:, {axes}] = (tx.min(0) + tx.max(0) - rx)[:, {axes}], as rows of a picture run "
+            "downwards"
+        )
         yield changing(f"rx have {name} from the other end", ["positions"], move, mend)
     yield _everywhere(
         ("rx",), "rx have x and y negated", " * [-1, -1, 1]", torch.diag(torch.tensor([-1, -1, 1]))

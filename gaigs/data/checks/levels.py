@@ -43,7 +43,10 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
     another unit.
     """
     low, high = np.quantile(levels.numpy(), (0.05, 0.95)).tolist()
-    text = f"{int((levels > 0).sum())} levels are above 0 dBm, {levels.min():.3g} to {levels.max():.3g}"
+    text = (
+        f"{int((levels > 0).sum())} levels are above 0 dBm, {levels.min():.3g} to "
+        f"{levels.max():.3g}"
+    )
     known = sample_of_given(links)
     # Powers span decades, decibels of one survey seldom a factor of 100; amplitudes are small, too.
     if high > 100 * max(low, 1e-300) or levels.max() < 0.1:
@@ -188,7 +191,10 @@ def check_places_of_levels(
     slope = (logarithms @ flat / squares).item()
     deviation = (flat.square().mean() / squares).sqrt().item()
     if slope - 3 * deviation > -12:  # free space has -20
-        text = f"levels change by {slope:.2g} +- {deviation:.2g} dB a decade of distance, and near places do not agree"
+        text = (
+            f"levels change by {slope:.2g} +- {deviation:.2g} dB a decade of distance, and near "
+            "places do not agree"
+        )
         yield Finding("order of rows", text, "are places and levels in the same order?")
 
 

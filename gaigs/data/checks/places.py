@@ -109,7 +109,8 @@ def check_arrays(links: Any) -> Iterator[Finding]:
         if extent > room > 0:
             yield Finding(
                 "unit of elements",
-                f"the array of {receiver.name} is {extent:.3g} m across, transmitters and receivers {room:.3g} m",
+                f"the array of {receiver.name} is {extent:.3g} m across, transmitters and "
+                f"receivers {room:.3g} m",
                 "are its elements in m?",
             )
         elif len(elements) > 1 and aside > 2 * extent:
@@ -123,14 +124,16 @@ def check_arrays(links: Any) -> Iterator[Finding]:
             if apart > 3 * wavelength:
                 yield Finding(
                     "unit of elements",
-                    f"elements of {receiver.name} are {apart:.3g} m apart, {apart / wavelength:.3g} wavelengths",
+                    f"elements of {receiver.name} are {apart:.3g} m apart, "
+                    f"{apart / wavelength:.3g} wavelengths",
                     "are they in m?",
                 )
     rounding = places.abs().max().item() * torch.finfo(torch.float32).eps / 2
     if links.task.dtype.is_complex and rounding > wavelength / 300 > 0:
         yield Finding(
             "origin",
-            f"positions are rounded by up to {rounding:.2g} m, {rounding / wavelength:.2g} wavelengths, which phases "
+            f"positions are rounded by up to {rounding:.2g} m, {rounding / wavelength:.2g} "
+            "wavelengths, which phases "
             "show",
             "subtract a common origin from all",
         )

@@ -52,7 +52,10 @@ def check_power(links: Any) -> Iterator[Finding]:
         return sample.labels + 20 * (4 * math.pi * distances / wavelength).log10()
 
     strong = powers(1e8).quantile(0.95).item()
-    middle = f"levels of {sample.labels.median():.3g} dBm at {distances.median():.3g} m take a transmitter of "
+    middle = (
+        f"levels of {sample.labels.median():.3g} dBm at {distances.median():.3g} m take a "
+        "transmitter of "
+    )
     if strong > 60:
         yield Finding(
             "unit of places", f"{middle}{strong:.2g} dBm in free space", "are places in mm or cm?"

@@ -43,7 +43,8 @@ def check_extremes(links: Any) -> Iterator[Finding]:
     if min(task.shape) < SSIM_WINDOW:
         rows, columns = task.shape
         raise ValueError(
-            f"spectra must have {SSIM_WINDOW} x {SSIM_WINDOW} pixels or more, got {rows} x {columns}"
+            f"spectra must have {SSIM_WINDOW} x {SSIM_WINDOW} pixels or more, got {rows} x "
+            f"{columns}"
         )
     parts = (labels[index].flatten(1) for index in torch.arange(len(labels)).split(256))
     low, high = torch.cat([torch.stack((part.amin(1), part.amax(1)), 1) for part in parts]).T
@@ -61,7 +62,8 @@ def check_extremes(links: Any) -> Iterator[Finding]:
             span = f"{low[first]:.3g} to {high[first]:.3g}"
             yield Finding(
                 "range of spectra",
-                f"{int(which.sum())} of {len(labels)} spectra {defect}, first that of link {first}, {span}",
+                f"{int(which.sum())} of {len(labels)} spectra {defect}, first that of link "
+                f"{first}, {span}",
             )
 
 
@@ -147,12 +149,14 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
     if best is not None:
         yield Finding(
             "directions of spectra",
-            f"spectra are bright towards their transmitters (score {best_score:.2f} instead of {read.mean():.2f}) if "
+            f"spectra are bright towards their transmitters (score {best_score:.2f} instead of "
+            f"{read.mean():.2f}) if "
             f"{best.name}",
             best.mend,
             read.mean().item(),
             best_score,
-            "rareness of pixels as bright as the one towards the transmitter, less that in other spectra",
+            "rareness of pixels as bright as the one towards the transmitter, less that in other "
+            "spectra",
         )
         return
     alike = near_likeness(sample)
@@ -162,7 +166,10 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
         and read.mean() < 2 * read.std() / math.sqrt(len(read))
         and alike < 0.1
     ):
-        text = f"spectra are not bright towards their transmitters, and near places have a correlation of {alike:.2f}"
+        text = (
+            "spectra are not bright towards their transmitters, and near places have a "
+            f"correlation of {alike:.2f}"
+        )
         yield Finding("order of rows", text, "are places and spectra in the same order?")
 
 
@@ -284,7 +291,10 @@ def order_changes(links: Any) -> list[Hypothesis]:
     changes = []
     for name, order in orders.items():
         places = links.query.transmitters[order].double()
-        change = lambda own, places=places: replace(own, transmitters=places[own.index])
+
+        def change(own, places=places):
+            return replace(own, transmitters=places[own.index])
+
         changes.append(Hypothesis(name, change, "sort spectra and positions alike"))
     return changes
 

@@ -46,7 +46,10 @@ def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
 def constant_sentence(constant: Bool[Tensor, " s"], frequencies: Float[Tensor, " s"]) -> str:
     """What was found about constant subcarriers."""
     named = shortened([f"{carrier / 1e9:.6g}" for carrier in frequencies[constant].tolist()])
-    return f"{int(constant.sum())} of {len(constant)} subcarriers have one value in every link, {{}}: {named} GHz"
+    return (
+        f"{int(constant.sum())} of {len(constant)} subcarriers have one value in every link, {{}}: "
+        f"{named} GHz"
+    )
 
 
 def check_constant_subcarriers(links: Any) -> Iterator[Finding]:
@@ -67,7 +70,10 @@ def check_powers(sample: Sample) -> Iterator[Finding]:
     odd = (10 * (powers / powers.median()).log10()).abs() > 30
     if len(sample.labels) >= 5 and odd.any():
         named = shortened([f"{carrier / 1e9:.6g}" for carrier in sample.frequencies[odd].tolist()])
-        text = f"{int(odd.sum())} of {len(odd)} subcarriers are 30 dB or more from the usual one in power: {named} GHz"
+        text = (
+            f"{int(odd.sum())} of {len(odd)} subcarriers are 30 dB or more from the usual one in "
+            f"power: {named} GHz"
+        )
         yield Finding(
             "power of subcarriers", text, "leave them out if they are guards, or scale them alike"
         )
@@ -107,7 +113,8 @@ def order_of_subcarriers(sample: Sample) -> Finding | None:
     if not torch.equal(order, torch.arange(count)):
         mend = "frequencies = np.sort(frequencies)"
     text = (
-        f"channels jump at subcarrier {after} of {count}, with a correlation of {least:.2f}, and go on from the last "
+        f"channels jump at subcarrier {after} of {count}, with a correlation of {least:.2f}, and "
+        "go on from the last "
         f"subcarrier to the first, with {around:.2f}: FFT order?"
     )
     return Finding(
