@@ -1,0 +1,234 @@
+"""Columns of a wide table: coordinates with their units, gateways, marks of "not heard"."""
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy import ndarray
+
+from gaigs.data.maps import metres_of
+from gaigs.data.readings import LOUDEST, QUIETEST, and_list, marks_given, marks_of
+from gaigs.io import tables
+
+FORMS = ("{}", "{}pos", "pos{}", "{}coord", "coord{}", "position{}", "tx{}", "loc{}")
+PLAIN = {axis: {form.format(axis) for form in FORMS} for axis in "xyz"}
+PAIRS = (
+    (PLAIN["x"], PLAIN["y"]),
+    (
+        {"easting", "east", "utmx", "utme", "utmeasting"},
+        {"northing", "north", "utmy", "utmn", "utmnorthing"},
+    ),
+    ({"longitude", "lon", "long", "lng"}, {"latitude", "lat"}),
+)
+"""Names of columns of x and y, easting and northing, longitude and latitude, in small letters."""
+
+HEIGHTS = PLAIN["z"] | {"alt", "altitude", "elevation", "height"}
+FLOORS = {"floor", "storey", "floorid"}
+NAMES = {"name", "gateway", "ap", "id", "mac", "bssid", "ssid", "station", "anchor", "beacon"}
+
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048}
+
+WEAK = -20.0
+"""Upper bound of the median of a gateway's column [dBm]; larger numbers are something else."""
+
+
+class Columns(NamedTuple):
+    """Columns of gateways and what else the table has.
+
+    Attributes:
+        gateways: Numbers of the gateways' columns.
+        marks: Values that mean "not heard".
+        silent: Names of gateways that heard nothing.
+        ignored: Names of other columns.
+    """
+
+    gateways: list[int]
+    marks: list[float]
+    silent: list[str]
+    ignored: list[str]
+
+
+class Axes(NamedTuple):
+    """Columns of x, of y and of the height or the floor; a column of -1 is not there."""
+
+    x: int
+    y: int
+    z: int
+    is_floor: bool
+    is_global: bool
+
+
+def plain_name(name: str) -> tuple[str, float | None]:
+    """Name of a column in small letters and digits, and its unit [m]; None if it has no unit."""
+    unit = r"[\s_]*[\[(]?\s*(mm|cm|km|m|ft|feet|deg|°)?\s*[\])]?"
+    match = re.fullmatch(rf"(.*?){unit}", name.strip().lower())
+    return re.sub(r"[\W_]", "", match[1]), UNITS.get(match[2])
+
+
+def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
+    """Factors of x, y and z to metres, or of x and y to the unit of the system.
+
+    Raises:
+        ValueError: A heading's unit differs from the system's.
+    """
+    columns = [axes.x, axes.y, axes.z if axes.z >= 0 else axes.x]
+    units = [plain_name(table.names[column])[1] for column in columns]
+    metres = 1.0 if epsg is None else metres_of(epsg)
+    for k, unit in enumerate(units[:2]):
+        if unit is None or metres == 1.0:
+            continue
+        if metres is None or abs(unit - metres) > 1e-5:
+            kind = "degrees" if metres is None else f"units of {metres:.6g} m"
+            raise ValueError(
+                f"{table.file}, line 1: column {table.names[columns[k]]} is in units of {unit:g} "
+                f"m, and data.epsg={epsg} in {kind}\n"
+                "mend the heading, or name the system of these coordinates"
+            )
+        units[k] = 1.0
+    if axes.is_floor:
+        units[2] = 1.0
+    return [1.0 if unit is None else unit for unit in units]
+
+
+def find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) -> Axes:
+    """The columns of coordinates, by the names given or by usual ones."""
+    plain = [plain_name(name)[0] for name in table.names]
+    has_unit = [plain_name(name)[1] is not None for name in table.names]
+    longitudes, latitudes = PAIRS[2]
+    if coordinates is not None:
+        if len(coordinates) not in (2, 3):
+            raise ValueError(
+                f"data.coordinates must be the columns of x, y and optionally z, got {coordinates}"
+            )
+        x, y, *height = [table.column(name) for name in coordinates]
+        z = height[0] if height else -1
+        if plain[x] in latitudes and plain[y] in longitudes:
+            raise ValueError(f"data.coordinates must have the longitude first, got {coordinates}")
+        is_floor = z >= 0 and plain[z] in FLOORS
+        return Axes(x, y, z, is_floor, plain[x] in longitudes and not has_unit[x])
+
+    def columns_of(names):
+        return [k for k, name in enumerate(plain) if name in names]
+
+    here = f"{table.file}, line 1"
+    for first, second in PAIRS:
+        x, y = columns_of(first), columns_of(second)
+        if not (x and y):
+            continue
+        heights = columns_of(HEIGHTS)
+        z = heights or columns_of(FLOORS)
+        for columns in (x, y, z):
+            if len(columns) > 1:
+                doubled = ", ".join(table.names[k] for k in columns)
+                raise ValueError(
+                    f"{here}: several columns of one coordinate, {doubled}; choose by "
+                    "data.coordinates"
+                )
+        is_global = first is longitudes and not has_unit[x[0]]
+        return Axes(x[0], y[0], z[0] if z else -1, bool(z) and not heights, is_global)
+    several = [name for k, name in enumerate(table.names) if tables.numbers_in(table.text(0, k))]
+    hint = ""
+    if several:
+        hint = f"; column {several[0]} holds several numbers: give each its column"
+    raise ValueError(
+        f"{here}: expected columns x and y, easting and northing, or longitude and latitude, got "
+        f"{tables.quote(', '.join(table.names))}; name them by data.coordinates=[x,y]{hint}"
+    )
+
+
+def refuse_cells(
+    table: tables.Table, columns: Sequence[int], wrong: Bool[ndarray, "rows c"], expected: str
+) -> None:
+    """Raises a ``ValueError`` that names the first wrong cell of each row."""
+    cells = {}
+    for row in wrong.any(1).nonzero()[0].tolist():
+        cells[row + 2] = table.cell(row, columns[int(wrong[row].argmax())])
+    tables.refuse(table.file, cells, expected)
+
+
+def find_gateways(
+    table: tables.Table,
+    axes: Axes,
+    placed: Mapping,
+    ignore: Sequence[str],
+    not_heard: float | list[float] | None,
+) -> Columns:
+    """The columns of gateways, and the marks of "not heard" in them."""
+    reserved = {axes.x, axes.y, axes.z, *(table.column(name) for name in ignore)}
+    coordinate = HEIGHTS.union(*PAIRS[0], *PAIRS[1], *PAIRS[2])
+    free = [k for k in range(len(table.names)) if k not in reserved]
+    likely = []
+    for k in free:
+        name = table.names[k]
+        numbers = table.numbers[:, k]
+        distinct = np.unique(numbers[np.isfinite(numbers)])
+        weak = ((distinct >= QUIETEST) & (distinct <= WEAK)).sum() >= max(1, len(distinct) / 2)
+        if name in placed or (weak and plain_name(name)[0] not in coordinate):
+            likely.append(k)
+    marks = marks_of(table.numbers[:, likely]) if not_heard is None else marks_given(not_heard)
+    gateways: list[int] = []
+    silent: list[str] = []
+    others: list[int] = []
+    for k in free:
+        numbers = table.numbers[:, k]
+        levels = numbers[~(np.isnan(numbers) | np.isin(numbers, marks))]
+        within = levels[(levels >= QUIETEST) & (levels <= LOUDEST)]
+        is_gateway = table.names[k] in placed
+        if k in likely and len(levels):
+            is_gateway |= len(within) / len(levels) >= 0.5 and np.median(within) <= WEAK
+        if not len(levels):
+            silent.append(table.names[k])
+        elif is_gateway:
+            gateways.append(k)
+        else:
+            others.append(k)
+    _refuse_lists(table, others)
+    powers = [table.names[k] for k in others if _are_powers(table.numbers[:, k])]
+    if not gateways and powers:
+        raise ValueError(
+            f"{table.file}: expected levels [dBm], got powers in W or mW in "
+            f"{tables.shortened(powers)}\nwrite 10 log10(P / 1 mW)"
+        )
+    if not gateways:
+        raise ValueError(
+            f"{table.file}: expected columns of levels [dBm], a gateway each, got none in "
+            f"{tables.quote(', '.join(table.names))}; write levels with their sign, or name "
+            "gateways by data.gateways"
+        )
+    levels = table.numbers[:, gateways]
+    is_level = (levels >= QUIETEST) & (levels <= LOUDEST)
+    marked = and_list(marks) or "an empty cell"
+    refuse_cells(
+        table,
+        gateways,
+        ~(np.isnan(levels) | np.isin(levels, marks) | is_level),
+        f"a level from {QUIETEST:g} to {LOUDEST:g} dBm ({marked} where nothing was heard)",
+    )
+    ignored = []
+    for k in others:
+        name = table.names[k]
+        ignored.append(f"{name} (powers in W or mW?)" if name in powers else name)
+    return Columns(gateways, marks, [*filter(None, silent)], [*filter(None, ignored)])
+
+
+def _refuse_lists(table: tables.Table, columns: Sequence[int]) -> None:
+    """Raises a ``ValueError`` if a cell of these columns holds several levels."""
+    for k in columns:
+        for row in np.flatnonzero(np.isinf(table.numbers[:, k]))[:1].tolist():
+            levels = tables.numbers_in(table.text(row, k))
+            if levels and QUIETEST <= min(levels) <= max(levels) <= WEAK:
+                raise ValueError(
+                    f"{table.file}, line {row + 2}: expected one level [dBm] a cell, got "
+                    f"{table.cell(row, k)}, or set data.ignore"
+                )
+
+
+def _are_powers(column: Float[ndarray, " n"]) -> bool:
+    """True if numbers are positive, below 0.01, and spread over a factor of 3, as powers are."""
+    numbers = column[np.isfinite(column) & (column != 0)]
+    if len(numbers) < 3:
+        return False
+    low, high = numbers.min(), numbers.max()
+    return bool(low > 0 and high < 1e-2 and high > 3 * low)
