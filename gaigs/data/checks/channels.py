@@ -1,6 +1,4 @@
-"""Checks of complex channels: conventions under which geometry explains them, and phases that it
-does not.
-"""
+"""Checks of complex channels: conventions that explain them, and phases without geometry."""
 
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -10,7 +8,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from gaigs.core.phases import MANY, phase_sign, strange_parts, unknown_phase
+from gaigs.core.phases import MANY, StrangeParts, phase_sign, strange_parts, unknown_phase
 from gaigs.core.query import evenly
 from gaigs.core.scene import Scene, direct_waves
 from gaigs.data.checks.conventions import conventions
@@ -49,6 +47,17 @@ class Measure(NamedTuple):
     meaning: str
 
 
+COHERENT = Measure(
+    coherence, 0.1, 0.8, "the direct wave explains {} of the channels", "in the mean over links"
+)
+WITHIN = Measure(
+    likeness, 0.3, 0.8, "the direct wave explains {} of each channel", "of the power within a link"
+)
+LEVEL = Measure(
+    level_share, 0.22, 0.3, "distance explains {} of the levels' spread", "of the spread of levels"
+)
+
+
 def check_channels(links: Any) -> Iterator[Finding]:
     """Findings about complex channels."""
     yield from check_constant_subcarriers(links)
@@ -64,9 +73,7 @@ def check_channels(links: Any) -> Iterator[Finding]:
 
 
 def check_signs(sample: Sample) -> Iterator[Finding]:
-    """A finding if channels lack a part, or if one that is never negative seems to be their
-    amplitude.
-    """
+    """A finding if channels lack a part, or if a part that is never negative seems an amplitude."""
     parts = {"real": sample.labels.real, "imaginary": sample.labels.imag}
     for name, part in parts.items():
         if sample.labels.numel() < 100 or part.min() < 0:
@@ -81,120 +88,120 @@ def check_signs(sample: Sample) -> Iterator[Finding]:
 
 
 def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterator[Finding]:
-    """Findings if phases of channels do not follow the geometry, or disagree with those that are
-    declared.
-    """
+    """Findings if phases of channels do not follow the geometry, or differ from the declared."""
     task = links.task
     few = sample.some(192)
-    is_known, has_gain = task.phase == "known", task.phase != "per_link_and_delay"
+    is_known = task.phase == "known"
+    has_gain = task.phase != "per_link_and_delay"
     receivers, labels = sample.receivers, sample.labels
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
     waves = direct_waves(everywhere, links.query[train], task.frequencies)
     sign = phase_sign(labels, waves, receivers) if is_known else 0
-    coherent = Measure(
-        coherence, 0.1, 0.8, "the direct wave explains {} of the channels", "in the mean over links"
-    )
-    each = likeness if has_gain else aligned_likeness
-    within = Measure(
-        each, 0.3, 0.8, "the direct wave explains {} of each channel", "of the power within a link"
-    )
-    level = Measure(
-        level_share,
-        0.22,
-        0.3,
-        "distance explains {} of the levels' spread",
-        "of the spread of levels",
-    )
-    for score in (coherent,) * is_known + (within,) * (not sign):
-        found = best_convention(few, score)
-        if found is not None:
-            yield found
+    measures = []
+    if is_known:
+        measures.append(COHERENT)
+    if not sign:
+        measures.append(WITHIN if has_gain else WITHIN._replace(measure=aligned_likeness))
+    for measure in measures:
+        finding = best_convention(few, measure)
+        if finding is not None:
+            yield finding
             return
     if not has_gain:
         return
     strange = strange_parts(labels, waves, receivers, task.frequencies, sign) if sign else {}
-    if strange:  # unless another convention explains as much with a calibrated array
-        found = best_convention(
-            few, coherent._replace(measure=partial(coherence, is_calibrated=True))
-        )
-        if found is not None and found.fits > 0.7 * coherence(few):
-            yield found
+    if strange:
+        # Another convention may explain as much with a calibrated array.
+        calibrated = COHERENT._replace(measure=partial(coherence, is_calibrated=True))
+        finding = best_convention(few, calibrated)
+        if finding is not None and finding.fits > 0.7 * coherence(few):
+            yield finding
             return
-    is_fixed = any(elements or delay is not None for elements, _, delay in strange.values())
-    is_enough = len(train) >= MANY * len(receivers.unique())
-    if not is_fixed and (
-        phase := unknown_phase(labels, waves, receivers, task.frequencies, task.phase)
-    ):
+    is_fixed = any(part.elements or part.delay is not None for part in strange.values())
+    phase = None
+    if not is_fixed:
+        phase = unknown_phase(labels, waves, receivers, task.frequencies, task.phase)
+    if phase:
         common = "phase" if is_known else "delay"
         yield Finding(
             "phase of each link",
             f"channels have no {common} in common, as if each packet had its own",
             f"set data.phase={phase}, or check units, axes and order of tx, rx and elements",
         )
-        strange = {}
-    elif not sign and (found := best_convention(few, level)):
-        yield found
-    elif is_known and not sign and is_enough:
+        return
+    if not sign:
+        is_enough = len(train) >= MANY * len(receivers.unique())
+        yield from _without_sign(few, is_known and is_enough)
+    for receiver, parts in strange.items():
+        yield from _strange_findings(links.receivers[receiver].name, parts)
+
+
+def _without_sign(few: Sample, is_enough: bool) -> Iterator[Finding]:
+    """A finding about channels whose phases follow the distance with neither sign."""
+    finding = best_convention(few, LEVEL)
+    if finding is not None:
+        yield finding
+    elif is_enough:
         yield Finding(
             "phases without geometry",
             "phases of the channels do not follow the direct distance",
             "unless walls block most direct waves, check units and order of tx, rx, elements and "
-            "h, and the "
-            "frequencies, or set data.phase=per_link if each packet has a phase of its own",
+            "h, and the frequencies, or set data.phase=per_link if each packet has a phase of its "
+            "own",
         )
-    for receiver, (elements, subcarriers, delay) in strange.items():
-        unexplained = "have phases that geometry does not explain, the same at all links"
-        if elements:
-            yield Finding(
-                "phases of elements",
-                f"the elements of {links.receivers[receiver].name} {unexplained}",
-                "check order, axes and unit of elements and tx, or calibrate the array",
+
+
+def _strange_findings(name: str, parts: StrangeParts) -> Iterator[Finding]:
+    """Findings about elements and subcarriers of a receiver with fixed phases."""
+    unexplained = "have phases that geometry does not explain, the same at all links"
+    if parts.elements:
+        yield Finding(
+            "phases of elements",
+            f"the elements of {name} {unexplained}",
+            "check order, axes and unit of elements and tx, or calibrate the array",
+        )
+    if parts.subcarriers:
+        mend = "check their order"
+        if parts.delay is not None:
+            mend = (
+                f"take a delay of {1e9 * parts.delay:.3g} ns off h, or set "
+                "data.phase=per_link_and_delay"
             )
-        if subcarriers:
-            late = "check their order"
-            if delay is not None:
-                late = (
-                    f"take a delay of {1e9 * delay:.3g} ns off h, or set "
-                    "data.phase=per_link_and_delay"
-                )
-            yield Finding(
-                "phases of subcarriers",
-                f"the subcarriers of {links.receivers[receiver].name} {unexplained}",
-                late,
-            )
+        yield Finding("phases of subcarriers", f"the subcarriers of {name} {unexplained}", mend)
 
 
 def best_convention(sample: Sample, score: Measure) -> Finding | None:
-    """A finding about the conventions by which geometry explains the channels best, if it is
-    clearly better so.
+    """A finding about the conventions that explain the channels best, if they do so clearly.
 
     Conventions that explain them equally well are named together.
     """
     read = score.measure(sample)
     if read > score.enough or len(sample.labels) < MANY:
         return None
-    few, tried = sample.some(64), []
-    for one in conventions(few, score.measure):
-        changed = one.change(few)
+    few = sample.some(64)
+    tried = []
+    for convention in conventions(few, score.measure):
+        changed = convention.change(few)
         share = score.measure(changed)
         # Channels that are alike at all links fit any convention under which distances hardly
         # differ.
         is_telling = share > max(read, score.least / 2) and has_extent(changed)
         if is_telling and share > 1.1 * score.measure(without_geometry(changed)) + 0.02:
-            tried.append((share, one))
-    likely = sorted((share for share, _ in tried), reverse=True)[:8]
-    if not likely:
+            tried.append((share, convention))
+    if not tried:
         return None
-    fitting = [
-        (score.measure(one.change(sample)), one) for share, one in tried if share >= likely[-1]
-    ]
+    likely = sorted((share for share, _ in tried), reverse=True)[:8]
+    fitting = []
+    for share, convention in tried:
+        if share >= likely[-1]:
+            fitting.append((score.measure(convention.change(sample)), convention))
     fits = max(share for share, _ in fitting)
     is_better = fits > 1.5 * read + 0.05 or 1 - fits < (1 - read) / 2
     if fits < score.least or not is_better:
         return None
-    best = [one for share, one in fitting if share > 0.98 * fits]
-    names = list(dict.fromkeys(one.name for one in best))[:3]
-    mends = list(dict.fromkeys(one.mend for one in best))[:3]
+    best = [convention for share, convention in fitting if share > 0.98 * fits]
+    names = list(dict.fromkeys(convention.name for convention in best))[:3]
+    mends = list(dict.fromkeys(convention.mend for convention in best))[:3]
     text = score.sentence.format(f"{fits:.0%}")
     text += f" in place of {max(read, 0):.0%} if {' or '.join(names)}"
     return Finding(

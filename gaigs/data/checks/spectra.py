@@ -1,12 +1,10 @@
-"""Checks of spatial spectra: constant ones, and conventions by which bright directions follow the
-transmitters.
-"""
+"""Checks of spatial spectra: constant ones, and conventions of their directions."""
 
 import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -96,8 +94,7 @@ class Limits:
 
 
 def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Finding]:
-    """The convention by which spectra are bright where the transmitters stand, if it is not the one
-    read.
+    """The convention by which spectra are bright towards the transmitters, unless it is the one read.
 
     The score of a spectrum says how rare a pixel is that is as bright as the one towards its
     transmitter, less the same in other spectra of the receiver. So what is bright in every spectrum
@@ -111,61 +108,23 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
     directions = Directions(links.task.directions, sample, limits.pixels)
     sample = replace(sample, labels=directions.ranks)
     read = directions.scores(sample)
-    groups = [
-        [*of_axes(sample, [("tx",), ("rx",), ("tx", "rx")])],
-        [*of_units([("tx",), ("rx",)])],  # in any unit of both, directions are the same
-        [*of_orientations(sample)],
-        pixel_changes(sample),
-        column_changes(directions.grid),
-    ]
-    axes, *others = groups
-    single = [*of_frames(), *itertools.chain(*others)]
-    single += [*scaling_changes(sample, directions.grid), *order_changes(links)]
-    single += of_receivers(sample, lambda own: directions.scores(own).mean().item())
-    tries = [(single, limits.of_others, 1), (axes, limits.of_axes, 1)]
-    if read.mean() < limits.known:
-        pairs = itertools.chain.from_iterable(
-            itertools.product(*two) for two in itertools.combinations(groups, 2)
-        )
-        tries.append(
-            ([both(*pair) for pair in pairs], limits.of_pairs, 2)
-        )  # by every other link: there are hundreds
-    best: Hypothesis | None = None
-    best_score = 0.0
-    for candidates, deviations, step in tries:
-        some = sample.at(torch.arange(0, len(read), step))
-        means = [
-            directions.scores(candidate.change(some)).mean().item() for candidate in candidates
-        ]
-        likeliest = candidates[next(k for k, mean in enumerate(means) if mean > max(means) - 0.01)]
-        scores = directions.scores(likeliest.change(sample))
-        score = scores.mean().item()
-        excess = scores - read
-        needed = deviations * excess.std().item() / math.sqrt(directions.places)
-        is_clear = excess.mean() >= max(limits.better, needed, limits.share * score)
-        # A pair has to be better than one fault, which is simpler.
-        if is_clear and score > best_score + limits.better * (step - 1):
-            best, best_score = likeliest, score
+    best = best_directions(links, sample, directions, read, limits)
     if best is not None:
         yield Finding(
             "directions of spectra",
-            f"spectra are bright towards their transmitters (score {best_score:.2f} instead of "
-            f"{read.mean():.2f}) if "
-            f"{best.name}",
-            best.mend,
+            f"spectra are bright towards their transmitters (score {best.score:.2f} instead of "
+            f"{read.mean():.2f}) if {best.convention.name}",
+            best.convention.mend,
             read.mean().item(),
-            best_score,
+            best.score,
             "rareness of pixels as bright as the one towards the transmitter, less that in other "
             "spectra",
         )
         return
-    alike = near_likeness(sample)
     # Near places of a survey have more in common, also behind walls.
-    if (
-        len(read) >= limits.near
-        and read.mean() < 2 * read.std() / math.sqrt(len(read))
-        and alike < 0.1
-    ):
+    alike = near_likeness(sample)
+    is_dark = read.mean() < 2 * read.std() / math.sqrt(len(read))
+    if len(read) >= limits.near and is_dark and alike < 0.1:
         text = (
             "spectra are not bright towards their transmitters, and near places have a "
             f"correlation of {alike:.2f}"
@@ -173,10 +132,81 @@ def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Findi
         yield Finding("order of rows", text, "are places and spectra in the same order?")
 
 
-def near_likeness(sample: Sample) -> float:
-    """Mean correlation of each spectrum with that of the nearest other place, without what all have
-    in common.
+class Scored(NamedTuple):
+    """A convention and its score."""
+
+    convention: Hypothesis
+    score: float
+
+
+class Trial(NamedTuple):
+    """Conventions to compare.
+
+    Attributes:
+        conventions: The conventions.
+        deviations: Least excess of the best score [standard errors].
+        step: 1 to compare at every link, 2 at every other one.
     """
+
+    conventions: list[Hypothesis]
+    deviations: float
+    step: int
+
+
+def trials(
+    links: Any, sample: Sample, directions: "Directions", is_known: bool, limits: Limits
+) -> Iterator[Trial]:
+    """All conventions: single ones, those of axes, and unless the read one is known, pairs."""
+    axes = [*of_axes(sample, [("tx",), ("rx",), ("tx", "rx")])]
+    units = [*of_units([("tx",), ("rx",)])]  # in any unit of both, directions are the same
+    orientations = [*of_orientations(sample)]
+    pixels = pixel_changes(sample)
+    columns = column_changes(directions.grid)
+    single = [*of_frames(), *units, *orientations, *pixels, *columns]
+    single += [*scaling_changes(sample, directions.grid), *order_changes(links)]
+    single += of_receivers(sample, lambda links: directions.scores(links).mean().item())
+    yield Trial(single, limits.of_others, 1)
+    yield Trial(axes, limits.of_axes, 1)
+    if is_known:
+        return
+    pairs = []
+    for first, second in itertools.combinations([axes, units, orientations, pixels, columns], 2):
+        for a, b in itertools.product(first, second):
+            pairs.append(both(a, b))
+    yield Trial(pairs, limits.of_pairs, 2)  # there are hundreds
+
+
+def best_directions(
+    links: Any,
+    sample: Sample,
+    directions: "Directions",
+    read: Float[Tensor, " n"],
+    limits: Limits,
+) -> Scored | None:
+    """The convention with a clearly higher score than ``read``; None if there is none."""
+    best: Scored | None = None
+    is_known = bool(read.mean() >= limits.known)
+    for conventions, deviations, step in trials(links, sample, directions, is_known, limits):
+        few = sample.at(torch.arange(0, len(read), step))
+        means = []
+        for convention in conventions:
+            means.append(directions.scores(convention.change(few)).mean().item())
+        # Of equal ones the first is the likeliest fault.
+        first = next(k for k, mean in enumerate(means) if mean > max(means) - 0.01)
+        scores = directions.scores(conventions[first].change(sample))
+        score = scores.mean().item()
+        excess = scores - read
+        needed = deviations * excess.std().item() / math.sqrt(directions.places)
+        is_clear = excess.mean() >= max(limits.better, needed, limits.share * score)
+        # A pair has to be better than one fault, which is simpler.
+        least = (best.score if best else 0.0) + limits.better * (step - 1)
+        if is_clear and score > least:
+            best = Scored(conventions[first], score)
+    return best
+
+
+def near_likeness(sample: Sample) -> float:
+    """Mean correlation of each spectrum with the nearest other place's, less the mean spectrum."""
     pixels = sample.labels.flatten(1)
     likeness = torch.corrcoef(pixels - pixels.mean(0))  # (n, n)
     apart = torch.cdist(sample.transmitters, sample.transmitters).fill_diagonal_(math.inf)
@@ -208,9 +238,8 @@ class Directions:
         azimuths, elevations, _ = to_spherical(sample.local.float())
         rows = (elevations[:, None] - self.grid.elevations).abs().argmin(1)
         columns = torch.cos(azimuths[:, None] - self.grid.azimuths).argmax(1)
-        brighter = (
-            1 - sample.labels[:, rows, columns]
-        )  # share of brighter pixels (spectrum, transmitter)
+        # Share of brighter pixels (spectrum, transmitter).
+        brighter = 1 - sample.labels[:, rows, columns]
         # ln(1 / share) as in a likelihood: the top per cent counts more than the top tenth.
         least = 0.02
         rareness = ((brighter + least).log() / math.log(least)).clamp_min(0)
@@ -254,11 +283,10 @@ def column_changes(grid: Grid) -> list[Hypothesis]:
         """Labels whose columns stand at the azimuths turn + sign * those read."""
         azimuths = sign * (grid.azimuths - turn)
         source = torch.cos(azimuths[:, None] - grid.azimuths).argmax(1)  # (columns,)
-        return lambda own: replace(own, labels=own.labels[:, :, source])
+        return lambda read: replace(read, labels=read.labels[:, :, source])
 
-    is_symmetric = torch.allclose(
-        grid.azimuths, -grid.azimuths.flip(0), atol=1e-3
-    )  # such as -90..90 degrees
+    # Such as -90..90 degrees.
+    is_symmetric = torch.allclose(grid.azimuths, -grid.azimuths.flip(0), atol=1e-3)
     columns = "::-1" if is_symmetric else "-np.arange(columns)"
     changes = [
         Hypothesis("azimuths run clockwise", moved(0.0, -1), f"spectra = spectra[:, :, {columns}]"),
@@ -292,50 +320,44 @@ def order_changes(links: Any) -> list[Hypothesis]:
     for name, order in orders.items():
         places = links.query.transmitters[order].double()
 
-        def change(own, places=places):
-            return replace(own, transmitters=places[own.index])
+        def change(read, places=places):
+            return replace(read, transmitters=places[read.index])
 
         changes.append(Hypothesis(name, change, "sort spectra and positions alike"))
     return changes
 
 
 def scaling_changes(sample: Sample, grid: Grid) -> list[Hypothesis]:
-    """Transmitters that were scaled, with the scales and offsets along the axes that suit the
-    spectra best.
-    """
+    """Transmitters that were scaled, with the scales and offsets that suit the spectra best."""
     scale = scale_of(sample.transmitters)
+    if not scale:
+        return []
     mend = "undo it, such as tx = middle + half_extent * tx"
-    return (
-        [Hypothesis(f"tx are {scale}", change, mend) for change in _unscaled(sample, grid)]
-        if scale
-        else []
-    )
+    return [Hypothesis(f"tx are {scale}", change, mend) for change in _unscaled(sample, grid)]
 
 
 def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sample], Sample]]:
-    """Positive scales s and offsets t of the axes by random threes of links, for the receiver with
-    most links.
+    """Positive scales s and offsets t of the axes by random threes of a receiver's links.
 
     The direction u of a link's brightest pixel and its position x obey u x (s x + t) = 0, six
     equations of three links for s and t but for a common factor. Threes are many, as a reflection
     may be the brightest.
     """
     receiver = int(sample.receivers.bincount().argmax())
-    own = (sample.receivers == receiver).nonzero()[:, 0]
-    brightest = sample.labels[own].flatten(1).argmax(1)
+    links = (sample.receivers == receiver).nonzero()[:, 0]
+    brightest = sample.labels[links].flatten(1).argmax(1)
     pixels = grid.flatten()[brightest]
-    towards = (
-        from_spherical(pixels.azimuths, pixels.elevations).double() @ sample.rotations[receiver].T
-    )  # (k, 3)
-    units = torch.eye(3, dtype=torch.float64).expand(len(own), 3, 3)
-    crossed = torch.linalg.cross(
-        units, towards[:, None].expand(-1, 3, -1)
-    ).mT  # (k, 3, 3), columns e x u
-    equations = torch.cat(
-        (crossed * sample.transmitters[own, None], crossed), 2
-    )  # (k, 3, 6), of s and t
+    local = from_spherical(pixels.azimuths, pixels.elevations).double()
+    towards = local @ sample.rotations[receiver].T  # (k, 3)
+    units = torch.eye(3, dtype=torch.float64).expand(len(links), 3, 3)
+    crossed = torch.linalg.cross(units, towards[:, None].expand(-1, 3, -1)).mT
+    # The columns of ``crossed`` (k, 3, 3) are e x u; the equations are in s and t.
+    equations = torch.cat((crossed * sample.transmitters[links, None], crossed), 2)  # (k, 3, 6)
     generator = torch.Generator().manual_seed(0)
-    threes = torch.stack([torch.randperm(len(own), generator=generator)[:3] for _ in range(draws)])
+    threes = []
+    for _ in range(draws):
+        threes.append(torch.randperm(len(links), generator=generator)[:3])
+    threes = torch.stack(threes)
     systems = equations[threes].flatten(1, 2)  # (draws, 9, 6)
     solutions = torch.linalg.svd(systems).Vh[:, -1]  # (draws, 6)
     solutions = solutions * solutions[:, :1].sgn()
