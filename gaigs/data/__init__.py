@@ -1,6 +1,4 @@
-"""Measured and simulated links, each from one transmitter position to one receiver, with their
-labels.
-"""
+"""Measured and simulated links, from a transmitter's position to a receiver, with labels."""
 
 import logging
 from collections.abc import Callable, Mapping
@@ -143,11 +141,10 @@ class Links:
     def batch(self, index: Int[Tensor, " b"]) -> Batch:
         """Links as a batch with labels, in all directions of the task."""
         # Rows of a tensor are copied five times as fast by index_select as by brackets.
-        labels = (
-            self.labels.index_select(0, index)
-            if isinstance(self.labels, Tensor)
-            else self.labels[index]
-        )
+        if isinstance(self.labels, Tensor):
+            labels = self.labels.index_select(0, index)
+        else:
+            labels = self.labels[index]
         return Batch(self.query[index], self.task.directions, labels)
 
     def known(self, receiver: int) -> Int[Tensor, " k"]:
@@ -157,8 +154,10 @@ class Links:
 
     @property
     def scene(self) -> Scene:
-        """The scene that a model is built from; a ``ValueError`` if all training transmitters stand
-        at one point.
+        """The scene that a model is built from.
+
+        Raises:
+            ValueError: All training transmitters stand at one point.
         """
         training = self.query[self.split.train]
         train = training.transmitters.unique(dim=0)
@@ -167,49 +166,49 @@ class Links:
                 f"training takes transmitters at two points or more, got {len(train)}; check the "
                 "split"
             )
-        frequencies = (
-            torch.zeros(0) if training.frequencies is None else training.frequencies.unique()
-        )
-        box = train.amin(0), train.amax(0), median_spacing(train)
+        frequencies = torch.zeros(0)
+        if training.frequencies is not None:
+            frequencies = training.frequencies.unique()
         return Scene(
-            self.receivers,
-            *box,
-            self.task,
-            frequencies,
-            self.bandwidth,
-            self.frame,
-            floors_of(train),
+            receivers=self.receivers,
+            lower=train.amin(0),
+            upper=train.amax(0),
+            spacing=median_spacing(train),
+            task=self.task,
+            frequencies=frequencies,
+            bandwidth=self.bandwidth,
+            frame=self.frame,
+            floors=floors_of(train),
         )
 
 
 def median_spacing(places: Float[Tensor, "n 3"]) -> float:
     """Median distance from a place to the nearest other one [m]; takes two places or more."""
-    distances, _ = cKDTree(places.double().numpy()).query(places.double().numpy(), k=2)
+    points = places.double().numpy()
+    distances, _ = cKDTree(points).query(points, k=2)
     return float(np.median(distances[:, 1]))
 
 
 def floors_of(places: Float[Tensor, "n 3"]) -> Float[Tensor, " k"]:
-    """Heights of separate floors [m], that with most places first; empty of one floor.
+    """Heights of separate floors [m], most places first; empty if there is one floor.
 
-    A floor has 5 places or more. None lies in the 2 m between two floors, nor in twice the range of
-    a floor's heights.
+    A floor has 5 places or more. Floors are 2 m apart, and twice the range of a floor's heights.
     """
     heights = places[:, 2].sort().values
     gaps = heights.diff()
     ends = (gaps > 2).nonzero()[:, 0]
     floors = heights.tensor_split(ends + 1)
-    if (
-        not len(ends)
-        or min(map(len, floors)) < 5
-        or gaps[ends].min() < 2 * max(floor[-1] - floor[0] for floor in floors)
-    ):
+    if not len(ends) or min(map(len, floors)) < 5:
+        return heights[:0]
+    if gaps[ends].min() < 2 * max(floor[-1] - floor[0] for floor in floors):
         return heights[:0]
     return torch.stack([floor.median() for floor in sorted(floors, key=len, reverse=True)])
 
 
 def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
-    """A data set with its split, by the configurations of both; ``task`` names the expected task,
-    None for any.
+    """A data set with its split, by the configurations of both.
+
+    ``task`` names the expected task; None for any.
 
     Raises:
         FileNotFoundError: The data are missing.
@@ -217,19 +216,18 @@ def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
     """
     links = registry("data").build(data)
     if task not in (None, links.task.name):
-        found = f"the labels of data {data['name']!r} are of task {links.task.name!r}"
         raise ValueError(
-            f"{found}, and the configuration is for {task!r}; add task={links.task.name}"
+            f"the labels of data {data['name']!r} are of task {links.task.name!r}, and the "
+            f"configuration is for {task!r}; add task={links.task.name}"
         )
     origin = {"data": dict(data), "split": dict(split)}
     return replace(divide(links, split), origin=origin)
 
 
 def divide(links: Links, split: Mapping) -> Links:
-    """Links with their split, by its configuration; remarks say what is doubtful, such as the phase
-    of channels.
+    """Links with their split, by its configuration; remarks name doubts, such as random phases.
 
-    Of links with ``uncertainties``, receivers without a training link are left out, and those
+    In links with ``uncertainties``, receivers without a training link are left out, and receivers
     without a place get an estimate of it from the training links.
 
     Raises:
@@ -240,17 +238,7 @@ def divide(links: Links, split: Mapping) -> Links:
         check_elements(links)
         links = without_constant(links)
     parts = registry("split").build(split, links=links)
-    given = [*parts.parts().values()]
-    numbers, is_whole = torch.cat(given), all(part.dtype == torch.long for part in given)
-    if (
-        not is_whole
-        or not ((numbers >= 0) & (numbers < len(links))).all()
-        or len(numbers.unique()) < len(numbers)
-    ):
-        raise ValueError(
-            f"split {parts.name!r} must give int64 numbers of links, no masks, and none in two "
-            "parts"
-        )
+    _check_split(parts, len(links))
     if links.held_out is not None:
         tasks: Any = links.task, links.held_out.task
         bands = [task.frequencies / 1e9 for task in tasks]
@@ -261,44 +249,65 @@ def divide(links: Links, split: Mapping) -> Links:
         check_metres("transmitters", links.query.transmitters.unique(dim=0).double().numpy())
     if links.uncertainties is not None:
         links = with_places(only_trained(links))
-    remarks, phase = [links.remarks], getattr(links.task, "phase", "known")
+    remarks = [links.remarks]
+    phase = getattr(links.task, "phase", "known")
     if phase != "known":
         unknown = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}[phase]
         remarks.append(f"{unknown} of each link unknown, and removed in every score")
-    found = tuple(check(links))
-    for finding in found:
+    for finding in check(links):
         log.warning("%s", finding)
         remarks.append(str(finding))
     return replace(links, remarks="; ".join(filter(None, remarks)))
 
 
+def _check_split(split: Split, count: int) -> None:
+    """Raises a ``ValueError`` unless the parts are lists of different links."""
+    given = [*split.parts().values()]
+    if not all(part.dtype == torch.long for part in given):
+        raise ValueError(
+            f"the parts of split {split.name!r} must be int64 numbers of links; turn a mask into "
+            "mask.nonzero()[:, 0]"
+        )
+    numbers = torch.cat(given)
+    if not ((numbers >= 0) & (numbers < count)).all():
+        raise ValueError(
+            f"the parts of split {split.name!r} must hold numbers from 0 to {count - 1}, got "
+            f"{int(numbers.min())} to {int(numbers.max())}"
+        )
+    if len(numbers.unique()) < len(numbers):
+        raise ValueError(
+            f"the parts of split {split.name!r} share a link; give each link to one part, once"
+        )
+
+
 def check_elements(links: Links) -> None:
-    """A ``ValueError`` unless channels have the elements of their receivers' arrays, and are 0 at
-    all others.
+    """Raises a ``ValueError`` if channels do not have the elements of their receivers' arrays.
+
+    Channels are 0 at elements that an array lacks.
     """
-    count, sizes = links.task.shape[0], [len(receiver.array) for receiver in links.receivers]
+    count = links.task.shape[0]
+    sizes = [len(receiver.array) for receiver in links.receivers]
     if max(sizes) != count:
         raise ValueError(
             f"the task has {count} elements, and the largest array of the receivers {max(sizes)}; "
             "give Csi the number of elements of the largest one"
         )
     for part in torch.arange(len(links) if min(sizes) < count else 0).split(1024):
-        own = links.query.receivers[part]
-        if (
-            beyond := (links.labels[part] != 0).any(2) & lacking(links.receivers, own, count)
-        ).any():
+        receivers = links.query.receivers[part]
+        is_set = (links.labels[part] != 0).any(2)  # (k, e)
+        beyond = is_set & lacking(links.receivers, receivers, count)
+        if beyond.any():
             link, element = beyond.nonzero()[0].tolist()
+            receiver = int(receivers[link])
             raise ValueError(
                 f"labels must be 0 at elements that an array lacks; that of link {int(part[link])} "
-                "is not at element "
-                f"{element}, and {links.receivers[int(own[link])].name} has "
-                f"{sizes[int(own[link])]} elements"
+                f"is not at element {element}, and {links.receivers[receiver].name} has "
+                f"{sizes[receiver]} elements"
             )
 
 
 def without_constant(links: Links) -> Links:
-    """Channels without the subcarriers, and then the links, that have no channel; remarks and a
-    warning count them.
+    """Channels without constant subcarriers, and then without silent links; remarks count them.
 
     The same holds for the subcarriers that are held out. If all subcarriers of the links are so,
     they stay.
@@ -306,7 +315,8 @@ def without_constant(links: Links) -> Links:
     Raises:
         ValueError: All subcarriers that are held out are so.
     """
-    both, remarks = [], [links.remarks]
+    both = []
+    remarks = [links.remarks]
     for part in filter(None, (links, links.held_out)):
         constant = constant_subcarriers(part)
         if constant.all() and part is not links:
@@ -323,10 +333,11 @@ def without_constant(links: Links) -> Links:
         both.append(part)
     if len(remarks) == 1:
         return links
-    heard = torch.stack([part.labels.abs().amax((1, 2)) > 0 for part in both]).all(0)
-    if silent := int((~heard).sum()):
+    received = torch.stack([part.labels.abs().amax((1, 2)) > 0 for part in both]).all(0)
+    silent = int((~received).sum())
+    if silent:
         remarks.append(f"{silent} links with no other subcarrier are left out")
-        both = [kept_links(part, heard) for part in both]
+        both = [kept_links(part, received) for part in both]
     return replace(
         both[0],
         held_out=both[1] if len(both) > 1 else None,
@@ -352,69 +363,65 @@ def kept_links(links: Links, kept: Bool[Tensor, " n"]) -> Links:
 
 
 def only_trained(links: Links) -> Links:
-    """Links to receivers that have training links: nothing is known of others. A remark names
-    these.
-    """
+    """Links to receivers that have training links; a remark names the other receivers."""
     trained = links.query.receivers[links.split.train].unique()
     if len(trained) == len(links.receivers):
         return links
-    number = torch.full((len(links.receivers),), -1).index_copy(
-        0, trained, torch.arange(len(trained))
-    )
-    kept = (number[links.query.receivers] >= 0).nonzero()[:, 0]
+    number = torch.full((len(links.receivers),), -1)
+    number = number.index_copy(0, trained, torch.arange(len(trained)))  # (receivers,), anew
+    index = (number[links.query.receivers] >= 0).nonzero()[:, 0]
 
-    def some(values):
-        return None if values is None else values[kept]
+    def at_index(values):
+        return None if values is None else values[index]
 
-    parts = {
-        name: torch.isin(kept, part).nonzero()[:, 0] for name, part in links.split.parts().items()
-    }
-    if len(links.split.test) and not len(parts["test"]) and len(links) < 1.5 * len(links.receivers):
-        each = f"{len(links.receivers)} receivers have {len(links)} links"
+    parts = {}
+    for name, part in links.split.parts().items():
+        parts[name] = torch.isin(index, part).nonzero()[:, 0]
+    is_moving = len(links) < 1.5 * len(links.receivers)
+    if len(links.split.test) and not len(parts["test"]) and is_moving:
         raise ValueError(
-            f"{each}, and those with test links none to train on: models are learnt for each "
-            "receiver\n"
+            f"{len(links.receivers)} receivers have {len(links)} links, and those with test links "
+            "none to train on: models are learnt for each receiver\n"
             "give a fixed receiver one place for all its links, and the moving end as transmitters"
         )
-    names = [
-        receiver.name for receiver, new in zip(links.receivers, number, strict=True) if new < 0
-    ]
+    untrained = [links.receivers[old].name for old in (number < 0).nonzero()[:, 0].tolist()]
     remark = (
-        f"receivers without a training link are left out, with {len(links) - len(kept)} links: "
-        f"{shortened(names)}"
+        f"receivers without a training link are left out, with {len(links) - len(index)} links: "
+        f"{shortened(untrained)}"
     )
     return replace(
         links,
-        query=replace(links.query[kept], receivers=number[links.query.receivers[kept]]),
+        query=replace(links.query[index], receivers=number[links.query.receivers[index]]),
         receivers=tuple(links.receivers[old] for old in trained.tolist()),
-        labels=links.labels[kept],
-        rows=some(links.rows),
+        labels=links.labels[index],
+        rows=at_index(links.rows),
         official=None,
-        split=Split(links.split.name, **parts, groups=some(links.split.groups)),
+        split=Split(links.split.name, **parts, groups=at_index(links.split.groups)),
         uncertainties=links.uncertainties[trained],
-        noises=some(links.noises),
+        noises=at_index(links.noises),
         remarks="; ".join(filter(None, (links.remarks, remark))),
     )
 
 
 def with_places(links: Links) -> Links:
-    """Links whose receivers without a place have an estimate from the training links; remarks say
-    how certain it is.
-    """
+    """Links whose receivers without a place have an estimate; a remark says how certain it is."""
     if links.uncertainties.isfinite().all():
         return links
-    receivers, deviations, named = [*links.receivers], links.uncertainties.clone(), []
+    receivers = [*links.receivers]
+    deviations = links.uncertainties.clone()
+    named = []
     train = links.split.train
     for number in (~deviations.isfinite()).nonzero()[:, 0].tolist():
-        own, receiver = train[links.query.receivers[train] == number], receivers[number]
-        place, deviation = estimate_place(links.query.transmitters[own], links.labels[own])
+        receiver = receivers[number]
+        index = train[links.query.receivers[train] == number]
+        place, deviation = estimate_place(links.query.transmitters[index], links.labels[index])
         receivers[number] = replace(receiver, pose=Pose(place, torch.eye(3)))
         deviations[number] = deviation
         named.append(f"{receiver.name} {deviation:.2g}")
     remark = (
         f"places of {len(named)} receivers are estimated from the training links, with a median "
-        "standard deviation of "
-        f"{deviations[deviations > 0].median().item():.2g} m: {shortened(named)}"
+        f"standard deviation of {deviations[deviations > 0].median().item():.2g} m: "
+        f"{shortened(named)}"
     )
     return replace(
         links,

@@ -1,37 +1,62 @@
 """Places of gateways that no file gives, estimated from the levels that they read."""
 
+from dataclasses import dataclass
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.core.query import evenly
 
-READINGS, ROUNDS, ACROSS = 100, 3, 18
-"""Most readings of a gateway, evenly spread; rounds, each on a finer grid; candidates along x and
-along y.
-"""
 
-SLOPE, SLOPES, SHADOWING = -30.0, 10.0, 6.0
-"""Before any reading: the slope of levels with its standard deviation [dB per decade], and that of
-shadowing [dB].
-"""
+@dataclass(frozen=True)
+class Prior:
+    """What is known of a gateway before any reading, and how its place is searched.
 
-CORRELATIONS = ((2.0, 0.5), (6.0, 0.5), (6.0, 0.9), (20.0, 0.9))
-"""Lengths of the shadowing's correlation to average over [m], and its share of the variance; the
-rest is noise.
-"""
+    Attributes:
+        readings: Most readings that count, evenly spread.
+        rounds: Number of grids, each finer than the last.
+        across: Candidates along x and along y.
+        slope: Mean slope of levels [dB per decade].
+        slope_deviation: Its standard deviation [dB per decade].
+        shadowing: Standard deviation of shadowing [dB].
+        correlations: Correlation lengths [m] to average over, each with the share of the variance
+            that is correlated; the rest is noise.
+        above: Greatest height above the highest place [m].
+        nearest: Least distance; shorter ones count as this [m].
+        noise: Least standard deviation of the noise [dB].
+    """
 
-ABOVE, NEAREST, FINEST = 2.0, 0.5, 0.5
-"""Greatest height above the highest place [m]; distances below the second count as it [m]; least
-noise [dB].
-"""
+    readings: int = 100
+    rounds: int = 3
+    across: int = 18
+    slope: float = -30.0
+    slope_deviation: float = 10.0
+    shadowing: float = 6.0
+    correlations: tuple[tuple[float, float], ...] = (
+        (2.0, 0.5),
+        (6.0, 0.5),
+        (6.0, 0.9),
+        (20.0, 0.9),
+    )
+    above: float = 2.0
+    nearest: float = 0.5
+    noise: float = 0.5
+
+
+class Laws(NamedTuple):
+    """Laws constant + slope log10(distance), by correlation and candidate, with their evidence."""
+
+    evidence: Float[Tensor, "c g"]
+    slopes: Float[Tensor, "c g"]
+    constants: Float[Tensor, "c g"]
 
 
 def estimate_place(
-    places: Float[Tensor, "n 3"], levels: Float[Tensor, " n"]
+    places: Float[Tensor, "n 3"], levels: Float[Tensor, " n"], prior: Prior | None = None
 ) -> tuple[Float[Tensor, "3"], float]:
-    """Place of a gateway [m] from levels [dBm] that it reads, and the root mean square error to
-    expect of it [m].
+    """Place of a gateway [m] from the levels [dBm] that it reads, and its expected error [m].
 
     Levels follow a + b log10(distance) with shadowing, whose correlation makes many readings at one
     spot count as few. Places within half the extent of the readings around them are equally likely
@@ -42,72 +67,75 @@ def estimate_place(
     marginal likelihood is that of Rasmussen and Williams, Gaussian Processes for Machine Learning,
     2006, section 2.7.
     """
-    some = evenly(torch.arange(len(places)), READINGS)
-    places, levels = places[some].double(), levels[some].double()
+    prior = prior or Prior()
+    index = evenly(torch.arange(len(places)), prior.readings)
+    places = places[index].double()
+    levels = levels[index].double()
     low, high = places.amin(0), places.amax(0)
     margin = max(5.0, (high - low).max().item() / 2)
-    low, high = (
-        low - low.new_tensor([margin, margin, 0]),
-        high + low.new_tensor([margin, margin, ABOVE]),
-    )
+    low = low - low.new_tensor([margin, margin, 0])
+    high = high + low.new_tensor([margin, margin, prior.above])
     apart = torch.cdist(places, places)
-    shadowing = torch.stack([share * (-apart / length).exp() for length, share in CORRELATIONS])
+    shadowing = []
+    for length, share in prior.correlations:
+        shadowing.append(share * (-apart / length).exp())
+    shadowing = torch.stack(shadowing)  # (c, n, n)
     shadowing.diagonal(dim1=1, dim2=2).fill_(1)
     factors = torch.linalg.cholesky(shadowing)
     lower, upper = low, high
-    for _ in range(ROUNDS):
-        counts = (ACROSS, ACROSS, 3)
-        candidates = torch.cartesian_prod(
-            *map(torch.linspace, lower.tolist(), upper.tolist(), counts)
-        ).double()
-        decades = torch.cdist(places, candidates).clamp_min(NEAREST).log10()
-        evidence, slopes, constants = _evidence(factors, decades, levels)
-        probabilities = evidence.flatten().softmax(0).reshape(evidence.shape)
-        _, best = divmod(int(probabilities.argmax()), len(candidates))
-        shares = probabilities.sum(0)
+    for _ in range(prior.rounds):
+        counts = (prior.across, prior.across, 3)
+        axes = map(torch.linspace, lower.tolist(), upper.tolist(), counts)
+        candidates = torch.cartesian_prod(*axes).double()  # (g, 3)
+        decades = torch.cdist(places, candidates).clamp_min(prior.nearest).log10()  # (n, g)
+        laws = _fit_laws(factors, decades, levels, prior)
+        probabilities = laws.evidence.flatten().softmax(0).reshape(laws.evidence.shape)  # (c, g)
+        best = int(probabilities.argmax()) % len(candidates)
+        shares = probabilities.sum(0)  # (g,)
         place = shares @ candidates
         deviations = (shares @ (candidates - place).square()).sqrt()
+        # Readings far from the best law are pulled in to three deviations.
         which = int(probabilities[:, best].argmax())
-        law = constants[which, best] + slopes[which, best] * decades[:, best]
+        law = laws.constants[which, best] + laws.slopes[which, best] * decades[:, best]
         errors = levels - law
         bound = 3 * max(1.0, 1.4826 * errors.abs().median().item())
         levels = law + errors.clamp(-bound, bound)
-        half = torch.maximum(3 * deviations, (upper - lower) / (ACROSS - 1))
-        lower, upper = torch.maximum(low, place - half), torch.minimum(high, place + half)
+        # The next grid is finer, around the mean.
+        half = torch.maximum(3 * deviations, (upper - lower) / (prior.across - 1))
+        lower = torch.maximum(low, place - half)
+        upper = torch.minimum(high, place + half)
     return place.float(), deviations.norm().item()
 
 
-def _evidence(
-    factors: Float[Tensor, "c n n"], decades: Float[Tensor, "n g"], levels: Float[Tensor, " n"]
-) -> tuple[Float[Tensor, "c g"], Float[Tensor, "c g"], Float[Tensor, "c g"]]:
-    """Log likelihood of each candidate by each correlation, over all laws and variances; slopes and
-    constants of laws.
+def _fit_laws(
+    factors: Float[Tensor, "c n n"],
+    decades: Float[Tensor, "n g"],
+    levels: Float[Tensor, " n"],
+    prior: Prior,
+) -> Laws:
+    """Laws of each candidate under each correlation, with their log likelihood.
 
-    The prior of the slope is one more observation.
+    The likelihood is over all laws and variances; the prior of the slope is one more observation.
     """
     columns = torch.cat((torch.ones_like(levels)[:, None], levels[:, None], decades), 1)
-    white = torch.linalg.solve_triangular(
-        factors, columns.expand(len(factors), -1, -1), upper=False
-    )
-    one, own, logs = white[:, :, :1], white[:, :, 1:2], white[:, :, 2:]
-    weight = (SHADOWING / SLOPES) ** 2
-    ones, mixed, means = one.square().sum(1), (one * logs).sum(1), (one * own).sum(1)
+    columns = columns.expand(len(factors), -1, -1)  # (c, n, 2 + g)
+    white = torch.linalg.solve_triangular(factors, columns, upper=False)
+    one, level, logs = white[:, :, :1], white[:, :, 1:2], white[:, :, 2:]
+    weight = (prior.shadowing / prior.slope_deviation) ** 2
+    ones = one.square().sum(1)  # (c, 1)
+    mixed = (one * logs).sum(1)  # (c, g)
+    means = (one * level).sum(1)  # (c, 1)
     squares = logs.square().sum(1) + weight - mixed.square() / ones
-    products = (logs * own).sum(1) + weight * SLOPE - mixed * means / ones
-    left = (
-        own.square().sum(1)
-        + weight * SLOPE**2
+    products = (logs * level).sum(1) + weight * prior.slope - mixed * means / ones
+    unexplained = (
+        level.square().sum(1)
+        + weight * prior.slope**2
         - means.square() / ones
         - products.square() / squares
     )
     slopes = products / squares
-    size = (
-        factors.diagonal(dim1=1, dim2=2).log().sum(1, keepdim=True)
-        + (ones.log() + squares.log()) / 2
-    )
-    least = FINEST**2 * len(levels)
-    return (
-        -size - len(levels) / 2 * left.clamp_min(least).log(),
-        slopes,
-        (means - slopes * mixed) / ones,
-    )
+    log_determinants = factors.diagonal(dim1=1, dim2=2).log().sum(1, keepdim=True)
+    size = log_determinants + (ones.log() + squares.log()) / 2
+    least = prior.noise**2 * len(levels)
+    evidence = -size - len(levels) / 2 * unexplained.clamp_min(least).log()
+    return Laws(evidence, slopes, (means - slopes * mixed) / ones)

@@ -36,9 +36,8 @@ def metres_of(epsg: int) -> float | None:
     try:
         system = pyproj.CRS.from_epsg(epsg)
     except pyproj.exceptions.ProjError as error:
-        raise ValueError(
-            f"data.epsg={epsg} is no coordinate system: {' '.join(str(error).split())}"
-        ) from None
+        cause = " ".join(str(error).split())
+        raise ValueError(f"data.epsg={epsg} is no coordinate system: {cause}") from None
     return None if system.is_geographic else system.axis_info[0].unit_conversion_factor
 
 
@@ -54,9 +53,8 @@ def are_degrees(points: Float[ndarray, "n d"]) -> bool:
     span = np.ptp(points[:, :2], axis=0).max()
     rests = np.abs(points[:, :2] - points[:, :2].round(4))
     is_on_earth = max(x, y) <= 180 and min(x, y) <= 90
-    return bool(
-        is_on_earth and 0 < span < min(0.3, max(x, y) / 100) and (rests > 1e-5).mean() > 0.3
-    )
+    is_small = 0 < span < min(0.3, max(x, y) / 100)
+    return bool(is_on_earth and is_small and (rests > 1e-5).mean() > 0.3)
 
 
 def check_metres(
@@ -64,9 +62,7 @@ def check_metres(
     points: Float[ndarray, "n d"],
     mend: str = "convert them, as gaigs.data.maps.to_utm(points, 4326) does, longitude first",
 ) -> None:
-    """Raises a ``ValueError`` if coordinates are longitudes and latitudes; ``mend`` says how to
-    read them.
-    """
+    """Raises a ``ValueError`` if coordinates are degrees; ``mend`` says how to read them."""
     if are_degrees(points):
         x, y = points[0, :2].tolist()
         raise ValueError(

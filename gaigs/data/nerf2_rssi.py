@@ -47,10 +47,9 @@ def read(root: str | Path, frequency: float | None = None) -> Links:
         root / "tx_pos.csv", "xyz", "x,y,z [m] of one measurement a line"
     )
     file = root / "gateway_position.yml"
-    gateways = {
-        name: to_position(f"{file}: {name}", value)
-        for name, value in read_mapping(file, "each gateway's name: [x, y, z] [m]").items()
-    }
+    gateways = {}
+    for name, value in read_mapping(file, "each gateway's name: [x, y, z] [m]").items():
+        gateways[name] = to_position(f"{file}: {name}", value)
     names, readings = _read_readings(root / "gateway_rssi.csv", [*gateways])
     if len(positions) != len(readings):
         raise ValueError(
@@ -60,25 +59,25 @@ def read(root: str | Path, frequency: float | None = None) -> Links:
     layout = root / "layout.csv"
     walls = tables.read_walls(layout) if tables.has_file(layout) else torch.zeros(0, 2, 3)
 
-    dbm = torch.tensor(readings, dtype=torch.float64)
-    heard = dbm > NOT_HEARD
-    rows, columns = heard.nonzero(as_tuple=True)
+    dbm = torch.tensor(readings, dtype=torch.float64)  # (rows, gateways)
+    received = dbm > NOT_HEARD
+    rows, columns = received.nonzero(as_tuple=True)
     present, receivers = columns.unique(return_inverse=True)
     remarks = (
         f"{len(rows)} readings of {len(dbm)} rows at {len(present)} gateways; "
-        f"{int((~heard).sum())} of {NOT_HEARD:g} dBm were not heard and are left out"
+        f"{int((~received).sum())} of {NOT_HEARD:g} dBm were not heard and are left out"
     )
     silent = [name for k, name in enumerate(names) if k not in present]
     if silent:
         remarks += f", and so are the gateways that heard nothing: {', '.join(silent)}"
-    remarks += loud_remark(dbm[heard].tolist())
+    remarks += loud_remark(dbm[received].tolist())
     return Links(
         query=Query(torch.tensor(positions)[rows], receivers, carriers_of(frequency, len(rows))),
         receivers=tuple(gateway(names[k], gateways[names[k]]) for k in present.tolist()),
-        labels=dbm[heard].float(),
+        labels=dbm[received].float(),
         task=Rssi(),
         rows=rows,
-        official=partial(_read_official, root, heard, names),
+        official=partial(_read_official, root, received, names),
         edges=walls,
         remarks=remarks,
     )
@@ -89,11 +88,12 @@ def _read_readings(file: Path, gateways: Sequence[str]) -> tuple[list[str], list
     lines = tables.read_lines(file, "an RSSI [dBm] of each gateway, one measurement a line")
     delimiter = tables.find_delimiter(lines)
     first = tables.split_cells(lines[0], delimiter)
-    header = any(cell in gateways for cell in first) or all(
-        math.isnan(tables.to_number(cell)) for cell in first
-    )
-    matched = match_names(first, gateways) if header else {}
-    names = [matched.get(cell, cell) for cell in first] if header else [*gateways]
+    has_no_number = all(math.isnan(tables.to_number(cell)) for cell in first)
+    has_heading = has_no_number or any(cell in gateways for cell in first)
+    names = [*gateways]
+    if has_heading:
+        matched = match_names(first, gateways)
+        names = [matched.get(cell, cell) for cell in first]
     for name in names:
         if name not in gateways:
             near = suggested(name, [other for other in gateways if other not in names])
@@ -105,7 +105,7 @@ def _read_readings(file: Path, gateways: Sequence[str]) -> tuple[list[str], list
             raise ValueError(
                 f"{file}, line 1: expected one column {tables.quote(name)}, got {names.count(name)}"
             )
-    rows = tables.split_rows(file, lines, names, int(header), delimiter)
+    rows = tables.split_rows(file, lines, names, int(has_heading), delimiter)
     readings = to_dbm(file, rows, names, NOT_HEARD, [NOT_HEARD], f"write {NOT_HEARD:g}")
     if all(value == NOT_HEARD for row in readings for value in row):
         raise ValueError(
@@ -115,32 +115,36 @@ def _read_readings(file: Path, gateways: Sequence[str]) -> tuple[list[str], list
     return names, readings
 
 
-def _read_official(root: Path, heard: Bool[Tensor, "rows gateways"], names: Sequence[str]) -> Parts:
+def _read_official(
+    root: Path, received: Bool[Tensor, "rows gateways"], names: Sequence[str]
+) -> Parts:
     """Training and test links of the index files, which list rows, or pairs of row and gateway."""
+    columns = {name: k for k, name in enumerate(names)}
     # A gateway has its column's number as a second name, unless names are numbers.
-    columns = (
-        {} if any(name.isdecimal() for name in names) else {str(k): k for k in range(len(names))}
-    )
-    columns |= {name: k for k, name in enumerate(names)}
+    if not any(name.isdecimal() for name in names):
+        columns |= {str(k): k for k in range(len(names))}
 
     def parse(line: str) -> tuple[int | None, ...] | None:
         row, *column = re.split(r"\s*,\s*|\s+", line, maxsplit=1)
         entry = tables.to_index(row), *(columns.get(name) for name in column)
-        return None if None in entry or entry[0] >= len(heard) else entry
+        return None if None in entry or entry[0] >= len(received) else entry
 
-    parts = tables.read_parts(root, parse, f"a row in 0..{len(heard) - 1}, or a row and a gateway")
-    if len({len(entry) for part in parts for entry in part}) > 1:
+    expected = f"a row in 0..{len(received) - 1}, or a row and a gateway"
+    parts = tables.read_parts(root, parse, expected)
+    lengths = {len(entry) for entry in (*parts[0], *parts[1])}
+    if len(lengths) > 1:
         raise ValueError(
             f"{root}: index files must list rows, or pairs of row and gateway, got both"
         )
-    found = []
+    indices = []
     for name, part in zip(("train", "test"), parts, strict=True):
-        listed = torch.zeros_like(heard)
+        listed = torch.zeros_like(received)
         for entry in part:
             listed[entry] = True
-        found.append(listed[heard].nonzero()[:, 0])  # links are heard readings, row by row
-        if not len(found[-1]):
+        index = listed[received].nonzero()[:, 0]  # links are received readings, row by row
+        if not len(index):
             raise ValueError(
                 f"{root}/{name}_index.txt: expected a reading that was heard, got none"
             )
-    return found[0], found[1]
+        indices.append(index)
+    return indices[0], indices[1]

@@ -36,8 +36,7 @@ def read(
     frequency: float | None = 920e6,
     bandwidth: float | None = None,
 ) -> Links:
-    """A data set from its folder. Everything but the pixels is checked here; images are decoded
-    when requested.
+    """A data set from its folder; images are decoded when requested, and all else is checked here.
 
     With a carrier for each link, the links of one position share a row.
 
@@ -66,14 +65,8 @@ def read(
         )
     if frequency is not None:
         check_carrier("frequency", frequency)
-    is_pair = isinstance(elements, Sequence) and len(elements) == 2
-    if elements is not None and not (
-        is_pair and all(isinstance(count, int) and count > 0 for count in elements)
-    ):
-        raise ValueError(
-            "elements must be the array's rows and columns, such as [4, 4], or null, got "
-            f"{elements!r}"
-        )
+    if elements is not None:
+        _check_elements(elements)
     root = tables.find_folder(root)
     positions = tables.read_points(root / "tx_pos.csv", "xyz", "x,y,z [m] of one spectrum a line")
     receiver = _read_receiver(root / "gateway_info.yml")
@@ -90,18 +83,15 @@ def read(
         )
     array = Array.single()
     if elements is not None and frequencies is not None:
-        array = Array.planar(
-            elements[0], elements[1], speed_of_light / frequencies.double().max().item() / 2
-        )
+        wavelength = speed_of_light / frequencies.double().max().item()
+        array = Array.planar(*elements, pitch=wavelength / 2)
     elif elements is not None:
         remarks.append(
             "the array counts as a single antenna, since without a frequency its extent is unknown"
         )
     grid = Grid.degrees()
     return Links(
-        query=Query(
-            torch.tensor(positions), torch.zeros(len(files), dtype=torch.long), frequencies
-        ),
+        query=Query(torch.tensor(positions), torch.zeros(len(files)).long(), frequencies),
         receivers=(replace(receiver, array=array),),
         labels=GreyImages(files, SHAPE),
         task=Spectrum(grid.elevations, grid.azimuths),
@@ -124,15 +114,11 @@ def write(folder: str | Path, links: Links) -> None:
     """
     folder = Path(folder)
     tables.check_empty(folder)
-    if (
-        len(links.receivers) != 1
-        or not isinstance(links.task, Spectrum)
-        or links.task.shape != SHAPE
-    ):
+    is_fitting = isinstance(links.task, Spectrum) and links.task.shape == SHAPE
+    if len(links.receivers) != 1 or not is_fitting:
         raise ValueError(
             f"the layout holds spectra of {SHAPE[0]} x {SHAPE[1]} directions at one receiver, got "
-            "labels of "
-            f"{links.task.name} {links.task.shape} at {len(links.receivers)}"
+            f"labels of {links.task.name} {links.task.shape} at {len(links.receivers)}"
         )
     split, query = links.split, links.query
     if split is None:
@@ -146,36 +132,38 @@ def write(folder: str | Path, links: Links) -> None:
         with atomic_write(folder / "spectrum" / f"{k + 1:05d}.png") as part:
             Image.fromarray(pixels.numpy()).save(part)
     # Nine digits give the same float32.
-    rows = [
-        "x,y,z",
-        *(",".join(f"{value:.9g}" for value in row) for row in query.transmitters.tolist()),
-    ]
-    write_text(folder / "tx_pos.csv", "\n".join(rows) + "\n")
+    rows = [f"{x:.9g},{y:.9g},{z:.9g}" for x, y, z in query.transmitters.tolist()]
+    write_text(folder / "tx_pos.csv", "\n".join(["x,y,z", *rows]) + "\n")
     if query.frequencies is not None:
-        write_text(
-            folder / "freq.txt",
-            "".join(f"{value / 1e9:.9g}\n" for value in query.frequencies.tolist()),
-        )
+        carriers = [f"{value / 1e9:.9g}\n" for value in query.frequencies.tolist()]
+        write_text(folder / "freq.txt", "".join(carriers))
     receiver = links.receivers[0]
     quaternion = Rotation.from_matrix(receiver.pose.rotation.double().numpy()).as_quat()
     pose = {"position": receiver.pose.position.tolist(), "orientation": quaternion.tolist()}
-    write_text(
-        folder / "gateway_info.yml", yaml.safe_dump({receiver.name: pose}, default_flow_style=None)
-    )
+    text = yaml.safe_dump({receiver.name: pose}, default_flow_style=None)
+    write_text(folder / "gateway_info.yml", text)
     for name, index in (("train", split.known), ("test", split.test)):
         write_text(folder / f"{name}_index.txt", "".join(f"{k + 1:05d}\n" for k in index.tolist()))
 
 
+def _check_elements(elements: object) -> None:
+    """Raises a ``ValueError`` unless elements are two positive whole numbers."""
+    if isinstance(elements, Sequence) and len(elements) == 2:
+        if all(isinstance(count, int) and count > 0 for count in elements):
+            return
+    raise ValueError(
+        f"elements must be the array's rows and columns, such as [4, 4], or null, got {elements!r}"
+    )
+
+
 def _read_receiver(file: Path) -> Receiver:
     expected = "one gateway with position [m] and orientation (quaternion x, y, z, w)"
-    gateways = {
-        name: pose for name, pose in read_mapping(file, expected).items() if isinstance(pose, dict)
-    }
+    entries = read_mapping(file, expected).items()
+    gateways = [(name, pose) for name, pose in entries if isinstance(pose, dict)]
     if len(gateways) != 1:
-        raise ValueError(
-            f"{file}: expected {expected}, got {tables.quote(', '.join(gateways) or 'none')}"
-        )
-    ((name, pose),) = gateways.items()
+        names = ", ".join(name for name, _ in gateways) or "none"
+        raise ValueError(f"{file}: expected {expected}, got {tables.quote(names)}")
+    name, pose = gateways[0]
     position = to_position(f"{file}: {name}: position", pose.get("position"))
     orientation = to_vector(f"{file}: {name}: orientation", pose.get("orientation"), "xyzw")
     try:
@@ -193,31 +181,38 @@ def _read_frequencies(file: Path, count: int) -> Float[Tensor, " n"]:
         )
     gigahertz = [tables.to_number(line) for line in lines]
     low, high = (bound / 1e9 for bound in CARRIERS)
-    wrong = {
-        number: f"{tables.described(line)}{unit_hint(value)}"
-        for number, (line, value) in enumerate(zip(lines, gigahertz, strict=True), 1)
-        if not low <= value <= high
-    }
+    wrong = {}
+    for number, (line, value) in enumerate(zip(lines, gigahertz, strict=True), 1):
+        if not low <= value <= high:
+            wrong[number] = f"{tables.described(line)}{unit_hint(value)}"
     tables.refuse(file, wrong, f"one carrier from {low:g} to {high:g} GHz")
     return (1e9 * torch.tensor(gigahertz, dtype=torch.float64)).float()
 
 
 def _find_images(root: Path, count: int) -> list[Path]:
-    """The image of each position; a ``ValueError`` for a missing image or one without a position."""
+    """The image of each position.
+
+    Raises:
+        ValueError: An image is missing, has no position, or is there twice.
+    """
     folder = root / "spectrum"
-    names, found = [f"{k:05d}.png" for k in range(1, count + 1)], dict[str, list[Path]]()
-    for file in (file for file in folder.glob("*") if file.suffix.lower() == ".png"):
-        found.setdefault(file.with_suffix(".png").name, []).append(file)
-    missing = [name for name in names if name not in found]
-    unknown = (name for name in found.keys() - {*names} if name.removesuffix(".png").isdecimal())
-    surplus = sorted([*unknown, *(name for name in names if len(found.get(name, [])) > 1)])
+    names = [f"{number:05d}.png" for number in range(1, count + 1)]
+    images: dict[str, list[Path]] = {}
+    for file in folder.glob("*"):
+        if file.suffix.lower() == ".png":
+            images.setdefault(file.with_suffix(".png").name, []).append(file)
+    missing = [name for name in names if name not in images]
+    surplus = [name for name in names if len(images.get(name, [])) > 1]
+    for name in images.keys() - {*names}:
+        if name.removesuffix(".png").isdecimal():
+            surplus.append(name)
     if missing or surplus:
         raise ValueError(
             f"{folder}: expected an image of each of the {count} rows of tx_pos.csv, got "
-            f"{len(missing)} too few and "
-            f"{len(surplus)} too many, the first {(missing or surplus)[0]}"
+            f"{len(missing)} too few and {len(surplus)} too many, the first "
+            f"{(missing or sorted(surplus))[0]}"
         )
-    return [found[name][0] for name in names]
+    return [images[name][0] for name in names]
 
 
 def _read_official(root: Path, count: int) -> Parts:

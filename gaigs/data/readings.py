@@ -18,12 +18,13 @@ from gaigs.io.tables import Rows, to_number, to_numbers
 from gaigs.registry import suggest
 
 QUIETEST, LOUDEST = -150.0, 30.0
-"""Bounds of readings [dBm]: others are another unit, a lost sign or a mark of "not heard" such as
-100.
-"""
+"""Bounds of readings [dBm]; others have another unit, a lost sign, or mean "not heard"."""
 
-MARKS, ROUND = (100.0, 127.0, -200.0, -999.0), (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)
-"""Usual marks of "not heard", out of these bounds and within."""
+MARKS = (100.0, 127.0, -200.0, -999.0)
+"""Usual marks of "not heard" out of these bounds."""
+
+ROUND = (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)
+"""Usual marks of "not heard" within these bounds."""
 
 
 def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiver:
@@ -39,12 +40,16 @@ def to_dbm(
     not_heard: Sequence[float],
     mend: str,
 ) -> list[list[float]]:
-    """Cells of a table as readings [dBm]; a ``ValueError`` where one is neither ``not_heard`` nor
-    in range.
+    """Cells of a table as readings [dBm].
 
     ``mend`` says in the error what to do with other marks of "not heard".
+
+    Raises:
+        ValueError: A cell is neither ``not_heard`` nor in range.
     """
-    cells = {line: [re.sub(r"(?i)\s*dbm$", "", cell) for cell in own] for line, own in rows.items()}
+    cells = {}
+    for line, texts in rows.items():
+        cells[line] = [re.sub(r"(?i)\s*dbm$", "", text) for text in texts]
 
     def holds(value):
         return value in not_heard or lowest <= value <= LOUDEST
@@ -56,7 +61,7 @@ def to_dbm(
     try:
         return to_numbers(file, cells, names, holds, expected)
     except ValueError as error:
-        levels = np.array([[to_number(cell) for cell in own] for own in cells.values()])
+        levels = np.array([[*map(to_number, texts)] for texts in cells.values()])
         others = [mark for mark in marks_of(levels) if mark not in not_heard]
         if not others:
             raise
@@ -69,29 +74,27 @@ def marks_given(not_heard: float | Sequence[float]) -> list[float]:
 
 
 def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
-    """The known name of each name: the same, or the only one that differs in case, blanks, ``_``,
-    ``-`` and ``:``.
-    """
+    """The known name of each name: the same, or the only one alike in letters and digits."""
 
     def plain(name):
         return re.sub(r"[\s_:-]", "", name.casefold())
 
-    spelt, alike = Counter(map(plain, names)), Counter(map(plain, known))
-    same, last = {*known}, {plain(name): name for name in known}
-    found = {}
+    spelt = Counter(map(plain, names))
+    alike = Counter(map(plain, known))
+    by_letters = {plain(name): name for name in known}
+    matched = {}
     for name in names:
-        if name in same:
-            found[name] = name
+        if name in known:
+            matched[name] = name
         elif alike[plain(name)] == 1 == spelt[plain(name)]:
-            found[name] = last[plain(name)]
-    return found
+            matched[name] = by_letters[plain(name)]
+    return matched
 
 
 def suggested(name: str, others: Iterable[str]) -> str:
     """A name, with the most similar one of others that have the same digits."""
-    return suggest(
-        name, [other for other in others if re.findall(r"\d+", other) == re.findall(r"\d+", name)]
-    )
+    digits = re.findall(r"\d+", name)
+    return suggest(name, [other for other in others if re.findall(r"\d+", other) == digits])
 
 
 def and_list(numbers: Iterable[float]) -> str:
@@ -107,13 +110,11 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
 
     - 0 and repeated values from -1 up, three at most, more than 10 dB above all others;
     - of columns with two values or more, a usual value from -105 down, 5 dB below all others, or 10
-    dB if it is not
-      repeated; -100, if it is repeated and more than 10 dB below them; and the lowest or a usual
-      value with 5 % of the readings, five times those of each value within 5 dB, in two columns or
-      the only one;
+      dB if it is not repeated; -100, if it is repeated and more than 10 dB below them; and the
+      lowest or a usual value with 5 % of the readings, five times those of each value within 5 dB,
+      in two columns or the only one;
     - the lowest values, three at most, more than 10 dB below all others, each of them three times
-    and in two columns
-      that have higher levels.
+      and in two columns that have higher levels.
     """
     values, counts = np.unique(levels[np.isfinite(levels)], return_counts=True)
     outside = (values < QUIETEST) | (values > LOUDEST)
@@ -123,30 +124,47 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     if 0 < loud.sum() <= min(3, len(values) - 1) and values[loud][0] > values[~loud][-1] + 10:
         marks += values[loud & ((counts > 1) | (values == 0))].tolist()
     lowest = values.min(initial=0)
-    own = np.where((levels >= QUIETEST) & (levels <= LOUDEST), levels, np.nan)
-    own = own[:, [len(np.unique(column[~np.isnan(column)])) > 1 for column in own.T]]
-    values, counts = np.unique(own[~np.isnan(own)], return_counts=True)
+    inside = np.where((levels >= QUIETEST) & (levels <= LOUDEST), levels, np.nan)
+    has_several = [len(np.unique(column[~np.isnan(column)])) > 1 for column in inside.T]
+    inside = inside[:, has_several]
+    marks += _usual_marks(inside, lowest)
+    return marks + _lowest_marks(inside, marks)
+
+
+def _usual_marks(levels: Float[ndarray, "n k"], lowest: float) -> list[float]:
+    """Usual values, or the lowest, that are far from other levels or far more frequent."""
+    values, counts = np.unique(levels[~np.isnan(levels)], return_counts=True)
+    marks = []
     for value in values[np.isin(values, [*ROUND, lowest])].tolist():
-        count, near = (
-            counts[values == value][0],
-            counts[(values != value) & (np.abs(values - value) < 5)],
-        )
+        count = counts[values == value][0]
+        near = counts[(values != value) & (np.abs(values - value) < 5)]
         is_often = count >= max(3, 0.05 * counts.sum()) and count > 5 * near.max(initial=0)
         is_alone = (np.abs(values - value) <= 10).sum() == 1
-        is_apart = (
-            value in ROUND[1:] and value == lowest and not len(near) and (count > 1 or is_alone)
-        )
-        is_apart |= value == ROUND[0] == lowest and count > 1 and is_alone
-        if is_apart or (is_often and (own == value).any(0).sum() >= min(2, own.shape[1])):
-            marks.append(value)
-    ends = np.flatnonzero(np.diff(values[:4]) > 10)
-    for value in values[: ends[-1] + 1 if len(ends) else 0].tolist():
-        mixed = (own == value).any(0) & (own > values[ends[-1]]).any(
-            0
-        )  # a weak receiver has its floor alone
-        if value not in marks and (own == value).sum() >= 3 and mixed.sum() >= 2:
+        is_apart = False
+        if value == lowest == ROUND[0]:
+            is_apart = count > 1 and is_alone
+        elif value == lowest and value in ROUND:
+            is_apart = not len(near) and (count > 1 or is_alone)
+        columns = (levels == value).any(0).sum()
+        if is_apart or (is_often and columns >= min(2, levels.shape[1])):
             marks.append(value)
     return marks
+
+
+def _lowest_marks(levels: Float[ndarray, "n k"], marks: Sequence[float]) -> list[float]:
+    """The lowest values, at most three, that stand more than 10 dB below all others."""
+    values = np.unique(levels[~np.isnan(levels)])
+    gaps = np.flatnonzero(np.diff(values[:4]) > 10)
+    if not len(gaps):
+        return []
+    last = gaps[-1]
+    lowest = []
+    for value in values[: last + 1].tolist():
+        # A weak receiver has its floor alone.
+        mixed = (levels == value).any(0) & (levels > values[last]).any(0)
+        if value not in marks and (levels == value).sum() >= 3 and mixed.sum() >= 2:
+            lowest.append(value)
+    return lowest
 
 
 def loud_remark(levels: Iterable[float]) -> str:

@@ -73,18 +73,19 @@ def read(
     fixed = fixed or ("rx" if len(numbered["rx"][0]) <= len(numbered["tx"][0]) else "tx")
     moving = "tx" if fixed == "rx" else "rx"
     places, at = numbered[fixed]
-    heard = torch.tensor([value not in marks for value in dbm])
-    present, receivers = at[heard].unique(return_inverse=True)
-    transmitters = torch.tensor(points[moving])[heard]
+    received = torch.tensor([value not in marks for value in dbm])
+    present, receivers = at[received].unique(return_inverse=True)
+    transmitters = torch.tensor(points[moving])[received]
     remarks = (
         f"{len(transmitters)} readings of a moving {ENDS[moving]} at {len(present)} places of a "
-        f"fixed {ENDS[fixed]}; "
-        f"{int((~heard).sum())} of {and_list(marks)} dBm were not heard and are left out"
+        f"fixed {ENDS[fixed]}; {int((~received).sum())} of {and_list(marks)} dBm were not heard "
+        "and are left out"
     )
     silent = [f"{fixed}{k + 1}" for k in range(len(places)) if k not in present]
     if silent:
         remarks += f", and so are the places that nothing was heard at: {', '.join(silent)}"
-    if below := sum(value < min(marks) < 0 for value in dbm):
+    below = sum(value < min(marks) < 0 for value in dbm)
+    if below:
         remarks += f"; {below} readings below {min(marks):g} dBm are taken for levels"
     remarks += loud_remark(value for value in dbm if value not in marks)
     if ignored:
@@ -92,9 +93,9 @@ def read(
     return Links(
         query=Query(transmitters, receivers, carriers_of(frequency, len(receivers))),
         receivers=tuple(gateway(f"{fixed}{k + 1}", places[k]) for k in present.tolist()),
-        labels=torch.tensor(dbm)[heard],
+        labels=torch.tensor(dbm)[received],
         task=Rssi(),
-        rows=numbered[moving][1][heard],
+        rows=numbered[moving][1][received],
         edges=walls,
         remarks=remarks,
     )
@@ -104,12 +105,11 @@ def write(folder: str | Path, links: Links) -> None:
     """Writes readings as ``room.csv`` in a folder, for ``read``."""
     receivers = np.array([receiver.pose.position.numpy() for receiver in links.receivers])
     index = links.query.receivers.numpy()
-    table = np.column_stack(
-        (links.query.transmitters.numpy(), receivers[index], links.labels.numpy())
-    )
-    rows = [
-        ",".join(f"{value:.9g}" for value in row) for row in table
-    ]  # nine digits give the same float32
+    transmitters = links.query.transmitters.numpy()
+    table = np.column_stack((transmitters, receivers[index], links.labels.numpy()))
+    rows = []
+    for row in table:
+        rows.append(",".join(f"{value:.9g}" for value in row))  # nine digits give the same float32
     write_text(Path(folder) / "room.csv", "\n".join((",".join(COLUMNS), *rows)) + "\n")
 
 
@@ -122,11 +122,11 @@ def _read_table(file: Path, marks: list[float]) -> tuple[dict[str, list], list[f
     if not any(name in COLUMNS for name in names):
         raise ValueError(
             f"{file}, line 1: expected columns {','.join(COLUMNS)}, got {tables.quote(lines[0])}; "
-            "a table with a place "
-            "a row and a gateway a column takes data=rssi_wide"
+            "a table with a place a row and a gateway a column takes data=rssi_wide"
         )
     for name in COLUMNS:
-        if (count := names.count(name)) != 1:
+        count = names.count(name)
+        if count != 1:
             raise ValueError(
                 f"{file}, line 1: expected one column {name}, got {count} in "
                 f"{tables.quote(lines[0])}"
@@ -134,16 +134,12 @@ def _read_table(file: Path, marks: list[float]) -> tuple[dict[str, list], list[f
     at = [names.index(name) for name in COLUMNS]
     everything = tables.split_rows(file, lines, names, 1, delimiter)
     rows = {number: [cells[k] for k in at] for number, cells in everything.items()}
-    positions = tables.to_coordinates(
-        file, {number: cells[:6] for number, cells in rows.items()}, COLUMNS
-    )
+    ends = {number: cells[:6] for number, cells in rows.items()}
+    positions = tables.to_coordinates(file, ends, COLUMNS)
     levels = {number: cells[6:] for number, cells in rows.items()}
-    dbm = [
-        value
-        for (value,) in to_dbm(
-            file, levels, COLUMNS[6:], QUIETEST, marks, "list them in data.not_heard"
-        )
-    ]
+    mend = "list them in data.not_heard"
+    readings = to_dbm(file, levels, COLUMNS[6:], QUIETEST, marks, mend)
+    dbm = [value for (value,) in readings]
     if all(value in marks for value in dbm):
         raise ValueError(
             f"{file}: expected a reading that was heard, got none but {and_list(marks)} dBm"

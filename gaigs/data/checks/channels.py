@@ -97,17 +97,13 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
     waves = direct_waves(everywhere, links.query[train], task.frequencies)
     sign = phase_sign(labels, waves, receivers) if is_known else 0
-    measures = []
-    if is_known:
-        measures.append(COHERENT)
-    if not sign:
-        measures.append(WITHIN if has_gain else WITHIN._replace(measure=aligned_likeness))
-    for measure in measures:
+    finding = best_convention(few, COHERENT) if is_known else None
+    if finding is None and not sign:
+        measure = WITHIN if has_gain else WITHIN._replace(measure=aligned_likeness)
         finding = best_convention(few, measure)
-        if finding is not None:
-            yield finding
-            return
-    if not has_gain:
+    if finding is not None:
+        yield finding
+    if finding is not None or not has_gain:
         return
     strange = strange_parts(labels, waves, receivers, task.frequencies, sign) if sign else {}
     if strange:

@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
 import torch
 from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
@@ -111,43 +112,35 @@ def of_axes(sample: Sample, ends: Sequence[Sequence[str]]) -> Iterator[Hypothesi
     points = torch.cat((sample.transmitters, sample.positions))
     # A wall or floor in a plane of the axes reflects as if that axis were negated.
     has_wall = (points >= 0).all(0) | (points <= 0).all(0)
-    for own in ends:
-        subject = " and ".join(own)
+    for subjects in ends:
+        text = " and ".join(subjects)
         for name, order in exchanged.items():
-            mend = f"[:, {order}]"
-            yield _everywhere(own, f"{subject} have {name} exchanged", mend, torch.eye(3)[:, order])
+            matrix = torch.eye(3)[:, order]
+            yield _everywhere(subjects, f"{text} have {name} exchanged", f"[:, {order}]", matrix)
         for axis, name in enumerate("xyz"):
             signs = [1, 1, 1]
             signs[axis] = -1
-            if own == ("elements",) or not has_wall[axis]:
-                yield _everywhere(
-                    own, f"{subject} have {name} negated", f" * {signs}", torch.tensor(signs).diag()
-                )
-    for own in (own for own in ends if own in (("tx",), ("rx",))):
+            if subjects == ("elements",) or not has_wall[axis]:
+                matrix = torch.tensor(signs).diag()
+                yield _everywhere(subjects, f"{text} have {name} negated", f" * {signs}", matrix)
+    for subjects in ends:
+        if subjects not in (("tx",), ("rx",)):
+            continue
         for name, order in {"y, z, x": [2, 0, 1], "z, x, y": [1, 2, 0]}.items():
-            yield _everywhere(
-                own, f"{own[0]} have the order {name}", f"[:, {order}]", torch.eye(3)[:, order]
-            )
+            text = f"{subjects[0]} have the order {name}"
+            yield _everywhere(subjects, text, f"[:, {order}]", torch.eye(3)[:, order])
 
 
 def of_angles() -> Iterator[Hypothesis]:
     """Places computed from angles, about their receiver or the origin."""
-    polar, other = (
-        "elevations taken for polar angles, or the reverse",
-        "elevation = np.pi / 2 - elevation",
-    )
+    north = "azimuths clockwise from north"
+    polar = "elevations taken for polar angles, or the reverse"
+    complement = "elevation = np.pi / 2 - elevation"
     for name, move, mend in (
-        (
-            "azimuths clockwise from north",
-            lambda points: points[:, [1, 0, 2]],
-            "azimuth = np.pi / 2 - azimuth",
-        ),
-        (polar, _tilted, other),
-        (
-            polar,
-            lambda points: -_tilted(points),
-            other,
-        ),  # below the horizon the azimuth is turned by half a circle
+        (north, lambda points: points[:, [1, 0, 2]], "azimuth = np.pi / 2 - azimuth"),
+        (polar, _tilted, complement),
+        # Below the horizon the azimuth is turned by half a circle.
+        (polar, lambda points: -_tilted(points), complement),
         ("radians taken for degrees", _widened, "angles = np.rad2deg(angles)"),
     ):
         yield Hypothesis(f"tx are of {name}", partial(_about_receivers, move=move), mend)
@@ -156,15 +149,10 @@ def of_angles() -> Iterator[Hypothesis]:
 
 def of_units(ends: Sequence[Sequence[str]]) -> Iterator[Hypothesis]:
     """Places and elements in other units than metres; km is the rarest."""
-    for unit, factor in {
-        "mm": 1e-3,
-        "cm": 1e-2,
-        "inches": 0.0254,
-        "feet": 0.3048,
-        "km": 1e3,
-    }.items():
-        for own in sorted(ends, key=len, reverse=True):
-            yield _scaled(own, unit, factor)
+    units = {"mm": 1e-3, "cm": 1e-2, "inches": 0.0254, "feet": 0.3048, "km": 1e3}
+    for unit, factor in units.items():
+        for subjects in sorted(ends, key=len, reverse=True):
+            yield _scaled(subjects, unit, factor)
 
 
 def of_frames() -> Iterator[Hypothesis]:
@@ -199,23 +187,20 @@ def of_plans(sample: Sample) -> Iterator[Hypothesis]:
 
 
 def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[Hypothesis]:
-    """The order of receivers by which the links of each fit one's place best; shifted by one if
-    there are many.
-    """
+    """The order in which receivers' links fit the places best; shifts by one of many receivers."""
     count = len(sample.positions)
-    own = torch.arange(count)
-    orders = [own.roll(1), own.roll(-1)][: count - 1]
+    read = torch.arange(count)
+    orders = [read.roll(1), read.roll(-1)][: count - 1]
     if 2 < count <= 8:
         fits = torch.zeros(count, count)  # links of one receiver at the place of another
         for receiver in sample.receivers.unique().tolist():
             links = sample.at((sample.receivers == receiver).nonzero()[:, 0])
             for place in range(count):
-                fits[receiver, place] = measure(
-                    replace(links, receivers=torch.full_like(links.receivers, place))
-                )
+                moved = replace(links, receivers=torch.full_like(links.receivers, place))
+                fits[receiver, place] = measure(moved)
         orders.append(torch.from_numpy(linear_sum_assignment(-fits.numpy())[1]))
     for order in orders:
-        is_shift = len((order - own).remainder(count).unique()) == 1
+        is_shift = len((order - read).remainder(count).unique()) == 1
         name = "rows of rx are exchanged" + ", as by numbers from 1" * is_shift
         yield changing(name, ["receivers"], order.__getitem__, f"rx = rx[{order.tolist()}]")
 
@@ -240,11 +225,10 @@ def _scaled(ends: Sequence[str], unit: str, factor: float) -> Hypothesis:
 
 
 def _changed(sample: Sample, parts: Sequence[str], move: Move) -> Sample:
-    values = {name: getattr(sample, name) for name in parts}
-    moved = {
-        name: tuple(map(move, own)) if isinstance(own, tuple) else move(own)
-        for name, own in values.items()
-    }
+    moved = {}
+    for name in parts:
+        value = getattr(sample, name)
+        moved[name] = tuple(map(move, value)) if isinstance(value, tuple) else move(value)
     return replace(sample, **moved)
 
 
@@ -272,9 +256,8 @@ def _transposed(labels: Complex[Tensor, "n e s"], rows: int) -> Complex[Tensor, 
 def _rolled(rotations: Float[Tensor, "r 3 3"], by: int) -> Float[Tensor, "r 3 3"]:
     """Rotations of quaternions whose four numbers are rolled."""
     quaternions = Rotation.from_matrix(rotations.numpy()).as_quat()
-    return torch.from_numpy(
-        Rotation.from_quat(torch.from_numpy(quaternions).roll(by, 1).numpy()).as_matrix()
-    )
+    rolled = np.roll(quaternions, by, 1)
+    return torch.from_numpy(Rotation.from_quat(rolled).as_matrix())
 
 
 def _tilted(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
@@ -292,13 +275,10 @@ def _widened(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
 
 
 def _with_carrier(sample: Sample, at_elements: bool) -> Sample:
-    """Channels times the direct wave's phase at the middle of the band, alike at all elements or
-    not.
-    """
+    """Channels times the direct wave's phase at the middle of the band."""
     distances = direct_distances(sample)
     if not at_elements:
         distances = distances.mean(1, keepdim=True)
-    phases = -2 * math.pi * sample.frequencies.mean() / speed_of_light * distances
-    return replace(
-        sample, labels=sample.labels * torch.polar(torch.ones_like(phases), phases)[..., None]
-    )
+    phases = -2 * math.pi * sample.frequencies.mean() / speed_of_light * distances  # (n, e)
+    turns = torch.polar(torch.ones_like(phases), phases)[..., None]
+    return replace(sample, labels=sample.labels * turns)

@@ -23,9 +23,7 @@ class Law(NamedTuple):
 
 
 class Gain(NamedTuple):
-    """Mean errors of data as read and under another convention [dB], and the gain of log
-    likelihood.
-    """
+    """Mean errors of data as read and by another convention [dB], and gain of log likelihood."""
 
     read: float
     fits: float
@@ -48,8 +46,7 @@ def decades_of(distances: Float[Tensor, "*h n"]) -> Float[Tensor, "*h n"]:
 
 
 def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = False) -> Law:
-    """The law of distance of each receiver, by Huber's weights, so that a few wrong levels do not
-    bend it.
+    """The law of distance of each receiver, by Huber's weights: a few wrong levels do not bend it.
 
     Args:
         logarithms: Logarithms of the links' distances, under h conventions at once.
@@ -88,8 +85,7 @@ def explained(sample: Sample) -> float:
 def compare(
     read: Float[Tensor, " n"], fits: Float[Tensor, " n"], sample: Sample, cells: int = 6
 ) -> Gain:
-    """Gain of errors about one law over those about another, where errors above 30 dB count as 30
-    dB.
+    """Gain of errors about one law over those about another; above 30 dB they count as 30 dB.
 
     Shadowing is alike at near places, so that each receiver's cells, at most ``cells`` along x and
     along y, count as single observations. The log likelihood of m of them with a mean error of s is

@@ -16,8 +16,8 @@ class Finding:
         score: Meaning of both scores with their unit.
 
     Example:
-        >>> str(Finding("unit of levels", "levels are positive", "levels = 10 * np.log10(levels / 1e-3)"))
-        'levels are positive; levels = 10 * np.log10(levels / 1e-3)'
+        >>> str(Finding("unit of levels", "levels are positive", "levels = 10 * np.log10(levels)"))
+        'levels are positive; levels = 10 * np.log10(levels)'
     """
 
     fault: str

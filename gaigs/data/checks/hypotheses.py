@@ -43,14 +43,16 @@ class Sample:
 
     def at(self, index: Int[Tensor, " k"]) -> "Sample":
         """Some of the links."""
-        parts = {
-            name: getattr(self, name)[index]
-            for name in ("index", "transmitters", "receivers", "labels")
-        }
-        return replace(self, **parts)
+        return replace(
+            self,
+            index=self.index[index],
+            transmitters=self.transmitters[index],
+            receivers=self.receivers[index],
+            labels=self.labels[index],
+        )
 
     def some(self, most: int) -> "Sample":
-        """At most so many of the links, evenly spread."""
+        """At most ``most`` of the links, evenly spread."""
         return self.at(evenly(torch.arange(len(self.labels)), most))
 
 

@@ -1,6 +1,4 @@
-"""Checks of received levels: units, signs, marks, single levels that are wrong, and the places of
-receivers.
-"""
+"""Checks of received levels: units, signs, marks, wrong single levels, places of receivers."""
 
 import math
 from collections.abc import Iterator
@@ -22,11 +20,11 @@ from gaigs.io.tables import shortened
 
 
 def check_levels(links: Any) -> Iterator[Finding]:
-    """Findings about the unit, sign and marks of levels, about single levels, and about receivers."""
+    """Findings about unit, sign and marks of levels, about single levels, and about receivers."""
     levels = links.labels[torch.arange(len(links))].double()
-    heard = levels[levels != 0]
-    if len(heard) and (heard > 0).double().mean() > 0.9:
-        yield from check_unit(links, heard)
+    nonzero = levels[levels != 0]
+    if len(nonzero) and (nonzero > 0).double().mean() > 0.9:
+        yield from check_unit(links, nonzero)
         return
     yield from check_signs(links, levels)
     for mark in marks_of(levels[:, None].numpy()):
@@ -39,9 +37,7 @@ def check_levels(links: Any) -> Iterator[Finding]:
 
 
 def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
-    """A finding about levels that are positive: powers, amplitudes, or decibels without sign or of
-    another unit.
-    """
+    """A finding about positive levels: powers, amplitudes, or decibels of another sign or unit."""
     low, high = np.quantile(levels.numpy(), (0.05, 0.95)).tolist()
     text = (
         f"{int((levels > 0).sum())} levels are above 0 dBm, {levels.min():.3g} to "
@@ -52,12 +48,13 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
     if high > 100 * max(low, 1e-300) or levels.max() < 0.1:
         yield _linear_unit(known, text, math.log10(np.median(levels)))
         return
-    if known is None or explained(replace(known[0], labels=-known[0].labels)) >= explained(
-        known[0]
-    ):
-        yield Finding(
-            "sign of levels", text, "was a sign lost, or are they path losses? levels = -levels"
-        )
+    is_inverted = known is None
+    if known is not None:
+        inverted = replace(known[0], labels=-known[0].labels)
+        is_inverted = explained(inverted) >= explained(known[0])
+    if is_inverted:
+        mend = "was a sign lost, or are they path losses? levels = -levels"
+        yield Finding("sign of levels", text, mend)
         return
     mend = "percent, scaled, dB over the noise, or dBuV? levels = levels - 107 of dBuV at 50 ohm"
     yield Finding("unit of levels", f"{text}, and fall with the distance", mend)
@@ -70,21 +67,24 @@ def _linear_unit(known: tuple[Sample, list[str]] | None, text: str, middle: floa
     if known:
         sample = known[0]
         decibels = _decibels(sample)
-        read, fits = explained(sample), explained(decibels)
+        read = explained(sample)
+        fits = explained(decibels)
         slope = fit_law(decades(decibels), decibels).slopes.median().item()
-        text += f"; the distance explains {read:.0%} of their spread, {fits:.0%} of that of their logarithm"
+        text += f"; the distance explains {read:.0%} of their spread, "
+        text += f"{fits:.0%} of that of their logarithm"
     # Power falls by 20 dB a decade in free space, and amplitude by half of that.
     if -14 < slope < -4 and fits > 0.1:
-        unit, mend = "volts", "levels = 20 * np.log10(levels) + 13 at 50 ohm"
+        unit = "volts"
+        mend = "levels = 20 * np.log10(levels) + 13 at 50 ohm"
     elif 10 * middle + 30 < -20:
-        unit, mend = (
-            "watts",
-            "levels = 10 * np.log10(levels / 1e-3), or 10 * np.log10(levels) of mW",
-        )
+        unit = "watts"
+        mend = "levels = 10 * np.log10(levels / 1e-3), or 10 * np.log10(levels) of mW"
     elif 10 * middle < -10:
-        unit, mend = "mW", "levels = 10 * np.log10(levels)"
+        unit = "mW"
+        mend = "levels = 10 * np.log10(levels)"
     else:
-        unit, mend = "microwatts or less", "levels = 10 * np.log10(levels * 1e-3) of microwatts"
+        unit = "microwatts or less"
+        mend = "levels = 10 * np.log10(levels * 1e-3) of microwatts"
     return Finding("unit of levels", f"{text}; are they {unit}?", mend, read, fits, score)
 
 
@@ -110,14 +110,14 @@ def check_columns(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
     equal: list[str] = []
     first: dict[bytes, int] = {}
     for number in range(len(names)):
-        own = links.query.receivers == number
-        if own.sum() >= 5 and levels[own].unique().numel() == 1:
+        at_receiver = links.query.receivers == number
+        if at_receiver.sum() >= 5 and levels[at_receiver].unique().numel() == 1:
             constant.append(names[number])
             continue
         column = np.full(count, np.nan)
-        column[place[own].numpy()] = levels[own].numpy()
+        column[place[at_receiver].numpy()] = levels[at_receiver].numpy()
         other = first.setdefault(column.tobytes(), number)
-        if other != number and own.sum() >= 3:
+        if other != number and at_receiver.sum() >= 3:
             equal.append(f"{names[other]} and {names[number]} have the same levels")
     if constant:
         yield Finding("constant levels", f"levels are constant at {shortened(constant)}")
@@ -126,9 +126,7 @@ def check_columns(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 
 
 def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterator[Finding]:
-    """Findings about levels far from those of near places, and about levels that no near place
-    shares.
-    """
+    """Findings about levels far from near places' levels, and about an order of rows."""
     sample = sample_of(replace(links, split=None), most)
     near = apart_from_neighbours(sample)
     is_placed = torch.ones(len(links.receivers), dtype=torch.bool)
@@ -159,34 +157,30 @@ def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterato
 
 
 def apart_from_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, " n"]:
-    """Each level less the median of the nearest ones of its receiver [dB]; 0 where it has fewer
-    than 6 links.
-    """
+    """Each level less the median of its nearest ones [dB]; 0 at receivers with under 6 links."""
     apart = torch.zeros_like(sample.labels)
     for number in range(len(sample.positions)):
-        own = (sample.receivers == number).nonzero()[:, 0]
-        if len(own) < 6:
+        links = (sample.receivers == number).nonzero()[:, 0]
+        if len(links) < 6:
             continue
-        places = sample.transmitters[own].numpy()
-        _, near = cKDTree(places).query(places, k=min(neighbours + 1, len(own)))
-        levels = sample.labels[own]
-        apart[own] = levels - levels[torch.from_numpy(near[:, 1:])].median(1).values
+        places = sample.transmitters[links].numpy()
+        _, near = cKDTree(places).query(places, k=min(neighbours + 1, len(links)))
+        levels = sample.labels[links]
+        apart[links] = levels - levels[torch.from_numpy(near[:, 1:])].median(1).values
     return apart
 
 
 def check_places_of_levels(
     sample: Sample, near: Float[Tensor, " n"], is_placed: Bool[Tensor, " r"]
 ) -> Iterator[Finding]:
-    """A finding if levels follow neither the distance nor their neighbours, as in a wrong order of
-    rows.
-    """
-    own = is_placed[sample.receivers] & (near != 0)
-    flat = fit_law(torch.zeros_like(near), sample).errors[own]
-    if not own.any() or near[own].abs().mean() < 0.95 * flat.abs().mean():
+    """A finding if levels follow neither distance nor neighbours, as in a wrong order of rows."""
+    counts = is_placed[sample.receivers] & (near != 0)
+    constant = torch.zeros_like(near)
+    flat = fit_law(constant, sample).errors[counts]
+    if not counts.any() or near[counts].abs().mean() < 0.95 * flat.abs().mean():
         return
-    logarithms = fit_law(torch.zeros_like(near), replace(sample, labels=decades(sample))).errors[
-        own
-    ]
+    # The regression of levels on logarithms of distances, both less their receiver's mean.
+    logarithms = fit_law(constant, replace(sample, labels=decades(sample))).errors[counts]
     squares = logarithms.square().sum()
     slope = (logarithms @ flat / squares).item()
     deviation = (flat.square().mean() / squares).sqrt().item()
@@ -199,16 +193,16 @@ def check_places_of_levels(
 
 
 def _scale(errors: Float[Tensor, " n"], sample: Sample) -> Float[Tensor, " r"]:
-    """Robust standard deviation at each receiver; of all where a receiver has fewer than 10 links."""
+    """Robust standard deviation at each receiver, or of all at a receiver with under 10 links."""
     scales = (1.4826 * errors.abs().median()).expand(len(sample.positions)).clone()
     for number in range(len(scales)):
-        own = errors[sample.receivers == number]
-        if len(own) >= 10:
-            scales[number] = 1.4826 * own.abs().median()
+        at_receiver = errors[sample.receivers == number]
+        if len(at_receiver) >= 10:
+            scales[number] = 1.4826 * at_receiver.abs().median()
     return scales
 
 
 def _decibels(sample: Sample) -> Sample:
     """The sample's positive levels as powers."""
-    heard = sample.at((sample.labels > 0).nonzero()[:, 0])
-    return replace(heard, labels=10 * heard.labels.log10())
+    positive = sample.at((sample.labels > 0).nonzero()[:, 0])
+    return replace(positive, labels=10 * positive.labels.log10())

@@ -31,9 +31,8 @@ def check_places(links: Any) -> Iterator[Finding]:
     if len(sites) > 1 and near.sum() > 1:  # one may be measured beside a receiver
         text = f"{int(near.sum())} places are where a receiver stands"
         yield Finding("places at a receiver", text)
-    if (
-        links.task.is_scalar
-    ):  # antennas of one mast may share their place; levels show whether they do
+    # Antennas of one mast may share their place; levels show whether they do.
+    if links.task.is_scalar:
         return
     for a, b in itertools.combinations(given, 2):
         turned = (receivers[a].pose.rotation - receivers[b].pose.rotation).norm()
@@ -60,12 +59,9 @@ def check_extent(links: Any) -> Iterator[Finding]:
         )
     elif links.frame is None and span < 0.3:  # less than a table
         yield Finding("unit of places", f"places span {span:.3g} m", "are they in km or degrees?")
-    elif links.task.is_scalar and (
-        scale := scale_of(sites)
-    ):  # spectra and channels show whether they are
-        yield Finding(
-            "unit of places", f"places span {span:.3g} m, as if {scale}", "give them in metres"
-        )
+    elif links.task.is_scalar and scale_of(sites):  # spectra and channels show it themselves
+        text = f"places span {span:.3g} m, as if {scale_of(sites)}"
+        yield Finding("unit of places", text, "give them in metres")
     if len(sites) > 1 and given:
         stands = _stands(links)[given]
         closest = torch.cdist(sites.double(), stands.double()).min().item()
@@ -75,9 +71,7 @@ def check_extent(links: Any) -> Iterator[Finding]:
 
 
 def scale_of(places: Float[Tensor, "n 3"]) -> str:
-    """How places seem to be scaled: to 0..1, -1..1 or -0.5..0.5, or standardised; empty if they are
-    not.
-    """
+    """How places seem to be scaled, such as to 0..1, or standardised; empty if not."""
     low, high = places.min().item(), places.max().item()
     for lower, upper in ((0.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)):
         margin = 0.15 * (upper - lower)  # places seldom reach the walls of the room that was scaled
@@ -133,26 +127,23 @@ def check_arrays(links: Any) -> Iterator[Finding]:
         yield Finding(
             "origin",
             f"positions are rounded by up to {rounding:.2g} m, {rounding / wavelength:.2g} "
-            "wavelengths, which phases "
-            "show",
+            "wavelengths, which phases show",
             "subtract a common origin from all",
         )
 
 
 def check_walls(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> Iterator[Finding]:
-    """A finding if walls are in another unit or elsewhere than transmitters and receivers as seen
-    from above.
-    """
-    own = _diagonal(walls[:, :2])
+    """A finding if walls, from above, are in another unit or elsewhere than the places."""
+    across = _diagonal(walls[:, :2])
     room = _diagonal(places[:, :2])
-    if own and room and not 1 / 50 < own / room < 50:  # millimetres differ by 1000
-        text = f"the walls are {own:.3g} m across, transmitters and receivers {room:.3g} m"
+    if across and room and not 1 / 50 < across / room < 50:  # millimetres differ by 1000
+        text = f"the walls are {across:.3g} m across, transmitters and receivers {room:.3g} m"
         yield Finding("unit of walls", text, "are both in m?")
         return
     lower, upper = walls[:, :2].amin(0), walls[:, :2].amax(0)
     gaps = torch.maximum(lower - places[:, :2].amax(0), places[:, :2].amin(0) - upper)  # (2,)
     apart = gaps.clamp_min(0).norm().item()
-    if apart > 0.1 * (own + room):  # a single wall stands apart, too
+    if apart > 0.1 * (across + room):  # a single wall stands apart, too
         text = f"the walls are {apart:.3g} m from all transmitters and receivers"
         yield Finding("frame of walls", text, "are both in one frame?")
 

@@ -1,4 +1,4 @@
-"""Checks of receivers' places by the levels: units, axes, order and places that levels contradict."""
+"""Checks of receivers' places by the levels: units, axes, order, and wrong places."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -19,24 +19,21 @@ from gaigs.io.tables import shortened
 
 
 def check_receivers(links: Any) -> Iterator[Finding]:
-    """Findings about receivers' places that levels contradict: the first kind that explains them."""
+    """Findings about receivers' places that levels contradict: the first kind that explains it."""
     known = sample_of_given(links)
     if known is None:
         return
     sample, names = known
-    found = [*check_conventions(sample)]
+    findings = [*check_conventions(sample)]
     exchanged = [*check_order(sample, names)]
-    # Gateways in the corners of a room that is mirrored seem exchanged, too: the clearly closer fit
-    # counts.
-    if exchanged and (not found or _share(exchanged[0]) < 0.9 * _share(found[0])):
-        found = exchanged
-    yield from found or [*check_origin(sample)] or check_each(sample, names)
+    # Gateways in the corners of a mirrored room seem exchanged, too: the clearly closer fit counts.
+    if exchanged and (not findings or _share(exchanged[0]) < 0.9 * _share(findings[0])):
+        findings = exchanged
+    yield from findings or [*check_origin(sample)] or check_each(sample, names)
 
 
 def check_power(links: Any) -> Iterator[Finding]:
-    """A finding if no usual transmitter has such levels at such distances: places may be in mm, cm
-    or km.
-    """
+    """A finding if no usual transmitter has such levels at such distances, as with mm or km."""
     known = sample_of_given(links)
     if known is None or links.frame is not None:
         return
@@ -52,38 +49,32 @@ def check_power(links: Any) -> Iterator[Finding]:
         return sample.labels + 20 * (4 * math.pi * distances / wavelength).log10()
 
     strong = powers(1e8).quantile(0.95).item()
-    middle = (
-        f"levels of {sample.labels.median():.3g} dBm at {distances.median():.3g} m take a "
-        "transmitter of "
-    )
+    weak = powers(6e9).quantile(0.95).item()
+    usual = f"levels of {sample.labels.median():.3g} dBm at {distances.median():.3g} m"
+    power = f"{usual} take a transmitter of {{:.2g}} dBm in free space"
+    height = offsets[:, 2].abs().min()
     if strong > 60:
-        yield Finding(
-            "unit of places", f"{middle}{strong:.2g} dBm in free space", "are places in mm or cm?"
-        )
-    elif offsets[:, 2].abs().min() > 300 and powers(4e8).quantile(0.95) > 40:
-        text = f"receivers are {offsets[:, 2].abs().min():.3g} m above or below all places"
+        yield Finding("unit of places", power.format(strong), "are places in mm or cm?")
+    elif height > 300 and powers(4e8).quantile(0.95) > 40:
+        text = f"receivers are {height:.3g} m above or below all places"
         yield Finding("unit of places", text, "are places in mm?")
-    elif (weak := powers(6e9).quantile(0.95).item()) < -40:
-        yield Finding(
-            "unit of places", f"{middle}{weak:.2g} dBm in free space", "are places in km?"
-        )
+    elif weak < -40:
+        yield Finding("unit of places", power.format(weak), "are places in km?")
 
 
 def sample_of_given(
     links: Any, most: int = 2000, fewest: int = 8
 ) -> tuple[Sample, list[str]] | None:
-    """Some links of the receivers with a given place and ``fewest`` links or more, and the
-    receivers' names.
-    """
+    """Links of the receivers with a given place and ``fewest`` links or more, and their names."""
     sample = sample_of(links, most)
     counts = sample.receivers.bincount(minlength=len(sample.positions))
     used = counts >= fewest
     if links.uncertainties is not None:
         used &= links.uncertainties == 0
-    kept = used.nonzero()[:, 0]
-    if not len(kept):
+    numbers = used.nonzero()[:, 0]
+    if not len(numbers):
         return None
-    return _only(sample, kept), [links.receivers[k].name for k in kept.tolist()]
+    return _only(sample, numbers), [links.receivers[k].name for k in numbers.tolist()]
 
 
 def check_conventions(sample: Sample) -> Iterator[Finding]:
@@ -117,12 +108,10 @@ def check_order(sample: Sample, names: Sequence[str]) -> Iterator[Finding]:
     costs.diagonal().mul_(0.9)  # receivers stay unless another place is clearly better
     order = torch.from_numpy(linear_sum_assignment(costs.numpy())[1])
     moved = (order != torch.arange(count)).nonzero()[:, 0]
-    own = torch.isin(sample.receivers, moved).nonzero()[:, 0]
-    gain = (
-        _gain(_only(sample, moved), errors[order[sample.receivers[own]], own])
-        if len(moved)
-        else None
-    )
+    if not len(moved):
+        return
+    links = torch.isin(sample.receivers, moved).nonzero()[:, 0]
+    gain = _gain(_only(sample, moved), errors[order[sample.receivers[links]], links])
     if gain is None:
         return
     mend = "are names or places exchanged?"
@@ -135,7 +124,7 @@ def check_order(sample: Sample, names: Sequence[str]) -> Iterator[Finding]:
 
 
 def check_origin(sample: Sample) -> Iterator[Finding]:
-    """A finding if levels follow the distance clearly better once all receivers are shifted alike."""
+    """A finding if a common shift of all receivers explains the levels clearly better."""
     (x, y), gain = best_shift(sample)
     if gain is not None and len(sample.positions) > 1:
         mend = f"rx = rx + [{x:.3g}, {y:.3g}, 0], if their origin is another one"
@@ -145,7 +134,7 @@ def check_origin(sample: Sample) -> Iterator[Finding]:
 
 def check_each(sample: Sample, names: Sequence[str], most: int = 4) -> Iterator[Finding]:
     """Findings about receivers whose levels are those of another place, the clearest first."""
-    found = []
+    findings = []
     for number, name in enumerate(names):
         alone = _only(sample, torch.tensor([number]))
         if len(alone.labels) < 16:  # place, level and slope fit a few links by chance
@@ -156,14 +145,12 @@ def check_each(sample: Sample, names: Sequence[str], most: int = 4) -> Iterator[
         at = ", ".join(f"{x:.4g}" for x in (alone.positions[0, :2] + shift).tolist())
         text = f"from ({at}) m, {shift.norm():.3g} m off its place"
         mend = "check its place, name, axes and unit"
-        found.append(_finding("place of a receiver", f"levels of {name}", gain, text, mend))
-    yield from sorted(found, key=_share)[:most]
+        findings.append(_finding("place of a receiver", f"levels of {name}", gain, text, mend))
+    yield from sorted(findings, key=_share)[:most]
 
 
 def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain | None]:
-    """The shift of all receivers along x and y that explains levels best, within twice the places'
-    extent.
-    """
+    """The common shift along x and y that explains levels best, within twice the extent."""
     low, high = sample.transmitters.amin(0), sample.transmitters.amax(0)
     offsets = sample.transmitters - sample.positions[sample.receivers]  # (n, 3)
     shift = ((low + high) / 2 - sample.positions.mean(0))[:2]
@@ -211,7 +198,11 @@ def _share(finding: Finding) -> float:
 
 def _only(sample: Sample, numbers: Int[Tensor, " k"]) -> Sample:
     """The links of some receivers, numbered anew."""
-    own = sample.at(torch.isin(sample.receivers, numbers).nonzero()[:, 0])
-    _, receivers = own.receivers.unique(return_inverse=True)
-    positions, rotations = sample.positions[numbers], sample.rotations[numbers]
-    return replace(own, receivers=receivers, positions=positions, rotations=rotations)
+    links = sample.at(torch.isin(sample.receivers, numbers).nonzero()[:, 0])
+    _, receivers = links.receivers.unique(return_inverse=True)
+    return replace(
+        links,
+        receivers=receivers,
+        positions=sample.positions[numbers],
+        rotations=sample.rotations[numbers],
+    )

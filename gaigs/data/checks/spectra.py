@@ -94,7 +94,7 @@ class Limits:
 
 
 def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Finding]:
-    """The convention by which spectra are bright towards the transmitters, unless it is the one read.
+    """The convention by which spectra are bright towards their transmitters, if not the one read.
 
     The score of a spectrum says how rare a pixel is that is as bright as the one towards its
     transmitter, less the same in other spectra of the receiver. So what is bright in every spectrum

@@ -16,25 +16,21 @@ from gaigs.io.tables import shortened
 
 
 def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
-    """True for each subcarrier at which all links have one value, or none: a guard or null
-    subcarrier.
+    """True for each guard or null subcarrier: all links have one value there, or 0.
 
     An element may have another value than others. Fewer than five links tell nothing.
     """
     count = len(links.task.frequencies)
     chosen = torch.arange(count)
     few = evenly(torch.arange(len(links)), 64)
-    for index in (
-        few,
-        torch.arange(len(links)),
-    ):  # most subcarriers are channels, which few links show
+    # Most subcarriers are channels, which few links show.
+    for index in (few, torch.arange(len(links))):
         values = links.labels[index]
         absent = lacking(links.receivers, links.query.receivers[index], values.shape[1])  # (n, e)
         strengths = values.abs().amax((1, 2))[:, None, None]
         values = values[..., chosen]
-        first = values[
-            absent.int().argmin(0), torch.arange(values.shape[1])
-        ]  # (e, k), of a link with the element
+        # Of a link that has the element (e, k).
+        first = values[absent.int().argmin(0), torch.arange(values.shape[1])]
         is_same = ((values == first) | absent[..., None]).all(0).all(0)
         is_faint = (values.abs() <= 1e-6 * strengths).all(0).all(0)  # 0 but for rounding
         chosen = chosen[is_same | is_faint]
@@ -63,9 +59,7 @@ def check_constant_subcarriers(links: Any) -> Iterator[Finding]:
 
 
 def check_powers(sample: Sample) -> Iterator[Finding]:
-    """A finding about subcarriers that are 30 dB from the usual one: guards with noise, pilots or
-    unscaled ones.
-    """
+    """A finding about subcarriers 30 dB from the usual one: guards, pilots or unscaled ones."""
     powers = sample.labels.abs().square().mean((0, 1)).clamp_min(1e-300)  # (s,)
     odd = (10 * (powers / powers.median()).log10()).abs() > 30
     if len(sample.labels) >= 5 and odd.any():
@@ -92,15 +86,16 @@ def order_of_subcarriers(sample: Sample) -> Finding | None:
         return None
     powers = values.abs().square().mean((1, 2), keepdim=True)
     values = values / torch.where(powers > 0, powers, 1).sqrt()
-    steps = (
-        values.roll(-1, 2) * values.conj()
-    )  # (n, e, s), the last from the band's end to its start
+    # The last step leads from the band's end to its start.
+    steps = values.roll(-1, 2) * values.conj()  # (n, e, s)
     turn = steps.sum((1, 2), keepdim=True).sgn().conj()
     # Where a subcarrier is left out between two, the phase turns twice as far.
     likeness = torch.stack([(steps * turn**power).sum((0, 1)).abs() for power in (1, 2)]).amax(0)
     likeness = likeness / steps.abs().sum((0, 1)).clamp_min(1e-300)
-    usual, around = likeness.median().item(), likeness[-1].item()
-    least, jump = (part.item() for part in likeness[:-1].min(0))
+    usual = likeness.median().item()
+    around = likeness[-1].item()
+    jump = int(likeness[:-1].argmin())
+    least = likeness[jump].item()
     bound = min(usual, around) - 0.3
     if not (usual > 0.6 and around > 0.6 and (likeness < bound).sum() == 1 and least < bound):
         return None
@@ -114,8 +109,7 @@ def order_of_subcarriers(sample: Sample) -> Finding | None:
         mend = "frequencies = np.sort(frequencies)"
     text = (
         f"channels jump at subcarrier {after} of {count}, with a correlation of {least:.2f}, and "
-        "go on from the last "
-        f"subcarrier to the first, with {around:.2f}: FFT order?"
+        f"go on from the last subcarrier to the first, with {around:.2f}: FFT order?"
     )
     return Finding(
         "order of subcarriers",

@@ -1,6 +1,4 @@
-"""How well the direct wave explains channels: coherently over links, within each link, and by
-power.
-"""
+"""How well the direct wave explains channels: over links, within each link, and by power."""
 
 import math
 from dataclasses import replace
@@ -31,8 +29,9 @@ class Turned(NamedTuple):
 
 
 def direct_distances(sample: Sample) -> Float[Tensor, "n e"]:
-    """Distances of each link's transmitter from the elements of its receiver [m]; lacking ones are
-    in its middle.
+    """Distances of transmitters from the elements of their receivers [m].
+
+    Elements that an array lacks are in its middle.
     """
     elements = pad_sequence([*sample.elements], batch_first=True)  # (r, e, 3)
     places = sample.positions[:, None] + torch.einsum("rwa,rea->rew", sample.rotations, elements)
@@ -40,58 +39,53 @@ def direct_distances(sample: Sample) -> Float[Tensor, "n e"]:
 
 
 def turned(sample: Sample, elements: int = 8, subcarriers: int = 6) -> Turned:
-    """Channels and direct waves at some elements and subcarriers, evenly spread, which show the
-    geometry as well.
-    """
+    """Channels and direct waves at a few elements and subcarriers, evenly spread."""
     chosen = evenly(torch.arange(sample.labels.shape[1]), elements)
     tones = evenly(torch.arange(len(sample.frequencies)), subcarriers)
-    phases = direct_distances(sample)[:, chosen, None] * (
-        -2 * math.pi / speed_of_light * sample.frequencies[tones]
-    )
+    wavenumbers = -2 * math.pi / speed_of_light * sample.frequencies[tones]
+    phases = direct_distances(sample)[:, chosen, None] * wavenumbers  # (n, e, s)
     sizes = torch.tensor([len(array) for array in sample.elements])[sample.receivers]
-    channels = sample.labels[:, chosen][..., tones] * (chosen < sizes[:, None])[..., None]
+    exists = (chosen < sizes[:, None])[..., None]  # (n, e, 1)
+    channels = sample.labels[:, chosen][..., tones] * exists
     powers = channels.abs().square().mean((1, 2), keepdim=True)
     channels = channels / torch.where(powers > 0, powers, 1).sqrt()
     return Turned(channels, torch.polar(torch.ones_like(phases), phases), sample.frequencies[tones])
 
 
 def has_extent(sample: Sample) -> bool:
-    """True unless distances differ by less than a wavelength, or an array is smaller than a tenth
-    of one.
-    """
+    """False if distances differ by under a wavelength, or an array is below a tenth of one."""
     wavelength = speed_of_light / sample.frequencies.mean()
+    for array in sample.elements:
+        extent = (array.amax(0) - array.amin(0)).norm()
+        if 0 < extent < wavelength / 10:
+            return False
     distances = (sample.transmitters - sample.positions[sample.receivers]).norm(dim=1)
-    extents = [(array.amax(0) - array.amin(0)).norm() for array in sample.elements]
-    return bool(distances.std() > wavelength) and not any(
-        0 < extent < wavelength / 10 for extent in extents
-    )
+    return bool(distances.std() > wavelength)
 
 
 def without_geometry(sample: Sample) -> Sample:
-    """The same channels of transmitters and elements in the middle of their receiver: waves without
-    a phase.
-    """
+    """The same channels with all transmitters and elements in the middle of their receiver."""
     points = tuple(torch.zeros_like(array) for array in sample.elements)
     return replace(sample, transmitters=sample.positions[sample.receivers], elements=points)
 
 
 def shares(sample: Sample, is_calibrated: bool = False) -> Float[Tensor, "2 r"]:
-    """Share of the power that the direct wave keeps in each receiver's mean over links, for each
-    sign of its phase.
+    """Share of power that the direct wave keeps in each receiver's mean, by sign of its phase.
 
-    That of chance is taken off. Unless arrays are calibrated, each element and subcarrier may have
-    a phase of its own, the same in all links.
+    The share of chance is taken off. Unless arrays are calibrated, each element and subcarrier may
+    have a phase of its own, the same in all links.
     """
-    counts, found = sample.receivers.bincount(minlength=len(sample.positions)), []
+    counts = sample.receivers.bincount(minlength=len(sample.positions))
+    by_sign = []
     for still in turned(sample).still():
         if is_calibrated:
             still = still.mean((1, 2), keepdim=True)
-        totals = still.new_zeros(len(counts), *still.shape[1:]).index_add(
-            0, sample.receivers, still
-        )
-        powers = totals.abs().square().mean((1, 2)) / counts.clamp_min(1)  # n |mean|^2, by chance 1
-        found.append((powers - 1) / (counts - 1).clamp_min(1) * (counts > 1))
-    return torch.stack(found)
+        totals = still.new_zeros(len(counts), *still.shape[1:])
+        totals = totals.index_add(0, sample.receivers, still)  # (r, e, s)
+        # n |mean|^2, which is 1 by chance.
+        powers = totals.abs().square().mean((1, 2)) / counts.clamp_min(1)
+        by_sign.append((powers - 1) / (counts - 1).clamp_min(1) * (counts > 1))
+    return torch.stack(by_sign)
 
 
 def coherence(sample: Sample, is_calibrated: bool = False) -> float:
@@ -105,29 +99,28 @@ def likeness(sample: Sample) -> float:
 
     Each element and subcarrier may have a phase of its own, the same in all links.
     """
-    found = []
+    by_sign = []
     for still in turned(sample).still():
-        explained = 0.0
+        power = 0.0
         for receiver in sample.receivers.unique():
-            own = still[sample.receivers == receiver].flatten(1)  # (k, m)
-            common = torch.ones_like(own[0])
+            links = still[sample.receivers == receiver].flatten(1)  # (k, m)
+            common = torch.ones_like(links[0])
             for _ in range(3):  # the power method for the first singular vector
-                common = own.mH @ (own @ common)
-            explained += (
-                (own @ common).abs().square().sum() / common.abs().square().sum().clamp_min(1e-300)
-            ).item()
-        found.append(explained / still.numel())
-    return max(found)
+                common = links.mH @ (links @ common)
+            size = common.abs().square().sum().clamp_min(1e-300)
+            power += ((links @ common).abs().square().sum() / size).item()
+        by_sign.append(power / still.numel())
+    return max(by_sign)
 
 
 def aligned_likeness(sample: Sample) -> float:
-    """Share of the power that the direct wave explains after the best phase and delay of each link."""
+    """Share of power that the direct wave explains after each link's best phase and delay."""
     parts = turned(sample, subcarriers=16)
-    kept = [
-        still * alignment(still, torch.ones_like(still), parts.frequencies)
-        for still in parts.still()
-    ]
-    return max(still.mean((1, 2)).abs().square().mean().item() for still in kept)
+    by_sign = []
+    for still in parts.still():
+        aligned = still * alignment(still, torch.ones_like(still), parts.frequencies)
+        by_sign.append(aligned.mean((1, 2)).abs().square().mean().item())
+    return max(by_sign)
 
 
 def level_share(sample: Sample) -> float:
