@@ -21,6 +21,7 @@ from gaigs.data.simulation import (
     to_spectra,
 )
 from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, is_free, respond, trace
+from gaigs.io.meshes import Mesh
 from gaigs.registry import register
 
 ROOM = Room(
@@ -163,24 +164,19 @@ def edges(room: Room) -> Float[Tensor, "k 2 3"]:
     return (lower[:, None] + (upper - lower)[:, None] * corners)[:, pairs].flatten(0, 1)
 
 
-def wavefront_obj(room: Room) -> str:
-    """The room as a Wavefront OBJ file [m]: one object a cuboid, with each wall's material."""
-    # Corners from 1 of the faces in the order of ``Room.walls``, counterclockwise as seen from
-    # outside.
-    sides = (1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)
-    lines = []
+def meshes(room: Room) -> list[Mesh]:
+    """The room and its furniture: a mesh for each material of a cuboid."""
+    # Corners of the faces in the order of ``Room.walls``, counterclockwise as seen from outside.
+    sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     cuboids = [("room", (0.0, 0.0, 0.0), room.size, room.walls)]
-    cuboids += [
-        (box.name, box.lower, box.upper, (f"loss_{box.loss_db:g}_db",) * 6)
-        for box in room.furniture
-    ]
-    for number, (name, lower, upper, materials) in enumerate(cuboids):
-        lines.append(f"o {name}")
-        corners = itertools.product(*zip(lower, upper, strict=True))
-        lines += [f"v {x:g} {y:g} {z:g}" for x, y, z in corners]
-        for face, material in zip(sides, materials, strict=True):
-            lines += [
-                f"usemtl {material}",
-                "f " + " ".join(str(8 * number + corner) for corner in face),
-            ]
-    return "\n".join(lines) + "\n"
+    for box in room.furniture:
+        cuboids.append((box.name, box.lower, box.upper, (f"loss_{box.loss_db:g}_db",) * 6))
+    parts = []
+    for name, lower, upper, materials in cuboids:
+        corners = tuple(itertools.product(*zip(lower, upper, strict=True)))
+        faces: dict[str, list[tuple[int, ...]]] = {}
+        for side, material in zip(sides, materials, strict=True):
+            faces.setdefault(material, []).append(side)
+        for material, alike in faces.items():
+            parts.append(Mesh(name, material, corners, tuple(alike)).compact())
+    return parts
