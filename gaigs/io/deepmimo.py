@@ -44,11 +44,13 @@ def write_scenario(
 
     Example:
         >>> from gaigs.io.deepmimo import Station, write_scenario
-        >>> users, station = np.array([[3.0, 0.0, 1.0], [0.0, 4.0, 1.0]]), np.array([0.0, 0.0, 1.0])
+        >>> users = np.array([[3.0, 0.0, 1.0], [0.0, 4.0, 1.0]])
         >>> gains = 0.01 * np.exp(-2j * np.pi * 3.5e9 / 299792458 * np.array([[3.0], [4.0]]))
-        >>> write_scenario(tmp_path, 3.5e9, users, [Station(station, gains, np.zeros((2, 1, 0, 3)))])
-        >>> gaigs.links("deepmimo", root=tmp_path, subcarriers=4).labels.shape
-        torch.Size([2, 8, 4])
+        >>> station = Station(np.array([0.0, 0.0, 1.0]), gains, np.zeros((2, 1, 0, 3)))
+        >>> write_scenario(tmp_path, 3.5e9, users, [station])
+        >>> np.load(tmp_path / "power_t000_tx000_r001.npz")["power"].round()
+        array([[-40.],
+               [-40.]], dtype=float32)
     """
     folder = Path(folder)
     depth = 0

@@ -9,7 +9,11 @@ from gaigs.io.meshes import Mesh
 
 
 def write_gltf(file: Path, meshes: Sequence[Mesh], extras: Sequence[Mapping[str, float]]) -> None:
-    """Writes meshes as ``.glb`` or, with its buffers within, ``.gltf``: a node each, with extras."""
+    """Writes meshes as ``.glb``, or as ``.gltf`` with its buffers within: a node each, with extras.
+
+    Args:
+        extras: Numbers of each node by name.
+    """
     import trimesh  # slow to import
     from trimesh.exchange import gltf
     from trimesh.visual import TextureVisuals

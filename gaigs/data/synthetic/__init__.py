@@ -40,9 +40,7 @@ ROOM = Room(
 """The default room; its corner is the world's origin, z points up."""
 
 POSE = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.15403, 0.87354, 0.23087, 0.39989))
-"""Pose of the array: high in the corner at the origin, facing down into the room, and turned about
-its normal.
-"""
+"""Pose of the array: high in the corner at the origin, facing down, turned about its normal."""
 
 GATEWAYS = {
     "west": (0.1, 2.6, 2.4),
@@ -65,10 +63,10 @@ def furnished_room(
     order: int = 2,
     seed: int = 0,
 ) -> Links:
-    """Spectra of transmitters at random places in the default room; the official split tests on the
-    last fifth of them.
+    """Spectra of transmitters at random places in the default room.
 
-    Each place sends at each carrier, and these links share a row.
+    The official split tests on the last fifth of the places. Each place sends at each carrier, and
+    these links share a row.
 
     Args:
         spectrum: ``band``: power averaged over the band, as a channel sounder reports it; paths
@@ -111,22 +109,17 @@ def respond_in_parts(
     offsets: Float[Tensor, " f"],
     order: int,
 ) -> Iterator[Complex[Tensor, "part elements f"]]:
-    """``respond`` for the paths of at most ``order`` reflections in any room, ``PART`` transmitters
-    [m] at a time.
+    """``respond`` for the paths of at most ``order`` reflections in any room.
+
+    ``PART`` transmitters [m] are taken at a time.
     """
     for part in transmitters.split(PART):
-        yield respond(
-            trace(room, part, receiver.pose.position, frequency, order),
-            receiver,
-            frequency,
-            offsets,
-        )
+        paths = trace(room, part, receiver.pose.position, frequency, order)
+        yield respond(paths, receiver, frequency, offsets)
 
 
 def place(count: int, seed: int) -> Float[Tensor, "count 3"]:
-    """Random places in the default room [m], uniform over the part of ``REGION`` that is free of
-    furniture.
-    """
+    """Random places in the default room [m], uniform over the free part of ``REGION``."""
     lower, upper = torch.tensor(REGION)
     return draw_places(lower, upper, lambda points: is_free(ROOM, points), count, seed)
 
@@ -156,12 +149,15 @@ def spectra(
 
 def edges(room: Room) -> Float[Tensor, "k 2 3"]:
     """Edges of the room and its furniture [m], 12 of each cuboid."""
-    corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))
+    corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))  # of the unit cube
     pairs = torch.combinations(torch.arange(8))
-    pairs = pairs[(corners[pairs[:, 0]] - corners[pairs[:, 1]]).abs().sum(-1) == 1]
+    # An edge joins corners that differ along one axis.
+    steps = (corners[pairs[:, 0]] - corners[pairs[:, 1]]).abs().sum(-1)
+    pairs = pairs[steps == 1]  # (12, 2)
     lower = torch.tensor([(0.0, 0.0, 0.0), *(box.lower for box in room.furniture)])
     upper = torch.tensor([room.size, *(box.upper for box in room.furniture)])
-    return (lower[:, None] + (upper - lower)[:, None] * corners)[:, pairs].flatten(0, 1)
+    points = lower[:, None] + (upper - lower)[:, None] * corners  # (cuboids, 8, 3)
+    return points[:, pairs].flatten(0, 1)
 
 
 def meshes(room: Room) -> list[Mesh]:
