@@ -1,7 +1,7 @@
 """Scores of fits of one gain over free space to channels, and the influence of a few links on them.
 
     python benchmarks/channel_gains.py                                   the built-in room
-    python benchmarks/channel_gains.py l_shape slanted furnished         rooms of the ray tracer; needs gaigs[sionna]
+    python benchmarks/channel_gains.py l_shape slanted furnished         rooms of the ray tracer; needs sionna-rt
 
 Gains are fitted to the training links, scores are of the validation links, a quarter of those that
 are not tested on. Prints a table in Markdown: median SNR and mean SINAD [dB], and by how much the

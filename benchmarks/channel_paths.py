@@ -1,7 +1,7 @@
 """Scores of channels of which some kinds of paths are known exactly: what a model of walls can
 reach in a traced room.
 
-    python benchmarks/channel_paths.py l_shape slanted furnished         rooms of the ray tracer; needs gaigs[sionna]
+    python benchmarks/channel_paths.py l_shape slanted furnished         rooms of the ray tracer; needs sionna-rt
 
 Test places of ``sionna_csi``, traced anew. Prints a table in Markdown: each kind's share of a
 place's power, and SNR of channels of this kind of paths and all kinds above. docs/results.md has
@@ -9,6 +9,7 @@ the numbers.
 """
 
 import sys
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,9 +18,12 @@ from numpy import ndarray
 from torch import Tensor
 
 from gaigs.data import load
-from gaigs.data.sionna import ROOMS, tracing
 from gaigs.data.synthetic.image_source import Paths, respond
 from gaigs.report.table import markdown
+
+sys.path.append(str(Path(__file__).parents[1] / "plugins/sionna"))  # the plug-in
+from gaigs_sionna import tracing
+from gaigs_sionna.rooms import ROOMS
 
 KINDS = "walls, two reflections or fewer", "walls, three", "furniture", "edges"
 

@@ -6,7 +6,7 @@
 The room is exported as a scene of Mitsuba, loaded by Sionna RT, and traced at the test places, with
 as many reflections as the model's paths have and up to ``DEPTH`` crossings of furniture. Each
 receiver's channels have the gain that stands in the scene's file; nothing is fitted to the links
-that are compared. Prints tables in Markdown. Needs gaigs[sionna].
+that are compared. Prints tables in Markdown. Needs sionna-rt.
 """
 
 import cmath
@@ -23,13 +23,15 @@ from torch import Tensor
 import gaigs
 from gaigs.core.query import Query
 from gaigs.data import Links
-from gaigs.data.sionna.tracing import open_scene, trace_scene
 from gaigs.data.synthetic.image_source import respond
 from gaigs.model.kriging import Kriging
 from gaigs.planes.export import facts
 from gaigs.planes.materials import materials
 from gaigs.report.table import markdown
 from gaigs.runs import links_of, load
+
+sys.path.append(str(Path(__file__).parents[1] / "plugins/sionna"))  # the plug-in
+from gaigs_sionna.tracing import open_scene, trace_scene
 
 FOLDER = Path("runs/learnt_room")
 

@@ -4,6 +4,7 @@ benchmarks/scenario.py
 The model has the faces of the built-in room, 40 random obstacles and no training. Seed 0.
 """
 
+import sys
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +14,12 @@ from scipy.constants import speed_of_light
 
 import gaigs
 from gaigs.core.task.csi import Csi
-from gaigs.data import deepmimo, synthetic
+from gaigs.data import synthetic
 from gaigs.model.mirrored import MirroredSplatting
+
+sys.path.append(str(Path(__file__).parents[1] / "plugins/deepmimo"))  # the plug-in
+from gaigs_deepmimo.readers import read_channels
+from gaigs_deepmimo.scenarios import UPRIGHT
 
 CARRIER, SUBCARRIERS, SIZE = 6.4896e9, 9, (7.0, 5.0, 3.0)
 
@@ -29,14 +34,14 @@ def main() -> None:
             "synthetic_csi", transmitters=60, bandwidth=bandwidth, subcarriers=SUBCARRIERS, order=0
         )
         array = gaigs.Array.planar(rows, columns, speed_of_light / CARRIER / 2)
-        pose = gaigs.Pose(synthetic.POSE.position, torch.tensor(deepmimo.UPRIGHT))
+        pose = gaigs.Pose(synthetic.POSE.position, torch.tensor(UPRIGHT))
         task = Csi(len(array), links.task.frequencies, "known")
         model = room(
             replace(links.scene, receivers=(gaigs.Receiver("array", pose, array),), task=task)
         )
         with tempfile.TemporaryDirectory() as folder:
             gaigs.export(model, Path(folder) / "room.deepmimo", links.query.transmitters)
-            found = deepmimo.read(
+            found = read_channels(
                 Path(folder) / "room.deepmimo", [rows, columns], bandwidth, SUBCARRIERS
             )
         expected = model.predict(found.query)

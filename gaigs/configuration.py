@@ -34,6 +34,7 @@ from omegaconf.errors import (
 
 from gaigs.registry import KINDS, check_type, listed, registry, similar, storable, suggest
 from gaigs.registry.holders import plugin_packages
+from gaigs.registry.shipped import not_installed
 
 log = logging.getLogger(__name__)
 composing = threading.RLock()  # Hydra composes one configuration at a time
@@ -429,18 +430,8 @@ def explain(error: Exception) -> str | None:
             return f"{part} has no key {suggest(word, has)}; it has: {listed(sorted(has))}{hint}"
         case MissingConfigException(missing_cfg_file=str(file), options=list(names)), _:
             kind, _, name = file.rpartition("/")
-            package = (
-                OmegaConf.load(conf_dir() / "published.yaml").packages.get(name)
-                if kind == "model"
-                else None
-            )
-            if package is None:
-                return f"there is no {kind} {suggest(name, names)}; there are: {listed(names)}"
-            folder = package.removeprefix("gaigs-").replace("-", "_")
-            return (
-                f"model {name!r} is in the package {package}, which is not installed\n"
-                f"pip install {package}, or in a copy of the repository pip install plugins/{folder}"
-            )
+            unknown = f"there is no {kind} {suggest(name, names)}; there are: {listed(names)}"
+            return not_installed(kind, name) or unknown
         case HydraException(), _ if str(error).startswith("gaigs: "):  # the message of a job
             reason = f"\n{cause}" if isinstance(cause, OmegaConfBaseException) else ""
             return f"{str(error).removeprefix('gaigs: ')}{reason}"

@@ -122,7 +122,7 @@ def unchecked():
 @pytest.fixture(scope="session")
 def tracer(tmp_path_factory):
     """Sionna RT with few rays and a cache of its own, or the test is skipped."""
-    from gaigs.data.sionna import tracing
+    from gaigs_sionna import tracing
 
     try:
         tracing.find_packages()

@@ -14,7 +14,8 @@ import torch
 from omegaconf import OmegaConf
 
 import gaigs
-from gaigs.data import deepmimo, load, nerf2_spectrum
+from gaigs.data import load, nerf2_spectrum
+from gaigs.io import deepmimo
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.registry import registry
 from gaigs.splatting.pooling.softmax_attention import SoftmaxAttention
@@ -183,13 +184,9 @@ def write_wide_table(root):
 
 def write_scenario(root):
     users = np.random.default_rng(0).uniform((1, -5, 0.5), (9, 5, 2), (20, 3))
-    bounces = np.full((20, 1, 0, 3), np.nan)
-    deepmimo.write(
-        root,
-        3.5e9,
-        users,
-        [(np.zeros(3), 1j / np.linalg.norm(users, axis=1, keepdims=True), bounces)],
-    )
+    fields = 1j / np.linalg.norm(users, axis=1, keepdims=True)
+    station = deepmimo.Station(np.zeros(3), fields, np.full((20, 1, 0, 3), np.nan))
+    deepmimo.write_scenario(root, 3.5e9, users, [station])
     return [f"data.root={root}"]
 
 

@@ -174,6 +174,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ("xyzzy=1", "the configuration has no key 'xyzzy'; it has: baselines, command"),
         ("tokenizer=gaa", "there is no tokenizer 'gaa' (did you mean 'ga'?); there are: euclidean, "),
         ("model=gsrf", "model 'gsrf' is in the package gaigs-gsrf, which is not installed\npip install gaigs-gsrf"),
+        ("data=sionna_csi", "data 'sionna_csi' is in the package gaigs-sionna, which is not installed"),
         ("+experiment=foo", "there is no experiment 'foo'; there are: claims, claims_rssi, csi, mirrored, "),
         ("seed=[", "Hydra cannot read it: no viable alternative at input '['"),
         ("~nothing", "Hydra cannot read it: Could not delete from config. 'nothing' does not exist."),

@@ -4,11 +4,15 @@ import json
 import os
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
 from hatchling.builders.wheel import WheelBuilder
+
+from gaigs.registry import registry
+from gaigs.registry.shipped import PACKAGES
 
 ROOT = Path(__file__).parents[1]
 
@@ -195,3 +199,17 @@ print(json.dumps([str(conf_dir()), registry("projection").names()]))
     conf, projections = place.python(script, gaigs=unpacked)
     assert Path(conf) == unpacked / "gaigs" / "conf"
     assert "mercator" in projections
+
+
+def test_the_table_of_shipped_plug_ins_has_all_entry_points():
+    names = {}
+    for file in (ROOT / "plugins").glob("*/pyproject.toml"):
+        groups = tomllib.loads(file.read_text())["project"]["entry-points"].values()
+        names[file.parent.name] = {name for group in groups for name in group}
+    assert names == {folder: {*shipped} for folder, shipped in PACKAGES.items()}
+
+
+def test_an_unknown_name_of_a_shipped_plug_in_says_how_to_install_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ValueError, match=r"gaigs-sionna, which is not installed\npip install"):
+        registry("data").get("sionna")

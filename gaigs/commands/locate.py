@@ -24,7 +24,7 @@ from gaigs.core.geometry import ExtrapolationWarning, Frame, even_places
 from gaigs.core.query import ROUNDING, as_positions, as_receivers, as_tensor, evenly
 from gaigs.core.task import Task, check_range
 from gaigs.data import Links
-from gaigs.data.matching import check_fit
+from gaigs.data.compatibility import check_fit
 from gaigs.io.files import write_text
 from gaigs.io.tables import find_file, read_table, refuse, shortened
 from gaigs.kriging.links import chance_to_hear, distances, folds_of

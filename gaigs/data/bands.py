@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from jaxtyping import Bool
 from torch import Tensor
 
 from gaigs.core.query import check_carrier
@@ -18,10 +19,10 @@ def hold_out_band(
 
     Args:
         links: Channels at all subcarriers.
-        band_train: Lowest and highest subcarrier to train and validate on [Hz]; None: all, and none
-            is held out.
-        band_test: Lowest and highest subcarrier to test on [Hz], less those to train on; None: all
-            the others.
+        band_train: Lowest and highest subcarrier to train and validate on [Hz]; None for all, with
+            none held out.
+        band_test: Lowest and highest subcarrier to test on [Hz], except those to train on; None for
+            all others.
 
     Raises:
         ValueError: A band is not two carriers in ascending order, or has no subcarrier.
@@ -32,41 +33,47 @@ def hold_out_band(
         return links
     task: Csi = links.task
     chosen = _within(task, "band_train", band_train)
-    others = ~chosen & (
-        torch.tensor(True) if band_test is None else _within(task, "band_test", band_test)
-    )
+    others = ~chosen
+    if band_test is not None:
+        others &= _within(task, "band_test", band_test)
     if not others.any():
         raise ValueError(
-            f"data.band_train={[*band_train]} leaves no subcarrier to test on; choose a narrower band"
+            f"data.band_train={[*band_train]} leaves no subcarrier to test on; "
+            "choose a narrower band"
         )
-    own, rest = task.frequencies[chosen], task.frequencies[others]
-    heard = [
-        part.abs().amax((1, 2)) > 0
-        for part in (links.labels[..., chosen], links.labels[..., others])
-    ]
-    kept = heard[0] & heard[1]
-    if silent := int((~kept).sum()):
-        remarks = "; ".join(
-            filter(None, (links.remarks, f"{silent} that are zero in a band are left out"))
-        )
-        links = replace(kept_links(links, kept), remarks=remarks)
-    carriers = torch.full((len(links),), (own.min() + own.max()).item() / 2)
+    has_both = _has_signal(links, chosen) & _has_signal(links, others)  # (n,)
+    if silent := int((~has_both).sum()):
+        remark = f"{silent} that are zero in a band are left out"
+        remarks = f"{links.remarks}; {remark}" if links.remarks else remark
+        links = replace(kept_links(links, has_both), remarks=remarks)
+    trained = task.frequencies[chosen]
+    carriers = torch.full((len(links),), (trained.min() + trained.max()).item() / 2)
     links = replace(links, query=replace(links.query, frequencies=carriers))
-    part = lambda which, some: replace(
-        links, labels=links.labels[..., which], task=Csi(task.elements, some, task.phase)
-    )
-    return replace(part(chosen, own), held_out=part(others, rest))
+    return replace(_at(links, chosen), held_out=_at(links, others))
 
 
-def _within(task: Csi, option: str, band: Sequence[float]) -> Tensor:
+def _within(task: Csi, option: str, band: Sequence[float]) -> Bool[Tensor, " s"]:
     """True for each subcarrier in a band, to the precision of float64."""
     check_carrier(f"data.{option}", torch.tensor(band, dtype=torch.float64))
     if len(band) != 2 or not band[0] <= band[1]:
         raise ValueError(
             f"data.{option} must be the lowest and the highest subcarrier [Hz], got {[*band]}"
         )
-    found = (task.frequencies >= band[0] * (1 - 1e-9)) & (task.frequencies <= band[1] * (1 + 1e-9))
-    if not found.any():
+    low, high = band
+    is_above = task.frequencies >= low * (1 - 1e-9)
+    is_within = is_above & (task.frequencies <= high * (1 + 1e-9))
+    if not is_within.any():
         span = f"{task.frequencies.min():.7g} to {task.frequencies.max():.7g} Hz"
         raise ValueError(f"data.{option}={[*band]} has no subcarrier; they lie from {span}")
-    return found
+    return is_within
+
+
+def _has_signal(links: Links, subcarriers: Bool[Tensor, " s"]) -> Bool[Tensor, " n"]:
+    return links.labels[..., subcarriers].abs().amax((1, 2)) > 0
+
+
+def _at(links: Links, subcarriers: Bool[Tensor, " s"]) -> Links:
+    """Links with the labels of some subcarriers."""
+    task: Csi = links.task
+    part = Csi(task.elements, task.frequencies[subcarriers], task.phase)
+    return replace(links, labels=links.labels[..., subcarriers], task=part)

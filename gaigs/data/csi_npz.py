@@ -1,14 +1,13 @@
 """Complex channels in one file of arrays, by numpy, MATLAB or HDF5; docs/data.md describes them."""
 
-import contextlib
 import reprlib
-import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
-import scipy.io
 import torch
+from torch import Tensor
 
 from gaigs.core.antenna import Array, Receiver
 from gaigs.core.geometry import Pose
@@ -19,35 +18,46 @@ from gaigs.data.bands import hold_out_band
 from gaigs.data.impulse_responses import from_sionna
 from gaigs.data.parts import check_parts, join
 from gaigs.io import FAR, WITHIN
+from gaigs.io.arrays import ArrayFile, array_format
 from gaigs.io.files import atomic_write
 from gaigs.io.tables import find_file, number_places
 from gaigs.registry import listed, register, suggest
 
+
+class Layout(NamedTuple):
+    """Numbers of an array, ``real``, ``whole`` or ``complex``, and its shape.
+
+    Letters of shapes: n links, k receivers, s subcarriers, e elements, m antennas, p paths.
+    """
+
+    kind: str
+    sizes: tuple[str | int, ...]
+
+    def __str__(self) -> str:
+        shape = str(self.sizes).replace("'", "")
+        return f"{self.kind} numbers of {shape}"
+
+
 ARRAYS = {
-    "tx": ("real", ("n", 3)),
-    "rx": ("real", ("k", 3)),
-    "rx_index": ("whole", ("n",)),
-    "frequencies": ("real", ("s",)),
-    "h": ("complex", ("n", "e", "s")),
-    "elements": ("real", ("e", 3)),
+    "tx": Layout("real", ("n", 3)),
+    "rx": Layout("real", ("k", 3)),
+    "rx_index": Layout("whole", ("n",)),
+    "frequencies": Layout("real", ("s",)),
+    "h": Layout("complex", ("n", "e", "s")),
+    "elements": Layout("real", ("e", 3)),
 }
-"""Numbers and shape of each array: n links, k receivers, s subcarriers, e elements. ``elements``
-may be missing.
-"""
+"""Arrays of files with channels; ``elements`` may be missing."""
 
 RESPONSES = {
-    "tx": ("real", ("n", 3)),
-    "rx": ("real", ("k", 3)),
-    "frequencies": ("real", ("s",)),
-    "carrier": ("real", (1,)),
-    "a": ("complex", ("k", "e", "n", "m", "p", 1)),
-    "tau": ("real", ("k", "n", "p")),
-    "elements": ("real", ("e", 3)),
+    "tx": Layout("real", ("n", 3)),
+    "rx": Layout("real", ("k", 3)),
+    "frequencies": Layout("real", ("s",)),
+    "carrier": Layout("real", (1,)),
+    "a": Layout("complex", ("k", "e", "n", "m", "p", 1)),
+    "tau": Layout("real", ("k", "n", "p")),
+    "elements": Layout("real", ("e", 3)),
 }
-"""The same of files with impulse responses ``a`` and ``tau`` in place of ``h``."""
-
-HDF5 = b"\x89HDF\r\n\x1a\n"
-"""Signature of HDF5 files, at the start or, from MATLAB, after 512 bytes."""
+"""Arrays of files with impulse responses ``a`` and ``tau`` in place of ``h``."""
 
 STRENGTHS = 1e-18, 1e18
 """Range of the strongest entry of a channel, whose square float32 can hold."""
@@ -98,7 +108,8 @@ def read(
         raise ValueError(f"data.arrays has no array {listed(unknown)}; it has: {listed(known)}")
     if parts not in (None, "first", "last"):
         raise ValueError(
-            f"data.parts must be first or last, the axis of real and imaginary part, or null, got {parts!r}"
+            "data.parts must be first or last, the axis of real and imaginary part, or null, "
+            f"got {parts!r}"
         )
     loaded, ignored = _load(file, arrays, parts)
     added: list[str] = []
@@ -111,44 +122,62 @@ def read(
     _check_values(file, loaded)
     check_parts(f"{file}: h", loaded["h"])
     _move_missing_elements_last(file, loaded)
+    links = _to_links(loaded, phase, added, ignored)
+    return hold_out_band(links, band_train, band_test)
 
-    numbers = {name: torch.from_numpy(array) for name, array in loaded.items()}
-    heard = (numbers["h"] != 0).flatten(1).any(1)
-    present, receivers = numbers["rx_index"][heard].unique(return_inverse=True)
-    transmitters = numbers["tx"].float()[heard]
+
+def _to_links(
+    arrays: Mapping[str, np.ndarray], phase: str, added: Sequence[str], ignored: Sequence[str]
+) -> Links:
+    """Links of checked arrays, without channels of zeros.
+
+    Args:
+        added: Remarks on their making.
+        ignored: Names of other arrays in the file.
+    """
+    numbers = {name: torch.from_numpy(array) for name, array in arrays.items()}
+    has_signal = (numbers["h"] != 0).flatten(1).any(1)  # (n,)
+    present, receivers = numbers["rx_index"][has_signal].unique(return_inverse=True)
+    transmitters = numbers["tx"].float()[has_signal]
     places, rows = number_places(transmitters.tolist())
     frequencies = numbers["frequencies"]
     carrier = (frequencies.min() + frequencies.max()).item() / 2
-    count, positions = numbers["h"].shape[1], numbers["rx"].float()
-    elements = numbers.get("elements", torch.zeros(count, 3)).float().expand(len(positions), -1, -1)
-    antennas = [Array(own[own.isfinite().all(1)]) for own in elements]
-    poses = [Pose(position, torch.eye(3)) for position in positions]
-    everyone = [
-        Receiver(f"rx{k}", *parts) for k, parts in enumerate(zip(poses, antennas, strict=True))
-    ]
+    count = numbers["h"].shape[1]
+    elements = numbers.get("elements", torch.zeros(count, 3))
+    everyone = _to_receivers(numbers["rx"].float(), elements.float())
+
     remarks = [
         f"{len(rows)} channels from {len(places)} places at {len(present)} receivers",
         *added,
     ]
-    if silent := int((~heard).sum()):
+    if silent := int((~has_signal).sum()):
         remarks.append(f"{silent} that are zero throughout are left out")
     if absent := [receiver.name for k, receiver in enumerate(everyone) if k not in present]:
         remarks.append(f"receivers without links are left out: {', '.join(absent)}")
-    if count > 1 and "elements" not in loaded:
+    if count > 1 and "elements" not in arrays:
         remarks.append(
-            f"positions of the {count} elements are unknown: all count as standing at their receiver's"
+            f"positions of the {count} elements are unknown: "
+            "all count as standing at their receiver's"
         )
     if ignored:
         remarks.append(f"arrays ignored: {', '.join(ignored)}")
-    links = Links(
+    return Links(
         query=Query(transmitters, receivers, torch.full((len(rows),), carrier)),
         receivers=tuple(everyone[k] for k in present.tolist()),
-        labels=numbers["h"][heard],
+        labels=numbers["h"][has_signal],
         task=Csi(count, frequencies, phase),
         rows=rows,
         remarks="; ".join(remarks),
     )
-    return hold_out_band(links, band_train, band_test)
+
+
+def _to_receivers(positions: Tensor, elements: Tensor) -> list[Receiver]:
+    """Receivers at positions (k, 3), with the same elements (e, 3) or their own (k, e, 3) [m]."""
+    receivers = []
+    for k, offsets in enumerate(elements.expand(len(positions), -1, -1)):
+        array = Array(offsets[offsets.isfinite().all(1)])
+        receivers.append(Receiver(f"rx{k}", Pose(positions[k], torch.eye(3)), array))
+    return receivers
 
 
 def write(folder: str | Path, links: Links) -> None:
@@ -170,145 +199,103 @@ def write(folder: str | Path, links: Links) -> None:
 def _load(
     file: Path, given: Mapping[str, str | list], axis: str | None
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The arrays by name, and the names of ignored arrays; ``given`` has other names of arrays in
-    the file.
+    """The arrays by name, and the names of ignored arrays.
+
+    Args:
+        given: Other names of arrays in the file.
+        axis: Option ``parts`` of ``read``.
     """
     arrays: dict[str, np.ndarray] = {}
-    place, used = "", list[str]()
-    with file.open("rb") as stream:
-        head = stream.read(520)
-    opened, expected = _npz, "an .npz file as numpy.savez writes it"
-    if HDF5 in (head[:8], head[512:520]):
-        opened, expected = _hdf5, "an HDF5 file"
-    elif file.suffix.lower() == ".mat":
-        opened, expected = _mat, "a .mat file as MATLAB writes it"
+    used: set[str] = set()
+    place = ""
+    form = array_format(file)
     try:
-        with opened(file) as (members, get):
-            has = {*members, *given}
-            for name, (kind, sizes) in (
-                RESPONSES if {"a", "tau"} <= has and "h" not in has else ARRAYS
-            ).items():
-                place, names = f"{name}: ", given.get(name, name)
-                names = [names] if isinstance(names, str) else [*names]
-                if name not in given and name not in members:
-                    if name == "elements":
-                        continue
-                    if name == "rx_index" and arrays["rx"].shape[:1] == (1,):
-                        arrays[name] = np.zeros(arrays["tx"].shape[:1], np.int64)
-                        continue
-                    if name == "rx_index" and arrays["rx"].shape[1:] != (3,):
-                        continue  # the error names the shape of rx
-                if len(names) > 1 and not (name in ("h", "a") and len(names) == 2):
-                    raise ValueError(f"data.arrays has {len(names)} names")
-                if missing := [own for own in names if members.count(own) != 1]:
-                    shape = str(sizes).replace("'", "")
-                    raise ValueError(
-                        f"expected one array of {kind} numbers of {shape}, got {members.count(missing[0])} called "
-                        f"{missing[0]!r} among {reprlib.repr(members)}; data.arrays takes other names"
-                    )
-                parts, used = [get(own) for own in names], used + names
-                array = join(parts, axis) if kind == "complex" else parts[0]
-                if opened is not _npz and name != "a":
-                    array = _from_matlab(array, kind, len(sizes))
+        with form.open(file) as content:
+            has = {*content.names, *given}
+            layouts = RESPONSES if {"a", "tau"} <= has and "h" not in has else ARRAYS
+            for name, layout in layouts.items():
+                place = f"{name}: "
+                if name not in has and _is_optional(name, arrays):
+                    continue
+                names = _names_in_file(name, given)
+                array = _read_array(content, names, layout, axis)
+                if form.is_matlab and name != "a":
+                    array = _from_matlab(array, layout)
                 arrays[name] = array
+                used.update(names)
     except ImportError:
         raise
-    except (
-        Exception
-    ) as error:  # damaged files make numpy, scipy and h5py raise exceptions of many types
+    # Damaged files make numpy, scipy and h5py raise exceptions of many types.
+    except Exception as error:
+        expected = form.description
         raise ValueError(f"cannot parse {file}: {place}{error}; expected {expected}") from error
-    return arrays, [name for name in members if name not in used]
+    if "rx_index" not in arrays and "h" in arrays and arrays["rx"].shape[:1] == (1,):
+        arrays["rx_index"] = np.zeros(arrays["tx"].shape[:1], np.int64)
+    return arrays, [name for name in content.names if name not in used]
 
 
-def _from_matlab(array: np.ndarray, kind: str, axes: int) -> np.ndarray:
+def _is_optional(name: str, arrays: Mapping[str, np.ndarray]) -> bool:
+    """True if a file may lack an array, given those in front of it."""
+    if name == "rx_index":
+        # Another shape of rx is an error of its own.
+        return arrays["rx"].shape[:1] == (1,) or arrays["rx"].shape[1:] != (3,)
+    return name == "elements"
+
+
+def _names_in_file(name: str, given: Mapping[str, str | list]) -> list[str]:
+    """The names of an array, or of its real and imaginary part."""
+    names = given.get(name, name)
+    names = [names] if isinstance(names, str) else [*names]
+    if len(names) > 1 and not (name in ("h", "a") and len(names) == 2):
+        raise ValueError(f"data.arrays has {len(names)} names")
+    return names
+
+
+def _read_array(
+    content: ArrayFile, names: Sequence[str], layout: Layout, axis: str | None
+) -> np.ndarray:
+    for name in names:
+        count = content.names.count(name)
+        if count != 1:
+            raise ValueError(
+                f"expected one array of {layout}, got {count} called {name!r} among "
+                f"{reprlib.repr(content.names)}; data.arrays takes other names"
+            )
+    parts = [content.read(name) for name in names]
+    return join(parts, axis) if layout.kind == "complex" else parts[0]
+
+
+def _from_matlab(array: np.ndarray, layout: Layout) -> np.ndarray:
     """MATLAB has no vectors, drops a last axis of 1, and stores whole numbers as doubles."""
+    axes = len(layout.sizes)
     if axes == 1 and array.size == max(array.shape, default=0):
         array = array.reshape(-1)
-    elif kind == "complex" and array.ndim == axes - 1:
+    elif layout.kind == "complex" and array.ndim == axes - 1:
         array = array[..., None]
-    is_whole = kind == "whole" and array.dtype.kind == "f" and (array == np.rint(array)).all()
-    return array.astype(np.int64) if is_whole else array
-
-
-Opened = Iterator[tuple[list[str], Callable[[str], np.ndarray]]]
-
-
-@contextlib.contextmanager
-def _npz(file: Path) -> Opened:
-    """Names of the arrays, and a function that reads one to the end, where zipfile compares
-    checksums.
-    """
-    # Opened here, since numpy leaves a damaged file open; it warns of headers written by Python 2.
-    with file.open("rb") as stream, warnings.catch_warnings(action="ignore"):
-        content = np.load(stream, allow_pickle=False)
-        if not isinstance(content, np.lib.npyio.NpzFile):
-            raise ValueError(f"a single array of shape {content.shape}")
-
-        def get(name: str) -> np.ndarray:
-            with content.zip.open(f"{name}.npy") as member:
-                array = np.lib.format.read_array(member, allow_pickle=False)
-                if member.read(1):
-                    raise ValueError(f"more numbers than its shape {array.shape} has")
-            return array
-
-        yield [name.removesuffix(".npy") for name in content.zip.namelist()], get
-
-
-@contextlib.contextmanager
-def _mat(file: Path) -> Opened:
-    """The same of a MATLAB file before version 7.3."""
-    yield (
-        [name for name, *_ in scipy.io.whosmat(file)],
-        lambda name: np.asarray(scipy.io.loadmat(file, variable_names=[name])[name]),
-    )
-
-
-@contextlib.contextmanager
-def _hdf5(file: Path) -> Opened:
-    """The same of an HDF5 file; those of MATLAB, with reversed axes, have an attribute."""
-    try:
-        import h5py
-    except ModuleNotFoundError as error:
-        raise ImportError(f"{file} needs h5py: pip install 'gaigs[hdf5]'") from error
-    with h5py.File(file, "r") as content:
-        members: list[str] = []
-        content.visititems(
-            lambda name, item: members.append(name) if isinstance(item, h5py.Dataset) else None
-        )
-
-        def get(name: str) -> np.ndarray:
-            array = content[name][()]
-            if array.dtype.names and len(array.dtype.names) == 2:  # MATLAB's complex numbers
-                real, imaginary = (array[part] for part in array.dtype.names)
-                array = real + 1j * imaginary
-            return array.T if "MATLAB_class" in content[name].attrs else array
-
-        yield [name for name in members if not name.startswith("#refs#")], get
+    is_whole = layout.kind == "whole" and array.dtype.kind == "f"
+    return array.astype(np.int64) if is_whole and (array == np.rint(array)).all() else array
 
 
 def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises a ``ValueError`` for other kinds and shapes of arrays; the first array with a size
-    fixes it.
-    """
+    """Raises a ``ValueError`` for other kinds and shapes; the first array with a size fixes it."""
     known: dict[object, int] = {}
     kinds = {"real": "iuf", "whole": "iu", "complex": "c"}  # of numpy's data types
     for name, array in arrays.items():
         kind, letters = ARRAYS[name]
-        letters = ("k", *letters) if name == "elements" and array.ndim == 3 else letters
+        if name == "elements" and array.ndim == 3:
+            letters = ("k", *letters)
         if array.dtype.kind not in kinds[kind]:
-            hint = "; data.arrays={h: [RE, IM]} names real and imaginary part, data.parts=last or first their axis of 2"
-            hint += "; amplitudes alone have no phase"
-            got = f"{array.dtype}{hint}" if kind == "complex" else array.dtype
+            got = str(array.dtype)
+            if kind == "complex":
+                got += (
+                    "; data.arrays={h: [RE, IM]} names real and imaginary part, "
+                    "data.parts=last or first their axis of 2; amplitudes alone have no phase"
+                )
             raise ValueError(f"{file}: {name}: expected {kind} numbers, got {got}")
         sizes = tuple(known.get(letter, letter) for letter in letters)
-        fits = [
-            isinstance(size, str) or size == got
-            for size, got in zip(sizes, array.shape, strict=False)
-        ]
-        if array.ndim != len(sizes) or not all(fits) or not array.size:
-            is_flat = name == "h" and (
-                array.ndim == 2 or array.shape[-1] == 1
-            )  # MATLAB's arrays get a last axis of 1
+        if not array.size or not _fits(array.shape, sizes):
+            # MATLAB's arrays get a last axis of 1.
+            is_flat = name == "h" and (array.ndim == 2 or array.shape[-1] == 1)
             hint = "; for one antenna add an axis, h[:, None, :]" if is_flat else ""
             expected = str(sizes).replace("'", "")
             raise ValueError(
@@ -317,59 +304,71 @@ def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
         known |= dict(zip(letters, array.shape, strict=True))
 
 
+def _fits(shape: Sequence[int], sizes: Sequence[str | int]) -> bool:
+    """True if a shape has given sizes, where letters stand for any size."""
+    if len(shape) != len(sizes):
+        return False
+    return all(isinstance(size, str) or size == got for size, got in zip(sizes, shape, strict=True))
+
+
 def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Converts arrays to the types of the computation; a ``ValueError`` for a number out of range."""
+    """Converts arrays to the types of the computation.
+
+    Raises:
+        ValueError: A number is out of range; the message names array, row and value.
+    """
+    dtypes = {"h": np.complex64, "rx_index": np.int64}
     for name, array in arrays.items():
-        with np.errstate(
-            all="ignore"
-        ):  # numbers too large for a type become infinite, which fails below
-            dtype = {"h": np.complex64, "rx_index": np.int64}.get(name, np.float64)
-            arrays[name] = array = array.astype(dtype, copy=False)
-            match name:
-                case "h":
-                    (low, high), strengths = STRENGTHS, np.abs(array)
-                    strongest = strengths.max((1, 2), keepdims=True)
-                    holds = (strengths < high) & ~((strongest > 0) & (strongest < low))
-                    expected = f"magnitudes below {high:g}, the largest of a link {low:g} or more unless all are 0"
-                case "rx_index":
-                    count = len(arrays["rx"])
-                    holds, expected = (
-                        (array >= 0) & (array < count),
-                        f"a row of rx, counted from 0, 0..{count - 1}",
-                    )
-                case "frequencies":
-                    low, high = CARRIERS
-                    holds, expected = (
-                        (low <= array) & (array <= high),
-                        f"a frequency from {low:g} to {high:g} Hz",
-                    )
-                case _:
-                    # An element that a receiver lacks has no position.
-                    array = (
-                        np.where(np.isnan(array).all(-1, keepdims=True), 0, array)
-                        if array.ndim == 3
-                        else array
-                    )
-                    holds, expected = np.abs(array) < FAR, WITHIN
-        for rule, good in (("a number", ~np.isnan(array)), (expected, holds)):
-            wrong = np.argwhere(~good)
-            if len(wrong):
-                value, rows = array[tuple(wrong[0])], len(np.unique(wrong[:, 0]))
-                got = (
-                    "NaN"
-                    if np.isnan(value)
-                    else f"{value}{unit_hint(value) if name == 'frequencies' else ''}"
-                )
-                count = f"in {rows} of {len(array)} rows"
-                raise ValueError(
-                    f"{file}: {name}{wrong[0].tolist()}: expected {rule}, got {got} ({count})"
-                )
+        # Numbers too large for a type become infinite, which fails below.
+        with np.errstate(all="ignore"):
+            array = array.astype(dtypes.get(name, np.float64), copy=False)
+            arrays[name] = array
+            if name == "elements" and array.ndim == 3:
+                # An element that a receiver lacks has no position.
+                array = np.where(np.isnan(array).all(-1, keepdims=True), 0, array)
+            expected, holds = _rule(name, array, len(arrays["rx"]))
+        _require(file, name, array, "a number", ~np.isnan(array))
+        _require(file, name, array, expected, holds)
     if len(np.unique(arrays["frequencies"])) < len(arrays["frequencies"]):
         raise ValueError(
             f"{file}: frequencies: expected different ones, got one twice; leave one subcarrier out"
         )
     if not arrays["h"].any():
         raise ValueError(f"{file}: h: expected a channel that is not zero throughout, got none")
+
+
+def _rule(name: str, array: np.ndarray, receivers: int) -> tuple[str, np.ndarray]:
+    """The range of an array in words, and True for numbers within it."""
+    if name == "h":
+        low, high = STRENGTHS
+        sizes = np.abs(array)
+        strongest = sizes.max((1, 2), keepdims=True)  # (n, 1, 1)
+        is_faint = (strongest > 0) & (strongest < low)
+        words = f"magnitudes below {high:g}, the largest of a link {low:g} or more unless all are 0"
+        return words, (sizes < high) & ~is_faint
+    if name == "rx_index":
+        words = f"a row of rx, counted from 0, 0..{receivers - 1}"
+        return words, (array >= 0) & (array < receivers)
+    if name == "frequencies":
+        low, high = CARRIERS
+        return f"a frequency from {low:g} to {high:g} Hz", (low <= array) & (array <= high)
+    return WITHIN, np.abs(array) < FAR
+
+
+def _require(file: Path, name: str, array: np.ndarray, expected: str, holds: np.ndarray) -> None:
+    """Raises a ``ValueError`` that names the first number for which a rule does not hold."""
+    wrong = np.argwhere(~holds)
+    if not len(wrong):
+        return
+    value = array[tuple(wrong[0])]
+    got = "NaN" if np.isnan(value) else f"{value}"
+    if name == "frequencies" and not np.isnan(value):
+        got += unit_hint(value)
+    rows = len(np.unique(wrong[:, 0]))
+    raise ValueError(
+        f"{file}: {name}{wrong[0].tolist()}: expected {expected}, got {got} "
+        f"(in {rows} of {len(array)} rows)"
+    )
 
 
 def _move_missing_elements_last(file: Path, arrays: dict[str, np.ndarray]) -> None:

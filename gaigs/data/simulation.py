@@ -1,5 +1,6 @@
 """Data sets of simulated rooms: the same labels, whatever simulates the room."""
 
+import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -23,9 +24,7 @@ from gaigs.data import Links, Parts
 from gaigs.registry import check_type
 
 PART = 64
-"""Transmitters simulated at a time, since the waves of all paths take a hundred times the memory of
-the labels.
-"""
+"""Transmitters simulated at a time: the waves of their paths take 100 times the labels' memory."""
 
 
 @dataclass(frozen=True)
@@ -59,25 +58,19 @@ def simulate_spectra(
     bandwidth: float,
     seed: int,
 ) -> Links:
-    """Spectra of transmitters at random places; ``gaigs.data.synthetic.furnished_room`` describes
-    the options.
+    """Spectra of transmitters at random places.
+
+    ``gaigs.data.synthetic.furnished_room`` describes the options.
     """
-    carriers: list[Any] = list(frequency) if isinstance(frequency, list | tuple) else [frequency]
-    for carrier in carriers:
-        check_type("frequency", carrier, float)
-        check_carrier("frequency", carrier)
-    if not carriers or len(set(carriers)) < len(carriers):
-        raise ValueError(
-            f"frequency must be a carrier or several different ones [Hz], got {frequency}"
-        )
+    carriers = _to_carriers(frequency)
     offsets = spectrum_offsets(spectrum, room.frequency_offsets, bandwidth)
     places = room.place(transmitters, seed)
     receiver = patch_array(room.pose, max(carriers))
     grid = Grid.degrees()
-    labels = [
-        to_spectra(room.respond(places, receiver, f, offsets), grid, receiver.array, f)
-        for f in carriers
-    ]
+    labels = []
+    for carrier in carriers:
+        responses = room.respond(places, receiver, carrier, offsets)
+        labels.append(to_spectra(responses, grid, receiver.array, carrier))
     rows = torch.arange(transmitters).repeat_interleave(len(carriers))
     links = Links(
         query=Query(
@@ -86,7 +79,7 @@ def simulate_spectra(
             torch.tensor(carriers).float().repeat(transmitters),
         ),
         receivers=(receiver,),
-        labels=torch.stack(labels, 1).flatten(0, 1),
+        labels=torch.stack(labels, 1).flatten(0, 1),  # (places * carriers, rows, columns)
         task=Spectrum(grid.elevations, grid.azimuths),
         rows=rows,
         official=partial(last_fifth, transmitters, rows),
@@ -94,6 +87,19 @@ def simulate_spectra(
         edges=room.edges,
     )
     return without_silent(links, transmitters, ~links.labels.isnan().flatten(1).any(1))
+
+
+def _to_carriers(frequency: float | Sequence[float]) -> list[Any]:
+    """The carriers of an option, one or several [Hz]."""
+    carriers: list[Any] = list(frequency) if isinstance(frequency, list | tuple) else [frequency]
+    for carrier in carriers:
+        check_type("frequency", carrier, float)
+        check_carrier("frequency", carrier)
+    if not carriers or len(set(carriers)) < len(carriers):
+        raise ValueError(
+            f"frequency must be a carrier or several different ones [Hz], got {frequency}"
+        )
+    return carriers
 
 
 def simulate_channels(
@@ -105,13 +111,11 @@ def simulate_channels(
     seed: int,
     phase: str = "known",
 ) -> Links:
-    """Channels of transmitters at random places; ``gaigs.data.synthetic_csi`` describes the
-    options.
+    """Channels of transmitters at random places; ``gaigs.data.synthetic_csi`` has the options.
 
     A channel's squared magnitude is the power that an element receives of unit power sent, between
     antennas of unit gain. Its time dependence is exp(+j omega t). There is no noise. Unless
-    ``phase`` is known, each link has a random phase; with ``per_link_and_delay`` also a delay of at
-    most two over the bandwidth, and a gain of -6 to 6 dB.
+    ``phase`` is known, links are distorted at random as a receiver would.
     """
     if not 0 < bandwidth < math.inf:
         raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")
@@ -121,22 +125,12 @@ def simulate_channels(
     offsets = torch.linspace(-edge, edge, subcarriers, dtype=torch.float64)
     places = room.place(transmitters, seed)
     receiver = patch_array(room.pose, frequency)
-    rows, task = torch.arange(transmitters), Csi(len(receiver.array), frequency + offsets, phase)
+    task = Csi(len(receiver.array), frequency + offsets, phase)
     labels = torch.cat([*room.respond(places, receiver, frequency, offsets)])
     if phase != "known":
-        sequence = np.random.SeedSequence((seed % 2**64, 2))  # the places use ``seed`` itself
-        (state,) = sequence.generate_state(1, np.uint64)
-        generator = torch.Generator().manual_seed(int(state) % 2**63)
-        angles, delays, gains = (
-            2 * torch.rand(3, transmitters, 1, 1, generator=generator, dtype=torch.float64) - 1
-        )
-        angles = math.pi * angles
-        if phase == "per_link_and_delay":
-            angles, labels = (
-                angles + 4 * math.pi / bandwidth * delays * offsets,
-                10 ** (0.3 * gains) * labels,
-            )
-        labels = labels * torch.polar(torch.ones_like(angles), angles)
+        has_delays = phase == "per_link_and_delay"
+        labels = _distort(labels, offsets, bandwidth if has_delays else None, seed)
+    rows = torch.arange(transmitters)
     links = Links(
         query=Query(places, torch.zeros_like(rows), torch.full((transmitters,), float(frequency))),
         receivers=(receiver,),
@@ -149,67 +143,89 @@ def simulate_channels(
     return without_silent(links, transmitters, links.labels.flatten(1).any(1))
 
 
-def without_silent(links: Links, transmitters: int, heard: Bool[Tensor, " n"]) -> Links:
-    """Links from places that a path leads to; the remarks count the others. A ``ValueError`` if
-    there are too few.
+def _distort(
+    labels: Complex[Tensor, "n elements f"],
+    offsets: Float[Tensor, " f"],
+    bandwidth: float | None,
+    seed: int,
+) -> Complex[Tensor, "n elements f"]:
+    """Channels with a random phase a link.
+
+    With a bandwidth [Hz] each link also has a delay of at most two over the bandwidth, and a gain
+    of -6 to 6 dB.
     """
-    if heard.all():
+    sequence = np.random.SeedSequence((seed % 2**64, 2))  # the places use ``seed`` itself
+    (state,) = sequence.generate_state(1, np.uint64)
+    generator = torch.Generator().manual_seed(int(state) % 2**63)
+    draws = 2 * torch.rand(3, len(labels), 1, 1, generator=generator, dtype=torch.float64) - 1
+    turns, delays, gains = draws  # (n, 1, 1) each
+    angles = math.pi * turns
+    if bandwidth is not None:
+        angles = angles + 4 * math.pi / bandwidth * delays * offsets
+        labels = 10 ** (0.3 * gains) * labels
+    return labels * torch.polar(torch.ones_like(angles), angles)
+
+
+def without_silent(links: Links, transmitters: int, has_path: Bool[Tensor, " n"]) -> Links:
+    """Links from places that a path leads to; the remarks count the others.
+
+    Raises:
+        ValueError: Paths lead to fewer than two places.
+    """
+    if has_path.all():
         return links
-    rows = links.rows[heard]
+    rows = links.rows[has_path]
     if len(rows.unique()) < 2:
         raise ValueError(
-            f"paths must lead to two of {transmitters} transmitters or more; move the receiver or heights"
+            f"paths must lead to two of {transmitters} transmitters or more; "
+            "move the receiver or heights"
         )
     return replace(
         links,
-        query=links.query[heard],
-        labels=links.labels[heard],
+        query=links.query[has_path],
+        labels=links.labels[has_path],
         rows=rows,
         official=partial(last_fifth, transmitters, rows),
-        remarks=f"{int((~heard).sum())} links without a path are left out",
+        remarks=f"{int((~has_path).sum())} links without a path are left out",
     )
 
 
 def simulate_readings(
     room: SimulatedRoom, transmitters: int, noise: float, sensitivity: float, seed: int
 ) -> Links:
-    """Signal strength of transmitters of 0 dBm at random places; ``gaigs.data.synthetic_rssi``
-    describes the options.
+    """Signal strength of transmitters of 0 dBm at random places.
 
-    Power is averaged over the band of Bluetooth's advertising channels. The links of one place
-    share a row.
+    ``gaigs.data.synthetic_rssi`` describes the options. Power is averaged over the band of
+    Bluetooth's advertising channels. The links of one place share a row.
     """
     if not 0 <= noise < math.inf:
         raise ValueError(f"noise must be a standard deviation, 0 or more [dB], got {noise}")
     places = room.place(transmitters, seed)
-    frequency, bandwidth = 2.441e9, 78e6  # Bluetooth's advertising channels span 2.402 to 2.480 GHz
+    # Bluetooth's advertising channels span 2.402 to 2.480 GHz.
+    frequency = 2.441e9
+    bandwidth = 78e6
     offsets = room.frequency_offsets(bandwidth)
-    strengths = torch.stack(
-        [
-            torch.cat([*map(rss_dbm, room.respond(places, each, frequency, offsets))])
-            for each in room.gateways
-        ],
-        1,
-    )
-    generator = torch.Generator().manual_seed(
-        hash((seed, 1)) % 2**63
-    )  # the places use ``seed`` itself
-    readings = strengths + noise * torch.randn(
-        strengths.shape, dtype=strengths.dtype, generator=generator
-    )
-    heard = readings >= sensitivity
-    if deaf := [
-        each.name
-        for each, any_heard in zip(room.gateways, heard.any(0), strict=True)
-        if not any_heard
-    ]:
-        none = f"{deaf[0]!r} hears none of {len(places)} at {sensitivity:g} dBm"
-        raise ValueError(f"sensitivity must let each gateway hear a reading, but {none}; lower it")
-    rows, columns = heard.nonzero(as_tuple=True)
+    strengths = []
+    for gateway in room.gateways:
+        responses = room.respond(places, gateway, frequency, offsets)
+        strengths.append(torch.cat([*map(rss_dbm, responses)]))
+    exact = torch.stack(strengths, 1)  # (places, gateways)
+    # The places use ``seed`` itself.
+    generator = torch.Generator().manual_seed(hash((seed, 1)) % 2**63)
+    errors = torch.randn(exact.shape, dtype=exact.dtype, generator=generator)
+    readings = exact + noise * errors
+    is_received = readings >= sensitivity
+    for gateway, is_any in zip(room.gateways, is_received.any(0), strict=True):
+        if not is_any:
+            got = f"{gateway.name!r} hears none of {len(places)} at {sensitivity:g} dBm"
+            raise ValueError(
+                f"sensitivity must let each gateway hear a reading, but {got}; lower it"
+            )
+    rows, columns = is_received.nonzero(as_tuple=True)
     return Links(
         query=Query(places[rows], columns, torch.full((len(rows),), frequency)),
         receivers=room.gateways,
-        labels=readings[heard].float(),
+        labels=readings[is_received].float(),
         task=Rssi(),
         rows=rows,
         official=partial(last_fifth, transmitters, rows),
@@ -217,7 +233,8 @@ def simulate_readings(
         edges=room.edges,
         remarks=(
             f"{len(rows)} readings of {len(places)} places at {len(room.gateways)} gateways; "
-            f"{int((~heard).sum())} below {sensitivity:g} dBm were not heard and are left out"
+            f"{int((~is_received).sum())} below {sensitivity:g} dBm "
+            "were not heard and are left out"
         ),
     )
 
@@ -232,15 +249,16 @@ def spectrum_offsets(
 
 
 def patch_array(pose: Pose, frequency: float) -> Receiver:
-    """A receiver with 4 x 4 patches, as in the NeRF² spectra, half a wavelength of the frequency
-    [Hz] apart.
+    """A receiver with 4 x 4 patches half a wavelength of the frequency [Hz] apart.
+
+    The NeRF² spectra have such an array.
     """
     check_carrier("frequency", frequency)
     return Receiver("gateway1", pose, Array.planar(4, 4, speed_of_light / frequency / 2, "cosine"))
 
 
 def last_fifth(transmitters: int, rows: Int[Tensor, " n"]) -> Parts:
-    """Official parts of links by the transmitter of each; the last fifth of the transmitters tests."""
+    """Official parts of links by the transmitter of each: the last fifth of these tests."""
     training = transmitters - max(1, round(transmitters / 5))
     return (rows < training).nonzero()[:, 0], (rows >= training).nonzero()[:, 0]
 
@@ -258,25 +276,30 @@ def draw_places(
             f"transmitters must be at least 2, one to train and one to test on, got {count}"
         )
     generator = torch.Generator().manual_seed(seed)
-    places, rounds = torch.zeros(0, 3), 0
-    while len(places) < count:
+    places = torch.zeros(0, 3)
+    for tried in itertools.count(count, count):
         tries = lower + (upper - lower) * torch.rand(count, 3, generator=generator)
-        places, rounds = torch.cat((places, tries[is_free(tries)])), rounds + 1
-        if rounds == 1000 and not len(places):
+        places = torch.cat((places, tries[is_free(tries)]))
+        if len(places) >= count:
+            break
+        if tried == 1000 * count and not len(places):
             raise ValueError(
-                f"transmitters must have free space to stand in, got none at {1000 * count} places tried"
+                f"transmitters must have free space to stand in, got none at {tried} places tried"
             )
     return places[:count]
 
 
 def sample_band(bandwidth: float, longest: float) -> Float[Tensor, " f"]:
-    """Frequencies that sample a band, relative to its middle [Hz]: no beat of paths up to a length
-    [m] is aliased.
+    """Frequencies that sample a band, relative to its middle [Hz].
+
+    Beats of paths up to the longest length [m] are not aliased.
     """
     if not 0 < bandwidth < math.inf:
         raise ValueError(
-            f"bandwidth must be positive [Hz], got {bandwidth}; one frequency is the spectrum 'carrier'"
+            f"bandwidth must be positive [Hz], got {bandwidth}; "
+            "one frequency is the spectrum 'carrier'"
         )
+    # Two paths beat with a period of the speed of light over their difference in length.
     count = math.ceil(bandwidth * longest / speed_of_light) + 1
     return torch.linspace(-bandwidth / 2, bandwidth / 2, count, dtype=torch.float64)
 
@@ -288,13 +311,15 @@ def to_spectra(
     frequency: float,
 ) -> Float[Tensor, "n rows columns"]:
     """Spectra of an array's responses at a carrier [Hz], float32 in [0, 1]."""
-    return torch.cat(
-        [min_max(bartlett(part, grid, array, frequency)).float() for part in responses]
-    )
+    spectra = []
+    for part in responses:
+        spectra.append(min_max(bartlett(part, grid, array, frequency)).float())
+    return torch.cat(spectra)
 
 
 def rss_dbm(responses: Complex[Tensor, "b elements f"]) -> Float[Tensor, " b"]:
-    """Received signal strength of a transmitter of 0 dBm [dBm]: power averaged over elements and
-    frequencies.
+    """Received signal strength of a transmitter of 0 dBm [dBm].
+
+    Power is averaged over elements and frequencies.
     """
     return 10 * torch.log10(responses.abs().square().mean((1, 2)))

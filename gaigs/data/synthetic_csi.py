@@ -1,6 +1,4 @@
-"""Complex channels of the built-in room, as a wideband receiver with an antenna array estimates
-them.
-"""
+"""Complex channels of the built-in room, at a wideband receiver with an antenna array."""
 
 from collections.abc import Sequence
 
@@ -23,8 +21,7 @@ def furnished_room_csi(
     band_train: Sequence[float] | None = None,
     band_test: Sequence[float] | None = None,
 ) -> Links:
-    """Channels of transmitters at random places in the default room, at each element of its 4 x 4
-    array.
+    """Channels of transmitters at random places in the default room, at its array of 4 x 4.
 
     Places, array and other options are those of ``synthetic``; unit and time dependence are those
     of ``gaigs.data.simulation.simulate_channels``. The official split tests on the last fifth of

@@ -14,11 +14,10 @@ def furnished_room_rssi(
     order: int = 2,
     seed: int = 0,
 ) -> Links:
-    """Signal strength of transmitters of 0 dBm at random places in the default room, at four
-    gateways.
+    """Signal strength of transmitters of 0 dBm at random places in the default room.
 
-    Antennas are isotropic. Links of one place share a row. The official split tests on the last
-    fifth of the places.
+    Four gateways receive. Antennas are isotropic. Links of one place share a row. The official
+    split tests on the last fifth of the places.
 
     Args:
         noise: Standard deviation of the Gaussian error of each reading [dB].

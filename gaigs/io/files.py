@@ -10,8 +10,7 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary path with the same ending, which replaces the file once it is written and
-    on the disk.
+    """Yields a temporary path with the same ending, which replaces the file once it is on the disk.
 
     Each writer has a path of its own: of several the last replaces the file. If writing fails or is
     interrupted, the temporary file is removed and the old file stays.
@@ -56,22 +55,25 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def file_message(error: OSError, folder: Path) -> str:
-    """The message of a file's error: its own, or for a plain system error the file or folder, cause
-    and remedy.
+    """The message of a file's error.
+
+    For a plain system error it is the file or folder, the cause and the remedy.
     """
     if error.errno is None or error.strerror != os.strerror(error.errno):
         return str(error.strerror or error)
     path = error.filename or f"a file in {folder}"
-    if error.errno in (
-        errno.ENOSPC,
-        errno.EDQUOT,
-        errno.EFBIG,
-        errno.EROFS,
-    ):  # only writing raises them
+    # Only writing raises these.
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS):
         return _unwritten(path, error)
-    return f"{path} could not be read or written ({error.strerror})\ncheck its folder and permissions, and try again"
+    return (
+        f"{path} could not be read or written ({error.strerror})\n"
+        "check its folder and permissions, and try again"
+    )
 
 
 def _unwritten(path: object, error: OSError) -> str:
     cause = error.strerror or error
-    return f"{path} could not be written ({cause})\ncheck that its folder exists and has room, and try again"
+    return (
+        f"{path} could not be written ({cause})\n"
+        "check that its folder exists and has room, and try again"
+    )

@@ -11,16 +11,12 @@ from jaxtyping import Float, Int, UInt
 from PIL import Image
 from torch import Tensor
 
-MODES = {"1", "L", "LA", "P", "RGB", "RGBA", "I", "I;16", "I;16B"}
-"""Pillow's modes that may hold grey values."""
-
 
 class GreyImages:
-    """PNGs of grey values (rows, columns), decoded when first requested and then kept at one or two
-    bytes a pixel.
+    """PNGs of grey values (rows, columns), decoded when first requested and then kept.
 
-    8-bit values count in 255, 16-bit ones in 65535. Colour images have equal channels, and no pixel
-    is transparent.
+    They take one or two bytes a pixel. 8-bit values count in 255, 16-bit ones in 65535. Colour
+    images have equal channels, and no pixel is transparent.
 
     Raises:
         ValueError: A file has no PNG header, or another shape; when requested: its pixels are
@@ -28,20 +24,22 @@ class GreyImages:
     """
 
     def __init__(self, files: Sequence[Path], shape: tuple[int, int]):
+        # Pillow's modes that may hold grey values.
+        allowed = {"1", "L", "LA", "P", "RGB", "RGBA", "I", "I;16", "I;16B"}
         modes = set()
         for file in files:
             with _opened(file) as image:  # reads the header only
-                mode, (width, height) = image.mode, image.size
-            if mode not in MODES or (height, width) != shape:
+                mode = image.mode
+                width, height = image.size
+            if mode not in allowed or (height, width) != shape:
                 expected = f"grey values of {shape[0]} x {shape[1]} pixels"
                 raise ValueError(
                     f"{file}: expected {expected}, got mode {mode} of {height} x {width}"
                 )
             modes.add(mode)
         self.files = files
-        self._pixels = np.empty(
-            (len(files), *shape), np.uint16 if any("I" in mode for mode in modes) else np.uint8
-        )
+        dtype = np.uint16 if any("I" in mode for mode in modes) else np.uint8
+        self._pixels = np.empty((len(files), *shape), dtype)
         self._decoded = torch.zeros(len(files), dtype=torch.bool)
 
     def __len__(self) -> int:
@@ -55,10 +53,9 @@ class GreyImages:
             with _opened(self.files[k]) as image:
                 image.load()
             grey = _grey(self.files[k], image)
-            wide = (
-                257 if self._pixels.dtype == np.uint16 and grey.dtype == np.uint8 else 1
-            )  # 255 becomes 65535
-            self._pixels[k] = grey.astype(self._pixels.dtype) * self._pixels.dtype.type(wide)
+            dtype = self._pixels.dtype
+            scale = 257 if dtype == np.uint16 and grey.dtype == np.uint8 else 1  # 255 is 65535
+            self._pixels[k] = grey.astype(dtype) * dtype.type(scale)
             self._decoded[k] = True
         most = np.iinfo(self._pixels.dtype).max
         return torch.from_numpy(self._pixels[indices.numpy()].astype(np.float32) / np.float32(most))
@@ -90,7 +87,8 @@ def _opened(file: Path) -> Iterator[Image.Image]:
     try:
         with warnings.catch_warnings(action="error"), Image.open(file, formats=["PNG"]) as image:
             yield image
-    except Exception as error:  # a damaged file makes Pillow raise exceptions of many types
+    # A damaged file makes Pillow raise exceptions of many types.
+    except Exception as error:
         raise ValueError(
             f"cannot parse {file}: no whole PNG image ({error}); copy it again"
         ) from error

@@ -1,7 +1,8 @@
 """Mesh files of rooms: Wavefront OBJ and PLY."""
 
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,69 +22,136 @@ NO_NAME = "mesh", "unnamed"
 """Names of an object and a material without a name."""
 
 
+@dataclass(frozen=True)
+class Mesh:
+    """One object of one material.
+
+    Attributes:
+        name: Name of the object; several meshes may share it.
+        material: Name of the material; empty without one.
+        vertices: Corners, world frame [m].
+        faces: Corners of each planar convex face, counted from 0, in order.
+    """
+
+    name: str
+    material: str
+    vertices: tuple[tuple[float, float, float], ...]
+    faces: tuple[Face, ...]
+
+    def triangles(self) -> list[tuple[int, int, int]]:
+        """Faces cut into triangles."""
+        return triangles(self.faces)
+
+    def compact(self) -> "Mesh":
+        """The mesh without corners that no face has."""
+        used = sorted(set(itertools.chain(*self.faces)))
+        number = {corner: k for k, corner in enumerate(used)}
+        vertices = tuple(self.vertices[corner] for corner in used)
+        faces = tuple(tuple(map(number.__getitem__, face)) for face in self.faces)
+        return Mesh(self.name, self.material, vertices, faces)
+
+
+def wavefront_obj(
+    meshes: Sequence[Mesh], heading: Sequence[str] = (), notes: Sequence[Sequence[str]] = ()
+) -> str:
+    """Meshes as a Wavefront OBJ file [m]: one object a mesh, with its material.
+
+    Args:
+        heading: Comments at the start of the file.
+        notes: Comments in front of each mesh; empty without any.
+    """
+    # trimesh writes triangles alone, and a material only by a second file and with a texture.
+    lines = [f"# {comment}" for comment in heading]
+    first = 1  # number of the next vertex
+    for mesh, comments in itertools.zip_longest(meshes, notes, fillvalue=()):
+        lines += [f"# {comment}" for comment in comments]
+        lines.append(f"o {mesh.name.replace(' ', '_')}")
+        if mesh.material:
+            lines.append(f"usemtl {mesh.material}")
+        lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in mesh.vertices]
+        for face in mesh.faces:
+            lines.append(" ".join(["f", *(str(first + corner) for corner in face)]))
+        first += len(mesh.vertices)
+    return "\n".join(lines) + "\n"
+
+
 def read_obj(file: Path) -> tuple[Float[np.ndarray, "v 3"], Groups]:
     """Vertices [m] and faces of a Wavefront OBJ file, as by ``parse_obj``."""
     return parse_obj(read_lines(file, "a mesh of 'v x y z' and 'f i j k'"), str(file))
 
 
 def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3"], Groups]:
-    """Vertices [m] and faces of the lines of a Wavefront OBJ file; a ``ValueError`` names the
-    source and the line.
+    """Vertices [m] and faces of the lines of a Wavefront OBJ file.
+
+    Raises:
+        ValueError: A line has a defect; the message names the source, the line and its text.
     """
+    # trimesh's reader cuts polygons, loses materials without an .mtl file, counts negative numbers
+    # from the end of the file, and leaves defects without their line.
     vertices: list[list[float]] = []
     groups: Groups = {}
     name, material = NO_NAME
-    begun = ""
-    for number, part in enumerate(lines, 1):
-        line, begun = begun + part, ""
-        if (
-            line.rstrip().endswith("\\") and "#" not in line
-        ):  # goes on in the next one; a comment may end in a path
-            begun = line.rstrip()[:-1] + " "
-            continue
-        word, *rest = line.split("#")[0].split() or [""]
+    for number, line in _joined(lines, source):
+        word, *words = line.split("#")[0].split() or [""]
         try:
             match word:
                 case "o" | "g":
-                    name = " ".join(rest) or NO_NAME[0]
+                    name = " ".join(words) or NO_NAME[0]
                 case "usemtl":
-                    material = " ".join(rest) or NO_NAME[1]
+                    material = " ".join(words) or NO_NAME[1]
                 case "v":
-                    if len(rest) < 3 or not all(map(NUMBER.fullmatch, rest[:3])):
-                        raise ValueError("numbers x y z")
-                    vertices.append([float(word) for word in rest[:3]])
-                    if not all(abs(value) < FAR for value in vertices[-1]):
-                        raise ValueError(WITHIN)
+                    vertices.append(_vertex(words))
                 case "f":
-                    face = _face([part.split("/")[0] for part in rest], len(vertices))
+                    face = _face(words, len(vertices))
                     groups.setdefault((name, material), []).append(face)
         except ValueError as error:
             shown = line.strip() if len(line) < 80 else f"{line.strip()[:80]} ..."
             raise ValueError(f"{source}, line {number}: expected {error}, got {shown!r}") from error
-    if begun:
-        raise ValueError(
-            f"{source}, line {number}: expected another line after the \\ at its end, got none"
-        )
     return np.array(vertices, dtype=float).reshape(-1, 3), groups
 
 
-def _face(words: list[str], count: int) -> Face:
+def _joined(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]]:
+    """Lines with their last number; those that end in a backslash are joined with the next one."""
+    begun = ""
+    number = 0
+    for number, part in enumerate(lines, 1):
+        line = begun + part
+        if line.rstrip().endswith("\\") and "#" not in line:  # a comment may end in a path
+            begun = line.rstrip()[:-1] + " "
+            continue
+        begun = ""
+        yield number, line
+    if begun:
+        expected = "another line after the \\ at its end"
+        raise ValueError(f"{source}, line {number}: expected {expected}, got none")
+
+
+def _vertex(words: Sequence[str]) -> list[float]:
+    if len(words) < 3 or not all(map(NUMBER.fullmatch, words[:3])):
+        raise ValueError("numbers x y z")
+    point = [float(word) for word in words[:3]]
+    if not all(abs(value) < FAR for value in point):
+        raise ValueError(WITHIN)
+    return point
+
+
+def _face(words: Sequence[str], count: int) -> Face:
+    """Vertices of a face among the ``count`` before it."""
     try:
-        numbers = [int(word) for word in words]
+        numbers = [int(word.split("/")[0]) for word in words]
     except ValueError:
         raise ValueError("numbers of vertices") from None
     # They count from 1, or back from the last vertex so far.
     face = tuple(k - 1 if k > 0 else count + k for k in numbers)
-    if len(face) < 3 or not all(
-        k and 0 <= corner < count for k, corner in zip(numbers, face, strict=True)
-    ):
+    if len(face) < 3 or 0 in numbers or not all(0 <= corner < count for corner in face):
         raise ValueError(f"a face of three vertices or more of the {count} before it")
     return face
 
 
 def read_ply(file: Path) -> tuple[np.ndarray, list[Face]]:
-    """Vertices, as a structured array with x, y and z [m] among its columns, and faces of a PLY
-    file.
+    """Vertices and faces of a PLY file.
+
+    Vertices are a structured array, with x, y and z [m] among its columns.
 
     Raises:
         ValueError: The file is damaged, a column holds no numbers, or the mesh has a defect, see
@@ -97,13 +165,11 @@ def read_ply(file: Path) -> tuple[np.ndarray, list[Face]]:
         columns = content["face"].data.dtype.names if "face" in content else ()
         key = next((name for name in ("vertex_indices", "vertex_index") if name in columns), None)
         faces = [] if key is None else [tuple(map(int, face)) for face in content["face"].data[key]]
-    except (
-        Exception
-    ) as error:  # damaged headers make plyfile and numpy raise exceptions of many types
+    # Damaged headers make plyfile and numpy raise exceptions of many types.
+    except Exception as error:
         cause = " ".join(str(error).split()) or type(error).__name__
-        raise ValueError(
-            f"cannot parse {file}: {cause}; expected a .ply file of vertices x, y, z"
-        ) from error
+        expected = "a .ply file of vertices x, y, z"
+        raise ValueError(f"cannot parse {file}: {cause}; expected {expected}") from error
     check_mesh(points, faces, str(file))
     return vertices, faces
 
@@ -115,18 +181,23 @@ def positions(vertices: np.ndarray) -> Float[np.ndarray, "v 3"]:
 
 def triangles(faces: Iterable[Face]) -> list[tuple[int, int, int]]:
     """Polygons cut into triangles, as fans about their first corners."""
-    return [(face[0], *pair) for face in faces for pair in itertools.pairwise(face[1:])]
+    corners = []
+    for face in faces:
+        corners += [(face[0], *pair) for pair in itertools.pairwise(face[1:])]
+    return corners
 
 
 def check_mesh(points: Float[np.ndarray, "v 3"], faces: Sequence[Face], source: str) -> None:
-    """Raises a ``ValueError`` for a vertex too far away or without numbers, or a face that refers
-    to a missing one.
+    """Checks that vertices are numbers within ``FAR``, and that faces refer to them.
+
+    Raises:
+        ValueError: A vertex or a face has a defect; the message names its number.
     """
-    if not (np.abs(points) < FAR).all():
-        row = int((~(np.abs(points) < FAR)).any(1).argmax())
-        raise ValueError(
-            f"{source}, vertex {row + 1}: expected {WITHIN}, got {points[row].tolist()}"
-        )
+    near = np.abs(points) < FAR
+    if not near.all():
+        row = int((~near).any(1).argmax())
+        got = points[row].tolist()
+        raise ValueError(f"{source}, vertex {row + 1}: expected {WITHIN}, got {got}")
     for number, face in enumerate(faces, 1):
         if len(face) < 3 or not all(0 <= corner < len(points) for corner in face):
             expected = f"three or more of the {len(points)} vertices"

@@ -12,9 +12,7 @@ from gaigs.io.files import atomic_write
 
 
 class Variable(NamedTuple):
-    """Real numbers or texts with a name for each dimension, and the attributes of the CF
-    conventions.
-    """
+    """Real numbers or texts, a name for each dimension, and attributes of the CF conventions."""
 
     dimensions: tuple[str, ...]
     values: ndarray
@@ -30,19 +28,19 @@ def write_netcdf(
     """
     with atomic_write(file) as part, netcdf_file(part, "w", version=2) as content:
         _describe(content, {"Conventions": "CF-1.11", **attributes})
-        for name, (dimensions, values, own) in variables.items():
+        for name, (dimensions, values, about) in variables.items():
             if values.dtype.kind == "U":
                 rows = [text.encode() for text in values.tolist()]
-                values = np.array(rows, f"S{max(map(len, rows), default=0) or 1}")[:, None].view(
-                    "S1"
-                )
-                dimensions, own = (*dimensions, f"{name}_length"), {"_Encoding": "utf-8", **own}
+                longest = max(map(len, rows), default=0) or 1
+                values = np.array(rows, f"S{longest}")[:, None].view("S1")  # (rows, longest)
+                dimensions = (*dimensions, f"{name}_length")
+                about = {"_Encoding": "utf-8", **about}
             for dimension, size in zip(dimensions, values.shape, strict=True):
                 if dimension not in content.dimensions:
                     content.createDimension(dimension, size)
             variable = content.createVariable(name, values.dtype, dimensions)
             variable[...] = values
-            _describe(variable, own)
+            _describe(variable, about)
 
 
 def _describe(part: Any, attributes: Mapping[str, Any]) -> None:

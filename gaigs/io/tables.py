@@ -1,9 +1,11 @@
-"""Text files of data sets: lines, tables of numbers, points and index files. Errors name file, line
-and content.
+"""Text files of data sets: lines, tables of numbers, points and index files.
+
+Errors name file, line and content.
 """
 
 import codecs
 import csv
+import functools
 import math
 import os
 import re
@@ -31,9 +33,8 @@ NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNOR
 
 def quote(value: object) -> str:
     """A value as errors show it: printable and short."""
-    text = (
-        repr(value) if isinstance(value, str) else reprlib.repr(value)
-    )  # of few entries: aliases of YAML multiply
+    # Few entries of a list are shown: aliases of YAML multiply.
+    text = repr(value) if isinstance(value, str) else reprlib.repr(value)
     return text if len(text) <= 100 else f"{text[:100]} ..."
 
 
@@ -46,7 +47,8 @@ def shortened(names: Sequence[str], most: int = 10) -> str:
 def find_folder(root: str | Path) -> Path:
     """The folder of a data set; a ``FileNotFoundError`` if it does not exist."""
     root = Path(os.path.expanduser(root))
-    if not os.path.isdir(root):  # Path.is_dir raises where a name is too long or a folder is closed
+    # Path.is_dir raises where a name is too long or a folder is closed.
+    if not os.path.isdir(root):
         raise FileNotFoundError(
             f"{root} must be the folder of a data set, and is no folder; set the data's root"
         )
@@ -54,9 +56,7 @@ def find_folder(root: str | Path) -> Path:
 
 
 def find_file(file: str | Path, content: str, option: str = "the data's file") -> Path:
-    """The file of an option, as of a data set that is one file; a ``FileNotFoundError`` if it does
-    not exist.
-    """
+    """The file of an option; a ``FileNotFoundError`` if it does not exist."""
     file = Path(os.path.expanduser(file))
     if not os.path.isfile(file):
         raise FileNotFoundError(f"{file} must be {content}, and is no file; set {option}")
@@ -64,7 +64,7 @@ def find_file(file: str | Path, content: str, option: str = "the data's file") -
 
 
 def has_file(file: Path) -> bool:
-    """True if a folder has an optional file; a broken link counts, so that reading it is an error."""
+    """True if a folder has an optional file; a broken link counts, and reading it is an error."""
     return os.path.lexists(file)
 
 
@@ -96,15 +96,17 @@ def read_lines(file: Path, content: str) -> list[str]:
 
 
 def refuse(file: Path, wrong: Mapping[int, str], expected: str) -> None:
-    """Raises a ``ValueError`` that names the first wrong line and counts the others, given each
-    content by number.
+    """Raises a ``ValueError`` that names the first wrong line and counts the others.
+
+    Args:
+        wrong: Contents of the wrong lines by number; empty without any.
     """
-    if wrong:
-        number, got = next(iter(wrong.items()))
-        others = {1: "", 2: " and 1 other line"}.get(
-            len(wrong), f" and {len(wrong) - 1} other lines"
-        )
-        raise ValueError(f"{file}, line {number}{others}: expected {expected}, got {got}")
+    if not wrong:
+        return
+    number, got = next(iter(wrong.items()))
+    count = len(wrong) - 1
+    others = {0: "", 1: " and 1 other line"}.get(count, f" and {count} other lines")
+    raise ValueError(f"{file}, line {number}{others}: expected {expected}, got {got}")
 
 
 def read_points(file: Path, names: Sequence[str], content: str) -> list[list[float]]:
@@ -118,16 +120,15 @@ def read_points(file: Path, names: Sequence[str], content: str) -> list[list[flo
         return to_coordinates(file, split_rows(file, lines, names, 0, delimiter), names)
     if len(lines) == 1:
         raise ValueError(f"{file}: no positions below the header")
-    rows = split_rows(file, lines, header, 1, delimiter).items()
-    return to_coordinates(
-        file, {line: [cells[header.index(name)] for name in names] for line, cells in rows}, names
-    )
+    columns = [header.index(name) for name in names]
+    points = {}
+    for line, cells in split_rows(file, lines, header, 1, delimiter).items():
+        points[line] = [cells[column] for column in columns]
+    return to_coordinates(file, points, names)
 
 
 def read_walls(file: Path) -> Float[Tensor, "k 2 3"]:
-    """Walls of a floor plan, at z = 0 [m]: segments between consecutive vertices x,y of a file, two
-    or more.
-    """
+    """Walls of a floor plan, at z = 0 [m]: segments between consecutive vertices x,y of a file."""
     vertices = read_points(file, "xy", "consecutive wall vertices x,y [m], one a line")
     if len(vertices) == 1:
         raise ValueError(f"{file}: expected two wall vertices or more, got 1")
@@ -140,8 +141,9 @@ SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": 
 
 
 def find_delimiter(lines: Sequence[str]) -> str:
-    """The mark that separates the first three lines into equally many cells, two or more; or else a
-    comma.
+    """The mark that cuts the first three lines into equally many cells, two or more.
+
+    Without such a mark it is a comma.
     """
     for mark in SEPARATORS:
         counts = {len(split_cells(line, mark)) for line in lines[:3]}
@@ -155,10 +157,8 @@ def split_cells(line: str, delimiter: str = ",") -> list[str]:
     if delimiter == " ":
         return line.split()
     try:
-        # csv appends blanks behind a quoted cell to it.
-        line = (
-            re.sub(rf"(?<=\")[ \t]+(?={re.escape(delimiter)}|$)", "", line) if '"' in line else line
-        )
+        if '"' in line:  # csv appends blanks behind a quoted cell to it
+            line = re.sub(rf"(?<=\")[ \t]+(?={re.escape(delimiter)}|$)", "", line)
         (cells,) = csv.reader(
             [line], delimiter=delimiter, skipinitialspace=delimiter != "\t", strict=True
         )
@@ -170,12 +170,13 @@ def split_cells(line: str, delimiter: str = ",") -> list[str]:
 def split_rows(
     file: Path, lines: Sequence[str], names: Sequence[str], skip: int, delimiter: str
 ) -> dict[int, list[str]]:
-    """Cells of all lines but the first few; a ``ValueError`` unless each line has one for each
-    name.
+    """Cells of all lines except the first few. A comma that separates no cells is a decimal one.
 
-    A comma that separates no cells is a decimal one.
+    Raises:
+        ValueError: A line has not one cell for each name.
     """
-    rows, wrong = {}, {}
+    rows: dict[int, list[str]] = {}
+    wrong: dict[int, str] = {}
     for number, line in enumerate(lines[skip:], skip + 1):
         cells = split_cells(line, delimiter)
         rows[number] = cells if delimiter == "," else [cell.replace(",", ".") for cell in cells]
@@ -239,20 +240,21 @@ class Table(NamedTuple):
         return self.names.index(name)
 
 
-def write_csv(file: Path, rows: Iterable[Sequence]) -> None:
-    """Writes rows as a CSV table; texts as ``inert`` gives them."""
+def write_table(file: Path, rows: Iterable[Sequence]) -> None:
+    """Writes rows as a CSV table, the heading first; texts as ``inert`` gives them."""
     with atomic_write(file) as part, part.open("w", encoding="utf-8", newline="") as opened:
         writer = csv.writer(opened, lineterminator="\n")
-        writer.writerows(
-            [inert(cell) if isinstance(cell, str) else cell for cell in row] for row in rows
-        )
+        for row in rows:
+            writer.writerow([inert(cell) if isinstance(cell, str) else cell for cell in row])
+
+
+write_csv = write_table  # the name in commands and reports
 
 
 def inert(text: str) -> str:
-    """A text that no spreadsheet takes for a formula: before =, +, -, @, a tab or a return it has
-    an apostrophe more.
+    """A text that no spreadsheet takes for a formula.
 
-    Numbers stay as they are.
+    An apostrophe more stands before =, +, -, @, a tab or a return. Numbers stay as they are.
     """
     starts = text.lstrip("'").startswith(("=", "+", "-", "@", "\t", "\r"))
     return f"'{text}" if starts and text != "-inf" and math.isnan(to_number(text)) else text
@@ -271,23 +273,13 @@ def read_table(file: Path, content: str) -> Table:
     for name in names:
         if not name.isprintable():
             raise ValueError(f"{file}, line 1: expected names of columns, got {quote(name)}")
-        if name and names.count(name) > 1:
-            raise ValueError(
-                f"{file}, line 1: expected each column once, got {quote(name)} {names.count(name)} times"
-            )
-    has_commas = delimiter != ","
-    numbers: dict[str, float] = {}
-
-    def number(cell: str) -> float:
-        if cell not in numbers:
-            text = re.sub(r"(?i)\s*dbm$", "", cell)
-            value = to_number(text.replace(",", ".") if has_commas else text)
-            numbers[cell] = (
-                math.inf if math.isnan(value) and text.strip().lower() not in EMPTY else value
-            )
-        return numbers[cell]
-
-    rows, wrong = [], {}
+        count = names.count(name)
+        if name and count > 1:
+            got = f"{quote(name)} {count} times"
+            raise ValueError(f"{file}, line 1: expected each column once, got {got}")
+    number = functools.cache(functools.partial(_level, has_commas=delimiter != ","))
+    rows: list[ndarray] = []
+    wrong: dict[int, str] = {}
     for line, text in enumerate(lines[1:], 2):
         cells = split_cells(text, delimiter)
         rows.append(np.array([number(cell) for cell in cells]))
@@ -299,25 +291,36 @@ def read_table(file: Path, content: str) -> Table:
     return Table(file, lines, delimiter, names, np.stack(rows))
 
 
+def _level(cell: str, has_commas: bool) -> float:
+    """The number of a cell, NaN for an empty one, infinity for another text.
+
+    Args:
+        has_commas: True if a comma is a decimal one.
+    """
+    text = re.sub(r"(?i)\s*dbm$", "", cell)
+    value = to_number(text.replace(",", ".") if has_commas else text)
+    is_text = math.isnan(value) and text.strip().lower() not in EMPTY
+    return math.inf if is_text else value
+
+
 def to_numbers(
     file: Path, rows: Rows, names: Sequence[str], holds: Callable[[float], bool], expected: str
 ) -> list[list[float]]:
-    """Cells of a table as numbers; a ``ValueError`` where one is out of range. A cell without a
-    number is NaN.
-    """
-    numbers = [[to_number(cell) for cell in cells] for cells in rows.values()]
-    wrong = {}
-    for (line, cells), values in zip(rows.items(), numbers, strict=True):
-        if bad := [k for k, value in enumerate(values) if not holds(value)]:
-            wrong[line] = f"{described(cells[bad[0]])} in column {names[bad[0]]}"
+    """Cells of a table as numbers, NaN without one; a ``ValueError`` where one is out of range."""
+    numbers: list[list[float]] = []
+    wrong: dict[int, str] = {}
+    for line, cells in rows.items():
+        values = [to_number(cell) for cell in cells]
+        numbers.append(values)
+        bad = next((k for k, value in enumerate(values) if not holds(value)), None)
+        if bad is not None:
+            wrong[line] = f"{described(cells[bad])} in column {names[bad]}"
     refuse(file, wrong, expected)
     return numbers
 
 
 def to_coordinates(file: Path, rows: Rows, names: Sequence[str]) -> list[list[float]]:
-    """Cells of a table as coordinates [m]; a ``ValueError`` where one is not finite, or too far for
-    float32.
-    """
+    """Cells of a table as coordinates [m]; a ``ValueError`` where one is not finite, or too far."""
     to_numbers(file, rows, names, math.isfinite, "a finite number")
     return to_numbers(file, rows, names, lambda value: abs(value) < FAR, WITHIN)
 
@@ -333,27 +336,25 @@ def to_index(text: str) -> int | None:
     if not (text.isascii() and text.isdecimal()):
         return None
     digits = text.lstrip("0")
-    return (
-        int(digits or "0") if len(digits) < 19 else sys.maxsize
-    )  # Python converts at most 4300 digits
+    # Python converts at most 4300 digits.
+    return int(digits or "0") if len(digits) < 19 else sys.maxsize
 
 
 def read_parts(
     root: Path, parse: Callable[[str], Hashable | None], expected: str
 ) -> tuple[list, list]:
-    """Distinct entries of ``train_index.txt`` and ``test_index.txt``, one a line; ``parse`` gives
-    None for a defect.
+    """Distinct entries of ``train_index.txt`` and ``test_index.txt``, one a line.
+
+    Args:
+        parse: Gives None for a defect.
     """
     places: dict[Hashable, str] = {}
     parts = []
     for file in (root / "train_index.txt", root / "test_index.txt"):
         lines = dict(enumerate(read_lines(file, expected), 1))
         entries = {number: parse(line.strip()) for number, line in lines.items()}
-        refuse(
-            file,
-            {number: quote(lines[number]) for number, entry in entries.items() if entry is None},
-            expected,
-        )
+        wrong = [number for number, entry in entries.items() if entry is None]
+        refuse(file, {number: quote(lines[number]) for number in wrong}, expected)
         repeated = {}
         for number, entry in entries.items():
             place = f"{file.name}, line {number}"
@@ -365,9 +366,7 @@ def read_parts(
 
 
 def number_places(points: Sequence[Sequence[float]]) -> tuple[list[tuple], Tensor]:
-    """Distinct points in the order of their first appearance, and the number of each point among
-    them.
-    """
+    """Distinct points, in the order of their first appearance, and the number of each point."""
     numbers: dict[tuple, int] = {}
     index = [numbers.setdefault(tuple(point), len(numbers)) for point in points]
     return [*numbers], torch.tensor(index)

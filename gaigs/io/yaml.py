@@ -1,5 +1,6 @@
-"""YAML files of data sets, with numbers as written: PyYAML reads 010 as 8, 1:30 as 90 and 1e-3 as a
-word.
+"""YAML files of data sets, with numbers as written.
+
+PyYAML reads 010 as 8, 1:30 as 90 and 1e-3 as a word.
 """
 
 import math
@@ -14,9 +15,7 @@ from gaigs.io.tables import quote, read_lines, to_number
 
 
 class TextLoader(yaml.SafeLoader):
-    """Loads scalars as text, and refuses repeated keys, where PyYAML keeps the last, and unknown
-    tags.
-    """
+    """Loads scalars as text, and refuses unknown tags and repeated keys: PyYAML keeps the last."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         """The mapping of a node."""
@@ -30,32 +29,31 @@ TextLoader.yaml_implicit_resolvers = {}
 
 
 def read_mapping(file: Path, content: str) -> dict[str, object]:
-    """The mapping of names to text, lists and mappings in a file; a ``ValueError`` for any other
-    content.
+    """The mapping of names to text, lists and mappings in a file.
+
+    Raises:
+        ValueError: The file has another content.
     """
     text = "\n".join(read_lines(file, content))
     try:
         mapping = yaml.load(text, TextLoader)
-    except (
-        yaml.YAMLError,
-        ValueError,
-        OverflowError,
-        RecursionError,
-    ) as error:  # of escapes and deep nesting
+    # Escapes and deep nesting raise other errors.
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError) as error:
         cause = " ".join(str(error).split())[:300]
         raise ValueError(f"cannot parse {file}: {cause}; expected {content}") from None
     if not isinstance(mapping, dict) or not mapping:
         raise ValueError(f"{file}: expected {content}, got {quote(text.splitlines()[0])}")
-    if unnamed := [
-        key for key in mapping if not (isinstance(key, str) and key.strip() and key.isprintable())
-    ]:
-        raise ValueError(f"{file}: expected a name in front of a colon, got {quote(unnamed[0])}")
+    for key in mapping:
+        if not (isinstance(key, str) and key.strip() and key.isprintable()):
+            raise ValueError(f"{file}: expected a name in front of a colon, got {quote(key)}")
     return mapping
 
 
 def to_vector(place: str, value: object, axes: str) -> list[float]:
-    """A list of finite numbers, one for each axis; another value is a ``ValueError`` with its
-    place.
+    """A list of finite numbers, one for each axis.
+
+    Raises:
+        ValueError: The value is another; the message names its place.
     """
     items = value if isinstance(value, list) else []
     octal = re.compile(r"[+-]?0[0-9]+")  # 010 is 8 in YAML 1.1 and 10 in YAML 1.2
@@ -71,8 +69,10 @@ def to_vector(place: str, value: object, axes: str) -> list[float]:
 
 
 def to_position(place: str, value: object) -> list[float]:
-    """A list of coordinates [m]; another value, or one too far for float32, is a ``ValueError``
-    with its place.
+    """A list of coordinates [m].
+
+    Raises:
+        ValueError: The value is another, or too far for float32; the message names its place.
     """
     numbers = to_vector(place, value, "xyz")
     if max(map(abs, numbers)) >= FAR:

@@ -14,7 +14,9 @@ from gaigs.core.propagation import fresnel
 from gaigs.core.query import Query
 from gaigs.core.scene import Scene
 from gaigs.data import Links
+from gaigs.io import meshes
 from gaigs.io.files import write_text
+from gaigs.io.meshes import Mesh
 from gaigs.planes.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
 from gaigs.planes.sheets import Sheet
 from gaigs.splatting.gaussians import write_ply
@@ -354,28 +356,38 @@ def wavefront_obj(placement: Mirrored, found: TracedPaths, sheets: Sequence[Shee
     A plane is one face, counterclockwise as seen from outside.
     """
     planes = _planes(placement, found)
-    lines = [
-        "# Planes learnt by gaigs; coordinates in metres, z up, the world frame of the data.",
-        "# loss: of a reflection at normal incidence; share: of the plane's paths in the received power.",
-        *(f"# {flat}" for flat in placement.scene.flat_axes),
+    drawn = outlines(placement, found)
+    heading = [
+        "Planes learnt by gaigs; coordinates in metres, z up, the world frame of the data.",
+        "loss: of a reflection at normal incidence; share: of the plane's paths in the received "
+        "power.",
+        *map(str, placement.scene.flat_axes),
     ]
-    count = 0
-    for plane in outlines(placement, found):
-        k = plane.number
+    notes = []
+    for plane in drawn:
         normal = " ".join(f"{part:.4f}" for part in plane.normal)
-        other = other_offset(placement.scene, planes, k)
-        words = "" if other is None else f" or {other:.3f} m"
-        lines += [
-            f"# normal {normal}, offset {planes.offsets[k]:.3f} m{words}, loss {planes.losses[k]:.1f} dB",
-            f"# share {100 * plane.share:.2f} %",
-            f"o plane_{k}",
-            *("v " + " ".join(f"{part:.4f}" for part in corner) for corner in plane.corners),
-            "f " + " ".join(str(count + corner + 1) for corner in range(len(plane.corners))),
-        ]
-        count += len(plane.corners)
+        offset = f"{planes.offsets[plane.number]:.3f} m"
+        other = other_offset(placement.scene, planes, plane.number)
+        if other is not None:
+            offset += f" or {other:.3f} m"
+        loss = f"{planes.losses[plane.number]:.1f} dB"
+        notes.append(
+            [f"normal {normal}, offset {offset}, loss {loss}", f"share {100 * plane.share:.2f} %"]
+        )
+    notes += [[f"loss {sheet.loss_db:.1f} dB"] for sheet in sheets]
+    return meshes.wavefront_obj(to_meshes(drawn, sheets), heading, notes)
+
+
+def to_meshes(planes: Sequence[LearntPlane], sheets: Sequence[Sheet]) -> list[Mesh]:
+    """Planes, a face each, and sheets of obstacles as meshes without materials."""
+    parts = []
+    for plane in planes:
+        face = tuple(range(len(plane.corners)))
+        parts.append(Mesh(f"plane_{plane.number}", "", _rows(plane.corners), (face,)))
     for number, sheet in enumerate(sheets):
-        lines += [f"# loss {sheet.loss_db:.1f} dB", f"o obstacle_{number}"]
-        lines += ["v {:.4f} {:.4f} {:.4f}".format(*corner) for corner in sheet.vertices.tolist()]
-        lines += ["f {} {} {}".format(*face) for face in (sheet.faces + count + 1).tolist()]
-        count += len(sheet.vertices)
-    return "\n".join(lines) + "\n"
+        parts.append(Mesh(f"obstacle_{number}", "", _rows(sheet.vertices), _rows(sheet.faces)))
+    return parts
+
+
+def _rows(array: ndarray) -> tuple:
+    return tuple(map(tuple, array.tolist()))

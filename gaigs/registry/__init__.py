@@ -25,6 +25,7 @@ from typing import Any
 
 from gaigs.registry.holders import GIVEN, MISSING, Holder, find_holders, is_plain, sources
 from gaigs.registry.modes import usual_modes
+from gaigs.registry.shipped import not_installed
 
 KINDS = (
     "task", "data", "split", "placement", "tokenizer", "deformation", "projection", "rasterizer", "pooling", "loss",
@@ -115,6 +116,8 @@ class Registry:
             return self._load(holders[0])
         if component is not None:
             return component
+        if hint := not_installed(self.kind, name):
+            raise ValueError(hint)
         names = self.names()
         causes = "".join(f"; cannot read {cause}" for cause in unreadable)
         advice = "; one of your own must be imported first, or be in the folder plugins"

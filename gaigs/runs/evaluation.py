@@ -35,7 +35,7 @@ from gaigs.core.query import Batch, Query, evenly
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.data import Links, with_places
-from gaigs.data.matching import check_fit
+from gaigs.data.compatibility import check_fit
 from gaigs.io.files import atomic_write
 from gaigs.kriging.links import folds_of, single_readings
 from gaigs.model import Model, call_optional

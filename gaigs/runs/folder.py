@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.data.matching import are_alike
+from gaigs.data.compatibility import are_alike
 from gaigs.io.files import atomic_write, remove_parts, write_text
 from gaigs.registry import digests
 from gaigs.version import __version__

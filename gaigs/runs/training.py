@@ -24,7 +24,7 @@ from torch import distributed
 from gaigs.configuration import composed, preset
 from gaigs.core import stages
 from gaigs.data import Links
-from gaigs.data.matching import check_fit
+from gaigs.data.compatibility import check_fit
 from gaigs.kriging.links import check_known
 from gaigs.model import Model, checkpoint
 from gaigs.model.ensemble import Ensemble

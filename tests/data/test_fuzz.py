@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 import torch
 from damages import BYTES, TEXTS
+from gaigs_deepmimo.readers import read_channels
 
-from gaigs.data import csi_npz, deepmimo, nerf2_rssi, nerf2_spectrum, rssi_csv, rssi_wide
+from gaigs.data import csi_npz, nerf2_rssi, nerf2_spectrum, rssi_csv, rssi_wide
 from gaigs.data.readings import LOUDEST
 from gaigs.io import FAR
+from gaigs.io.deepmimo import Station, write_scenario
 from gaigs.testing import check_data
 
 COUNT = 100
@@ -80,12 +82,8 @@ def files(request, tmp_path, reader):
         case "deepmimo":
             draw, root = np.random.default_rng(0), tmp_path
             points, gains = draw.uniform(1, 3, (10, 4, 1, 3)), draw.normal(size=(10, 4)) * 1e-3j
-            deepmimo.write(
-                root,
-                3.5e9,
-                draw.uniform(-3, 3, (10, 3)),
-                [(np.array([0.0, 0.0, 2.5]), gains, points)],
-            )
+            station = Station(np.array([0.0, 0.0, 2.5]), gains, points)
+            write_scenario(root, 3.5e9, draw.uniform(-3, 3, (10, 3)), [station])
             for unread in (
                 *root.glob("aoa*"),
                 *root.glob("inter_pos*"),
@@ -93,7 +91,7 @@ def files(request, tmp_path, reader):
                 root / "vertices.npz",
             ):
                 unread.unlink()
-            read = lambda: deepmimo.read(root, subcarriers=4)
+            read = lambda: read_channels(root, subcarriers=4)
     return read, sorted(file for file in root.rglob("*") if file.is_file())
 
 

@@ -7,11 +7,11 @@ import sys
 import numpy as np
 import pytest
 import torch
+from gaigs_sionna.rooms import ROOMS
 
 from gaigs.data import load, synthetic
 from gaigs.data.__main__ import main
-from gaigs.data.sionna import ROOMS
-from gaigs.data.sionna.meshes import wavefront_obj
+from gaigs.io.meshes import wavefront_obj
 
 OFFICIAL = {"name": "official", "validation": 0}
 ROOMS_OF = {"synthetic": {"order": 1}, "sionna": {"room": "slanted"}}
@@ -100,15 +100,11 @@ def test_the_command_writes_each_label_in_its_layout(request, tmp_path, monkeypa
     if room == "sionna":
         request.getfixturevalue("tracer")
     options = ROOMS_OF[room]
-    meshes = (
-        synthetic.wavefront_obj(synthetic.ROOM)
-        if room == "synthetic"
-        else wavefront_obj(ROOMS["slanted"].meshes())
-    )
+    meshes = synthetic.meshes(synthetic.ROOM) if room == "synthetic" else ROOMS["slanted"].meshes()
     for labels in (SPECTRA, READINGS, CHANNELS):
         words = [f"{key}={value}" for key, value in {"transmitters": 5, **options}.items()]
         command(monkeypatch, tmp_path / f"room{labels}", f"{room}{labels}", *words)
-        assert (tmp_path / f"room{labels}" / "geometry.obj").read_text() == meshes
+        assert (tmp_path / f"room{labels}" / "geometry.obj").read_text() == wavefront_obj(meshes)
     assert "room: 4 training and 1 test labels" in capsys.readouterr().out
     simulated = [
         simulate(f"{room}{labels}", transmitters=5, **options)

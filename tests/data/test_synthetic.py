@@ -9,9 +9,9 @@ import torch
 
 from gaigs.core.geometry import Grid
 from gaigs.data import load
-from gaigs.data.synthetic import REGION, ROOM, spectra, wavefront_obj
+from gaigs.data.synthetic import REGION, ROOM, meshes, spectra
 from gaigs.data.synthetic.image_source import is_free
-from gaigs.io.meshes import parse_obj
+from gaigs.io.meshes import parse_obj, wavefront_obj
 from gaigs.testing import check_data
 
 OFFICIAL = {"name": "official", "validation": 0}
@@ -84,18 +84,19 @@ def test_each_place_sends_at_each_carrier():
 
 
 def test_obj_faces_lie_on_the_walls_and_face_outwards():
-    vertices, groups = parse_obj(wavefront_obj(ROOM).splitlines(), "room.obj")
-    cuboids = [((0, 0, 0), ROOM.size, ROOM.walls)]
-    cuboids += [(box.lower, box.upper, (f"loss_{box.loss_db}_db",) * 6) for box in ROOM.furniture]
+    vertices, groups = parse_obj(wavefront_obj(meshes(ROOM)).splitlines(), "room.obj")
+    cuboids = {"room": ((0, 0, 0), ROOM.size, ROOM.walls)}
+    for box in ROOM.furniture:
+        cuboids[box.name] = box.lower, box.upper, (f"loss_{box.loss_db}_db",) * 6
     found = set()
-    for (_, material), group in groups.items():
+    for (name, material), group in groups.items():
         for face in group:
-            lower, upper, materials = cuboids[face[0] // 8]
+            lower, upper, materials = cuboids[name]
             corners = vertices[list(face)]
             normal = np.cross(corners[1] - corners[0], corners[2] - corners[1])
             axis = int(np.argmax(np.abs(normal)))
             side = int(normal[axis] > 0)
-            found.add((face[0] // 8, axis, side))
+            found.add((name, axis, side))
             assert material == materials[2 * axis + side]
             np.testing.assert_allclose(corners[:, axis], (lower, upper)[side][axis])
             assert np.linalg.norm(normal) == pytest.approx(

@@ -1,6 +1,4 @@
-"""Export for other programs: radio maps, predictions, the learnt room and its paths, by the suffix
-of the file.
-"""
+"""Export for other programs: radio maps, predictions, the learnt room and its paths."""
 
 from pathlib import Path
 
@@ -64,7 +62,8 @@ def export(
         >>> model = gaigs.train("path_loss", gaigs.links("synthetic_rssi", transmitters=50))
         >>> [path.name for path in gaigs.export(model, "floor.tif", pitch=0.5)]
         ['floor.tif']
-        >>> gaigs.export(model, "places.csv", [[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]])[0].read_text().splitlines()[0]
+        >>> (file,) = gaigs.export(model, "places.csv", [[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]])
+        >>> file.read_text().splitlines()[0]
         'x,y,z,receiver,frequency,value,deviation,lower,upper'
     """
     check_instance("model", model, Model)
@@ -104,13 +103,10 @@ def run(config: dict, folder: Path) -> None:
     takes_places = suffix in (*PREDICTIONS, SCENARIO)
     if places is None and takes_places and (suffix not in MAPS or not model.scene.task.is_scalar):
         places = "test"
-    name = (
-        "predictions"
-        if suffix in PREDICTIONS and places
-        else "radio_map"
-        if suffix in MAPS
-        else "room"
-    )
+    if suffix in PREDICTIONS and places:
+        name = "predictions"
+    else:
+        name = "radio_map" if suffix in MAPS else "room"
     if places == "test":
         places = links_of(config["folder"], config["trust"])
     elif isinstance(places, str):

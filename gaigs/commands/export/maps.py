@@ -1,5 +1,6 @@
 """Files of radio maps: GeoTIFF, GeoJSON, NetCDF, PNG and PDF."""
 
+import itertools
 import json
 import logging
 from pathlib import Path
@@ -36,52 +37,46 @@ class Layer(NamedTuple):
 
 def layers(floor: RadioMap, scene: Scene) -> dict[str, Layer]:
     """``value`` and, if the model states deviations, ``deviation``."""
-    found = {"value": Layer(floor.quantity, floor.unit, floor.values)}
+    parts = {"value": Layer(floor.quantity, floor.unit, floor.values)}
     if floor.deviations is not None:
         unit = getattr(scene.task, "error_unit", floor.unit)
-        found["deviation"] = Layer(
-            f"standard deviation of {floor.quantity}", unit, floor.deviations
-        )
-    return found
+        quantity = f"standard deviation of {floor.quantity}"
+        parts["deviation"] = Layer(quantity, unit, floor.deviations)
+    return parts
 
 
 def title(floor: RadioMap) -> str:
+    """Quantity, unit, height and carrier of a radio map."""
     carrier = "" if floor.frequency is None else f" at {floor.frequency / 1e9:.6g} GHz"
-    return f"{with_unit(floor.quantity, floor.unit)} of a transmitter at z = {floor.height:.2f} m{carrier}, by gaigs"
+    quantity = with_unit(floor.quantity, floor.unit)
+    return f"{quantity} of a transmitter at z = {floor.height:.2f} m{carrier}, by gaigs"
 
 
 def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
-    """Bands of value and deviation, one receiver after the other, north up, in the projected system
-    of the frame.
+    """Bands of value and deviation, one receiver after the other, north up.
+
+    Coordinates are those of the frame's projected system.
 
     Source: OGC GeoTIFF Standard 1.1; names of bands as GDAL stores them.
     """
     x, y = axes_on_map(file, floor, scene.frame)
-    width, height = np.diff(x[:2])[0], np.diff(y[:2])[0]
+    width = np.diff(x[:2])[0]
+    height = np.diff(y[:2])[0]
     kinds = layers(floor, scene).values()
-    bands = (
-        np.stack([kind.values[:, ::-1] for kind in kinds], 1)
-        .reshape(-1, len(y), len(x))
-        .astype(np.float32)
-    )
-    words = [
-        f"{name}: {with_unit(kind.quantity, kind.unit)}"
-        for name in floor.receivers
-        for kind in kinds
-    ]
+    # Rows run from north to south.
+    upright = np.stack([kind.values[:, ::-1] for kind in kinds], 1)  # (receivers, kinds, rows, ...)
+    bands = upright.reshape(-1, len(y), len(x)).astype(np.float32)
+    words = []
+    for name in floor.receivers:
+        words += [f"{name}: {with_unit(kind.quantity, kind.unit)}" for kind in kinds]
     items = "".join(
         f'<Item name="DESCRIPTION" sample="{band}" role="description">{escape(word)}</Item>'
         for band, word in enumerate(words)
     )
+    corner = (0.0, 0.0, 0.0, x[0] - width / 2, y[-1] + height / 2, 0.0)
     tags: list[tuple] = [
         (33550, "d", 3, (width, height, 0.0), True),  # ModelPixelScale
-        (
-            33922,
-            "d",
-            6,
-            (0.0, 0.0, 0.0, x[0] - width / 2, y[-1] + height / 2, 0.0),
-            True,
-        ),  # ModelTiepoint
+        (33922, "d", 6, corner, True),  # ModelTiepoint
         (42112, "s", 0, f"<GDALMetadata>{items}</GDALMetadata>".encode(), True),
     ]
     if scene.frame is not None:  # GeoKeyDirectory: projected, pixels are areas, EPSG code
@@ -98,10 +93,10 @@ def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 
 
 def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
-    """A point for each place, with value and deviation at each receiver, ``ap`` and ``ap
-    deviation``.
+    """A point for each place, with value and deviation at each receiver.
 
-    If a receiver has such a name, the keys are ``ap value`` and ``ap deviation``.
+    Keys are ``ap`` and ``ap deviation`` or, if a receiver has such a name, ``ap value`` and ``ap
+    deviation``.
 
     Source: RFC 7946: longitudes and latitudes of WGS 84. Without a frame, coordinates are metres.
     """
@@ -111,25 +106,23 @@ def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
         x, y = transformer.transform(x, y)
     kinds = layers(floor, scene)
     # Names that are also another's with "deviation": every key then ends with its kind.
-    collide = {f"{name} {key}" for name in floor.receivers for key in kinds} & {*floor.receivers}
+    full_names = {" ".join(pair) for pair in itertools.product(floor.receivers, kinds)}
+    collide = full_names & {*floor.receivers}
     columns = {}
     for receiver, name in enumerate(floor.receivers):
         for key, kind in kinds.items():
             full = name if key == "value" and not collide else f"{name} {key}"
             columns[full] = kind.values[receiver].ravel().tolist()
-    features = [
-        {
-            "type": "Feature",
-            "geometry": {
-                "type": "Point",
-                "coordinates": [round(east, 8), round(north, 8)],
-            },  # of degrees: 1 mm
-            "properties": {name: round(column[row], 4) for name, column in columns.items()},
-        }
-        for row, (east, north) in enumerate(
-            zip(x.ravel().tolist(), y.ravel().tolist(), strict=True)
+    features = []
+    for row, (east, north) in enumerate(zip(x.ravel().tolist(), y.ravel().tolist(), strict=True)):
+        place = [round(east, 8), round(north, 8)]  # of degrees: 1 mm
+        features.append(
+            {
+                "type": "Feature",
+                "geometry": {"type": "Point", "coordinates": place},
+                "properties": {name: round(column[row], 4) for name, column in columns.items()},
+            }
         )
-    ]
     content = {"type": "FeatureCollection", "title": title(floor), "features": features}
     write_text(file, json.dumps(content, ensure_ascii=False) + "\n")
     return [file]
@@ -161,14 +154,14 @@ def write_map_netcdf(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
         variables["frequency"] = Variable((), np.array(floor.frequency), carrier)
         shared["coordinates"] += " frequency"
     for name, kind in layers(floor, scene).items():
-        own = {"long_name": kind.quantity, "units": kind.unit or "1", **shared}
-        variables[name] = Variable(("receiver", "y", "x"), kind.values.astype(np.float32), own)
+        about = {"long_name": kind.quantity, "units": kind.unit or "1", **shared}
+        variables[name] = Variable(("receiver", "y", "x"), kind.values.astype(np.float32), about)
     write_netcdf(file, variables, {"title": title(floor)})
     return [file]
 
 
 def write_figures(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
-    """The maps as figures: pages of one PDF, or a PNG each; gives the files."""
+    """Writes the maps as figures, pages of one PDF or a PNG each; returns the files."""
     gateways = {one.name: one.pose.position.numpy() for one in scene.receivers}
     none = {name: np.zeros((0, 3), np.float32) for name in gateways}
     task: Any = scene.task
@@ -188,9 +181,7 @@ def write_figures(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 
 
 def axes_on_map(file: Path, floor: RadioMap, frame: Frame | None) -> tuple[ndarray, ndarray]:
-    """Coordinates x and y of the map's places in the system of the frame, or without one in the
-    data's own [m].
-    """
+    """Coordinates x and y of the map's places [m], in the system of the frame or the data's own."""
     if frame is None:
         log.warning("%s has no coordinate system: x and y are metres in the data's own frame", file)
         return floor.x, floor.y

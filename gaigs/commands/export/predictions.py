@@ -5,7 +5,7 @@ import logging
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,15 +19,27 @@ from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.core.task.csi import Csi
 from gaigs.data import Links
-from gaigs.data.matching import check_fit
-from gaigs.io import tables
+from gaigs.data.compatibility import check_fit
 from gaigs.io.netcdf import Variable, write_netcdf
+from gaigs.io.tables import write_table
 from gaigs.model import Model
 
 log = logging.getLogger(__name__)
 
-LINK = "x", "y", "z", "easting", "northing", "receiver", "frequency"
-"""Columns of a link."""
+
+class Labels(NamedTuple):
+    """The links to predict, and their test labels.
+
+    Attributes:
+        task: Task of the values; of held-out subcarriers their own.
+        measured: Labels of links' test; None for places.
+        subcarriers: Held-out subcarriers [Hz]; None without any.
+    """
+
+    query: Query
+    task: Task
+    measured: Tensor | None
+    subcarriers: Tensor | None
 
 
 def write_predictions(
@@ -45,37 +57,29 @@ def write_predictions(
     Raises:
         ValueError: There is no place, or a place, frequency or probability is impossible.
     """
-    scene, labels, subcarriers = model.scene, None, None
-    asked: Any = places
-    query = query_of("predictions", scene, places, frequency)
-    if isinstance(places, Links):
-        asked = places.held_out or places
-        subcarriers = None if places.held_out is None else asked.task.frequencies
-        labels = asked.labels[places.split.test]
+    scene = model.scene
+    query, task, measured, subcarriers = _to_predict(scene, places, frequency)
     if not 0 < interval < 1:
         raise ValueError(
             f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}"
         )
     if subcarriers is None and model.calibration is not None and model.calibration.gives(interval):
-        found = model.predict(query, interval=interval)
+        estimate = model.predict(query, interval=interval)
     else:
         log.warning("%s has values alone: the model has no intervals of %g here", file, interval)
-        found = Estimate(model.predict(query, frequencies=subcarriers), None, None, None)  # type: ignore[arg-type]
-    task = asked.task if subcarriers is not None else scene.task
+        values = model.predict(query, frequencies=subcarriers)
+        estimate = Estimate(values, None, None, None)  # type: ignore[arg-type]
     absent = torch.tensor(False).expand(len(query), *task.shape)
-    if isinstance(task, Csi):  # elements that a receiver's array lacks
-        absent = lacking(scene.receivers, query.receivers.cpu(), task.elements)[
-            ..., None
-        ].expand_as(absent)
-        blank = lambda part: (
-            part if part is None or part.ndim < 3 else part.cpu().masked_fill(absent, math.nan)
-        )
-        found, labels = Estimate(*map(blank, found)), blank(labels)
-    variables = tabulate(query, scene, task, found, labels)
+    if isinstance(task, Csi):
+        lacks = lacking(scene.receivers, query.receivers.cpu(), task.elements)  # (n, elements)
+        absent = lacks[..., None].expand_as(absent)
+        estimate = Estimate(*(_blank(part, absent) for part in estimate))
+        measured = _blank(measured, absent)
+    variables = tabulate(query, scene, task, estimate, measured)
     if scene.frame is not None:
         log.info("easting and northing are those of EPSG:%d", scene.frame.epsg)
     if file.suffix.lower() == ".csv":
-        write_csv(file, variables, absent.numpy())
+        write_table(file, _rows(variables, absent.numpy()))
         return [file]
     about = {"title": f"{task.quantity} predicted by gaigs", "interval": interval}
     if scene.frame is not None:
@@ -88,9 +92,29 @@ def write_predictions(
     return [file]
 
 
+def _to_predict(scene: Scene, places: object, frequency: float | None) -> Labels:
+    query = query_of("predictions", scene, places, frequency)
+    if not isinstance(places, Links):
+        return Labels(query, scene.task, None, None)
+    test = places.split.test
+    if places.held_out is None:
+        return Labels(query, scene.task, places.labels[test], None)
+    task: Any = places.held_out.task
+    return Labels(query, task, places.held_out.labels[test], task.frequencies)
+
+
+def _blank(part: Tensor | None, absent: Bool[Tensor, " n *shape"]) -> Tensor | None:
+    """A part of an estimate with NaN for elements that a receiver's array lacks."""
+    if part is None or part.ndim < 3:
+        return part
+    return part.cpu().masked_fill(absent, math.nan)
+
+
 def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -> Query:
-    """The links of ``places``, one or more, as for ``write_predictions``; ``kind`` names the file
-    in errors.
+    """The links of ``places``, one or more, as for ``write_predictions``.
+
+    Args:
+        kind: Name of the file in errors.
     """
     if places is None:
         raise ValueError(f"{kind} take places: positions [m], a query, or links with a test")
@@ -100,10 +124,8 @@ def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -
     elif isinstance(places, Query):
         query = places
     else:
-        points, names = (
-            as_positions("places", places),
-            [receiver.name for receiver in scene.receivers],
-        )
+        points = as_positions("places", places)
+        names = [receiver.name for receiver in scene.receivers]
         query, _ = Query.from_positions(points, None, frequency, names, scene.frequencies)
     if not len(query):
         raise ValueError(f"{kind} take one place or more; give positions [m], or links with a test")
@@ -111,101 +133,110 @@ def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -
 
 
 def tabulate(
-    query: Query, scene: Scene, task: Task, found: Estimate, labels: Tensor | None
+    query: Query, scene: Scene, task: Task, estimate: Estimate, measured: Tensor | None
 ) -> dict[str, Variable]:
-    """Columns of links, axes of labels, and values by links and axes; complex values as real and
-    imaginary part.
+    """Columns of links, axes of labels, and values by links and axes.
+
+    Complex values have a real and an imaginary part.
     """
-    places, metres = query.transmitters.cpu().double().numpy(), {"units": "m"}
-    variables = {axis: Variable(("link",), places[:, k], metres) for k, axis in enumerate("xyz")}
-    if scene.frame is not None:
-        about = metres | {"long_name": f"of EPSG:{scene.frame.epsg}"}
-        variables["easting"] = Variable(("link",), scene.frame.x + places[:, 0], about)
-        variables["northing"] = Variable(("link",), scene.frame.y + places[:, 1], about)
-    names = np.array([receiver.name for receiver in scene.receivers])
-    variables["receiver"] = Variable(("link",), names[query.receivers.cpu().numpy()])
-    if query.frequencies is not None:
-        carriers = query.frequencies.cpu().double().numpy()
-        variables["frequency"] = Variable(
-            ("link",), carriers, {"units": "Hz", "standard_name": "radiation_frequency"}
-        )
     axes = axes_of(task)
-    variables |= axes
+    variables = _link_columns(query, scene) | axes
     parts = {
-        "value": found.value,
-        "deviation": found.std,
-        "lower": found.lower,
-        "upper": found.upper,
+        "value": estimate.value,
+        "deviation": estimate.std,
+        "lower": estimate.lower,
+        "upper": estimate.upper,
+        "radius": estimate.radius,
+        "measured": measured,
     }
-    parts |= {"radius": found.radius, "measured": labels}
     for name, part in parts.items():
         if part is None:
             continue
-        part, unit = (
-            part.detach().cpu(),
-            {"units": task.unit or "1", "long_name": f"{task.quantity}: {name}"},
-        )
+        part = part.detach().cpu()
+        unit = task.unit
         if name in ("deviation", "radius"):
-            unit["units"] = getattr(task, "error_unit", task.unit) or "1"
-        of_link = part.reshape(len(part), *[1] * (len(task.shape) + 1 - part.ndim), *part.shape[1:])
-        ends = {"_real": "real", "_imag": "imag"} if part.is_complex() else {"": "real"}
-        for ending, side in ends.items():
-            values = getattr(of_link, side).expand(len(part), *task.shape).float().numpy()
-            variables[f"{name}{ending}"] = Variable(("link", *axes), values, unit)
+            unit = getattr(task, "error_unit", task.unit)
+        about = {"units": unit or "1", "long_name": f"{task.quantity}: {name}"}
+        # A part without some axes, such as one radius a link, is the same along them.
+        lacking_axes = len(task.shape) + 1 - part.ndim
+        of_link = part.reshape(len(part), *[1] * lacking_axes, *part.shape[1:])
+        sides = {"": of_link}
+        if part.is_complex():
+            sides = {"_real": of_link.real, "_imag": of_link.imag}
+        for ending, side in sides.items():
+            values = side.expand(len(part), *task.shape).float().numpy()
+            variables[f"{name}{ending}"] = Variable(("link", *axes), values, about)
     return variables
 
 
+def _link_columns(query: Query, scene: Scene) -> dict[str, Variable]:
+    """Columns of links: place, receiver and, if known, frequency."""
+    places = query.transmitters.cpu().double().numpy()
+    metres = {"units": "m"}
+    columns = {axis: Variable(("link",), places[:, k], metres) for k, axis in enumerate("xyz")}
+    if scene.frame is not None:
+        about = metres | {"long_name": f"of EPSG:{scene.frame.epsg}"}
+        columns["easting"] = Variable(("link",), scene.frame.x + places[:, 0], about)
+        columns["northing"] = Variable(("link",), scene.frame.y + places[:, 1], about)
+    names = np.array([receiver.name for receiver in scene.receivers])
+    columns["receiver"] = Variable(("link",), names[query.receivers.cpu().numpy()])
+    if query.frequencies is not None:
+        carriers = query.frequencies.cpu().double().numpy()
+        about = {"units": "Hz", "standard_name": "radiation_frequency"}
+        columns["frequency"] = Variable(("link",), carriers, about)
+    return columns
+
+
 def axes_of(task: Any) -> dict[str, Variable]:
-    """The axes of a label: elements and subcarriers, elevations and azimuths, or numbers of another
-    task's.
-    """
+    """The axes of a label: elements and subcarriers, directions, or numbers of another task's."""
     if task.directions is not None:
         angles = {"elevation": task.directions.elevations, "azimuth": task.directions.azimuths}
-        degrees = {
-            name: np.degrees(values.double().numpy()).round(6) for name, values in angles.items()
-        }
-        return {
-            name: Variable((name,), values, {"units": "degree"}) for name, values in degrees.items()
-        }
+        axes = {}
+        for name, values in angles.items():
+            degrees = np.degrees(values.double().numpy()).round(6)
+            axes[name] = Variable((name,), degrees, {"units": "degree"})
+        return axes
     if isinstance(task, Csi):
         subcarriers = Variable(("subcarrier",), task.frequencies.double().numpy(), {"units": "Hz"})
-        return {
-            "element": Variable(("element",), np.arange(task.elements, dtype=np.int32)),
-            "subcarrier": subcarriers,
-        }
-    names = [f"axis_{axis}" for axis in range(len(task.shape))]
-    return {
-        name: Variable((name,), np.arange(size, dtype=np.int32))
-        for name, size in zip(names, task.shape, strict=True)
-    }
+        elements = Variable(("element",), np.arange(task.elements, dtype=np.int32))
+        return {"element": elements, "subcarrier": subcarriers}
+    axes = {}
+    for number, size in enumerate(task.shape):
+        name = f"axis_{number}"
+        axes[name] = Variable((name,), np.arange(size, dtype=np.int32))
+    return axes
 
 
-def write_csv(
-    file: Path, variables: Mapping[str, Variable], absent: Bool[np.ndarray, " n *shape"]
-) -> None:
-    """A row for each number of each link that is not absent: columns of the link, of the axes, and
-    of the values.
+def _rows(
+    variables: Mapping[str, Variable], absent: Bool[np.ndarray, " n *shape"]
+) -> Iterator[Sequence[str]]:
+    """A heading, and a row for each number of each link that is not absent.
+
+    Columns are those of the link, then of the axes, then of the values.
     """
-    axes = {
-        name: one.values.tolist() for name, one in variables.items() if one.dimensions == (name,)
-    }
-    links = {name: one.values.tolist() for name, one in variables.items() if name in LINK}
-    values = {name: one.values for name, one in variables.items() if name not in axes | links}
-    shown = lambda value, digits=7: value if isinstance(value, str) else f"{value:.{digits}g}"
+    of_link = ("x", "y", "z", "easting", "northing", "receiver", "frequency")
+    axes: dict[str, list] = {}
+    links: dict[str, list] = {}
+    values: dict[str, np.ndarray] = {}
+    for name, variable in variables.items():
+        if variable.dimensions == (name,):
+            axes[name] = [f"{number:.10g}" for number in variable.values.tolist()]
+        elif name in of_link:
+            links[name] = variable.values.tolist()
+        else:
+            values[name] = variable.values
     digits = [10 if name in ("easting", "northing") else 7 for name in links]
-    places = [
-        *itertools.product(*([f"{number:.10g}" for number in axis] for axis in axes.values()))
-    ]
+    places = [*itertools.product(*axes.values())]
 
-    def rows() -> Iterator[Sequence[str]]:
-        yield [*links, *axes, *values]
-        for number, link in enumerate(zip(*links.values(), strict=True)):
-            start = [*map(shown, link, digits)]
-            own = (map(shown, part[number].ravel().tolist()) for part in values.values())
-            for place, row, is_absent in zip(
-                places, zip(*own, strict=True), absent[number].ravel(), strict=True
-            ):
-                if not is_absent:
-                    yield [*start, *place, *row]
+    yield [*links, *axes, *values]
+    for number, link in enumerate(zip(*links.values(), strict=True)):
+        start = [*map(_shown, link, digits)]
+        parts = [map(_shown, part[number].ravel().tolist()) for part in values.values()]
+        cells = zip(places, zip(*parts, strict=True), absent[number].ravel(), strict=True)
+        for place, row, is_absent in cells:
+            if not is_absent:
+                yield [*start, *place, *row]
 
-    tables.write_csv(file, rows())
+
+def _shown(value: Any, digits: int = 7) -> str:
+    return value if isinstance(value, str) else f"{value:.{digits}g}"

@@ -18,7 +18,7 @@ from gaigs.core.query import Query, evenly
 from gaigs.core.task.csi import Csi
 from gaigs.core.task.scalar import with_unit
 from gaigs.data import Links
-from gaigs.data.matching import check_fit
+from gaigs.data.compatibility import check_fit
 from gaigs.model import Model, call_optional
 from gaigs.report.csi import decibels, impulse_response
 from gaigs.splatting.gaussians import SH_DC

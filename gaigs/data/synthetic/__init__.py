@@ -21,6 +21,7 @@ from gaigs.data.simulation import (
     to_spectra,
 )
 from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, is_free, respond, trace
+from gaigs.io.meshes import Mesh
 from gaigs.registry import register
 
 ROOM = Room(
@@ -39,9 +40,7 @@ ROOM = Room(
 """The default room; its corner is the world's origin, z points up."""
 
 POSE = Pose.from_xyzw((0.2, 0.2, 2.5), (-0.15403, 0.87354, 0.23087, 0.39989))
-"""Pose of the array: high in the corner at the origin, facing down into the room, and turned about
-its normal.
-"""
+"""Pose of the array: high in the corner at the origin, facing down, turned about its normal."""
 
 GATEWAYS = {
     "west": (0.1, 2.6, 2.4),
@@ -64,10 +63,10 @@ def furnished_room(
     order: int = 2,
     seed: int = 0,
 ) -> Links:
-    """Spectra of transmitters at random places in the default room; the official split tests on the
-    last fifth of them.
+    """Spectra of transmitters at random places in the default room.
 
-    Each place sends at each carrier, and these links share a row.
+    The official split tests on the last fifth of the places. Each place sends at each carrier, and
+    these links share a row.
 
     Args:
         spectrum: ``band``: power averaged over the band, as a channel sounder reports it; paths
@@ -110,22 +109,17 @@ def respond_in_parts(
     offsets: Float[Tensor, " f"],
     order: int,
 ) -> Iterator[Complex[Tensor, "part elements f"]]:
-    """``respond`` for the paths of at most ``order`` reflections in any room, ``PART`` transmitters
-    [m] at a time.
+    """``respond`` for the paths of at most ``order`` reflections in any room.
+
+    ``PART`` transmitters [m] are taken at a time.
     """
     for part in transmitters.split(PART):
-        yield respond(
-            trace(room, part, receiver.pose.position, frequency, order),
-            receiver,
-            frequency,
-            offsets,
-        )
+        paths = trace(room, part, receiver.pose.position, frequency, order)
+        yield respond(paths, receiver, frequency, offsets)
 
 
 def place(count: int, seed: int) -> Float[Tensor, "count 3"]:
-    """Random places in the default room [m], uniform over the part of ``REGION`` that is free of
-    furniture.
-    """
+    """Random places in the default room [m], uniform over the free part of ``REGION``."""
     lower, upper = torch.tensor(REGION)
     return draw_places(lower, upper, lambda points: is_free(ROOM, points), count, seed)
 
@@ -155,32 +149,30 @@ def spectra(
 
 def edges(room: Room) -> Float[Tensor, "k 2 3"]:
     """Edges of the room and its furniture [m], 12 of each cuboid."""
-    corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))
+    corners = torch.tensor(list(itertools.product((0.0, 1.0), repeat=3)))  # of the unit cube
     pairs = torch.combinations(torch.arange(8))
-    pairs = pairs[(corners[pairs[:, 0]] - corners[pairs[:, 1]]).abs().sum(-1) == 1]
+    # An edge joins corners that differ along one axis.
+    steps = (corners[pairs[:, 0]] - corners[pairs[:, 1]]).abs().sum(-1)
+    pairs = pairs[steps == 1]  # (12, 2)
     lower = torch.tensor([(0.0, 0.0, 0.0), *(box.lower for box in room.furniture)])
     upper = torch.tensor([room.size, *(box.upper for box in room.furniture)])
-    return (lower[:, None] + (upper - lower)[:, None] * corners)[:, pairs].flatten(0, 1)
+    points = lower[:, None] + (upper - lower)[:, None] * corners  # (cuboids, 8, 3)
+    return points[:, pairs].flatten(0, 1)
 
 
-def wavefront_obj(room: Room) -> str:
-    """The room as a Wavefront OBJ file [m]: one object a cuboid, with each wall's material."""
-    # Corners from 1 of the faces in the order of ``Room.walls``, counterclockwise as seen from
-    # outside.
-    sides = (1, 2, 4, 3), (5, 7, 8, 6), (1, 5, 6, 2), (3, 4, 8, 7), (1, 3, 7, 5), (2, 6, 8, 4)
-    lines = []
+def meshes(room: Room) -> list[Mesh]:
+    """The room and its furniture: a mesh for each material of a cuboid."""
+    # Corners of the faces in the order of ``Room.walls``, counterclockwise as seen from outside.
+    sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
     cuboids = [("room", (0.0, 0.0, 0.0), room.size, room.walls)]
-    cuboids += [
-        (box.name, box.lower, box.upper, (f"loss_{box.loss_db:g}_db",) * 6)
-        for box in room.furniture
-    ]
-    for number, (name, lower, upper, materials) in enumerate(cuboids):
-        lines.append(f"o {name}")
-        corners = itertools.product(*zip(lower, upper, strict=True))
-        lines += [f"v {x:g} {y:g} {z:g}" for x, y, z in corners]
-        for face, material in zip(sides, materials, strict=True):
-            lines += [
-                f"usemtl {material}",
-                "f " + " ".join(str(8 * number + corner) for corner in face),
-            ]
-    return "\n".join(lines) + "\n"
+    for box in room.furniture:
+        cuboids.append((box.name, box.lower, box.upper, (f"loss_{box.loss_db:g}_db",) * 6))
+    parts = []
+    for name, lower, upper, materials in cuboids:
+        corners = tuple(itertools.product(*zip(lower, upper, strict=True)))
+        faces: dict[str, list[tuple[int, ...]]] = {}
+        for side, material in zip(sides, materials, strict=True):
+            faces.setdefault(material, []).append(side)
+        for material, alike in faces.items():
+            parts.append(Mesh(name, material, corners, tuple(alike)).compact())
+    return parts

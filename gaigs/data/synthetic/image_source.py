@@ -24,8 +24,9 @@ MATERIALS = {
     "ceiling_board": (1.48, 0.0011, 1.0750),
     "metal": (1.0, 1e7, 0.0),
 }
-"""Relative permittivity, and c and d of the conductivity c (f / GHz)^d [S/m]; ITU-R P.2040-3, table
-3, 1 to 40 GHz.
+"""Relative permittivity, and c and d of the conductivity c (f / GHz)^d [S/m], 1 to 40 GHz.
+
+Source: ITU-R P.2040-3, table 3.
 """
 
 TABULATED = {
@@ -68,8 +69,9 @@ class Room:
 
 
 def permittivity(material: str, frequency: float) -> complex:
-    """Complex relative permittivity of a material at a frequency [Hz], time dependence exp(+j omega
-    t).
+    """Complex relative permittivity of a material at a frequency [Hz].
+
+    The time dependence is exp(+j omega t).
 
     Raises:
         ValueError: The material is unknown, or the frequency is outside the tables.
@@ -80,12 +82,11 @@ def permittivity(material: str, frequency: float) -> complex:
         raise ValueError(f"unknown material {material!r}; there are: {', '.join(MATERIALS)}")
     if not 1e9 <= frequency <= 40e9:
         raise ValueError(
-            f"frequency must lie in 1e9..40e9 Hz, where materials are tabulated, got {frequency:.6g}"
+            "frequency must lie in 1e9..40e9 Hz, where materials are tabulated, "
+            f"got {frequency:.6g}"
         )
-    return complex(
-        MATERIALS[material][0],
-        -conductivity(material, frequency) / (2 * math.pi * epsilon_0 * frequency),
-    )
+    omega_epsilon = 2 * math.pi * epsilon_0 * frequency
+    return complex(MATERIALS[material][0], -conductivity(material, frequency) / omega_epsilon)
 
 
 def conductivity(material: str, frequency: float) -> float:
@@ -95,12 +96,17 @@ def conductivity(material: str, frequency: float) -> float:
 
 
 def cells(order: int) -> Int[Tensor, "p 3"]:
-    """Mirrored copies of the room, i along x, j along y, k along z, by |i| + |j| + |k| <= order
-    reflections.
+    """Mirrored copies of the room: i along x, j along y, k along z.
+
+    They take |i| + |j| + |k| reflections, at most ``order``; copies with fewer come first.
     """
+
+    def reflections(cell: tuple[int, ...]) -> int:
+        return sum(map(abs, cell))
+
     steps = range(-order, order + 1)
-    found = [cell for cell in itertools.product(steps, repeat=3) if sum(map(abs, cell)) <= order]
-    return torch.tensor(sorted(found, key=lambda cell: sum(map(abs, cell))))
+    near = [cell for cell in itertools.product(steps, repeat=3) if reflections(cell) <= order]
+    return torch.tensor(sorted(near, key=reflections))
 
 
 def mirror(
@@ -116,14 +122,15 @@ def passes(
     lower: Float[Tensor, "*#batch 3"],
     upper: Float[Tensor, "*#batch 3"],
 ) -> Tensor:
-    """True for segments from ``start`` to ``end`` that pass through the inside of cuboids along the
-    axes.
+    """True for segments from ``start`` to ``end`` that pass through cuboids along the axes.
 
-    It lies between the last entry and the first exit. A segment within a face has 0 / 0, hence NaN,
-    and does not pass.
+    The inside lies between the last entry and the first exit. A segment within a face has 0 / 0,
+    hence NaN, and does not pass.
     """
     ray = end - start
-    first, second = (lower - start) / ray, (upper - start) / ray
+    # Shares of the segment at which it crosses the planes of the faces.
+    first = (lower - start) / ray
+    second = (upper - start) / ray
     entry = torch.minimum(first, second).amax(-1).clamp(min=0)
     leave = torch.maximum(first, second).amin(-1).clamp(max=1)
     return entry < leave
@@ -151,11 +158,11 @@ def trace(
     frequency: float,
     order: int,
 ) -> Paths:
-    """Every path with at most ``order`` reflections between positions [m], with gains at a
-    frequency [Hz].
+    """Every path with at most ``order`` reflections between positions [m].
 
-    The field is vertically polarised: TE at the four walls, TM at floor and ceiling. The furniture
-    is mirrored with the room, so a path is the straight line from the receiver to an image.
+    Gains are those at a frequency [Hz]. The field is vertically polarised: TE at the four walls, TM
+    at floor and ceiling. The furniture is mirrored with the room, so a path is the straight line
+    from the receiver to an image.
 
     Raises:
         ValueError: A transmitter or the receiver is outside the room or inside furniture; the order
@@ -166,16 +173,17 @@ def trace(
     """
     if order < 0:
         raise ValueError(f"order must be the largest number of reflections, 0 or more, got {order}")
-    transmitters, receiver = transmitters.double(), receiver.double()
+    transmitters = transmitters.double()
+    receiver = receiver.double()
     size = transmitters.new_tensor(room.size)
     points = torch.cat((receiver[None], transmitters))
     if len(blocked := points[~is_free(room, points)]):
         raise ValueError(
-            f"transmitters and receiver must lie inside the room of {room.size} m and outside its furniture, "
-            f"got {blocked[0].round(decimals=4).tolist()}; move it"
+            f"transmitters and receiver must lie inside the room of {room.size} m and outside its "
+            f"furniture, got {blocked[0].round(decimals=4).tolist()}; move it"
         )
     cell = cells(order).to(size.device)
-    images = mirror(transmitters[:, None], cell, size)
+    images = mirror(transmitters[:, None], cell, size)  # (b, p, 3)
     rays = images - receiver
     cosines = rays.abs() / rays.norm(dim=-1, keepdim=True)
 
@@ -193,9 +201,8 @@ def trace(
         corners = size.new_tensor([(box.lower, box.upper) for box in room.furniture])
         mirrored = mirror(corners[:, :, None], cell, size)
         through = passes(receiver, images[:, :, None, None], mirrored.amin(1), mirrored.amax(1))
-        loss_db = through.sum(-1).double() @ size.new_tensor(
-            [box.loss_db for box in room.furniture]
-        )
+        counts = through.sum(-1).double()
+        loss_db = counts @ size.new_tensor([box.loss_db for box in room.furniture])
         gains = gains * 10 ** (-loss_db / 20)
     return Paths(images, gains)
 
@@ -203,20 +210,21 @@ def trace(
 def bounces(
     room: Room, images: Float[Tensor, "b p 3"], receiver: Float[Tensor, "3"], order: int
 ) -> Float[Tensor, "b p order 3"]:
-    """Points at which paths are reflected, from the receiver on, world frame [m]; NaN after the
-    last one.
+    """Points at which paths are reflected, from the receiver on [m]; NaN after the last one.
 
     A straight line to an image crosses a plane of the lattice at each reflection; folded back, all
     are in the room.
     """
-    start, size = receiver.to(images), images.new_tensor(room.size)
-    ray = images - start
-    planes = torch.arange(1 - order, order + 1).to(images)[:, None] * size
-    shares = ((planes - start) / ray[:, :, None]).flatten(2)
-    shares = (
-        torch.where((shares > 0) & (shares < 1), shares, torch.nan).sort(-1).values[..., :order]
-    )
+    start = receiver.to(images)
+    size = images.new_tensor(room.size)
+    ray = images - start  # (b, p, 3)
+    planes = torch.arange(1 - order, order + 1).to(images)[:, None] * size  # (2 order, 3)
+    # Shares of the line at which it crosses each plane.
+    shares = ((planes - start) / ray[:, :, None]).flatten(2)  # (b, p, 6 order)
+    shares = torch.where((shares > 0) & (shares < 1), shares, torch.nan)
+    shares = shares.sort(-1).values[..., :order]  # (b, p, order)
     points = (start + shares[..., None] * ray[:, :, None]) / size
+    # Every other copy of the room is mirrored: a triangle wave of period 2.
     return (points - 2 * (points / 2).round()).abs() * size
 
 
@@ -224,9 +232,9 @@ def is_free(room: Room, points: Float[Tensor, "*batch 3"]) -> Tensor:
     """True for points inside the room and outside its furniture."""
     free = ((points > 0) & (points < points.new_tensor(room.size))).all(-1)
     for box in room.furniture:
-        free &= ~(
-            (points >= points.new_tensor(box.lower)) & (points <= points.new_tensor(box.upper))
-        ).all(-1)
+        is_above = points >= points.new_tensor(box.lower)
+        is_below = points <= points.new_tensor(box.upper)
+        free &= ~(is_above & is_below).all(-1)
     return free
 
 
@@ -252,16 +260,15 @@ def respond(
         raise ValueError(
             f"frequencies must be positive, got {frequencies.min():.6g} Hz; narrow the bandwidth"
         )
-    position, rotation = receiver.pose.position.double(), receiver.pose.rotation.double()
-    elements = position + receiver.array.elements.double() @ rotation.T
-    found = []
-    # 16 transmitters at a time, because the waves of all paths take many times the memory of their
-    # sums.
+    position = receiver.pose.position.double()
+    rotation = receiver.pose.rotation.double()
+    elements = position + receiver.array.elements.double() @ rotation.T  # (elements, 3)
+    fields = []
+    # 16 transmitters at a time: the waves of all paths take many times the memory of their sums.
     for images, gains in zip(paths.images.split(16), paths.gains.split(16), strict=True):
-        local = (images - position) @ rotation
+        local = (images - position) @ rotation  # (16, p, 3)
         gains = gains * receiver.array.gain(local / local.norm(dim=-1, keepdim=True))
-        distances = (images[:, :, None] - elements).norm(dim=-1)
-        found.append(
-            torch.einsum("bp,bpnf->bnf", gains, free_space(distances[..., None], frequencies))
-        )
-    return torch.cat(found)
+        distances = (images[:, :, None] - elements).norm(dim=-1)  # (16, p, elements)
+        waves = free_space(distances[..., None], frequencies)  # (16, p, elements, f)
+        fields.append(torch.einsum("bp,bpnf->bnf", gains, waves))
+    return torch.cat(fields)

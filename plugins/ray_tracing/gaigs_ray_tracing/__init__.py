@@ -6,6 +6,8 @@ import math
 from collections.abc import Mapping
 
 import torch
+from gaigs_sionna.meshes import THICKNESS
+from gaigs_sionna.tracing import frequency_offsets
 from jaxtyping import Float
 from scipy.constants import epsilon_0
 from torch import Tensor, nn
@@ -14,9 +16,8 @@ from gaigs.core.propagation import fit_gain, free_space
 from gaigs.core.query import Batch, Query, check_carrier
 from gaigs.core.scene import Scene, carriers, check_elements, direct_waves
 from gaigs.data import Links
-from gaigs.data.sionna.meshes import THICKNESS, wavefront_obj
-from gaigs.data.sionna.tracing import frequency_offsets
 from gaigs.data.synthetic.image_source import MATERIALS, Paths, respond
+from gaigs.io.meshes import wavefront_obj
 from gaigs.model import Model, Prediction
 from gaigs.splatting.pooling.beamformer import Beamformer
 
@@ -147,7 +148,7 @@ class RayTracing(Model):
 
         Raises:
             FileNotFoundError, ImportError, RuntimeError: As ``gaigs_ray_tracing.rooms.find_meshes``
-                and ``gaigs.data.sionna.tracing.make_scene``.
+                and ``gaigs_sionna.tracing.make_scene``.
             ValueError: The mesh is damaged or of unknown materials.
         """
         text = wavefront_obj(find_meshes(self.room, self.mesh))

@@ -5,10 +5,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from gaigs_sionna import tracing
+from gaigs_sionna.meshes import THICKNESS
+from gaigs_sionna.rooms import ROOMS
+
 from gaigs.data import synthetic
-from gaigs.data.sionna import ROOMS, tracing
-from gaigs.data.sionna.meshes import THICKNESS, Mesh
-from gaigs.io.meshes import NO_NAME, check_mesh, parse_obj, positions, read_ply
+from gaigs.io.meshes import NO_NAME, Mesh, check_mesh, parse_obj, positions, read_ply, wavefront_obj
 from gaigs.io.meshes import read_obj as read_mesh
 
 BUILT_IN = ("built_in", "synthetic", "synthetic_rssi", "synthetic_csi")
@@ -58,7 +60,7 @@ def find_meshes(room: str, mesh: str | None) -> list[Mesh]:
     check_room(room)
     if room in ROOMS:
         return ROOMS[room].meshes()
-    shell = read_obj(synthetic.wavefront_obj(synthetic.ROOM), "the built-in room")
+    shell = read_obj(wavefront_obj(synthetic.meshes(synthetic.ROOM)), "the built-in room")
     return [replace(part, material=part.name) if part.name in FURNITURE else part for part in shell]
 
 

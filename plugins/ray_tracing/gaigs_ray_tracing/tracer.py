@@ -9,14 +9,15 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from gaigs_sionna import cache, tracing
+from gaigs_sionna.meshes import THICKNESS
 from jaxtyping import Float, Int
 from numpy import ndarray
 from scipy.constants import speed_of_light
 from torch import Tensor
 
-from gaigs.data.sionna import cache, tracing
-from gaigs.data.sionna.meshes import THICKNESS, Mesh
 from gaigs.data.synthetic.image_source import MATERIALS
+from gaigs.io.meshes import Mesh
 
 from .fields import PASSED, REFLECTED, Traced
 from .rooms import read_obj

@@ -1,20 +1,17 @@
 """Exported rooms as readers of glTF, of meshes and of Mitsuba's scenes see them."""
 
-import base64
-import json
 import os
-import struct
 from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 import gaigs
 from gaigs.commands.export.rooms import itu_bsdf, mirrored_of, sheet_bsdf, write_scene
-from gaigs.data.sionna.meshes import Mesh
-from gaigs.io.meshes import positions, read_obj, read_ply
+from gaigs.io.meshes import Mesh, positions, read_obj, read_ply
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
 from gaigs.planes import sheets
@@ -31,58 +28,36 @@ WALL = Mesh(
 )
 
 
-def chunks(data):
-    """Content and buffer of a binary glTF."""
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    size, kind = struct.unpack_from("<I4s", data, 12)
-    rest, other = struct.unpack_from("<I4s", data, 20 + size)
-    assert (kind, other, 28 + size + rest, size % 4, rest % 4) == (
-        b"JSON",
-        b"BIN\0",
-        len(data),
-        0,
-        0,
-    )
-    return json.loads(data[20 : 20 + size]), data[28 + size :]
+@pytest.mark.parametrize("name", ["room.glb", "room.gltf"])
+def test_gltf_has_the_room_with_y_up(mirrored, tmp_path, name):
+    scene = trimesh.load_scene(*gaigs.export(mirrored, tmp_path / name))
+    np.testing.assert_allclose(scene.bounds, [(0, 0, -SIZE[1]), (SIZE[0], SIZE[2], 0)], atol=1e-3)
+    planes = {f"plane_{plane.number}": plane for plane in mirrored.learnt_room().planes}
+    assert scene.geometry.keys() == planes.keys()
+    upright = scene.graph.get("room")[0]
+    np.testing.assert_allclose(upright[:3, :3] @ (0, 0, 1), (0, 1, 0), atol=1e-6)
+    for node in scene.graph.nodes_geometry:
+        transform, key = scene.graph[node]
+        np.testing.assert_allclose(transform, upright, atol=1e-6)
+        assert node == key
+        shape = scene.geometry[key]
+        np.testing.assert_allclose(shape.vertices, planes[key].corners, atol=1e-5)
+        assert shape.faces.tolist() == [[0, 1, 2], [0, 2, 3]]
+        material = shape.visual.material
+        assert material.main_color.tolist() == [0, 115, 178, 89]
+        assert (material.alphaMode, material.doubleSided) == ("BLEND", True)
+        extras = scene.graph.transforms.edge_data["room", node]["metadata"]
+        assert extras == {"share": planes[key].share}
 
 
-def test_gltf_has_the_room_with_y_up(mirrored, tmp_path):
-    for name in ("room.glb", "room.gltf"):
-        gaigs.export(mirrored, tmp_path / name)
-    content, buffer = chunks((tmp_path / "room.glb").read_bytes())
-    plain = json.loads((tmp_path / "room.gltf").read_text())
-    assert base64.b64decode(plain["buffers"][0]["uri"].partition(",")[2]) == buffer
-    root, *nodes = content["nodes"]
-    assert root["children"] == [1, 2, 3, 4, 5, 6]
-    x, _, _, w = root["rotation"]
-    corners = []
-    for node in nodes:
-        (primitive,) = content["meshes"][node["mesh"]]["primitives"]
-        accessor, faces = (
-            content["accessors"][k]
-            for k in (primitive["attributes"]["POSITION"], primitive["indices"])
-        )
-        view, drawn = (content["bufferViews"][part["bufferView"]] for part in (accessor, faces))
-        points = np.frombuffer(buffer, "<f4", 3 * accessor["count"], view["byteOffset"]).reshape(
-            -1, 3
-        )
-        assert np.frombuffer(buffer, "<u4", faces["count"], drawn["byteOffset"]).tolist() == [
-            0,
-            1,
-            2,
-            0,
-            2,
-            3,
-        ]
-        np.testing.assert_allclose(
-            [accessor["min"], accessor["max"]], [points.min(0), points.max(0)]
-        )
-        corners.append(points)
-    turn = np.array([[1, 0, 0], [0, 1 - 2 * x * x, -2 * x * w], [0, 2 * x * w, 1 - 2 * x * x]])
-    corners = np.concatenate(corners) @ turn.T
-    np.testing.assert_allclose(corners.min(0), [0, 0, -SIZE[1]], atol=1e-3)
-    np.testing.assert_allclose(corners.max(0), [SIZE[0], SIZE[2], 0], atol=1e-3)
+def test_an_obj_has_names_and_geometry_in_any_reader(mirrored, tmp_path):
+    (file,) = gaigs.export(mirrored, tmp_path / "room.obj")
+    scene = trimesh.load_scene(file, split_objects=True, group_material=False)
+    planes = {f"plane_{plane.number}": plane for plane in mirrored.learnt_room().planes}
+    assert scene.geometry.keys() == planes.keys()
+    for name, shape in scene.geometry.items():
+        np.testing.assert_allclose(shape.bounds[0], planes[name].corners.min(0), atol=1e-5)
+        np.testing.assert_allclose(shape.bounds[1], planes[name].corners.max(0), atol=1e-5)
 
 
 def test_a_kriged_ensemble_has_the_room_of_its_first_member(mirrored):
@@ -188,8 +163,8 @@ def test_obstacles_are_surfaces_and_the_gain_of_channels_is_told(mirrored, tmp_p
     gaigs.export(mirrored, tmp_path / "room.obj")
     _, faces = read_obj(tmp_path / "room.obj")
     assert len(faces) == 6 + len(pieces)
-    content, _ = chunks(gaigs.export(mirrored, tmp_path / "room.glb")[0].read_bytes())
-    assert len(content["nodes"][0]["children"]) == 6 + len(pieces)
+    scene = trimesh.load_scene(*gaigs.export(mirrored, tmp_path / "room.glb"))
+    assert len(scene.geometry) == 6 + len(pieces)
 
 
 def test_obj_and_kriging_on_top(mirrored, tmp_path):

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 import torch
+from gaigs_deepmimo.readers import read_channels
 from scipy.constants import speed_of_light
 
 import gaigs
-from gaigs.data import deepmimo
 from gaigs.processes import only_run
 
 
@@ -40,7 +40,7 @@ def test_a_scenario_gives_the_channels_of_the_model(tmp_path):
     ):
         gaigs.export(kriging, tmp_path / "room.deepmimo", users)
     (folder,) = gaigs.export(kriging, tmp_path / "room.deepmimo", torch.cat((users, users[:2])))
-    found = deepmimo.read(folder, elements=[1, 1], bandwidth=20e6, subcarriers=5)
+    found = read_channels(folder, elements=[1, 1], bandwidth=20e6, subcarriers=5)
     assert len(found) == 24
     expected = model.predict(found.query) * (task.frequencies / task.frequencies.mean())
     torch.testing.assert_close(

@@ -6,8 +6,9 @@ import re
 import pytest
 import torch
 
-from gaigs.data.synthetic import ROOM, wavefront_obj
+from gaigs.data.synthetic import ROOM, meshes
 from gaigs.data.synthetic.image_source import Room
+from gaigs.io.meshes import wavefront_obj
 from gaigs.splatting.placement.mirrored.paths import Mirrored
 from gaigs.splatting.placement.mirrored.walls import read_planes
 from gaigs.testing import example_links
@@ -78,7 +79,7 @@ def test_pieces_of_one_wall_are_one_plane_and_count_together(tmp_path):
 
 
 def test_furniture_adds_its_faces_to_the_walls_it_stands_at(tmp_path):
-    planes = read_planes(write(tmp_path, "room.obj", wavefront_obj(ROOM)), LOWER, UPPER)
+    planes = read_planes(write(tmp_path, "room.obj", wavefront_obj(meshes(ROOM))), LOWER, UPPER)
     areas = {}
     for lower, upper in [
         ((0.0, 0.0, 0.0), ROOM.size),
@@ -142,7 +143,7 @@ def started(links, file, planes=8, **options):
 
 
 def test_a_placement_starts_from_the_walls(tmp_path, links):
-    file = write(tmp_path, "room.obj", wavefront_obj(EMPTY))
+    file = write(tmp_path, "room.obj", wavefront_obj(meshes(EMPTY)))
     placement = started(links, file)
     expected = read_planes(file, *placement.box)
     torch.testing.assert_close(placement.normals[:6], expected[:, :3])
@@ -156,7 +157,7 @@ def test_a_placement_starts_from_the_walls(tmp_path, links):
 
 
 def test_of_more_walls_than_planes_the_largest_are_taken(tmp_path, links, caplog):
-    file = write(tmp_path, "room.obj", wavefront_obj(ROOM))
+    file = write(tmp_path, "room.obj", wavefront_obj(meshes(ROOM)))
     placement = started(links, file, planes=6)
     planes = read_planes(file, *placement.box)
     torch.testing.assert_close(
@@ -168,7 +169,9 @@ def test_of_more_walls_than_planes_the_largest_are_taken(tmp_path, links, caplog
 
 @pytest.mark.parametrize("fixed", [True, False])
 def test_training_moves_walls_unless_they_are_fixed(tmp_path, links, fixed):
-    placement = started(links, write(tmp_path, "room.obj", wavefront_obj(EMPTY)), fixed=fixed)
+    placement = started(
+        links, write(tmp_path, "room.obj", wavefront_obj(meshes(EMPTY))), fixed=fixed
+    )
     before = placement.normals.clone(), placement.offsets.clone(), placement.plane_gains.clone()
     groups = placement.parameter_groups()
     assert ("planes" in groups) != fixed

@@ -1,6 +1,4 @@
-"""Traced paths, stored on disk: they are the same for every spectrum, bandwidth and number of
-subcarriers.
-"""
+"""Traced paths, stored on disk: any spectrum and any band of a carrier has the same paths."""
 
 import hashlib
 import json
@@ -17,10 +15,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.data.sionna import tracing
-from gaigs.data.sionna.meshes import MeshRoom
-from gaigs.data.sionna.scenes import SceneFile
 from gaigs.data.synthetic.image_source import Paths
+
+from . import tracing
+from .meshes import THICKNESS, MeshRoom
+from .scenes import SceneFile
 
 log = logging.getLogger(__name__)
 
@@ -35,15 +34,13 @@ def find_paths(
     frequency: float,
     diffraction: bool = True,
 ) -> Paths:
-    """The paths in a room, traced by ``tracing.trace`` the first time and read by ``keep``
-    afterwards.
-    """
+    """The paths in a room: traced the first time, afterwards read from a file by ``keep``."""
     surfaces: dict[str, object] = (
         {"scene": room.digest}
         if isinstance(room, SceneFile)
         else {
             "meshes": [(mesh.material, mesh.vertices, mesh.faces) for mesh in room.meshes()],
-            "thickness": tracing.THICKNESS,
+            "thickness": THICKNESS,
         }
     )
     key = {
@@ -98,11 +95,11 @@ def keep(
         arrays = make()
         file.parent.mkdir(parents=True, exist_ok=True)
         # Two processes may trace at once, with slightly different results: the first file stays.
-        with tempfile.TemporaryDirectory(dir=file.parent) as own:
-            with open(f"{own}/paths.npz", "wb") as stream:
+        with tempfile.TemporaryDirectory(dir=file.parent) as scratch:
+            with open(f"{scratch}/paths.npz", "wb") as stream:
                 np.savez_compressed(stream, **arrays)
             if not file.is_file():
-                os.replace(f"{own}/paths.npz", file)
+                os.replace(f"{scratch}/paths.npz", file)
     try:
         with file.open("rb") as stream:  # numpy leaves a damaged file open
             return dict(np.load(stream, allow_pickle=False))

@@ -18,17 +18,10 @@ from torch import Tensor
 
 from gaigs.core.query import as_positions
 from gaigs.data.simulation import draw_places
-from gaigs.data.sionna import tracing
-from gaigs.data.sionna.meshes import Mesh, edges
+from gaigs.io.meshes import Mesh
 
-MARGIN = 0.1
-"""Smallest distance of transmitters from surfaces, in 26 directions [m]."""
-
-CELLS, PITCH = 300_000, 0.1
-"""Largest number of cells of the grid that free space is found on, and its smallest pitch [m]."""
-
-DRAWN = 20_000
-"""Largest number of triangles that figures show the edges of."""
+from . import tracing
+from .meshes import edges
 
 
 @dataclass(frozen=True)
@@ -73,7 +66,8 @@ class SceneFile:
                 r"Traceback \(most recent call last\):.*\n(?=\S)", "", str(error), flags=re.DOTALL
             )
             raise ValueError(
-                f"cannot load {self.file}: {' '.join(cause.split())}; expected a scene that sionna.rt.load_scene loads"
+                f"cannot load {self.file}: {' '.join(cause.split())}; "
+                "expected a scene that sionna.rt.load_scene loads"
             ) from error
         if frequency is not None:
             try:
@@ -86,20 +80,23 @@ class SceneFile:
 
     @cached_property
     def space(self) -> "FreeSpace":
-        """The free space; a ``ValueError`` if a receiver stands farther from the surfaces than
-        these are long.
+        """The free space.
+
+        Raises:
+            ValueError: A receiver stands farther from the surfaces than these are long.
         """
         scene = self.load().mi_scene
-        lower, upper = (
-            np.array(corner, float).reshape(3) for corner in (scene.bbox().min, scene.bbox().max)
-        )
+        box = scene.bbox()
+        lower = np.array(box.min, float).reshape(3)
+        upper = np.array(box.max, float).reshape(3)
         for receiver in self.receivers.double().numpy():
             if np.linalg.norm(receiver - receiver.clip(lower, upper)) > np.linalg.norm(
                 upper - lower
             ):
                 bounds = f"{lower.round(3).tolist()} to {upper.round(3).tolist()}"
                 raise ValueError(
-                    f"receivers must stand in the scene, whose surfaces lie from {bounds} m, got {receiver.tolist()}"
+                    f"receivers must stand in the scene, whose surfaces lie from {bounds} m, "
+                    f"got {receiver.tolist()}"
                 )
         return FreeSpace(scene, self.receivers.double().numpy())
 
@@ -114,18 +111,20 @@ class SceneFile:
         )
         if not space.reached[inside].any():
             raise ValueError(
-                f"{self.file}: expected free space at z from {low:.4g} to {high:.4g} m that the receivers see into, "
-                "got none; set data.heights"
+                f"{self.file}: expected free space at z from {low:.4g} to {high:.4g} m that the "
+                "receivers see into, got none; set data.heights"
             )
         return draw_places(lower, upper, space.is_free, count, seed)
 
     def edges(self) -> Float[Tensor, "k 2 3"]:
-        """Outlines of the surfaces for figures [m]; none if there are too many."""
+        """Outlines of the surfaces for figures [m]; empty if there are too many."""
         import mitsuba
+
+        most = 20_000  # triangles that figures show the edges of
 
         parts = [mitsuba.traverse(shape.mi_mesh) for shape in self.load().objects.values()]
         parts = [part for part in parts if "vertex_positions" in part]
-        if sum(len(part["faces"]) for part in parts) > 3 * DRAWN:
+        if sum(len(part["faces"]) for part in parts) > 3 * most:
             return torch.zeros(0, 2, 3)
         meshes = []
         for part in parts:
@@ -161,8 +160,10 @@ class FreeSpace:
         self.floor = float(bounds[0, 2])
         bounds = np.concatenate((bounds, receivers))
         self.lower, self.upper = bounds.min(0), bounds.max(0)
-        size = np.maximum(self.upper - self.lower, PITCH)
-        self.pitch = max(PITCH, float(size.prod() / CELLS) ** (1 / 3))
+        pitch = 0.1  # the smallest one [m]
+        cells = 300_000  # the largest number of them
+        size = np.maximum(self.upper - self.lower, pitch)
+        self.pitch = max(pitch, float(size.prod() / cells) ** (1 / 3))
         self.counts = np.ceil(size / self.pitch).astype(int)
         number = np.arange(self.counts.prod()).reshape(self.counts)
         self.centres = self.lower + (np.indices(self.counts).reshape(3, -1).T + 0.5) * self.pitch
@@ -201,12 +202,13 @@ class FreeSpace:
 
     def is_free(self, points: Float[Tensor, "k 3"]) -> Bool[Tensor, " k"]:
         """True for points [m] that can be reached, with a margin to all surfaces."""
+        margin = 0.1  # smallest distance from surfaces, in 26 directions [m]
         places = points.double().numpy()
         cells = np.ravel_multi_index(tuple(self.cells(places).T), tuple(self.counts))
         free = self.reached[cells] & self.is_open(places, self.centres[cells])
         around = np.indices((3, 3, 3)).reshape(3, -1).T - 1.0
         around = around[np.abs(around).any(1)]
-        around *= MARGIN / np.linalg.norm(around, axis=1, keepdims=True)
+        around *= margin / np.linalg.norm(around, axis=1, keepdims=True)
         ends = places[:, None] + around
         clear = self.is_open(places.repeat(len(around), 0), ends.reshape(-1, 3)).reshape(
             len(places), -1
@@ -215,9 +217,7 @@ class FreeSpace:
 
 
 def check_points(name: str, points: Sequence[Sequence[float]] | None) -> Float[Tensor, "k 3"]:
-    """Positions of an option [m]; a ``ValueError`` if there is none, or one has not three
-    coordinates.
-    """
+    """Positions of an option [m]; a ``ValueError`` without three coordinates of each."""
     if not points or not all(isinstance(point, Sequence) and len(point) == 3 for point in points):
         raise ValueError(f"{name} must be x, y, z of each receiver in the scene [m], got {points}")
     return as_positions(name, [[*point] for point in points])

@@ -1,39 +1,51 @@
-"""Links against the scene that a model was made for."""
+"""Links that fit the scene of a model: the same labels and receivers."""
 
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from gaigs.core.antenna import Receiver
 from gaigs.core.scene import Scene
 from gaigs.data import Links
 
 
 def check_fit(links: Links, scene: Scene | None = None) -> None:
-    """Raises a ``ValueError`` unless links have a split and, with a model's scene, its receivers
-    and labels.
+    """Checks that links have a split and, given a model's scene, its receivers and labels.
+
+    Raises:
+        ValueError: The links do not fit; the message has both sides.
     """
     if links.split is None:
         raise ValueError("links must have a split; gaigs.links(..., split='random') gives one")
     if scene is None:
         return
+    # The normalisation is the labels' scale in words.
     axes = [task.state() | {"normalisation": ""} for task in (scene.task, links.task)]
     if not are_alike(*axes):
         expected, got = (f"{task.name!r} {tuple(task.shape)}" for task in (scene.task, links.task))
         raise ValueError(
             f"links must have the model's labels, {expected} with the same axes, got {got}"
         )
-    both = scene.receivers, links.receivers
-    antennas = [
-        [(r.pose.position, r.pose.rotation, r.array.elements, r.array.pattern) for r in each]
-        for each in both
-    ]
-    if not are_alike(*antennas):
-        expected, got = (", ".join(receiver.name for receiver in each) for each in both)
+    if not are_alike(_antennas(scene.receivers), _antennas(links.receivers)):
+        expected, got = (_names(receivers) for receivers in (scene.receivers, links.receivers))
         raise ValueError(
-            f"links must have the model's receivers in the same order, with the same poses and arrays: {expected}; "
-            f"got {got}"
+            "links must have the model's receivers in the same order, with the same poses and "
+            f"arrays: {expected}; got {got}"
         )
+
+
+def _antennas(receivers: tuple[Receiver, ...]) -> list[tuple]:
+    antennas = []
+    for receiver in receivers:
+        pose = receiver.pose
+        array = receiver.array
+        antennas.append((pose.position, pose.rotation, array.elements, array.pattern))
+    return antennas
+
+
+def _names(receivers: tuple[Receiver, ...]) -> str:
+    return ", ".join(receiver.name for receiver in receivers)
 
 
 def are_alike(a: Any, b: Any) -> bool:

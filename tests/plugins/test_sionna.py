@@ -7,13 +7,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from gaigs_sionna.meshes import FURNITURE_MARGIN
+from gaigs_sionna.rooms import ROOMS
+from gaigs_sionna.simulation import HEIGHTS, place
 from scipy.constants import speed_of_light
 
 from gaigs.core.geometry import from_spherical
 from gaigs.data import load
-from gaigs.data.sionna import HEIGHTS, place
-from gaigs.data.sionna.meshes import FURNITURE_MARGIN
-from gaigs.data.sionna.rooms import ROOMS
 
 CARRIER, BANDWIDTH = 6.4896e9, 499.2e6
 CLEAR = {"noise": 0.0, "sensitivity": -300.0}

@@ -1,6 +1,6 @@
 """The rooms that are simulated: an L, one with a leaning wall, one full of furniture."""
 
-from gaigs.data.sionna.meshes import Cuboid, MeshRoom
+from .meshes import Cuboid, MeshRoom
 
 
 def _table(name: str, x: float, y: float, length: float, width: float) -> tuple[Cuboid, ...]:

@@ -3,10 +3,12 @@
 import numpy as np
 import pytest
 import torch
+from gaigs_sionna.meshes import Cuboid
+from gaigs_sionna.readers import traced_room, traced_room_csi, traced_room_rssi
+from gaigs_sionna.simulation import find_room
 from scipy.constants import speed_of_light
 
-from gaigs.data import sionna, sionna_csi, sionna_rssi
-from gaigs.data.sionna.meshes import Cuboid, wavefront_obj
+from gaigs.io.meshes import wavefront_obj
 
 MATERIAL = (
     '<bsdf type="itu-radio-material" id="{0}"><string name="type" value="{0}"/>'
@@ -43,7 +45,7 @@ def scene(tracer, tmp_path):
 
 def test_transmitters_stand_in_the_free_space_alone(scene):
     receivers = [[0.3, 0.3, 2.5], [4.7, 3.7, 1.0]]
-    room = sionna.find_room("", scene, "receivers", receivers, None, [0.5, 1.5])
+    room = find_room("", scene, "receivers", receivers, None, [0.5, 1.5])
     places = room.place(40, 0)
     low, high = places.new_tensor([0.1, 0.1, 0.5]), places.new_tensor([4.9, 3.9, 1.5])
     assert ((places >= low) & (places <= high)).all()
@@ -62,7 +64,7 @@ def test_paths_are_those_over_a_plate_of_metal(tracer, tmp_path):
     floor.
     """
     scene = write(tmp_path, floor=("metal", (-20, -20, -0.5), (20, 20, 0)))
-    links = sionna_rssi.traced_room_rssi(
+    links = traced_room_rssi(
         scene=scene,
         receivers=[[0.0, 0.0, 2.0]],
         transmitters=10,
@@ -90,7 +92,7 @@ def test_places_without_a_path_are_left_out(tracer, tmp_path):
         "transmitters": 4,
     }
     with pytest.raises(ValueError, match="paths must lead to two of 4 transmitters"):
-        sionna_csi.traced_room_csi(**options, bandwidth=1e6, subcarriers=2)
+        traced_room_csi(**options, bandwidth=1e6, subcarriers=2)
 
 
 @pytest.mark.parametrize(
@@ -108,7 +110,7 @@ def test_damaged_scenes_are_named(scene, text, message):
     with open(scene, "w") as file:
         file.write(text)
     with pytest.raises(ValueError, match=message):
-        sionna.traced_room(scene=scene, receiver=[0.3, 0.3, 2.5], transmitters=2)
+        traced_room(scene=scene, receiver=[0.3, 0.3, 2.5], transmitters=2)
 
 
 @pytest.mark.parametrize(
@@ -127,11 +129,9 @@ def test_damaged_scenes_are_named(scene, text, message):
 )
 def test_unsuitable_options_of_a_scene_are_refused(scene, options, message):
     with pytest.raises(ValueError, match=message):
-        sionna.traced_room(
-            **{"scene": scene, "receiver": [0.3, 0.3, 2.5], "transmitters": 2} | options
-        )
+        traced_room(**{"scene": scene, "receiver": [0.3, 0.3, 2.5], "transmitters": 2} | options)
 
 
 def test_a_missing_scene_is_named(tracer, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"no scene at .*none\.xml; set data\.scene"):
-        sionna.traced_room(scene=str(tmp_path / "none.xml"), receiver=[0.3, 0.3, 2.5])
+        traced_room(scene=str(tmp_path / "none.xml"), receiver=[0.3, 0.3, 2.5])

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from gaigs.core.geometry import Pose
-from gaigs.io.meshes import triangles
+from gaigs.io.meshes import Mesh
 
 THICKNESS = {
     "concrete": 0.2,
@@ -24,28 +24,11 @@ THICKNESS = {
 }
 """Thickness of the slab behind a face of each material [m]; furniture is hollow, of boards."""
 
-WALL_MARGIN, FURNITURE_MARGIN = 0.3, 0.05
-"""Smallest distance of transmitters from walls and from furniture [m]."""
+WALL_MARGIN = 0.3
+"""Smallest distance of transmitters from walls [m]."""
 
-
-@dataclass(frozen=True)
-class Mesh:
-    """One object of one material.
-
-    Attributes:
-        material: One of ``THICKNESS``.
-        vertices: Corners, world frame [m].
-        faces: Corners of each planar convex face, counted from 0, in order.
-    """
-
-    name: str
-    material: str
-    vertices: tuple[tuple[float, float, float], ...]
-    faces: tuple[tuple[int, ...], ...]
-
-    def triangles(self) -> list[tuple[int, int, int]]:
-        """Faces cut into triangles."""
-        return triangles(self.faces)
+FURNITURE_MARGIN = 0.05
+"""Smallest distance of transmitters from furniture [m]."""
 
 
 @dataclass(frozen=True)
@@ -69,18 +52,21 @@ class Cuboid:
         cos, sin, (u, v, _) = self._frame()
         corners = []
         for z, y, x in itertools.product(*zip(self.lower[::-1], self.upper[::-1], strict=True)):
-            x, y = x - u, y - v
-            corners.append((round(u + cos * x - sin * y, 6), round(v + sin * x + cos * y, 6), z))
-        sides = (0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)
+            across = x - u
+            along = y - v
+            turned_x = round(u + cos * across - sin * along, 6)
+            turned_y = round(v + sin * across + cos * along, 6)
+            corners.append((turned_x, turned_y, z))
+        sides = ((0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5))
         return Mesh(self.name, self.material, tuple(corners), sides)
 
     def contains(self, points: Float[Tensor, "k 3"], margin: float) -> Bool[Tensor, " k"]:
         """True for points [m] within it, or less than a margin [m] from it along its axes."""
         cos, sin, middle = self._frame()
         x, y, z = (points - points.new_tensor(middle)).unbind(-1)
-        own = torch.stack((cos * x + sin * y, cos * y - sin * x, z), -1).abs()
+        local = torch.stack((cos * x + sin * y, cos * y - sin * x, z), -1)  # (k, 3)
         half = (points.new_tensor(self.upper) - points.new_tensor(self.lower)) / 2
-        return (own <= half + margin).all(-1)
+        return (local.abs() <= half + margin).all(-1)
 
     def _frame(self) -> tuple[float, float, tuple[float, ...]]:
         """Cosine and sine of the rotation, and the middle [m]."""
@@ -116,8 +102,9 @@ class MeshRoom:
     gateways: dict[str, tuple[float, float, float]]
 
     def meshes(self) -> list[Mesh]:
-        """Walls, floor, ceiling and furniture. Neighbouring walls of one material are one mesh,
-        with a true edge.
+        """Walls, floor, ceiling and furniture.
+
+        Neighbouring walls of one material are one mesh, with a true edge.
         """
         count = len(self.floor)
         corners = (
@@ -128,16 +115,18 @@ class MeshRoom:
         for k, material in enumerate(self.walls):
             after = (k + 1) % count
             sides.setdefault(material, []).append((k, after, count + after, count + k))
-        above = tuple(tuple(count + k for k in part) for part in self.convex)
+        above = []
+        for part in self.convex:
+            above.append(tuple(count + k for k in part))
         shell = [
             Mesh(f"{material} walls", material, corners, tuple(faces))
             for material, faces in sides.items()
         ]
         shell += [
             Mesh("floor", self.slabs[0], corners, self.convex),
-            Mesh("ceiling", self.slabs[1], corners, above),
+            Mesh("ceiling", self.slabs[1], corners, tuple(above)),
         ]
-        return [*map(_compact, shell), *(cuboid.mesh() for cuboid in self.furniture)]
+        return [*(mesh.compact() for mesh in shell), *(cuboid.mesh() for cuboid in self.furniture)]
 
     def pose(self) -> Pose:
         """Pose of the receiver with the array: its normal points at the point that it faces."""
@@ -149,10 +138,14 @@ class MeshRoom:
         outline = torch.lerp(
             points.new_tensor(self.floor), points.new_tensor(self.ceiling), share[..., None]
         )
-        start, end = outline, outline.roll(-1, 1)  # of each wall, at the height of each point
-        along, to = end - start, points[:, None, :2] - start
+        # Ends of each wall, at the height of each point.
+        start = outline  # (k, walls, 2)
+        end = outline.roll(-1, 1)
+        along = end - start
+        to = points[:, None, :2] - start
         # Even-odd rule: the number of walls that a ray along x meets.
-        above, below = start[..., 1] > points[:, None, 1], end[..., 1] > points[:, None, 1]
+        above = start[..., 1] > points[:, None, 1]
+        below = end[..., 1] > points[:, None, 1]
         cross = along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0]
         meets = (above != below) & ((cross > 0) == (end[..., 1] > start[..., 1]))
         nearest = ((to * along).sum(-1) / along.square().sum(-1)).clamp(0, 1)
@@ -166,23 +159,14 @@ class MeshRoom:
 def facing(position: Sequence[float], target: Sequence[float], turn: float = 0.0) -> Pose:
     """Pose at a position [m] whose normal points at a target [m], rotated about the normal [deg]."""
     normal = torch.tensor(target, dtype=torch.float64) - torch.tensor(position, dtype=torch.float64)
-    azimuth, depression = (
-        torch.atan2(normal[1], normal[0]),
-        torch.atan2(-normal[2], normal[:2].norm()),
-    )
+    azimuth = torch.atan2(normal[1], normal[0])
+    depression = torch.atan2(-normal[2], normal[:2].norm())
     angles = [azimuth.item(), math.pi / 2 + depression.item(), math.radians(turn)]
     return Pose.from_xyzw(position, Rotation.from_euler("ZYZ", angles).as_quat())
 
 
-def _compact(mesh: Mesh) -> Mesh:
-    """The mesh without corners that no face has."""
-    used = sorted({corner for face in mesh.faces for corner in face})
-    faces = tuple(tuple(used.index(corner) for corner in face) for face in mesh.faces)
-    return Mesh(mesh.name, mesh.material, tuple(mesh.vertices[k] for k in used), faces)
-
-
 def edges(meshes: Sequence[Mesh]) -> Float[Tensor, "k 2 3"]:
-    """Outlines of meshes [m]: each edge once, without those between two coplanar faces of a mesh."""
+    """Outlines of meshes [m]: each edge once, except between two coplanar faces of a mesh."""
     lines: dict[tuple, None] = {}
     for mesh in meshes:
         corners = torch.tensor(mesh.vertices, dtype=torch.float64)
@@ -195,19 +179,8 @@ def edges(meshes: Sequence[Mesh]) -> Float[Tensor, "k 2 3"]:
                 normals.setdefault((min(start, end), max(start, end)), []).append(
                     normal / normal.norm()
                 )
-        for (start, end), found in normals.items():
+        for (start, end), beside in normals.items():
             # The product of coplanar faces' normals is 1 or -1, up to rounding.
-            if len(found) < 2 or (found[0] @ found[1]).abs() < 1 - 1e-9:
+            if len(beside) < 2 or (beside[0] @ beside[1]).abs() < 1 - 1e-9:
                 lines[tuple(sorted((mesh.vertices[start], mesh.vertices[end])))] = None
     return torch.tensor([*lines])
-
-
-def wavefront_obj(meshes: Sequence[Mesh]) -> str:
-    """Meshes as a Wavefront OBJ file [m]: one object a mesh, with its material."""
-    lines, before = [], 1
-    for mesh in meshes:
-        lines += [f"o {mesh.name.replace(' ', '_')}", f"usemtl {mesh.material}"]
-        lines += [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in mesh.vertices]
-        lines += ["f " + " ".join(str(before + corner) for corner in face) for face in mesh.faces]
-        before += len(mesh.vertices)
-    return "\n".join(lines) + "\n"

@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 import scipy.io
 import torch
+from gaigs_deepmimo.readers import read_channels, read_strengths
 from scipy.constants import speed_of_light
 
 from gaigs.core.antenna import Array, Receiver
-from gaigs.data import deepmimo, deepmimo_rssi, synthetic
+from gaigs.data import synthetic
 from gaigs.data.__main__ import main
+from gaigs.io.deepmimo import Station, write_scenario
 from gaigs.testing import check_data
 
 CARRIER = 3.5e9
@@ -63,7 +65,7 @@ def folder(tmp_path):
 
 def test_channels_are_the_sum_of_the_paths_by_hand(folder):
     """Rows of the array run upwards, columns along y, half a wavelength apart about the station."""
-    links = deepmimo.read(folder, elements=[2, 3], bandwidth=20e6, subcarriers=5)
+    links = read_channels(folder, elements=[2, 3], bandwidth=20e6, subcarriers=5)
     check_data(links)
     content = matrices()
     places = [(y / 2, z / 2) for y in (-1, 0, 1) for z in (-0.5, 0.5)]  # [wavelengths]
@@ -92,7 +94,7 @@ def test_channels_are_the_sum_of_the_paths_by_hand(folder):
 
 def test_formats_and_sets_of_users_are_read_alike(folder):
     """A second set of users, in MATLAB's format; paths between stations are not links."""
-    first = deepmimo.read(folder)
+    first = read_channels(folder)
     save(
         folder,
         matrices() | {"rx_pos": [[10.0, 0, 2], [20, 0, 2], [30, 5, 2]]},
@@ -100,15 +102,15 @@ def test_formats_and_sets_of_users_are_read_alike(folder):
         ".mat",
     )
     save(folder, matrices(), "t000_tx000_r000")
-    both = deepmimo.read(folder)
+    both = read_channels(folder)
     assert len(both.receivers) == 1
     assert both.query.transmitters[:, 2].tolist() == [1, 1, 2, 2]
     torch.testing.assert_close(both.labels[2:], first.labels, rtol=1e-3, atol=0)
-    some = deepmimo.read(folder, transmitters=3)
+    some = read_channels(folder, transmitters=3)
     assert len(some) == len(some.rows.unique()) == 3
 
 
-def write_scenario(folder, seed=0):
+def write_example(folder, seed=0):
     """Twelve users in free space and their mirror images in the floor; the gains without the
     floor's are known.
     """
@@ -121,12 +123,12 @@ def write_scenario(folder, seed=0):
     points = np.full((12, 2, 1, 3), NAN)
     points[:, 1, 0] = station + share * (images[:, 1] - station)
     fields = gains * np.exp(-2j * np.pi * CARRIER / speed_of_light * lengths)
-    deepmimo.write(folder, CARRIER, users, [(station, fields, points)])
+    write_scenario(folder, CARRIER, users, [Station(station, fields, points)])
     return users, station, fields, points[:, 1, 0]
 
 
 def test_written_paths_have_their_geometry(tmp_path):
-    users, station, fields, points = write_scenario(tmp_path)
+    users, station, fields, points = write_example(tmp_path)
     matrix = lambda name: np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name]
     ways = {"aod": (station, users, points), "aoa": (users, station, points)}
     for end, (start, direct, bounce) in ways.items():
@@ -138,21 +140,19 @@ def test_written_paths_have_their_geometry(tmp_path):
         np.testing.assert_allclose(found, expected, atol=1e-5)
     assert matrix("inter").tolist() == [[0, 1]] * 12
     np.testing.assert_allclose(matrix("inter_pos")[:, 1, 0], points, rtol=1e-5)
-    links = deepmimo.read(tmp_path, elements=[1, 1], subcarriers=1)
+    links = read_channels(tmp_path, elements=[1, 1], subcarriers=1)
     np.testing.assert_allclose(links.labels[:, 0, 0], fields.sum(1), rtol=1e-3)
     strengths = 20 * np.log10(np.abs(fields.sum(1)))
-    np.testing.assert_allclose(
-        deepmimo_rssi.read(tmp_path, bandwidth=1.0).labels, strengths, atol=1e-2
-    )
+    np.testing.assert_allclose(read_strengths(tmp_path, bandwidth=1.0).labels, strengths, atol=1e-2)
 
 
 def test_phases_without_the_carriers_get_it(tmp_path):
     """As of Sionna RT: the phase of a line of sight is 0 at all distances."""
-    *_, fields, _ = write_scenario(tmp_path)
-    expected = deepmimo.read(tmp_path)
+    *_, fields, _ = write_example(tmp_path)
+    expected = read_channels(tmp_path)
     file = tmp_path / "phase_t000_tx000_r001.npz"
     np.savez(file, phase=np.where(np.arange(2) == 1, 180.0, np.zeros(fields.shape)))
-    links = deepmimo.read(tmp_path)
+    links = read_channels(tmp_path)
     torch.testing.assert_close(links.labels, expected.labels, rtol=1e-3, atol=1e-6)
     assert "it is added" in links.remarks
     assert "it is added" not in expected.remarks
@@ -165,7 +165,7 @@ def test_the_built_in_room_is_written_and_read(tmp_path, monkeypatch):
         ["gaigs.data", str(tmp_path / "room"), "synthetic_csi", "--deepmimo", "transmitters=20"],
     )
     main()
-    links = deepmimo.read(tmp_path / "room", elements=[1, 1], subcarriers=1)
+    links = read_channels(tmp_path / "room", elements=[1, 1], subcarriers=1)
     receiver = Receiver("point", links.receivers[0].pose, Array.single())
     places = links.query.transmitters
     (expected,) = synthetic.respond_in_parts(
@@ -220,7 +220,7 @@ def test_the_built_in_room_is_written_and_read(tmp_path, monkeypatch):
 def test_defects_are_named(folder, changes, message):
     save(folder, changes)
     with pytest.raises(ValueError, match=message):
-        deepmimo.read(folder)
+        read_channels(folder)
 
 
 @pytest.mark.parametrize(
@@ -243,7 +243,7 @@ def test_defects_of_the_parameters_are_named(folder, content, message):
     if content is not None:
         (folder / "params.json").write_text(content)
     with pytest.raises(ValueError, match=message):
-        deepmimo.read(folder)
+        read_channels(folder)
 
 
 @pytest.mark.parametrize(
@@ -261,7 +261,7 @@ def test_scenarios_of_earlier_versions_are_named(tmp_path, names):
     message = r"a scenario of DeepMIMO v3 or before, as .*\nby the package deepmimo: deepmimo"
     for root in (scene, tmp_path):
         with pytest.raises(ValueError, match=message):
-            deepmimo.read(root)
+            read_channels(root)
 
 
 def test_a_folder_without_paths_and_options_out_of_range_are_refused(folder):
@@ -272,7 +272,7 @@ def test_a_folder_without_paths_and_options_out_of_range_are_refused(folder):
         ({"transmitters": 3}, "transmitters must be 2 to 2, the users with a path, got 3"),
     ):
         with pytest.raises(ValueError, match=message):
-            deepmimo.read(folder, **options)
+            read_channels(folder, **options)
     (folder / "power_t000_tx000_r001.npz").unlink()
     with pytest.raises(ValueError, match="expected paths from base stations to users"):
-        deepmimo.read(folder)
+        read_channels(folder)

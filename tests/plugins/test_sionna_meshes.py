@@ -7,12 +7,12 @@ import math
 import numpy as np
 import pytest
 import torch
+from gaigs_sionna.meshes import FURNITURE_MARGIN, WALL_MARGIN, Cuboid, edges
+from gaigs_sionna.rooms import ROOMS
 from matplotlib.path import Path
 from scipy.spatial import ConvexHull, Delaunay
 
-from gaigs.data.sionna.meshes import FURNITURE_MARGIN, WALL_MARGIN, Cuboid, edges, wavefront_obj
-from gaigs.data.sionna.rooms import ROOMS
-from gaigs.io.meshes import parse_obj
+from gaigs.io.meshes import parse_obj, wavefront_obj
 
 TURNED = Cuboid("desk", "wood", (1.0, 2.0, 0.5), (3.0, 2.6, 0.9), 30.0)
 

@@ -5,12 +5,13 @@ import math
 import numpy as np
 import pytest
 import torch
+from gaigs_sionna import cache, tracing
+from gaigs_sionna.meshes import THICKNESS, Cuboid
+from gaigs_sionna.rooms import ROOMS
 from scipy.constants import speed_of_light
 
-from gaigs.data.sionna import cache, tracing
-from gaigs.data.sionna.meshes import THICKNESS, Cuboid, Mesh
-from gaigs.data.sionna.rooms import ROOMS
 from gaigs.data.synthetic import image_source
+from gaigs.io.meshes import Mesh
 
 FREQUENCY = 6e9
 RECEIVER = torch.tensor([0.0, 0.0, 1.0])

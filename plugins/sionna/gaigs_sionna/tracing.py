@@ -1,5 +1,6 @@
 """Paths in a room of meshes by the ray tracer Sionna RT, on the processor."""
 
+import itertools
 import math
 import os
 import subprocess
@@ -19,8 +20,10 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from gaigs.data.simulation import sample_band
-from gaigs.data.sionna.meshes import THICKNESS, Mesh
 from gaigs.data.synthetic.image_source import MATERIALS, Paths, conductivity
+from gaigs.io.meshes import Mesh
+
+from .meshes import THICKNESS
 
 DEPTH = 3
 """Largest number of reflections, passages through surfaces and diffractions of a path; a wardrobe
@@ -32,14 +35,16 @@ CHUNK = 10
 displace others.
 """
 
-RAYS, CANDIDATES = 500_000, 1_000_000
-"""Rays from a receiver for each chunk, and chains tried, which is also the size of that table: 50
-transmitters with 80 chains each would lose 1 to 6 dB of the power at one place in ten."""
+RAYS = 500_000
+"""Rays from a receiver for each chunk."""
+
+CANDIDATES = 1_000_000
+"""Chains tried for each chunk, and the size of their table. Of 50 transmitters with 80 chains each
+one place in ten would lose 1 to 6 dB of the power.
+"""
 
 WEAKEST = 1e-4
-"""Fraction of a transmitter's power in the weakest paths that are left out: two thirds of its
-paths.
-"""
+"""Fraction of a transmitter's power in the paths left out, two thirds of all: the weakest."""
 
 
 def find_packages() -> dict[str, str]:
@@ -48,7 +53,7 @@ def find_packages() -> dict[str, str]:
         return {name: metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
     except metadata.PackageNotFoundError as error:
         raise ImportError(
-            f"rooms of the ray tracer need {error.name}: pip install 'gaigs[sionna]'"
+            f"rooms of the ray tracer need {error.name}: pip install sionna-rt"
         ) from error
 
 
@@ -79,8 +84,8 @@ def find_llvm() -> str:
             for file, version in versions.items()
         )
         raise RuntimeError(
-            f"the ray tracer needs libLLVM {oldest} or later, got {found or 'none'}; install it (Debian: apt-get "
-            "install libllvm19), or set DRJIT_LIBLLVM_PATH to its file"
+            f"the ray tracer needs libLLVM {oldest} or later, got {found or 'none'}; "
+            "install it (Debian: apt-get install libllvm19), or set DRJIT_LIBLLVM_PATH to its file"
         )
     return newest
 
@@ -91,7 +96,8 @@ def llvm_version(file: str) -> int:
     """
     code = (
         "import ctypes, sys; number = ctypes.c_uint(); "
-        "ctypes.CDLL(sys.argv[1]).LLVMGetVersion(ctypes.byref(number), None, None); print(number.value)"
+        "ctypes.CDLL(sys.argv[1]).LLVMGetVersion(ctypes.byref(number), None, None); "
+        "print(number.value)"
     )
     done = subprocess.run(
         [sys.executable, "-c", code, file], capture_output=True, text=True, check=False
@@ -126,10 +132,10 @@ def trace(
     paths = trace_scene(
         make_scene(meshes, frequency), receiver, transmitters, reflections=reflections
     )
-    if deaf := [k for k, gains in enumerate(paths.gains) if not gains.any()]:
-        raise ValueError(
-            f"a path must lead to each transmitter, got none to {transmitters[deaf[0]].tolist()}; move it"
-        )
+    for transmitter, gains in zip(transmitters, paths.gains, strict=True):
+        if not gains.any():
+            got = f"none to {transmitter.tolist()}"
+            raise ValueError(f"a path must lead to each transmitter, got {got}; move it")
     return paths
 
 
@@ -145,16 +151,18 @@ def trace_scene(
     With a largest number of reflections there are no diffractions: each triangle of a curved
     surface has edges.
     """
-    found = []
+    images: list[Tensor] = []
+    gains: list[Tensor] = []
+    wavelength = float(scene.wavelength[0])
     for paths in solve(scene, receiver, transmitters, depth, diffraction=reflections is None):
-        found += _strongest(
-            paths, receiver.double().numpy(), float(scene.wavelength[0]), reflections
-        )
-    images = pad_sequence(
-        [torch.from_numpy(places) for places, _ in found], batch_first=True, padding_value=1e3
-    )
+        strongest = _strongest(paths, receiver.double().numpy(), wavelength, reflections)
+        for places, strengths in strongest:
+            images.append(torch.from_numpy(places))
+            gains.append(torch.from_numpy(strengths))
+    # An image 1 km away, with a gain of 0, stands where a transmitter has fewer paths than others.
     return Paths(
-        images, pad_sequence([torch.from_numpy(gains) for _, gains in found], batch_first=True)
+        pad_sequence(images, batch_first=True, padding_value=1e3),
+        pad_sequence(gains, batch_first=True),
     )
 
 
@@ -165,8 +173,9 @@ def solve(
     depth: int = DEPTH,
     diffraction: bool = True,
 ) -> Iterator[Any]:
-    """The paths of ``sionna.rt`` to each ``CHUNK`` of the transmitters, which stand in the scene
-    only meanwhile.
+    """The paths of ``sionna.rt`` to each ``CHUNK`` of the transmitters.
+
+    Transmitters stand in the scene while their paths are traced.
     """
     from sionna import rt
 
@@ -193,9 +202,8 @@ def find_sionna() -> Any:
     os.environ["DRJIT_LIBLLVM_PATH"] = find_llvm()  # read once, when the first kernel is compiled
     import mitsuba
 
-    mitsuba.set_variant(
-        "llvm_ad_mono_polarized"
-    )  # on the processor, before the import chooses a graphics card
+    # On the processor, before the import chooses a graphics card.
+    mitsuba.set_variant("llvm_ad_mono_polarized")
     from sionna import rt
 
     return rt
@@ -203,10 +211,8 @@ def find_sionna() -> Any:
 
 def open_scene(frequency: float, file: Path | None = None) -> Any:
     """The scene of a Mitsuba file, or an empty one, ``set_up`` at a carrier [Hz]."""
-    low, high = (
-        0.3e9,
-        40e9,
-    )  # below, furniture is no larger than the wavelength; above, materials are not tabulated
+    low = 0.3e9  # below, furniture is no larger than the wavelength
+    high = 40e9  # above, materials are not tabulated
     if not low <= frequency <= high:
         raise ValueError(f"frequency must lie in {low:g}..{high:g} Hz, got {frequency:.6g}")
     scene = find_sionna().load_scene(file and str(file))
@@ -246,7 +252,7 @@ def make_scene(meshes: Sequence[Mesh], frequency: float) -> Any:
 
 
 def set_up(scene: Any, frequency: float) -> None:
-    """Sets the carrier of a scene [Hz], and isotropic, vertically polarised antennas at both ends."""
+    """Sets a scene's carrier [Hz], and isotropic, vertically polarised antennas at both ends."""
     from sionna import rt
 
     scene.frequency = frequency
@@ -265,18 +271,16 @@ def without_weakest(fields: Complex[ndarray, " p"]) -> Int[ndarray, " k"]:
 def fields_and_images(
     paths: Any, receiver: Float[ndarray, "3"]
 ) -> tuple[Complex[ndarray, "b p"], Float[ndarray, "b p 3"]]:
-    """Fields of the solver's paths from one receiver, and their images [m]; of fewer paths the rest
-    is 0.
-    """
-    fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, 0, 0]
-    lengths, zenith, azimuth = (
-        array.numpy()[:, 0].astype(float) for array in (paths.tau, paths.theta_t, paths.phi_t)
-    )
+    """Fields of the solver's paths from one receiver, and their images [m]; 0 for no path."""
+    fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, 0, 0]  # (b, p)
+    delays = paths.tau.numpy()[:, 0].astype(float)
+    zenith = paths.theta_t.numpy()[:, 0].astype(float)
+    azimuth = paths.phi_t.numpy()[:, 0].astype(float)
     horizontal = np.sin(zenith)
     directions = np.stack(
         (horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.cos(zenith)), -1
     )
-    return fields, receiver + speed_of_light * lengths[..., None] * directions
+    return fields, receiver + speed_of_light * delays[..., None] * directions
 
 
 def _strongest(
@@ -290,24 +294,22 @@ def _strongest(
         counts = (paths.interactions.numpy()[:, :, 0] == InteractionType.SPECULAR).sum(0)
         fields = np.where(counts <= reflections, fields, 0)
     lengths = np.linalg.norm(images - receiver, axis=-1)
-    found = []
+    strongest = []
     for k, field in enumerate(fields):
         order = without_weakest(field)
         # The path's gain has no spreading of free space, wavelength / (4 pi length).
-        found.append(
-            (images[k, order], field[order] * 4 * math.pi * lengths[k, order] / wavelength)
-        )
-    return found
+        gains = field[order] * 4 * math.pi * lengths[k, order] / wavelength
+        strongest.append((images[k, order], gains))
+    return strongest
 
 
 def frequency_offsets(meshes: Sequence[Mesh], bandwidth: float) -> Float[Tensor, " f"]:
     """Frequencies that sample a band, as by ``sample_band``, for the longest path among meshes."""
-    corners = torch.tensor(
-        [corner for mesh in meshes for corner in mesh.vertices], dtype=torch.float64
-    )
+    vertices = [*itertools.chain(*(mesh.vertices for mesh in meshes))]
+    corners = torch.tensor(vertices, dtype=torch.float64)
     return sample_paths(bandwidth, (corners.amax(0) - corners.amin(0)).norm().item())
 
 
 def sample_paths(bandwidth: float, diagonal: float) -> Float[Tensor, " f"]:
-    """The same for the longest path among surfaces within a box of a diagonal [m]."""
+    """Frequencies that sample a band, for the longest path in a box of a diagonal [m]."""
     return sample_band(bandwidth, (DEPTH + 1) * diagonal)

@@ -1,0 +1,1 @@
+"""Scenarios of DeepMIMO v4 as links with channels or signal strengths."""

@@ -1,0 +1,1 @@
+"""Rooms of any shape, simulated by the independent ray tracer Sionna RT."""
