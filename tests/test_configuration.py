@@ -10,7 +10,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from gaigs.configuration import conf_dir, differences, installed, known, launcher
+from gaigs.configuration import conf_dir, differences
+from gaigs.configuration.hydra_plugins import installed, known, launcher
 from gaigs.registry import registry
 
 ROOT = Path(__file__).parents[1]

@@ -29,7 +29,7 @@ SHAPE = (90, 360)
 """Elevations 1..90 deg and azimuths 0..359 deg, fixed by the format."""
 
 
-@register("data", "nerf2_spectrum")
+@register("data", "nerf2_spectrum", task="spectrum", split="official")
 def read(
     root: str | Path,
     elements: Sequence[int] | None = (4, 4),

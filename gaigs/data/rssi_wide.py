@@ -83,7 +83,7 @@ class Axes(NamedTuple):
     is_global: bool
 
 
-@register("data", "rssi_wide")
+@register("data", "rssi_wide", task="rssi", split="random")
 def read(
     file: str | Path,
     gateways: str | Path | None = None,

@@ -26,7 +26,7 @@ from gaigs.kriging.kernel import Process
 from gaigs.kriging.links import PART
 from gaigs.model import checkpoint
 from gaigs.registry import check_type, name_of, registry
-from gaigs.registry.modes import usual_modes
+from gaigs.registry.torch_modes import usual_modes
 from gaigs.splatting.gaussians import Gaussians
 
 NUMBERS, MOST = 2**17, 1024
