@@ -232,7 +232,7 @@ def divide(links: Links, split: Mapping) -> Links:
         ValueError: An option of the split has a defect, two of its parts share a link, or all
             spectra are constant.
     """
-    if isinstance(links.task, Csi) and isinstance(links.labels, Tensor):
+    if links.task.is_channel and isinstance(links.labels, Tensor):
         check_elements(links)
         links = without_constant(links)
     parts = registry("split").build(split, links=links)
@@ -256,7 +256,7 @@ def divide(links: Links, split: Mapping) -> Links:
         check_metres("transmitters", links.query.transmitters.unique(dim=0).double().numpy())
     if links.uncertainties is not None:
         links = with_places(only_trained(links))
-    remarks, phase = [links.remarks], getattr(links.task, "phase", "known")
+    remarks, phase = [links.remarks], links.task.phase
     if phase != "known":
         unknown = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}[phase]
         remarks.append(f"{unknown} of each link unknown, and removed in every score")

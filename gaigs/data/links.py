@@ -17,8 +17,6 @@ from gaigs.core.antenna import Array, Receiver
 from gaigs.core.geometry import Frame, Pose
 from gaigs.core.query import Query, as_numbers, as_positions, as_tensor, check_carrier
 from gaigs.core.task import Task, check_range
-from gaigs.core.task.csi import Csi
-from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links, divide, load
 from gaigs.data.parts import check_parts
 from gaigs.data.readings import loud_remark, marks_of
@@ -149,11 +147,10 @@ def from_arrays(
         ):
             distinct, index = number_places(stands.tolist())
             stands = torch.tensor(distinct)
-        elements = task.elements if isinstance(task, Csi) else 1
-        antenna = Array(torch.zeros(elements, 3))
-        if elements > 1:
+        antenna = Array(torch.zeros(task.elements, 3))
+        if task.elements > 1:
             remarks.append(
-                f"positions of the {elements} elements are unknown: all count as standing at their receiver's"
+                f"positions of the {task.elements} elements are unknown: all count as standing at their receiver's"
             )
         receivers = [
             Receiver(f"rx{k}", Pose(place, torch.eye(3)), antenna) for k, place in enumerate(stands)
@@ -203,7 +200,7 @@ def from_arrays(
     if not heard.all():
         remarks.append(f"{int((~heard).sum())} links were not heard and are left out")
     check_range(task, labels, "labels")
-    if isinstance(task, Rssi):
+    if task.is_scalar and task.unit == "dBm":
         doubtful = loud_remark(labels[heard].tolist())
         marks = {mark: int((labels == mark).sum()) for mark in marks_of(labels[:, None].numpy())}
         doubtful += "".join(
@@ -214,7 +211,7 @@ def from_arrays(
             remarks.append(doubtful.removeprefix("; "))
             log.warning("%s\ngive nan where nothing was heard, and levels in dBm", remarks[-1])
     carriers = None
-    if frequency is None and hasattr(task, "frequencies"):
+    if frequency is None and task.frequencies is not None:
         frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
     if frequency is not None:
         carriers = as_numbers("frequency", frequency, "a carrier in Hz")

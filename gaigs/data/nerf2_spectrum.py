@@ -123,11 +123,7 @@ def write(folder: str | Path, links: Links) -> None:
     """
     folder = Path(folder)
     tables.check_empty(folder)
-    if (
-        len(links.receivers) != 1
-        or not isinstance(links.task, Spectrum)
-        or links.task.shape != SHAPE
-    ):
+    if len(links.receivers) != 1 or links.task.directions is None or links.task.shape != SHAPE:
         raise ValueError(
             f"the layout holds spectra of {SHAPE[0]} x {SHAPE[1]} directions at one receiver, got labels of "
             f"{links.task.name} {links.task.shape} at {len(links.receivers)}"

@@ -38,7 +38,7 @@ def layers(floor: RadioMap, scene: Scene) -> dict[str, Layer]:
     """``value`` and, if the model states deviations, ``deviation``."""
     found = {"value": Layer(floor.quantity, floor.unit, floor.values)}
     if floor.deviations is not None:
-        unit = getattr(scene.task, "error_unit", floor.unit)
+        unit = scene.task.error_unit
         found["deviation"] = Layer(
             f"standard deviation of {floor.quantity}", unit, floor.deviations
         )

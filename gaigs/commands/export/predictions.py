@@ -17,7 +17,6 @@ from gaigs.core.antenna import lacking
 from gaigs.core.query import Query, as_positions
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
-from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.io import tables
@@ -63,7 +62,7 @@ def write_predictions(
         found = Estimate(model.predict(query, frequencies=subcarriers), None, None, None)  # type: ignore[arg-type]
     task = asked.task if subcarriers is not None else scene.task
     absent = torch.tensor(False).expand(len(query), *task.shape)
-    if isinstance(task, Csi):  # elements that a receiver's array lacks
+    if task.is_channel:  # elements that a receiver's array lacks
         absent = lacking(scene.receivers, query.receivers.cpu(), task.elements)[
             ..., None
         ].expand_as(absent)
@@ -146,7 +145,7 @@ def tabulate(
             {"units": task.unit or "1", "long_name": f"{task.quantity}: {name}"},
         )
         if name in ("deviation", "radius"):
-            unit["units"] = getattr(task, "error_unit", task.unit) or "1"
+            unit["units"] = task.error_unit or "1"
         of_link = part.reshape(len(part), *[1] * (len(task.shape) + 1 - part.ndim), *part.shape[1:])
         ends = {"_real": "real", "_imag": "imag"} if part.is_complex() else {"": "real"}
         for ending, side in ends.items():
@@ -155,29 +154,13 @@ def tabulate(
     return variables
 
 
-def axes_of(task: Any) -> dict[str, Variable]:
-    """The axes of a label: elements and subcarriers, elevations and azimuths, or numbers of another
-    task's.
-    """
-    if task.directions is not None:
-        angles = {"elevation": task.directions.elevations, "azimuth": task.directions.azimuths}
-        degrees = {
-            name: np.degrees(values.double().numpy()).round(6) for name, values in angles.items()
-        }
-        return {
-            name: Variable((name,), values, {"units": "degree"}) for name, values in degrees.items()
-        }
-    if isinstance(task, Csi):
-        subcarriers = Variable(("subcarrier",), task.frequencies.double().numpy(), {"units": "Hz"})
-        return {
-            "element": Variable(("element",), np.arange(task.elements, dtype=np.int32)),
-            "subcarrier": subcarriers,
-        }
-    names = [f"axis_{axis}" for axis in range(len(task.shape))]
-    return {
-        name: Variable((name,), np.arange(size, dtype=np.int32))
-        for name, size in zip(names, task.shape, strict=True)
-    }
+def axes_of(task: Task) -> dict[str, Variable]:
+    """The axes of a label."""
+    variables = {}
+    for name, axis in task.axes().items():
+        units = {"units": axis.unit} if axis.unit else {}
+        variables[name] = Variable((name,), axis.values, units)
+    return variables
 
 
 def write_csv(
