@@ -14,12 +14,6 @@ from gaigs.report.formats import figure_formats
 COMMANDS = ("agreement", "describe", "survey", "locate", "export", "view")
 """Commands beside the training, each a module of its name."""
 
-SCRIPTS = {
-    "report": "python -m gaigs.report FOLDER makes its tables",
-    "benchmark": "python benchmarks/step.py and others measure, in a clone",
-}
-"""What does the work of a command that others call by this name."""
-
 
 def run(configuration: Mapping, folder: str | Path, launcher: str | None = None) -> dict | None:
     """Executes the command of a configuration, as ``python -m gaigs`` does.
@@ -80,8 +74,12 @@ def _list_devices() -> None:
 
 def _check_command(command: str) -> None:
     """Raises a ``ValueError`` for an unknown command."""
-    if command in SCRIPTS:
-        raise ValueError(f"there is no command {command!r}; {SCRIPTS[command]}")
+    scripts = {
+        "report": "python -m gaigs.report FOLDER makes its tables",
+        "benchmark": "python benchmarks/step.py and others measure, in a clone",
+    }
+    if command in scripts:
+        raise ValueError(f"there is no command {command!r}; {scripts[command]}")
     known = ("train", *COMMANDS, "devices")
     if command not in known:
         words = ", ".join(known)

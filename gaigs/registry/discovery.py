@@ -2,6 +2,7 @@
 
 import functools
 import hashlib
+import itertools
 import os
 import re
 import sys
@@ -137,8 +138,9 @@ def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list
 
 def plugin_packages(kinds: Iterable[str]) -> list[Path]:
     """Folders of the packages with an entry point of gaigs, installed or in ./plugins."""
-    holders = [holder for kind in kinds for holder in _installed_holders(kind)]
-    holders += _dropped_holders()[0]
+    holders, _ = _dropped_holders()
+    installed = map(_installed_holders, kinds)
+    holders = [*itertools.chain(*installed), *holders]
     folders = [holder.folder for holder in holders if holder.file is None]
     return [folder for folder in folders if folder is not None]
 

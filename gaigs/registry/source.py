@@ -72,10 +72,10 @@ def read_options(file: Path, definition: str | Definition, given: tuple[str, ...
         UnclearSource: The constructor is inherited from another package, or a default is computed.
     """
     if isinstance(definition, str):
-        found = _definition(file, definition)
+        located = _definition(file, definition)
     else:
-        found = Located(file, definition)
-    constructor = _constructor(found)
+        located = Located(file, definition)
+    constructor = _constructor(located)
     if constructor is None:
         return {}
     arguments = constructor.node.args
@@ -87,7 +87,7 @@ def read_options(file: Path, definition: str | Definition, given: tuple[str, ...
         argument.arg: default
         for argument, default in zip(arguments.kwonlyargs, arguments.kw_defaults, strict=True)
     }
-    itself = names[:1] if isinstance(found.node, ast.ClassDef) else []
+    itself = names[:1] if isinstance(located.node, ast.ClassDef) else []
     no_options = {*itself, *given, *(argument.arg for argument in arguments.posonlyargs)}
     return {
         name: MISSING if default is None else _value(Located(constructor.file, default))
@@ -138,9 +138,9 @@ def _parse(file: Path, *_state: int) -> ast.Module:
     return ast.parse(file.read_bytes(), file.name)
 
 
-def _constructor(found: Located) -> Located | None:
+def _constructor(definition: Located) -> Located | None:
     """The function that takes the arguments of a class or function; None if it takes none."""
-    file, node = found
+    file, node = definition
     if not isinstance(node, Definition):
         raise UnclearSource
     for decorator in node.decorator_list:
@@ -148,7 +148,7 @@ def _constructor(found: Located) -> Located | None:
         if not ast.unparse(decorator).partition("(")[0].endswith("register"):
             raise UnclearSource
     if isinstance(node, ast.FunctionDef):
-        return found
+        return definition
     for statement in node.body:
         if getattr(statement, "name", "") in ("__init__", "__new__"):
             if not isinstance(statement, ast.FunctionDef) or statement.decorator_list:
