@@ -4,7 +4,7 @@
 >>> links = gaigs.links("synthetic")  # any registered reader
 >>> model = gaigs.train("mirrored", links, max_steps=300)  # any registered model
 >>> print(gaigs.evaluate(model, links))  # beside the task's baselines
->>> spectra = model.predict([[1.0, 2.0, 1.5]])  # positions [m] -> (places, receivers, rows, columns)
+>>> spectra = model.predict([[1.0, 2.0, 1.5]])  # [m] -> (places, receivers, rows, columns)
 >>> model.save("room.ckpt")
 >>> model = gaigs.load("room.ckpt")
 
@@ -13,10 +13,9 @@
 """
 
 import importlib
-import inspect
+from types import FunctionType
 from typing import TYPE_CHECKING
 
-from gaigs.registry.modes import usual_modes
 from gaigs.version import __version__
 
 if TYPE_CHECKING:
@@ -42,7 +41,6 @@ if TYPE_CHECKING:
     from gaigs.runs.evaluation import evaluate
     from gaigs.runs.training import train
     from gaigs.splatting.rasterizer import rasterize
-
 
 PLACES = {
     "Estimate": "calibration",
@@ -79,15 +77,13 @@ PLACES = {
     "train": "runs.training",
     "rasterize": "splatting.rasterizer",
 }
-"""The module of each public name, which is imported when the name is first used: torch is slow to
-import.
-"""
+"""The module of each public name, imported when the name is first used: torch is slow."""
 
 __all__ = [
-    "Array", "Description", "Estimate", "Fingerprints", "Frame", "Grid", "Links", "Location", "Metric", "Model", "Pose",
-    "Query", "Rays", "Receiver", "Scene", "SurveyPlan", "View", "__version__", "compose", "describe", "evaluate",
-    "export", "fingerprints", "links", "load", "locate", "radio_map", "rasterize", "register", "registries", "run",
-    "survey", "train", "view",
+    "Array", "Description", "Estimate", "Fingerprints", "Frame", "Grid", "Links", "Location",
+    "Metric", "Model", "Pose", "Query", "Rays", "Receiver", "Scene", "SurveyPlan", "View",
+    "__version__", "compose", "describe", "evaluate", "export", "fingerprints", "links", "load",
+    "locate", "radio_map", "rasterize", "register", "registries", "run", "survey", "train", "view",
 ]  # fmt: skip
 
 
@@ -96,9 +92,10 @@ def __getattr__(name: str):
         raise AttributeError(f"module 'gaigs' has no attribute {name!r}")
     module = importlib.import_module(f"gaigs.{PLACES[name]}")
     value = getattr(module, name)
-    if (
-        inspect.isfunction(value) and name != "register"
-    ):  # the decorator of ``register`` looks at its caller
+    # The decorator of ``register`` looks at its caller, and ``compose`` needs no torch.
+    if isinstance(value, FunctionType) and name not in ("register", "compose"):
+        from gaigs.registry.torch_modes import usual_modes
+
         value = usual_modes()(value)
         setattr(module, name, value)  # where pickle looks for it
     globals()[name] = value

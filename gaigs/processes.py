@@ -1,6 +1,4 @@
-"""Resources and signals of a run: threads, memory, Ctrl-C and SIGTERM, other processes, locked
-folders.
-"""
+"""Resources and signals of a run: threads, memory, Ctrl-C and SIGTERM, locked folders."""
 
 import atexit
 import contextlib
@@ -16,33 +14,26 @@ import traceback
 from collections.abc import Iterator
 from pathlib import Path
 
+from filelock import FileLock, Timeout
 from omegaconf.errors import OmegaConfBaseException
 
-from gaigs.io.files import file_message
+from gaigs.io.files import LOCK, file_message
 
 STOPPING = [signal.SIGINT, signal.SIGTERM]
-"""Signals at which a run saves and stops: Ctrl-C, that of schedulers, and that of a closed
-terminal.
-"""
-if (
-    hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN
-):  # as nohup sets it
+"""Signals at which a run saves and stops: Ctrl-C, a scheduler's, and a closed terminal's."""
+# nohup ignores it.
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
     STOPPING.append(signal.SIGHUP)
 
-THREADS = ("OMP_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
-"""Environment variables that limit threads of OpenMP and of PoCL's OpenCL, up to version 3 and
-later.
-"""
 
-AGAIN = 0.05
-"""Delay before an ignored signal is sent again [s]."""
+def _limit_forked_threads() -> None:
+    """A forked process lacks the threads of torch, and would wait for them for ever."""
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
 
-if hasattr(
-    os, "register_at_fork"
-):  # a forked process lacks the threads of torch, and would wait for them for ever
-    os.register_at_fork(
-        after_in_child=lambda: "torch" in sys.modules and sys.modules["torch"].set_num_threads(1)
-    )
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_limit_forked_threads)
 
 received: list[int] = []
 """Signals that have stopped runs of this process: a launcher's worker starts no further run."""
@@ -60,8 +51,8 @@ def keep_memory() -> None:
     """Makes this process faster and its memory larger.
 
     Freed arrays stay with the process: with glibc each step would map their pages anew. Imports
-    make half a million objects that stay: looking for cycles among them is rarer, and left out at
-    the end.
+    make half a million objects that stay: the search for cycles among them becomes rarer, and is
+    left out at the end.
     """
     gc.set_threshold(50_000)
     atexit.register(gc.freeze)
@@ -83,17 +74,21 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
     if count is None and jobs in (0, 1):
         yield
         return
-    processors = (
-        len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    )
+    if hasattr(os, "sched_getaffinity"):
+        processors = len(os.sched_getaffinity(0))
+    else:
+        processors = os.cpu_count() or 1
     if count is None:
         count = max(1, processors // (processors if jobs < 0 else jobs))
     if count < 1:
         raise ValueError(f"threads must be at least 1, or null for all, got {count}")
     import torch  # slow to import
 
-    before, environment = torch.get_num_threads(), {name: os.environ.get(name) for name in THREADS}
-    os.environ |= dict.fromkeys(THREADS, str(count))
+    # OpenMP, and OpenCL of PoCL up to version 3 and later.
+    variables = ("OMP_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
+    before = torch.get_num_threads()
+    environment = {name: os.environ.get(name) for name in variables}
+    os.environ |= dict.fromkeys(variables, str(count))
     torch.set_num_threads(count)
     try:
         yield
@@ -108,11 +103,18 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
 def lacks_memory(error: BaseException | None) -> bool:
     """True if an error, or its cause, is a lack of memory of the processor or of a GPU."""
     messages = (
-        "allocate memory", "unable to allocate", "not enough memory", "out of memory", "bad_alloc", "bad allocation",
-        "failed to map segment", "can't start new thread", "mem_object_allocation_failure",
+        "allocate memory",
+        "unable to allocate",
+        "not enough memory",
+        "out of memory",
+        "bad_alloc",
+        "bad allocation",
+        "failed to map segment",
+        "can't start new thread",
+        "mem_object_allocation_failure",
         "could not create a primitive",
         "error return without exception set",  # of Python without memory for the error itself
-    )  # fmt: skip
+    )
     while error is not None:
         if isinstance(error, MemoryError) or any(words in str(error).lower() for words in messages):
             return True
@@ -121,16 +123,18 @@ def lacks_memory(error: BaseException | None) -> bool:
 
 
 def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
-    """The message of an error of a run in a folder that a user can mend; None for a fault of the
-    program.
+    """The message of an error that a user can mend; None for a fault of the program.
 
-    ``goes_on`` says how to resume the run.
+    Args:
+        error: The error of a run.
+        folder: The run folder.
+        goes_on: How to resume the run.
     """
     if lacks_memory(error):
         cause = " ".join(str(error).split()) or type(error).__name__
         return (
-            f"out of memory ({cause})\nend other programs or give the run more, and {goes_on}; or take a smaller "
-            "training.batch_size in another folder"
+            f"out of memory ({cause})\nend other programs or give the run more, and {goes_on}; "
+            "or take a smaller training.batch_size in another folder"
         )
     if not folder.is_dir():  # the first cause, whatever file was missed
         return f"{folder} was removed during the run; the same command begins anew"
@@ -144,18 +148,28 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
 
 
 def fault_of_plug_in(error: Exception) -> str:
-    """File and line if code that is neither gaigs nor installed is at fault, and did not raise the
-    error itself.
+    """File and line in a plug-in at which an error arose; empty if its code raised the error.
+
+    Files of gaigs and installed packages are no plug-ins.
     """
-    here, stdlib = str(Path(__file__).parent) + os.sep, sysconfig.get_path("stdlib")
-    is_library = lambda name: (
-        name.startswith(("<", stdlib)) or "site-packages" in name or "dist-packages" in name
-    )
+    here = str(Path(__file__).parent) + os.sep
     trace = traceback.extract_tb(error.__traceback__)
-    frames = [one for one in trace if one.filename.startswith(here) or not is_library(one.filename)]
+    frames = [
+        frame
+        for frame in trace
+        if frame.filename.startswith(here) or not _is_library(frame.filename)
+    ]
     if not frames or frames[-1].filename.startswith(here) or "raise " in (frames[-1].line or ""):
         return ""
-    return f"\nat {frames[-1].filename}, line {frames[-1].lineno}; hydra.verbose=true prints the traceback"
+    place = f"at {frames[-1].filename}, line {frames[-1].lineno}"
+    return f"\n{place}; hydra.verbose=true prints the traceback"
+
+
+def _is_library(file: str) -> bool:
+    """True for a file of Python or of an installed package."""
+    if file.startswith(("<", sysconfig.get_path("stdlib"))):
+        return True
+    return "site-packages" in file or "dist-packages" in file
 
 
 def is_first() -> bool:
@@ -170,30 +184,40 @@ def is_first() -> bool:
 
 @contextlib.contextmanager
 def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
-    """Locks a folder, at most until this process ends; writes nothing there.
+    """Locks a folder, at most until this process ends.
 
-    Where another one holds it, it ``waits``, or raises a ``ValueError``.
+    The file ``.lock`` in the folder is removed at the end. A killed process leaves it, unlocked.
+
+    Args:
+        folder: An existing folder.
+        waits: True to wait for another process that holds the folder.
+
+    Raises:
+        ValueError: Another process holds the folder, and this one does not wait.
     """
+    folder.stat()  # raises an error for a missing folder, which FileLock would make
+    lock = FileLock(folder / LOCK)
     try:
-        import fcntl
-    except ImportError:  # Windows has no such locks
-        yield
-        return
-    handle = os.open(folder, os.O_RDONLY)
+        lock.acquire(blocking=waits, poll_interval=0.05)
+    except Timeout:
+        advice = "wait, or choose another folder (hydra.run.dir)"
+        raise ValueError(f"another run is at work in {folder}\n{advice}") from None
+    held = (folder / LOCK).stat()
     try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
-        except BlockingIOError:
-            advice = "wait, or choose another folder (hydra.run.dir)"
-            raise ValueError(f"another run is at work in {folder}\n{advice}") from None
         yield
     finally:
-        os.close(handle)
+        # Before the release: a process that opens the file meanwhile sees that it has no name.
+        # Windows removes no open file; in a folder made anew the file is another process's.
+        with contextlib.suppress(OSError):
+            if os.path.samestat(held, (folder / LOCK).stat()):
+                (folder / LOCK).unlink()
+        lock.release()
 
 
 def hang_up(number: int) -> None:
-    """At SIGHUP drops the output to the closed terminal, and ignores further ones: the shell sends
-    one, too.
+    """At SIGHUP drops the output to the closed terminal, and ignores further ones.
+
+    The shell sends one, too.
     """
     if number != getattr(signal, "SIGHUP", None):
         return
@@ -205,58 +229,81 @@ def hang_up(number: int) -> None:
                 os.dup2(null, output)
 
 
+class _Repeater:
+    """Handler of a stopping signal, which is sent again if Python ignores its error.
+
+    Python ignores errors that are raised while it destroys an object.
+    """
+
+    def __init__(self, delay: float = 0.05):
+        self.delay = delay  # [s]
+        self.timers: list[threading.Timer] = []
+        self.hook = sys.unraisablehook
+
+    def stop(self, number: int, _) -> None:
+        """Raises ``Stopped``; there is no second signal while the run stops."""
+        self.cancel()
+        hang_up(number)
+        raise Stopped("stopped", number)
+
+    def repeat(self, lost) -> None:
+        """The hook for ignored errors."""
+        if not isinstance(lost.exc_value, KeyboardInterrupt):
+            self.hook(lost)
+            return
+        number = getattr(lost.exc_value, "number", signal.SIGINT)
+        if number != signal.SIGINT:
+            signal.signal(number, self.stop)  # a second SIGHUP is ignored
+        timer = threading.Timer(self.delay, os.kill, (os.getpid(), number))
+        timer.daemon = True
+        self.timers.append(timer)
+        timer.start()
+
+    def raise_pending(self) -> None:
+        """Raises ``Stopped`` if a repeated signal has not come yet."""
+        for timer in self.timers:
+            if not timer.finished.is_set():
+                raise Stopped("stopped", timer.args[1])
+
+    def cancel(self) -> None:
+        for timer in self.timers:
+            timer.cancel()
+
+
 @contextlib.contextmanager
 def stopping(waits: bool = False) -> Iterator[None]:
     """Lets the signals ``STOPPING`` stop a run as Ctrl-C does, and restores the handlers.
 
-    Python ignores errors that are raised while it destroys an object; such a signal is sent again.
-    A process that ``waits`` for another run afterwards ignores them then, as its launcher would
-    wait for it forever.
+    Args:
+        waits: True for a process that waits for another run afterwards. It ignores the signals
+            then, as its launcher would wait for it forever.
     """
-    if (
-        threading.current_thread() is not threading.main_thread()
-    ):  # other threads may not set handlers
+    # Other threads may not set handlers.
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     handlers = {number: signal.getsignal(number) for number in STOPPING}
-
-    def stop(number: int, _) -> None:
-        for timer in timers:  # no second signal while the run stops
-            timer.cancel()
-        hang_up(number)
-        raise Stopped("stopped", number)
-
-    timers, hook = [], sys.unraisablehook
-
-    def repeat(lost) -> None:
-        if not isinstance(lost.exc_value, KeyboardInterrupt):
-            hook(lost)
-            return
-        number = getattr(lost.exc_value, "number", signal.SIGINT)
-        if number != signal.SIGINT:
-            signal.signal(number, stop)  # a second SIGHUP is ignored
-        timers.append(threading.Timer(AGAIN, os.kill, (os.getpid(), number)))
-        timers[-1].daemon = True
-        timers[-1].start()
-
+    repeater = _Repeater()
     for number in STOPPING[1:]:
-        signal.signal(number, stop)
-    sys.unraisablehook = repeat
+        signal.signal(number, repeater.stop)
+    sys.unraisablehook = repeater.repeat
     try:
         if received:  # between two runs of a process that waits
             raise Stopped("stopped", received[0])
         yield
-        for timer in timers:
-            if not timer.finished.is_set():  # the run ended first
-                raise Stopped("stopped", timer.args[1])
+        repeater.raise_pending()  # the run ended first
     finally:
-        for timer in timers:
-            timer.cancel()
-        sys.unraisablehook = hook
+        repeater.cancel()
+        sys.unraisablehook = repeater.hook
         for number, handler in handlers.items():
             signal.signal(number, handler)
-        for number in STOPPING[1:] if waits else ():
-            signal.signal(number, lambda number, _: received.append(number))
+        if waits:
+            for number in STOPPING[1:]:
+                signal.signal(number, _note_signal)
+
+
+def _note_signal(number: int, _) -> None:
+    received.append(number)
 
 
 def forward_to_children(number: int) -> None:

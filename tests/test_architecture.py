@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from gaigs.registry import KINDS, find_holders
-from gaigs.registry.holders import ROOMS
+from gaigs.registry.discovery import ROOMS
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs/architecture.md").read_text()
@@ -22,9 +22,11 @@ FILES = {
     for file in (ROOT / "gaigs").rglob("*.py")
 }
 LONGEST_CHAIN = 10
-LIMITS = {"lines of gaigs/": 38_000, "lines of a file": 1_200}
-"""Raised only with a reason. The checks of data against geometry (``data/checks``) took 1,700
-lines.
+LIMITS = {"lines of gaigs/": 38_500, "lines of a file": 1_200}
+"""Raised only with a reason.
+
+The checks of data against geometry (``data/checks``) took 1,700 lines, and options that are read
+without an import (``registry/source.py``) 250.
 """
 
 

@@ -22,6 +22,7 @@ from omegaconf import OmegaConf
 
 from gaigs import configuration
 from gaigs import registry as registry_module
+from gaigs.configuration import files
 from gaigs.registry import registry
 from gaigs.testing import example_links
 from gaigs.training.density_control import DensityControl
@@ -76,9 +77,7 @@ def found_once(files_read_once):
     find = functools.cache(registry_module.find_holders)
     with pytest.MonkeyPatch.context() as patch, repository():
         patch.setattr(registry_module, "find_holders", lambda kind, name=None: find(kind, name))
-        patch.setattr(
-            configuration, "plugin_packages", functools.cache(configuration.plugin_packages)
-        )
+        patch.setattr(files, "plugin_packages", functools.cache(files.plugin_packages))
         yield
 
 

@@ -2,7 +2,6 @@
 
 import functools
 import logging
-import tomllib
 from importlib import metadata
 from pathlib import Path
 
@@ -10,7 +9,8 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from gaigs.configuration import conf_dir, differences, installed, known, launcher
+from gaigs.configuration import conf_dir, differences
+from gaigs.configuration.hydra_plugins import installed, known, launcher
 from gaigs.registry import registry
 
 ROOT = Path(__file__).parents[1]
@@ -131,16 +131,6 @@ def test_systems_are_swept_over_as_far_as_they_are_installed(
     assert swept[-2:] == ["gaigs", "mirrored"]
     assert settings.sweep.dir == f"runs/systems_{task}"
     assert settings.callbacks.report["_target_"] == "gaigs.report.at_end.AtEnd"
-
-
-def test_the_packages_of_published_systems_are_those_of_the_plugins():
-    known = OmegaConf.load(conf_dir() / "published.yaml").packages
-    projects = [
-        tomllib.loads(file.read_text())["project"]
-        for file in Path(__file__).parents[1].glob("plugins/*/*.toml")
-    ]
-    held = {name: p["name"] for p in projects for name in p["entry-points"].get("gaigs.model", {})}
-    assert known == held
 
 
 def test_a_choice_by_task_exists_or_is_replaced():

@@ -26,6 +26,9 @@ from omegaconf import OmegaConf
 
 import gaigs
 from gaigs import configuration
+from gaigs.configuration.composing import CHOSEN
+from gaigs.configuration.hydra_plugins import CONSTRUCTED
+from gaigs.configuration.keys import KEYS
 from gaigs.data import load
 from gaigs.registry import find_holders, registry
 
@@ -210,7 +213,7 @@ def composable_lines(page):
 
 def chosen(line):
     """The words that choose parts, in their order; the others set values, in whatever order."""
-    values = configuration.KEYS.keys() - configuration.CHOSEN
+    values = KEYS.keys() - CHOSEN
     return tuple(
         word
         for word in line
@@ -290,7 +293,7 @@ def options_of(top, place):
             for folder in folders
             for file in folder.glob(f"{top}/*.yaml")
         }
-        if top in configuration.CONSTRUCTED:
+        if top in CONSTRUCTED:
             options |= {
                 name: registry(top).options(name)
                 for name in registry(top).names()

@@ -5,6 +5,7 @@ share.
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,7 @@ import torch
 
 import gaigs
 from gaigs import processes
+from gaigs.io.tables import check_empty
 from gaigs.report.curves import read_curves
 from gaigs.training.checkpoints import KeepLast
 
@@ -213,7 +215,7 @@ def test_an_ignored_signal_is_not_sent_again_while_a_run_stops():
             Dying(signal.SIGTERM)
             signal.raise_signal(signal.SIGTERM)
         finally:
-            time.sleep(4 * processes.AGAIN)
+            time.sleep(0.2)  # four times the delay
             saved.append(True)
 
     with pytest.raises(processes.Stopped), processes.stopping():
@@ -232,8 +234,9 @@ def test_only_one_machine_has_the_first_process(name, monkeypatch):
 
 def test_jobs_of_a_launcher_share_the_processors(monkeypatch):
     threads = torch.get_num_threads()
+    names = ("OMP_NUM_THREADS", "POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
-    for name in processes.THREADS:
+    for name in names:
         monkeypatch.setenv(name, "")
     for count, jobs, expected in (
         (None, 4, 2),
@@ -245,7 +248,7 @@ def test_jobs_of_a_launcher_share_the_processors(monkeypatch):
         with processes.limited_threads(count, jobs):
             assert torch.get_num_threads() == expected
             if expected != threads:
-                assert {os.environ[name] for name in processes.THREADS} == {str(expected)}
+                assert {os.environ[name] for name in names} == {str(expected)}
         assert torch.get_num_threads() == threads, "undone"
         assert os.environ["OMP_NUM_THREADS"] == ""
     with pytest.raises(ValueError, match="threads must be at least 1, or null for all, got 0"):
@@ -275,4 +278,32 @@ def test_a_folder_is_held_by_one_run_at_a_time(tmp_path):
         with processes.only_run(tmp_path), processes.only_run(tmp_path):
             pass
     with processes.only_run(tmp_path):
-        assert not list(tmp_path.iterdir())
+        check_empty(tmp_path)  # the lock does not count
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_killed_process_holds_no_folder(tmp_path):
+    code = (
+        "import os, pathlib, signal; from gaigs import processes\n"
+        f"with processes.only_run(pathlib.Path({str(tmp_path)!r})):\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    assert subprocess.run([sys.executable, "-c", code]).returncode == -signal.SIGKILL
+    assert [file.name for file in tmp_path.iterdir()] == [".lock"]
+    with processes.only_run(tmp_path):
+        pass
+
+
+def test_a_run_whose_folder_was_made_anew_leaves_the_lock_of_another(tmp_path):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    with processes.only_run(folder):
+        shutil.rmtree(folder)
+        folder.mkdir()
+        with processes.only_run(folder):
+            pass
+        (folder / ".lock").touch()  # of another run
+    assert (folder / ".lock").exists()
+    with pytest.raises(FileNotFoundError), processes.only_run(tmp_path / "missing"):
+        pass
+    assert not (tmp_path / "missing").exists()

@@ -1,5 +1,6 @@
 import math
 import re
+import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +13,18 @@ from lightning import Trainer
 from torch.optim.lr_scheduler import StepLR
 
 from gaigs.configuration import compose
-from gaigs.registry import KINDS, Registry, call, configuration_of, register, registries, registry
+from gaigs.registry import (
+    KINDS,
+    Registry,
+    call,
+    configuration_of,
+    find_holders,
+    register,
+    registries,
+    registry,
+)
+from gaigs.registry.building import named_parameters
+from gaigs.registry.storing import GIVEN
 
 
 class Waveguide:
@@ -480,10 +492,144 @@ def test_an_entry_point_names_an_attribute_or_a_module_that_registers(plugins, t
     )
 
 
-def test_a_plugin_that_cannot_be_imported_is_named_when_it_is_composed(plugins):
-    plugins("broken.py", "import nothing\n@register('model', 'broken')\nclass Broken: ...\n")
+def test_a_plugin_is_imported_when_composed_if_its_source_does_not_tell_its_options(plugins):
+    """Here the constructor is another package's."""
+    plugins(
+        "broken.py",
+        "from nothing import Whole\n@register('model', 'broken')\nclass Broken(Whole): ...\n"
+        "@register('model', 'sound')\nclass Sound:\n"
+        "    def __init__(self, scene, width: int = 3): ...\n",
+    )
+    assert compose(model="sound", width=5)["model"] == {"name": "sound", "width": 5}
     with pytest.raises(
         ValueError,
         match=r"model 'broken' of plugins.broken\.py cannot be loaded: ModuleNotFoundError",
     ):
         compose(model="broken")
+
+
+# --- options from the source ---
+
+BASES = """
+from dataclasses import dataclass
+from math import sqrt
+from typing import NamedTuple
+from gaigs.registry import register
+from torch import nn
+from .lengths import LONG as LENGTH, Base
+
+WIDTH: int = 4
+
+class Nearer(Base):
+    "It has no constructor of its own."
+
+@register("model", "plain")
+class Plain(nn.Module):
+    def __init__(self, scene, /, width=WIDTH, length=LENGTH, *, depth, octaves=(-3, 2), **rest): ...
+
+@register("model", "inherits")
+class Inherits(Nearer): ...
+
+@register("model", "bare")
+class Bare(nn.Module): ...
+
+@register("model", "function")
+def function(scene, count=-1, part=None): ...
+
+@register("model", "computed")
+class Computed:
+    def __init__(self, scene, width=sqrt(4)): ...
+
+@register("model", "frozen")
+@dataclass
+class Frozen:
+    width: int = 3
+
+@register("model", "tupled")
+class Tupled(NamedTuple):
+    width: int = 3
+"""
+
+
+def test_options_are_read_from_the_source_where_it_tells_them(plugins):
+    plugins("parts/__init__.py", "")
+    plugins("parts/bases.py", BASES)
+    base = "class Base:\n    def __init__(self, scene, pitch: float, name='x'): ...\n"
+    plugins("parts/lengths.py", f"LONG = 2.5\n{base}")
+    expected = {
+        "plain": {"width": 4, "length": 2.5, "octaves": (-3, 2), "depth": "???"},
+        "inherits": {"pitch": "???", "name": "x"},
+        "bare": {},
+        "function": {"count": -1, "part": None},
+    }
+    for name, options in expected.items():
+        assert registry("model").options(name) == options
+    assert "plugins.parts.bases" not in sys.modules
+    for name, options in {"computed": {"width": 2.0}, "tupled": {"width": 3}}.items():
+        assert registry("model").options(name) == options
+    assert "plugins.parts.bases" in sys.modules
+    for name, options in expected.items():
+        assert registry("model").options(name) == options, "of the imported component"
+    assert registry("model").options("frozen") == {"width": 3}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_sources_of_gaigs_tell_all_options(kind):
+    for holder in find_holders(kind)[0]:
+        if holder.root is None and holder.file is not None:
+            given = GIVEN.get(kind, ())
+            parameters = named_parameters(registry(kind).get(holder.name))
+            options = {
+                key: "???" if parameter.default is parameter.empty else parameter.default
+                for key, parameter in parameters.items()
+                if key not in given
+            }
+            assert holder.read_options(given) == options
+
+
+def test_the_task_and_split_of_a_reader_are_read_without_an_import(plugins):
+    reader = '@register("data", "mast", task="csi", split="runs")\ndef mast(file="m.csv"): ...\n'
+    plugins("mast.py", f"from gaigs.registry import register\n\n\n{reader}")
+    assert registry("data").choices("mast") == {"task": "csi", "split": "runs"}
+    config = compose("data=mast", "split.length=3")
+    assert config["data"] == {"file": "m.csv", "name": "mast"}
+    assert (config["task"]["name"], config["split"]["name"]) == ("csi", "runs")
+    config = compose("data=mast", "task=rssi", "split=random")
+    assert (config["task"]["name"], config["split"]["name"]) == ("rssi", "random")
+    assert "plugins.mast" not in sys.modules
+    with pytest.raises(ValueError, match="split 'thirds' chooses no task; only data take"):
+        register("split", "thirds", task="csi")
+    register("data", "scripted", task="rssi")(horn)
+    try:
+        assert compose("data=scripted")["task"]["name"] == "rssi"
+    finally:
+        del registries["data"]._registered["scripted"], registries["data"]._choices["scripted"]
+
+
+def test_a_composition_imports_neither_torch_nor_the_chosen_components(tmp_path):
+    code = """
+import sys, gaigs
+gaigs.compose("+experiment=mirrored_rssi", "model=knn", "tokenizer=ga", k=3, **{"seed": 2})
+gaigs.compose("+experiment=csi", "data=nerf2_rssi", "data.root=here")
+print([name for name in ("torch", "lightning", "numpy", "gaigs.model", "gaigs.data",
+    "gaigs.splatting.tokenizer.ga") if name in sys.modules])
+"""
+    words = [sys.executable, "-c", code]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("[]\n", "")
+
+
+@pytest.mark.parametrize("word", ["--help", "modle=knn", "knn.k=3", "command=trian", "seed=-1"])
+def test_help_and_messages_import_no_torch(word, tmp_path):
+    code = """
+import sys
+from gaigs.commands.command_line import main
+try:
+    main()
+finally:
+    assert not {"torch", "lightning"} & {*sys.modules}
+"""
+    words = [sys.executable, "-c", code, "hydra.run.dir=run", word]
+    done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
+    assert "AssertionError" not in done.stderr
+    assert done.returncode == (0 if word == "--help" else 1), done.stderr

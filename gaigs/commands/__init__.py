@@ -8,27 +8,22 @@ from gaigs import processes
 from gaigs.configuration import check
 from gaigs.core import stages
 from gaigs.registry import call, suggest
-from gaigs.registry.modes import usual_modes
+from gaigs.registry.torch_modes import usual_modes
 from gaigs.report.formats import figure_formats
 
 COMMANDS = ("agreement", "describe", "survey", "locate", "export", "view")
 """Commands beside the training, each a module of its name."""
 
-SCRIPTS = {
-    "report": "python -m gaigs.report FOLDER makes its tables",
-    "benchmark": "python benchmarks/step.py and others measure, in a clone",
-}
-"""What does the work of a command that others call by this name."""
 
+def run(configuration: Mapping, folder: str | Path, launcher: str | None = None) -> dict | None:
+    """Executes the command of a configuration, as ``python -m gaigs`` does.
 
-@usual_modes()
-def run(configuration: Mapping, folder: str | Path) -> dict | None:
-    """Executes the command of a configuration, as ``python -m gaigs`` does; resumes a run that was
-    stopped.
+    A run that was stopped is resumed.
 
     Args:
         configuration: The result of ``gaigs.compose``.
         folder: Gets the results; with ``command=train`` the run folder of docs/start.md.
+        launcher: Class name of Hydra's launcher in a job of a multirun; None elsewhere.
 
     Returns:
         With ``command=train`` the contents of ``metrics.json``, or None in all but the first of
@@ -43,7 +38,8 @@ def run(configuration: Mapping, folder: str | Path) -> dict | None:
             training.
 
     Example:
-        >>> configuration = gaigs.compose("model=knn", "data.transmitters=40", "data.order=0", baselines=["mean"])
+        >>> words = "model=knn", "data.transmitters=40", "data.order=0"
+        >>> configuration = gaigs.compose(*words, baselines=["mean"])
         >>> metrics = gaigs.run(configuration, "runs/room")
         Test scores
         ...
@@ -57,35 +53,47 @@ def run(configuration: Mapping, folder: str | Path) -> dict | None:
         )
     config, folder = dict(configuration), Path(folder)
     if config.get("command") == "devices":  # works with any other keys
-        from gaigs.splatting.rasterizer.devices import default_device, devices
-
-        names, default = devices(), default_device()
-        for number, name in enumerate(names):
-            print(
-                f"{name}  <- rasterizer=opencl takes this one"
-                if number == names.index(default)
-                else name
-            )
+        _list_devices()
         return None
     check(config)
     with call("figures", figure_formats, config["figures"]):
-        return _execute(config, folder)
+        _check_command(config["command"])
+        return _execute(config, folder, launcher)
 
 
-def _execute(config: dict, folder: Path) -> dict | None:
+def _list_devices() -> None:
+    """Prints the devices of OpenCL."""
+    from gaigs.splatting.rasterizer.devices import default_device, devices
+
+    names = devices()
+    default = default_device()
+    for number, name in enumerate(names):
+        is_default = number == names.index(default)  # the first of that name
+        print(f"{name}  <- rasterizer=opencl takes this one" if is_default else name)
+
+
+def _check_command(command: str) -> None:
+    """Raises a ``ValueError`` for an unknown command."""
+    scripts = {
+        "report": "python -m gaigs.report FOLDER makes its tables",
+        "benchmark": "python benchmarks/step.py and others measure, in a clone",
+    }
+    if command in scripts:
+        raise ValueError(f"there is no command {command!r}; {scripts[command]}")
+    known = ("train", *COMMANDS, "devices")
+    if command not in known:
+        words = ", ".join(known)
+        raise ValueError(f"command must be one of {words}, got {suggest(command, known)}")
+
+
+@usual_modes()
+def _execute(config: dict, folder: Path, launcher: str | None) -> dict | None:
     """Executes the command of a checked configuration."""
     command = config["command"]
     if command == "train":
         from gaigs import runs
 
-        return runs.run(config, folder)
-    if command not in COMMANDS:
-        if command in SCRIPTS:
-            raise ValueError(f"there is no command {command!r}; {SCRIPTS[command]}")
-        known = ("train", *COMMANDS, "devices")
-        raise ValueError(
-            f"command must be one of {', '.join(known)}, got {suggest(command, known)}"
-        )
+        return runs.run(config, folder, launcher)
     module = importlib.import_module(f"gaigs.commands.{command}")
     with processes.limited_threads(config["threads"]):
         if command == "view":

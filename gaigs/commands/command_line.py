@@ -1,4 +1,4 @@
-"""The command line of ``python -m gaigs``: Hydra's jobs, signals, and one message for each error."""
+"""The command line of ``python -m gaigs``: Hydra's jobs, signals, one message for each error."""
 
 import contextlib
 import logging
@@ -8,17 +8,37 @@ import signal
 import sys
 import traceback
 from pathlib import Path
+from typing import NamedTuple, NoReturn
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from gaigs import commands, configuration, processes
+from gaigs.io.files import LOCK
+from gaigs.registry import registry
 from gaigs.report import at_end
 
 log = logging.getLogger("gaigs")
+
+
+class Job(NamedTuple):
+    """What Hydra knows of a job.
+
+    Attributes:
+        folder: The run folder.
+        is_sweep: True for a job of a multirun.
+        launcher: Class name of Hydra's launcher.
+        goes_on: How to resume the run, for messages.
+    """
+
+    folder: Path
+    is_sweep: bool
+    launcher: str
+    goes_on: str
 
 
 def run(config: DictConfig) -> float | None:
@@ -29,61 +49,71 @@ def run(config: DictConfig) -> float | None:
     result there is no folder.
     """
     settings = HydraConfig.get()
-    is_sweep, launcher = (
-        settings.mode is RunMode.MULTIRUN,
-        settings.launcher["_target_"].rpartition(".")[2],
-    )
-    folder, mode, command = (
-        Path(settings.runtime.output_dir),
-        "sweep" if is_sweep else "run",
-        config.get("command"),
-    )
-    goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
-    if command in ("agreement", "describe", "survey", "locate", "export", "view"):
-        goes_on = "the same command starts anew"
+    job = describe_job(settings, config.get("command"))
     words = OmegaConf.to_container(settings.overrides.task)
-    jobs = settings.launcher.get("n_jobs", 1) if is_sweep else 1
+    parallel_jobs = settings.launcher.get("n_jobs", 1) if job.is_sweep else 1
     processes.keep_memory()
     try:
         # A process of joblib runs several jobs.
-        with processes.stopping(waits=is_sweep and launcher == "JoblibLauncher"):
-            plain = {"command": command} if command == "devices" else configuration.resolve(config)
+        with processes.stopping(waits=job.is_sweep and job.launcher == "JoblibLauncher"):
+            is_list = config.get("command") == "devices"
+            plain = {"command": "devices"} if is_list else configuration.resolve(config)
             note_task(words, plain)
-            with processes.limited_threads(None, jobs):
-                metrics = commands.run(plain, folder)
+            with processes.limited_threads(None, parallel_jobs):
+                launcher = job.launcher if job.is_sweep else None
+                metrics = commands.run(plain, job.folder, launcher)
     except KeyboardInterrupt as stop:
-        message = f"gaigs: {str(stop) or 'stopped'}; {goes_on}"
-        number = getattr(stop, "number", signal.SIGINT)
-        if is_sweep and launcher != "BasicLauncher":
-            # Only this job ends: a launcher that sees a process exit kills its other jobs before
-            # they have saved.
-            processes.received.append(number)
-            raise CompactHydraException(message) from None
-        if (
-            not processes.is_first()
-        ):  # exits with 0: at a failure Lightning would kill the first process
-            raise SystemExit(0) from None
-        print(message, file=sys.stderr)
-        raise SystemExit(128 + number) from None
+        end_stopped(job, stop)
     except Exception as error:
-        message = processes.advice(error, folder, goes_on)
-        if settings.verbose or (message is None and not is_sweep):
-            traceback.print_exc()
-        if not is_sweep:  # exits here, as Hydra would print a line of its own first
-            if isinstance(error, BrokenPipeError):
-                raise SystemExit(141) from None
-            if message is not None:
-                print(f"gaigs: {message}", file=sys.stderr)
-            raise SystemExit(1) from None
-        # Hydra prints the first failure only: each job writes its own, in one line of its log.
-        log.error("gaigs: %s", " ".join((message or str(error) or repr(error)).split()))
-        if message is None:
-            raise
-        raise CompactHydraException(f"gaigs: {message}") from error
+        end_failed(job, error, settings.verbose)
     finally:
-        if not is_sweep:
-            remove_without_result(folder)
+        if not job.is_sweep:
+            remove_without_result(job.folder)
     return None if metrics is None else metrics["validation_score"]
+
+
+def describe_job(settings: DictConfig, command: str | None) -> Job:
+    """The job of Hydra's settings."""
+    is_sweep = settings.mode is RunMode.MULTIRUN
+    mode = "sweep" if is_sweep else "run"
+    goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
+    if command in commands.COMMANDS:
+        goes_on = "the same command starts anew"
+    launcher = settings.launcher["_target_"].rpartition(".")[2]
+    return Job(Path(settings.runtime.output_dir), is_sweep, launcher, goes_on)
+
+
+def end_stopped(job: Job, stop: KeyboardInterrupt) -> NoReturn:
+    """Ends a job after a signal."""
+    message = f"gaigs: {str(stop) or 'stopped'}; {job.goes_on}"
+    number = getattr(stop, "number", signal.SIGINT)
+    if job.is_sweep and job.launcher != "BasicLauncher":
+        # Only this job ends: a launcher that sees a process exit kills its other jobs before they
+        # have saved.
+        processes.received.append(number)
+        raise CompactHydraException(message) from None
+    if not processes.is_first():  # at a failure Lightning would kill the first process
+        raise SystemExit(0) from None
+    print(message, file=sys.stderr)
+    raise SystemExit(128 + number) from None
+
+
+def end_failed(job: Job, error: Exception, is_verbose: bool) -> NoReturn:
+    """Ends a job after an error."""
+    message = processes.advice(error, job.folder, job.goes_on)
+    if is_verbose or (message is None and not job.is_sweep):
+        traceback.print_exc()
+    if not job.is_sweep:  # exits here, as Hydra would print a line of its own first
+        if isinstance(error, BrokenPipeError):
+            raise SystemExit(141) from None
+        if message is not None:
+            print(f"gaigs: {message}", file=sys.stderr)
+        raise SystemExit(1) from None
+    # Hydra prints the first failure only: each job writes its own, in one line of its log.
+    log.error("gaigs: %s", " ".join((message or str(error) or repr(error)).split()))
+    if message is None:
+        raise error
+    raise CompactHydraException(f"gaigs: {message}") from error
 
 
 def note_task(words: list[str], config: dict) -> None:
@@ -92,24 +122,20 @@ def note_task(words: list[str], config: dict) -> None:
     if not all(isinstance(part, dict) and "name" in part for part in parts):
         return  # the check of the configuration says what is wrong
     task, data = (part["name"] for part in parts)
+    message = "+experiment=%s is for task %s; labels of data=%s are of %s"
     for word in words:
         key, _, name = word.partition("=")
-        others = {*name.split("_")} & {"spectrum", "rssi", "csi"} - {task}
+        others = {*name.split("_")} & {*registry("task").names()} - {task}
         if key == "+experiment" and others:
-            log.warning(
-                "+experiment=%s is for task %s; labels of data=%s are of %s",
-                name,
-                min(others),
-                data,
-                task,
-            )
+            log.warning(message, name, min(others), data, task)
 
 
 def remove_without_result(folder: Path) -> None:
-    """Removes a run folder with nothing but what Hydra and the start of a run write, unless a run
-    is at work there.
+    """Removes a run folder without a result, unless a run is at work there.
+
+    Such a folder has only what Hydra and the start of a run write.
     """
-    begun = {".hydra", "gaigs.log", "config.yaml", "software.json"}
+    begun = {".hydra", "gaigs.log", "config.yaml", "software.json", LOCK}
     with contextlib.suppress(OSError, ValueError), processes.only_run(folder):
         names = {path.name for path in folder.iterdir()}
         is_ours = "config.yaml" not in names or "software.json" in names  # a run writes both
@@ -117,29 +143,36 @@ def remove_without_result(folder: Path) -> None:
             shutil.rmtree(folder)
 
 
+def wrong_flag() -> str | None:
+    """The message for a flag on the command line that Hydra does not have; None if it has all."""
+    _, unknown = get_args_parser().parse_known_args()
+    for word in unknown:
+        if word.startswith("-"):
+            flag = word.partition("=")[0]
+            name = flag.lstrip("-").replace("-", "_")
+            near = configuration.nearest(name, configuration.compose()) or "trainer.max_steps"
+            return f"there is no flag {flag}; options have no dashes, such as {near}=..."
+    return None
+
+
 def compose_and_run() -> None:
-    """Lets Hydra read the command line and run its jobs; exits with 1 after the message of an
-    error.
-    """
-    if message := configuration.wrong_flag():
+    """Lets Hydra read the command line and run its jobs; exits with 1 after an error's message."""
+    if message := wrong_flag():
         print(f"gaigs: {message}", file=sys.stderr)
         raise SystemExit(2)
     full_error = os.environ.get("HYDRA_FULL_ERROR", "")
     os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises errors instead of printing them
     try:
-        hydra.main(
-            version_base="1.3", config_path=str(configuration.conf_dir()), config_name="config"
-        )(run)()
+        folder = str(configuration.conf_dir())
+        hydra.main(version_base="1.3", config_path=folder, config_name="config")(run)()
     except Exception as error:
         if full_error == "1":
             raise
-        if (
-            isinstance(error, BrokenPipeError) and not configuration.is_multirun()
-        ):  # launchers have other pipes
+        # Launchers have other pipes.
+        if isinstance(error, BrokenPipeError) and not configuration.is_multirun():
             raise SystemExit(141) from None
-        message = configuration.explain(error) or processes.advice(
-            error, Path.cwd(), "the same command goes on"
-        )
+        message = configuration.explain(error)
+        message = message or processes.advice(error, Path.cwd(), "the same command goes on")
         if message is None:
             traceback.print_exc()
         else:
@@ -151,12 +184,10 @@ def compose_and_run() -> None:
 
 def main() -> None:
     """The console script ``gaigs``."""
-    logging.getLogger("matplotlib").setLevel(
-        logging.WARNING
-    )  # it reports the making of its font cache
-    logging.raiseExceptions = (
-        False  # on a full disk the log stays silent; the run's own files report it
-    )
+    # Matplotlib reports the making of its font cache.
+    logging.getLogger("matplotlib").setLevel(logging.WARNING)
+    # On a full disk the log stays silent; the run's own files report it.
+    logging.raiseExceptions = False
     signals = []
 
     def stop(number: int, _) -> None:

@@ -13,7 +13,6 @@ from torch import Tensor
 
 from gaigs.core.antenna import lacking
 from gaigs.core.query import evenly
-from gaigs.core.task.csi import Csi
 from gaigs.core.task.scalar import with_unit
 from gaigs.data import Links, load
 from gaigs.data.checks import Finding, check
@@ -132,7 +131,7 @@ def levels(links: Links, index: Tensor) -> Float[Tensor, " k"]:
         flat = links.labels[part].reshape(len(part), -1)
         is_wave = flat.is_complex()
         mean = (flat.abs().double().square() if is_wave else flat.double()).mean(1)
-        if isinstance(links.task, Csi):  # over the elements that arrays have
+        if links.task.is_channel:  # over the elements that arrays have
             absent = lacking(links.receivers, links.query.receivers[part], links.task.elements)
             mean = mean / (1 - absent.double().mean(1))
         found.append(10 * mean.clamp_min(1e-300).log10() if is_wave else mean)

@@ -255,7 +255,7 @@ def survey(
         else at(even_places(scene.lower, scene.upper, POINTS, scene.floors))
     )
     known, own, losses, superfluous = without(processes, box, factor)
-    unit = getattr(model.scene.task, "error_unit", model.scene.task.unit)
+    unit = model.scene.task.error_unit
     frame = model.scene.frame
     return SurveyPlan(
         places[chosen], torch.tensor(errors), known, losses, superfluous, unit, frame, own

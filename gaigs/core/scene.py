@@ -15,7 +15,6 @@ from gaigs.core.geometry import Frame, Pose
 from gaigs.core.propagation import free_space
 from gaigs.core.query import Query
 from gaigs.core.task import Task
-from gaigs.core.task.csi import Csi
 from gaigs.registry import registry
 
 log = logging.getLogger(__name__)
@@ -185,7 +184,7 @@ def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
     Raises:
         ValueError: The query has no frequency, and the data do not have exactly one.
     """
-    if isinstance(scene.task, Csi):
+    if scene.task.is_channel:
         return scene.task.frequencies.mean().to(query.transmitters).expand(len(query))
     if query.frequencies is not None:
         return query.frequencies
@@ -197,7 +196,7 @@ def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
     return scene.frequencies.to(query.transmitters).expand(len(query))
 
 
-def check_elements(owner: str, scene: Scene, pads: bool = False) -> Csi:
+def check_elements(owner: str, scene: Scene, pads: bool = False) -> Task:
     """The task of channels with as many elements as each receiver's array.
 
     ``owner`` names a component in errors. One that ``pads`` takes smaller arrays too, and predicts
@@ -207,7 +206,7 @@ def check_elements(owner: str, scene: Scene, pads: bool = False) -> Csi:
         ValueError: Labels are not channels, or an array has another number of elements.
     """
     task = scene.task
-    if not isinstance(task, Csi):
+    if not task.is_channel:
         raise ValueError(
             f"{owner} gives complex channels, not labels of task {task.name!r}; take another"
         )

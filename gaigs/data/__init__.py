@@ -234,7 +234,7 @@ def divide(links: Links, split: Mapping) -> Links:
         ValueError: An option of the split has a defect, two of its parts share a link, or all
             spectra are constant.
     """
-    if isinstance(links.task, Csi) and isinstance(links.labels, Tensor):
+    if links.task.is_channel and isinstance(links.labels, Tensor):
         check_elements(links)
         links = without_constant(links)
     parts = registry("split").build(split, links=links)
@@ -250,7 +250,7 @@ def divide(links: Links, split: Mapping) -> Links:
     if links.uncertainties is not None:
         links = with_places(only_trained(links))
     remarks = [links.remarks]
-    phase = getattr(links.task, "phase", "known")
+    phase = links.task.phase
     if phase != "known":
         unknown = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}[phase]
         remarks.append(f"{unknown} of each link unknown, and removed in every score")

@@ -63,7 +63,7 @@ STRENGTHS = 1e-18, 1e18
 """Range of the strongest entry of a channel, whose square float32 can hold."""
 
 
-@register("data", "csi_npz")
+@register("data", "csi_npz", task="csi", split="random")
 def read(
     file: str | Path,
     arrays: Mapping[str, str | list] | None = None,

@@ -17,8 +17,6 @@ from gaigs.core.antenna import Array, Receiver
 from gaigs.core.geometry import Frame, Pose
 from gaigs.core.query import Query, as_numbers, as_positions, as_tensor, check_carrier
 from gaigs.core.task import Task, check_range
-from gaigs.core.task.csi import Csi
-from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links, divide, load
 from gaigs.data.parts import check_parts
 from gaigs.data.readings import loud_remark, marks_of
@@ -135,7 +133,7 @@ def from_arrays(
     )
     received = _received(labels, task, remarks)
     check_range(task, labels, "labels")
-    if isinstance(task, Rssi):
+    if task.is_scalar and task.unit == "dBm":
         _doubt_levels(labels, received, remarks)
     row = rows[received]
     _, sites = number_places(places.tolist())
@@ -237,7 +235,7 @@ def _make_receivers(
     if is_one_a_place and len(stands) == len(places) > 1:
         distinct, index = number_places(stands.tolist())
         stands = torch.tensor(distinct)
-    elements = task.elements if isinstance(task, Csi) else 1
+    elements = task.elements
     if elements > 1:
         remarks.append(
             f"positions of the {elements} elements are unknown: all count as standing at their "
@@ -339,7 +337,7 @@ def _carriers(
     frequency: Any, task: Task, row: Int[Tensor, " m"], places: Float[Tensor, "n 3"]
 ) -> Float[Tensor, " m"] | None:
     """Carrier of each link [Hz]; of channels by default the middle of the subcarriers."""
-    if frequency is None and hasattr(task, "frequencies"):
+    if frequency is None and task.frequencies is not None:
         frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
     if frequency is None:
         return None

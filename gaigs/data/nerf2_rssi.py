@@ -22,7 +22,7 @@ NOT_HEARD = -100.0
 """Value of readings that were not heard [dBm]."""
 
 
-@register("data", "nerf2_rssi")
+@register("data", "nerf2_rssi", task="rssi", split="official_runs")
 def read(root: str | Path, frequency: float | None = None) -> Links:
     """A data set from its folder: one link for each reading that a gateway heard.
 

@@ -29,7 +29,7 @@ SHAPE = (90, 360)
 """Elevations 1..90 deg and azimuths 0..359 deg, fixed by the format."""
 
 
-@register("data", "nerf2_spectrum")
+@register("data", "nerf2_spectrum", task="spectrum", split="official")
 def read(
     root: str | Path,
     elements: Sequence[int] | None = (4, 4),
@@ -114,8 +114,7 @@ def write(folder: str | Path, links: Links) -> None:
     """
     folder = Path(folder)
     tables.check_empty(folder)
-    is_fitting = isinstance(links.task, Spectrum) and links.task.shape == SHAPE
-    if len(links.receivers) != 1 or not is_fitting:
+    if len(links.receivers) != 1 or links.task.directions is None or links.task.shape != SHAPE:
         raise ValueError(
             f"the layout holds spectra of {SHAPE[0]} x {SHAPE[1]} directions at one receiver, got "
             f"labels of {links.task.name} {links.task.shape} at {len(links.receivers)}"

@@ -22,7 +22,7 @@ QUIETEST = -200.0
 """Lower bound of readings [dBm]: thermal noise alone is -174 dBm in 1 Hz."""
 
 
-@register("data", "rssi_csv")
+@register("data", "rssi_csv", task="rssi", split="random")
 def read(
     file: str | Path,
     layout: str | Path | None = None,

@@ -9,7 +9,7 @@ from gaigs.data.synthetic import default_room
 from gaigs.registry import register
 
 
-@register("data", "synthetic_csi")
+@register("data", "synthetic_csi", task="csi", split="official")
 def furnished_room_csi(
     transmitters: int = 500,
     frequency: float = 6.4896e9,

@@ -6,7 +6,7 @@ from gaigs.data.synthetic import default_room
 from gaigs.registry import register
 
 
-@register("data", "synthetic_rssi")
+@register("data", "synthetic_rssi", task="rssi", split="official")
 def furnished_room_rssi(
     transmitters: int = 600,
     noise: float = 2.0,

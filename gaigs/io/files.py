@@ -7,6 +7,9 @@ import secrets
 from collections.abc import Iterator
 from pathlib import Path
 
+LOCK = ".lock"
+"""Name of the file in a folder that a run holds; a killed run leaves it, unlocked."""
+
 
 @contextlib.contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:

@@ -22,7 +22,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gaigs.io import FAR, WITHIN
-from gaigs.io.files import atomic_write
+from gaigs.io.files import LOCK, atomic_write
 
 Rows = Mapping[int, Sequence[str]]
 """Cells of each line of a table, by the line's number from 1."""
@@ -69,8 +69,11 @@ def has_file(file: Path) -> bool:
 
 
 def check_empty(folder: Path) -> None:
-    """Raises a ``FileExistsError`` unless a folder to be written is empty or missing."""
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    """Raises a ``FileExistsError`` unless a folder to be written is empty or missing.
+
+    The file of a lock does not count.
+    """
+    if folder.exists() and (not folder.is_dir() or {*os.listdir(folder)} - {LOCK}):
         raise FileExistsError(f"{folder} must be an empty folder or missing; choose another name")
 
 

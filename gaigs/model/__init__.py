@@ -20,13 +20,12 @@ from gaigs.core.geometry import Directions, ExtrapolationWarning
 from gaigs.core.query import ROUNDING, Batch, Query, as_directions, as_receivers, as_subcarriers
 from gaigs.core.scene import Scene
 from gaigs.core.stages import track
-from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.kriging.kernel import Process
 from gaigs.kriging.links import PART
 from gaigs.model import checkpoint
 from gaigs.registry import check_type, name_of, registry
-from gaigs.registry.modes import usual_modes
+from gaigs.registry.torch_modes import usual_modes
 from gaigs.splatting.gaussians import Gaussians
 
 NUMBERS, MOST = 2**17, 1024
@@ -298,15 +297,12 @@ class Model(nn.Module):
     @property
     def lacks_elements(self) -> bool:
         """True for channels if an array has fewer elements than another one."""
-        task = self.scene.task
-        return (
-            isinstance(task, Csi)
-            and min(len(one.array) for one in self.scene.receivers) < task.elements
-        )
+        smallest = min(len(one.array) for one in self.scene.receivers)
+        return smallest < self.scene.task.elements
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Model":
         """A copy of a model with ``any_frequency`` whose labels have other subcarriers [Hz]."""
-        scene = replace(self.scene, task=Csi(self.scene.task.shape[0], frequencies))
+        scene = replace(self.scene, task=self.scene.task.at_frequencies(frequencies))
         other = copy.deepcopy(self)
         for part in other.modules():
             if hasattr(part, "scene"):
@@ -329,7 +325,7 @@ class Model(nn.Module):
         )  # links of each position
         model, chosen, messages = self, None, []
         if frequencies is not None:
-            if not isinstance(scene.task, Csi):
+            if not scene.task.is_channel:
                 raise ValueError(
                     f"labels of task {scene.task.name!r} have no subcarriers; leave frequencies out"
                 )

@@ -77,7 +77,8 @@ def read(path: str | Path) -> dict:
         if lacks_memory(error):
             raise
         raise ValueError(
-            f"{path} is damaged, or no checkpoint of this gaigs\ntake a copy, or train again"
+            f"{path} cannot be read: it is damaged, or another program wrote it\n"
+            "copy the file again from where it was trained, or train again"
         ) from None
     part = content.get(KEY) if isinstance(content, dict) else None
     if not isinstance(part, dict):

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from gaigs.core.query import Batch, Query, evenly, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.core.stages import stage
-from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations
 from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, kernel, kriging_weights
@@ -75,12 +74,7 @@ class GaussianProcess(LookUp):
 
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
-        names = (
-            ("mean", "path_loss")
-            if scene.task.is_scalar
-            else ("friis" if isinstance(scene.task, Csi) else "mean",)
-        )
-        given = [{"name": name} for name in names] if trend is None else [trend]
+        given = [{"name": name} for name in scene.task.trends] if trend is None else [trend]
         self.trends = tuple(build_trend(one, scene) for one in given)
         if any([*built.parameters()] for built in self.trends):
             raise ValueError(

@@ -14,7 +14,6 @@ from torch import Tensor, nn
 from gaigs.core.propagation import fit_gain
 from gaigs.core.query import Batch, Query
 from gaigs.core.scene import Scene, carriers, direct_gains, direct_waves
-from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
@@ -122,7 +121,7 @@ class MirroredSplatting(GaussianSplatting):
             own = trend, self._start(), self.placement.used.tolist(), self.placement.order
             self.levels = LevelSearch(links, carriers(self.scene, links.query), *own)
         if (
-            not (isinstance(task, Csi) and isinstance(self.pooling, ChannelPooling))
+            not (task.is_channel and isinstance(self.pooling, ChannelPooling))
             or self.trend is not None
         ):
             return

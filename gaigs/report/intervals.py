@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from gaigs.core.task import Task
-from gaigs.core.task.scalar import Scalar
 from gaigs.report.figures import own_scores
 from gaigs.report.style import PAGE, STYLE, looks
 
@@ -63,7 +62,7 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
         right.plot(across, up, "o", color=looks(shares)[next(iter(shares))][0], markersize=4)
         furthest = 1.08 * max(across.max(), up.max()) or 1.0
         right.axline((0, 0), slope=1, color="0.3", linewidth=0.7)
-        unit = f" [{task.error_unit}]" if isinstance(task, Scalar) and task.error_unit else ""
+        unit = f" [{task.error_unit}]" if task.error_unit else ""
         right.set(xlim=(0, furthest), ylim=(0, furthest), aspect="equal")
         for axis in (right.xaxis, right.yaxis):
             axis.set_major_locator(MaxNLocator(5))

@@ -25,7 +25,7 @@ from gaigs.runs.folder import claim, is_configuration, store, stored_software, w
 log = logging.getLogger(__name__)
 
 
-def run(config: dict, folder: Path) -> dict | None:
+def run(config: dict, folder: Path, launcher: str | None = None) -> dict | None:
     """Trains, tests, and writes the run folder; resumes a run of the same configuration that was
     stopped there.
 
@@ -33,6 +33,7 @@ def run(config: dict, folder: Path) -> dict | None:
         config: The resolved configuration.
         folder: The run folder of docs/start.md. A finished run is not repeated. One run holds the
             folder at a time.
+        launcher: Class name of Hydra's launcher in a job of a multirun; None elsewhere.
 
     Returns:
         The contents of ``metrics.json``; None in all but the first of several processes.
@@ -42,6 +43,10 @@ def run(config: dict, folder: Path) -> dict | None:
     """
     from gaigs.training.budget import watched  # slow to import
 
+    if launcher is not None:
+        from gaigs.runs.training import check_processes
+
+        check_processes(config["trainer"], launcher)
     with limited_threads(config["threads"]), watched(config) as watch:
         if not is_first():
             logging.getLogger("gaigs").setLevel(logging.WARNING)  # the first process logs for all

@@ -14,8 +14,6 @@ from typing import Any, NamedTuple
 
 import lightning
 import torch
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
 from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from lightning.pytorch.utilities.seed import isolate_rng
@@ -299,8 +297,6 @@ def descend(
                 "tensorboard=true needs TensorBoard: pip install 'gaigs[tensorboard]'"
             ) from error
     context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
-    for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
-        logging.getLogger(name).setLevel(logging.WARNING)
     trainer = make_trainer(options, **context)
     if config["ensemble"] > 1 and trainer.world_size > 1:
         raise ValueError(
@@ -396,6 +392,8 @@ def make_trainer(options: dict, **context: Any) -> lightning.Trainer:
     """A trainer that can stop and resume at any step, in one process or several; a ``ValueError``
     for other options.
     """
+    for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
+        logging.getLogger(name).setLevel(logging.WARNING)
     with warnings.catch_warnings():
         warnings.filterwarnings(
             "ignore", "GPU available but not used"
@@ -410,24 +408,33 @@ def make_trainer(options: dict, **context: Any) -> lightning.Trainer:
                 f"trainer.{name} must be left out\n"
                 "set trainer.max_steps to end a training early, training.batch_size for larger batches"
             )
-    strategy, launcher = trainer.strategy, trainer.strategy.launcher
+    strategy = trainer.strategy
+    launcher = strategy.launcher
     starts_scripts = launcher is None or "Subprocess" in type(launcher).__name__
     if not isinstance(strategy, DDPStrategy | SingleDeviceStrategy) or not starts_scripts:
         raise ValueError(
             f"trainer.strategy must be auto for one process or ddp for several, got {type(strategy).__name__}"
         )
-    is_sweep = HydraConfig.initialized() and HydraConfig.get().mode is RunMode.MULTIRUN
-    # With other launchers the processes of one job would start the next job at different times.
-    if (
-        is_sweep
-        and launcher is not None
-        and not HydraConfig.get().launcher["_target_"].endswith("SlurmLauncher")
-    ):
+    return trainer
+
+
+def check_processes(options: dict, launcher: str) -> None:
+    """Raises a ``ValueError`` if a job of a multirun would train in several processes.
+
+    Args:
+        options: Of the trainer.
+        launcher: Class name of Hydra's launcher. That of SLURM starts the processes of each job;
+            with others they would start the next job at different times.
+    """
+    chosen = ("accelerator", "devices", "num_nodes", "strategy")
+    options = {key: options[key] for key in chosen if key in options}
+    trainer = make_trainer(options, logger=False, enable_checkpointing=False)
+    if trainer.strategy.launcher is not None and launcher != "SlurmLauncher":
         raise ValueError(
             "a job of a multirun must train in one process\n"
-            "run it alone, or use hydra/launcher=submitit_slurm, which starts the processes of each job"
+            "run it alone, or use hydra/launcher=submitit_slurm, "
+            "which starts the processes of each job"
         )
-    return trainer
 
 
 def count_gaussians(model: Model) -> int:

@@ -199,7 +199,7 @@ def _check_labels(links: Links) -> None:
         "a label must not depend on the others that are read",
     )
     require(torch.equal(batch.labels, labels), "a batch must have the labels of its links")
-    if isinstance(task, Spectrum):
+    if task.directions is not None:
         require((labels.ge(0) & labels.le(1)).all(), "spectra must lie in [0, 1]")
         require(
             task.directions.elevations.abs().max() <= math.pi / 2 + 1e-6,

@@ -10,7 +10,6 @@ import torch
 from gaigs.core.geometry import Directions, ExtrapolationWarning, Grid
 from gaigs.core.query import Batch, Query
 from gaigs.core.scene import Scene
-from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.model import Model, Prediction, call_optional
 from gaigs.registry import registry
@@ -86,7 +85,7 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
         rays = task.directions.flatten()[3::7]
         rule = "predict must give the directions of its argument"
         require_close(predict(places, directions=rays), values.flatten(1)[:, 3::7], 1e-4, rule)
-    if isinstance(task, Csi):
+    if task.is_channel:
         own = task.frequencies
         require_same(
             predict(places, frequencies=own[-1:]),

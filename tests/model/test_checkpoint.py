@@ -146,7 +146,7 @@ DEFECTS = {
     "no weights": (lambda content: content.pop("state_dict"), "it lacks state_dict"),
     "no model": (lambda content: content[checkpoint.KEY].pop("model"), "it lacks model"),
     "another program's": (lambda content: content.pop(checkpoint.KEY), "it lacks the entry 'gaigs'"),
-    "code": (lambda content: content.update(callback=Foreign()), "is damaged, or no checkpoint of this gaigs"),
+    "code": (lambda content: content.update(callback=Foreign()), "cannot be read: it is damaged, or another program"),
     "an earlier format": (lambda content: content[checkpoint.KEY].update(version=2), "has checkpoint format 2, not 3"),
     "no format": (lambda content: content[checkpoint.KEY].pop("version"), "has checkpoint format None, not"),
     "no receivers": (lambda content: SCENE(content).pop("receivers"), "KeyError: 'receivers'"),

@@ -39,7 +39,7 @@ def layers(floor: RadioMap, scene: Scene) -> dict[str, Layer]:
     """``value`` and, if the model states deviations, ``deviation``."""
     parts = {"value": Layer(floor.quantity, floor.unit, floor.values)}
     if floor.deviations is not None:
-        unit = getattr(scene.task, "error_unit", floor.unit)
+        unit = scene.task.error_unit
         quantity = f"standard deviation of {floor.quantity}"
         parts["deviation"] = Layer(quantity, unit, floor.deviations)
     return parts

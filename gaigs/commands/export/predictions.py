@@ -17,7 +17,6 @@ from gaigs.core.antenna import lacking
 from gaigs.core.query import Query, as_positions
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
-from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.data.compatibility import check_fit
 from gaigs.io.netcdf import Variable, write_netcdf
@@ -70,7 +69,7 @@ def write_predictions(
         values = model.predict(query, frequencies=subcarriers)
         estimate = Estimate(values, None, None, None)  # type: ignore[arg-type]
     absent = torch.tensor(False).expand(len(query), *task.shape)
-    if isinstance(task, Csi):
+    if task.is_channel:
         lacks = lacking(scene.receivers, query.receivers.cpu(), task.elements)  # (n, elements)
         absent = lacks[..., None].expand_as(absent)
         estimate = Estimate(*(_blank(part, absent) for part in estimate))
@@ -155,7 +154,7 @@ def tabulate(
         part = part.detach().cpu()
         unit = task.unit
         if name in ("deviation", "radius"):
-            unit = getattr(task, "error_unit", task.unit)
+            unit = task.error_unit
         about = {"units": unit or "1", "long_name": f"{task.quantity}: {name}"}
         # A part without some axes, such as one radius a link, is the same along them.
         lacking_axes = len(task.shape) + 1 - part.ndim
@@ -187,24 +186,13 @@ def _link_columns(query: Query, scene: Scene) -> dict[str, Variable]:
     return columns
 
 
-def axes_of(task: Any) -> dict[str, Variable]:
-    """The axes of a label: elements and subcarriers, directions, or numbers of another task's."""
-    if task.directions is not None:
-        angles = {"elevation": task.directions.elevations, "azimuth": task.directions.azimuths}
-        axes = {}
-        for name, values in angles.items():
-            degrees = np.degrees(values.double().numpy()).round(6)
-            axes[name] = Variable((name,), degrees, {"units": "degree"})
-        return axes
-    if isinstance(task, Csi):
-        subcarriers = Variable(("subcarrier",), task.frequencies.double().numpy(), {"units": "Hz"})
-        elements = Variable(("element",), np.arange(task.elements, dtype=np.int32))
-        return {"element": elements, "subcarrier": subcarriers}
-    axes = {}
-    for number, size in enumerate(task.shape):
-        name = f"axis_{number}"
-        axes[name] = Variable((name,), np.arange(size, dtype=np.int32))
-    return axes
+def axes_of(task: Task) -> dict[str, Variable]:
+    """The axes of a label."""
+    variables = {}
+    for name, axis in task.axes().items():
+        units = {"units": axis.unit} if axis.unit else {}
+        variables[name] = Variable((name,), axis.values, units)
+    return variables
 
 
 def _rows(

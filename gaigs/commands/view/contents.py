@@ -15,7 +15,6 @@ from torch import Tensor
 
 from gaigs.core.geometry import ExtrapolationWarning
 from gaigs.core.query import Query, evenly
-from gaigs.core.task.csi import Csi
 from gaigs.core.task.scalar import with_unit
 from gaigs.data import Links
 from gaigs.data.compatibility import check_fit
@@ -54,7 +53,7 @@ class Contents:
         self.model, self.links, self.title, self.scene = model, links, title, model.scene
         self.task: Any = model.scene.task
         kinds = {"spectrum": self.task.directions is not None, "level": self.task.is_scalar}
-        kinds["channel"] = isinstance(self.task, Csi)
+        kinds["channel"] = self.task.is_channel
         self.kind = next((kind for kind, fits in kinds.items() if fits), None)
         self.frequency = self.scene.middle_frequency
         self.interval = (

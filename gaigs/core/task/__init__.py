@@ -1,9 +1,9 @@
-"""Tasks: shape, unit and scores of a label, and the part of a batch that a training step reads."""
+"""Tasks: shape, unit and scores of a label, and the part of a batch that a step reads."""
 
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -14,10 +14,6 @@ from gaigs.core.query import Batch, thin_labels
 
 Thinning = Callable[[Batch, torch.Generator], Batch]
 """A batch of whole labels -> the part of it that a training step reads."""
-
-
-NUMBERS = 512
-"""Most numbers of a label by which places are told apart; arrays resolve fewer."""
 
 
 class Metric(NamedTuple):
@@ -38,18 +34,29 @@ class Metric(NamedTuple):
     is_brief: bool = True
 
 
+class Axis(NamedTuple):
+    """An axis of a label: its values, and their unit or an empty text."""
+
+    values: np.ndarray
+    unit: str = ""
+
+
 class Task(ABC):
-    """The contract of kind ``task``. A data set makes its task, and a checkpoint stores it with the
-    scene.
+    """The contract of kind ``task``.
+
+    A data set makes its task, and a checkpoint stores it with the scene.
 
     Attributes:
         name: The registered name.
         quantity: Name of the labelled quantity.
-        unit: Of a label; empty for a ratio.
+        unit: Unit of a label; empty for a ratio.
         higher_is_better: True if ``monitor`` is a similarity, False for an error.
-        dtype: Of labels and predictions.
+        dtype: Type of labels and predictions.
         is_noisy: True if labels of one place scatter, so that fine detail cannot be learnt.
         directions: Directions of a label's pixels; None for a label without.
+        elements: Elements of an array, the first axis of channels; 1 for other labels.
+        frequencies: Subcarriers [Hz], the last axis of channels; None for other labels.
+        phase: What is unknown of a channel's phase, see ``Csi``.
         lowest: Least possible number of a real label.
         limits: Bounds of the numbers of labels that are read: others are of another unit, or marks.
         beyond: What errors add on numbers beyond these bounds.
@@ -62,6 +69,9 @@ class Task(ABC):
     dtype: torch.dtype = torch.float32
     is_noisy: bool = False
     directions: Grid | None = None
+    elements: int = 1
+    frequencies: Any = None
+    phase: str = "known"
     lowest: float = -math.inf
     limits: tuple[float, float] = (-math.inf, math.inf)
     beyond: str = ""
@@ -69,12 +79,27 @@ class Task(ABC):
     @property
     @abstractmethod
     def shape(self) -> tuple[int, ...]:
-        """Of one label."""
+        """Shape of one label."""
 
     @property
     def is_scalar(self) -> bool:
         """True if a label is one real number."""
         return self.shape == () and not self.dtype.is_complex
+
+    @property
+    def is_channel(self) -> bool:
+        """True if a label is a channel (elements, subcarriers)."""
+        return self.frequencies is not None
+
+    @property
+    def error_unit(self) -> str:
+        """Unit of a difference of labels; by default ``unit``."""
+        return self.unit
+
+    @property
+    def trends(self) -> tuple[str, ...]:
+        """Look-ups among which a Gaussian process of labels chooses its trend."""
+        return ("mean", "path_loss") if self.is_scalar else ("mean",)
 
     @property
     @abstractmethod
@@ -106,25 +131,30 @@ class Task(ABC):
 
     @abstractmethod
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
-        """The numbers of a table by name, in the order of ``metrics``, from the result of
-        ``scores``.
+        """The numbers of a table by name, in the order of ``metrics``.
+
+        Args:
+            scores: Result of ``scores``.
 
         Raises:
             ValueError: There is no sample.
         """
 
     def logged(self, means: dict[str, float]) -> dict[str, float]:
-        """Values logged after a validation, from the mean of each score over its links; by default
-        these means.
+        """Values logged after a validation.
+
+        Args:
+            means: Mean of each score over the validation links, which is logged by default.
         """
         return means
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor] | None:
-        """Scores of a mean of many labels as the prediction, from scores of one label as that of
-        another.
+        """Scores of a mean of many labels as the prediction; by default None, unknown.
 
-        Labels that scatter alike and independently leave half of the squared difference. By default
-        None: unknown.
+        Labels that scatter alike and independently leave half of the squared difference.
+
+        Args:
+            scores: Scores of one label as the prediction of another.
         """
         return None
 
@@ -133,10 +163,27 @@ class Task(ABC):
     def metrics(cls) -> dict[str, Metric]:
         """The numbers that ``summarise`` may give; runs are compared by the first that it gives."""
 
-    def options(self) -> dict:
-        """Arguments of the constructor, as plain tensors, lists, numbers and strings; by default
-        none.
+    def axes(self) -> dict[str, Axis]:
+        """The axes of a label by name: its directions, or by default numbers."""
+        if self.directions is not None:
+            elevations = np.degrees(self.directions.elevations.double().numpy()).round(6)
+            azimuths = np.degrees(self.directions.azimuths.double().numpy()).round(6)
+            return {"elevation": Axis(elevations, "degree"), "azimuth": Axis(azimuths, "degree")}
+        return {
+            f"axis_{axis}": Axis(np.arange(size, dtype=np.int32))
+            for axis, size in enumerate(self.shape)
+        }
+
+    def at_frequencies(self, frequencies: Tensor) -> "Task":
+        """The task of the same labels at other subcarriers [Hz].
+
+        Raises:
+            ValueError: Labels have no subcarriers.
         """
+        raise ValueError(f"labels of task {self.name!r} have no subcarriers")
+
+    def options(self) -> dict:
+        """Arguments of the constructor, as plain tensors, lists, numbers and strings."""
         return {}
 
     def state(self) -> dict:
@@ -144,22 +191,28 @@ class Task(ABC):
         return {"name": self.name, **self.options()}
 
     def align(self, labels: Tensor, values: Tensor) -> Tensor:
-        """Labels turned onto predictions by all that is unknown of each link; by default as they
-        are.
+        """Labels turned onto predictions by all that is unknown of each link.
 
-        Losses, kriging and look-ups compare the result with the predictions. Shapes are (k,
-        *shape); either k may be 1.
+        By default they stay as they are. Losses, kriging and look-ups compare the result with the
+        predictions. Shapes are (k, *shape); either k may be 1.
         """
         return labels
 
+    def phase_sign(self, labels: Tensor, waves: Tensor, receivers: Tensor) -> int:
+        """The sign with which phases follow path lengths, see ``Csi``; 0 without phases."""
+        return 0
+
     def fingerprint(self, values: Tensor) -> Tensor:
-        """Real numbers (k, m) of labels or predictions that change steadily with the place; by
-        default at most ``NUMBERS`` of their own, evenly spread."""
-        return thin_labels(values, NUMBERS).float()
+        """Real numbers (k, m) of labels or predictions that change steadily with the place.
+
+        By default they are at most 512 numbers of their own, evenly spread: arrays resolve fewer.
+        """
+        return thin_labels(values, 512).float()
 
     def thinning(self) -> Thinning:
-        """The part of a batch that a step reads, by default all; parameters are options of
-        ``training.thinning``.
+        """The part of a batch that a step reads, by default all.
+
+        Parameters of a subclass are options of ``training.thinning``.
         """
         return lambda batch, generator: batch
 
@@ -170,13 +223,15 @@ class Task(ABC):
     def stored(
         self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]
     ) -> dict[str, np.ndarray]:
-        """Arrays of a model for ``predictions.npz``, by the key before ``_<model>``; by default all
-        scores.
+        """Arrays of a model for ``predictions.npz``, by default all scores.
+
+        Keys are those before ``_<model>``.
         """
         return {name: score.numpy() for name, score in scores.items()}
 
 
 def need_samples(scores: Tensor) -> None:
+    """Raises a ``ValueError`` if there is no sample."""
     if not len(scores):
         raise ValueError(
             "a summary needs at least one sample, got none; the split leaves nothing to test on"
@@ -187,7 +242,8 @@ def check_range(task: Task, labels: Tensor, name: str) -> None:
     """Raises a ``ValueError`` unless real labels are NaN or within the task's limits."""
     if task.dtype.is_complex:
         return
-    flat, (lowest, highest) = labels.reshape(len(labels), -1), task.limits
+    lowest, highest = task.limits
+    flat = labels.reshape(len(labels), -1)  # (k, numbers)
     wrong = ((flat < lowest) | (flat > highest + 1e-6)).any(1)
     if wrong.any():
         row = int(wrong.int().argmax())
@@ -207,9 +263,8 @@ def check_values(labels: Tensor, values: Tensor, shape: tuple[int, ...], samples
     for name, tensor in (("labels", labels), ("predictions", values)):
         broken = ~tensor.isfinite()[..., None].flatten(1).all(1)
         if broken.any():
+            count = f"{int(broken.sum())} of {len(tensor)} {samples}"
             raise ValueError(
-                f"{name} must be finite, got NaN or infinity in {int(broken.sum())} of "
-                f"{len(tensor)} {samples}, first "
-                f"in number {int(broken.int().argmax())}; the training diverged or the file is "
-                "damaged"
+                f"{name} must be finite, got NaN or infinity in {count}, first in number "
+                f"{int(broken.int().argmax())}; the training diverged or the file is damaged"
             )

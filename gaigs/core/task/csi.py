@@ -1,6 +1,4 @@
-"""Channel state information: a complex channel at each element of the receiver's array and each
-subcarrier.
-"""
+"""Channel state information: a complex channel at each element and each subcarrier."""
 
 import math
 from collections.abc import Sequence
@@ -11,11 +9,13 @@ from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
 from gaigs.core.phases import alignment, array_sign, phase_sign
-from gaigs.core.task import Metric, Task, check_values, need_samples
+from gaigs.core.task import Axis, Metric, Task, check_values, need_samples
 from gaigs.registry import check_type, register
 
 HIGHEST = 140.0
-"""Highest reported SNR [dB]: the resolution of complex64; a perfect prediction has no finite SNR.
+"""Highest reported SNR [dB], the resolution of complex64.
+
+A perfect prediction has no finite SNR.
 """
 
 PHASES = ("known", "per_link", "per_link_and_delay")
@@ -29,20 +29,18 @@ class Csi(Task):
     Scores of a link, with error e = h - h' over its elements and subcarriers:
 
     - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is the SNR after the best global phase of
-    the prediction,
-      for a receiver and a transmitter without a common clock. Where ``phase`` is not known, this is
-      the only SNR, and all scores are those of the aligned error.
+      the prediction, for a receiver and a transmitter without a common clock. Where ``phase`` is
+      not known, it is the only SNR, and all scores are those of the aligned error.
     - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²), at least 0. Its mean is monitored: a few links in
-    deep shadow, with
-      an SNR of -50 dB, would dominate a mean SNR.
+      deep shadow, with an SNR of -50 dB, would dominate a mean SNR.
 
     All links together have an NMSE [dB], 10 log10(sum |e|² / sum |h|²), in which strong links count
     most.
 
     Args:
-        elements: Of the largest array of the receivers; 1 for single antennas. Labels are 0 at
-            elements that a smaller array lacks.
-        frequencies: Of the subcarriers (s,) [Hz]; absolute.
+        elements: Number of elements of the receivers' largest array; 1 for single antennas. Labels
+            are 0 at elements that a smaller array lacks.
+        frequencies: Absolute frequencies of the subcarriers (s,) [Hz].
         phase: ``known``; ``per_link`` where each link has a phase of its own, which its elements
             and subcarriers share; ``per_link_and_delay`` where it also has its own delay and gain.
 
@@ -69,9 +67,9 @@ class Csi(Task):
         if elements < 1:
             raise ValueError(f"a channel needs at least one element, got {elements}")
         if not len(frequencies) or not ((frequencies > 0) & frequencies.isfinite()).all():
+            given = frequencies.tolist()[:3]
             raise ValueError(
-                "subcarriers must have positive, finite frequencies [Hz], got "
-                f"{frequencies.tolist()[:3]}"
+                f"subcarriers must have positive, finite frequencies [Hz], got {given}"
             )
         if len(frequencies.unique()) < len(frequencies):
             raise ValueError(
@@ -79,7 +77,9 @@ class Csi(Task):
             )
         if phase not in PHASES:
             raise ValueError(f"data.phase must be {' or '.join(PHASES)}, got {phase!r}")
-        self.elements, self.frequencies, self.phase = elements, frequencies, phase
+        self.elements = elements
+        self.frequencies = frequencies
+        self.phase = phase
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -93,45 +93,60 @@ class Csi(Task):
     def pair_score(self) -> str:
         return "SNR [dB]" if self.phase == "known" else "SNR, phase removed [dB]"
 
+    @property
+    def trends(self) -> tuple[str, ...]:
+        return ("friis",)
+
+    def axes(self) -> dict[str, Axis]:
+        """Numbers of elements, and subcarriers [Hz]."""
+        numbers = np.arange(self.elements, dtype=np.int32)
+        frequencies = self.frequencies.double().numpy()
+        return {"element": Axis(numbers), "subcarrier": Axis(frequencies, "Hz")}
+
+    def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Csi":
+        return Csi(self.elements, frequencies)
+
     def options(self) -> dict:
         return {"elements": self.elements, "frequencies": self.frequencies, "phase": self.phase}
 
     def align(
         self, labels: Complex[Tensor, "#k e s"], values: Complex[Tensor, "#k e s"]
     ) -> Complex[Tensor, "k e s"]:
-        """Labels with the phase that suits the predictions best; as they are if ``phase`` is known.
+        """Labels with the phase that suits the predictions best.
 
-        With ``per_link_and_delay`` they have the best delay and the power of the predictions too. A
-        gradient flows through this power, so that no loss of the result depends on the scale of the
-        predictions.
+        If ``phase`` is known, they stay as they are. With ``per_link_and_delay`` they have the best
+        delay and the power of the predictions too. A gradient flows through this power, so that no
+        loss of the result depends on the scale of the predictions.
         """
         if self.phase == "known":
             return labels
         turned = labels * self._turns(labels, values).to(labels)
         if self.phase == "per_link":
             return turned
-        sizes, wanted = (
-            part.to(torch.complex128).flatten(1).norm(dim=1) for part in (turned, values)
-        )
-        is_heard = (sizes > 0) & (wanted > 0)
-        gains = torch.where(is_heard, wanted, 1) / torch.where(is_heard, sizes, 1)
+        sizes = turned.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
+        wanted = values.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
+        is_received = (sizes > 0) & (wanted > 0)
+        gains = torch.where(is_received, wanted, 1) / torch.where(is_received, sizes, 1)  # (k,)
         return turned * gains[:, None, None].to(turned.real)
 
     def fingerprint(self, values: Complex[Tensor, "k e s"]) -> Float[Tensor, "k m"]:
-        """Products of the elements' channels, and of those some subcarriers apart, over the link's
-        power.
+        """Correlations over elements and over subcarriers, relative to the link's power.
 
         Both change slowly with the place, unlike phases.
         """
-        power = values.abs().square().sum((1, 2), keepdim=True)
-        between = (values @ values.mH / power)[:, *torch.triu_indices(*[self.elements] * 2)]
+        power = values.abs().square().sum((1, 2), keepdim=True)  # (k, 1, 1)
+        covariances = values @ values.mH / power  # (k, e, e)
+        rows, columns = torch.triu_indices(self.elements, self.elements)
+        between = covariances[:, rows, columns]  # (k, pairs)
+        # Wiener and Khinchin: the autocorrelation over subcarriers is the transform of the power
+        # spectrum; twice the length keeps it from wrapping around.
         count = len(self.frequencies)
-        lags = (
-            torch.fft.ifft(torch.fft.fft(values, 2 * count).abs().square()).sum(1)[:, :count]
-            / power[:, 0]
-        )
-        lags = lags.abs().to(lags) if self.phase == "per_link_and_delay" else lags
-        parts = torch.cat((between, lags), 1)
+        spectra = torch.fft.fft(values, 2 * count).abs().square()  # (k, e, 2 s)
+        correlations = torch.fft.ifft(spectra).sum(1)  # (k, 2 s)
+        lags = correlations[:, :count] / power[:, 0]  # (k, s)
+        if self.phase == "per_link_and_delay":  # a delay turns the phase from lag to lag
+            lags = lags.abs().to(lags)
+        parts = torch.cat((between, lags), 1)  # (k, pairs + s)
         return super().fingerprint(torch.cat((parts.real, parts.imag), 1))
 
     def phase_sign(
@@ -140,8 +155,7 @@ class Csi(Task):
         waves: Complex[Tensor, "k e s"],
         receivers: Int[Tensor, " k"],
     ) -> int:
-        """The sign with which phases follow path lengths, -1 or 1; 0 if known phases follow
-        neither.
+        """The sign with which phases follow path lengths, -1 or 1; 0 if neither fits.
 
         Arguments are as for ``gaigs.core.phases.phase_sign``.
         """
@@ -175,52 +189,51 @@ class Csi(Task):
         }
 
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
-        """SNR of each link, with its phase and without, SINAD [dB], and the powers of error and
-        label.
+        """SNR, SNR with the phase removed and SINAD [dB], and the powers of error and label.
 
-        Without the first where ``phase`` is not known. A label that is zero throughout has no SNR,
-        and is a ``ValueError``.
+        There is no SNR with the phase where ``phase`` is not known. A label that is zero throughout
+        has no SNR, and is a ``ValueError``.
         """
         check_values(labels, values, self.shape, "channels")
-        h, guess = (part.detach().cpu().to(torch.complex128) for part in (labels, values))
-        power = h.abs().square().sum((1, 2))
+        h = labels.detach().cpu().to(torch.complex128)  # (k, e, s)
+        guess = values.detach().cpu().to(torch.complex128)
+        power = h.abs().square().sum((1, 2))  # (k,)
         if silent := int((power == 0).sum()):
             raise ValueError(
                 f"labels must not be zero throughout, got {silent} such channels; leave them out"
             )
         aligned = self._turns(h, guess).conj() * guess
         if self.phase == "per_link_and_delay":
-            sizes = guess.abs().square().sum((1, 2))
+            # The gain of the least squared error; a prediction of zeros keeps its scale.
+            sizes = guess.abs().square().sum((1, 2))  # (k,)
             gains = (aligned.conj() * h).sum((1, 2)).real / torch.where(sizes > 0, sizes, 1)
             aligned = gains[:, None, None] * aligned
-        plain, left = ((h - turned).abs().square().sum((1, 2)) for turned in (guess, aligned))
-        error = plain if self.phase == "known" else left
-        return {
-            **({"snr_db": -decibels(plain, power)} if self.phase == "known" else {}),
-            "snr_aligned_db": -decibels(left, power),
+        plain_error = (h - guess).abs().square().sum((1, 2))  # (k,)
+        aligned_error = (h - aligned).abs().square().sum((1, 2))
+        error = plain_error if self.phase == "known" else aligned_error
+        scores = {"snr_db": -decibels(plain_error, power)} if self.phase == "known" else {}
+        return scores | {
+            "snr_aligned_db": -decibels(aligned_error, power),
             "sinad_db": -decibels(error, power + error),
             "error_power": error,
             "label_power": power,
         }
 
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
-        """Median, mean and percentiles of the SNRs (linear interpolation), mean SINAD, and the NMSE
-        of all links.
+        """Median, mean and percentiles of the SNRs, mean SINAD, and the NMSE of all links.
+
+        Percentiles are interpolated linearly.
         """
         need_samples(scores["label_power"])
         numbers: dict[str, float] = {}
         for name in ("snr_db", "snr_aligned_db"):
             if name in scores:
-                p10, median, p90 = torch.quantile(
-                    scores[name], scores[name].new_tensor([0.1, 0.5, 0.9])
-                ).tolist()
-                mean = scores[name].mean().item()
-                numbers |= {
-                    f"{name}_median": median,
-                    f"{name}_mean": mean,
-                    f"{name}_p10": p10,
-                    f"{name}_p90": p90,
-                }
+                levels = scores[name].new_tensor([0.1, 0.5, 0.9])
+                p10, median, p90 = torch.quantile(scores[name], levels).tolist()
+                numbers[f"{name}_median"] = median
+                numbers[f"{name}_mean"] = scores[name].mean().item()
+                numbers[f"{name}_p10"] = p10
+                numbers[f"{name}_p90"] = p90
         numbers["sinad_db_mean"] = scores["sinad_db"].mean().item()
         numbers["nmse_db"] = decibels(
             scores["error_power"].sum(), scores["label_power"].sum()
@@ -229,23 +242,21 @@ class Csi(Task):
 
     def logged(self, means: dict[str, float]) -> dict[str, float]:
         """The mean scores, with the NMSE in place of the powers."""
-        error, power = (
-            torch.tensor(means[name], dtype=torch.float64)
-            for name in ("error_power", "label_power")
-        )
-        kept = {name: mean for name, mean in means.items() if not name.endswith("_power")}
-        return kept | {"nmse_db": decibels(error, power).item()}
+        error = torch.tensor(means["error_power"], dtype=torch.float64)
+        power = torch.tensor(means["label_power"], dtype=torch.float64)
+        scores = {name: mean for name, mean in means.items() if not name.endswith("_power")}
+        return scores | {"nmse_db": decibels(error, power).item()}
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
         """Half of the error's power: 3 dB more."""
-        error, power = scores["error_power"] / 2, scores["label_power"]
-        snr = {
-            name: score + 10 * math.log10(2)
+        error = scores["error_power"] / 2
+        power = scores["label_power"]
+        ratios = {
+            name: (score + 10 * math.log10(2)).clamp(max=HIGHEST)
             for name, score in scores.items()
             if name.startswith("snr")
         }
-        snr = {name: score.clamp(max=HIGHEST) for name, score in snr.items()}
-        return snr | {
+        return ratios | {
             "sinad_db": -decibels(error, power + error),
             "error_power": error,
             "label_power": power,

@@ -10,11 +10,10 @@ from gaigs.core.task import Metric, Task, check_values, need_samples
 
 
 class Scalar(Task):
-    """One real number a link, with a unit; a subclass gives ``name``, ``quantity``, ``unit`` and
-    ``error_unit``.
+    """One real number a link, with a unit.
 
-    ``error_unit`` is the unit of a difference of labels; its lower case ends the names of scores
-    and metrics.
+    A subclass gives ``name``, ``quantity``, ``unit`` and ``error_unit``, the unit of a difference
+    of labels. Its lower case ends the names of scores and metrics.
     """
 
     error_unit: str
@@ -41,9 +40,8 @@ class Scalar(Task):
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
         """The absolute error of each prediction."""
         check_values(labels, values, (), "readings")
-        return {
-            self.monitor: (values.detach().cpu().double() - labels.detach().cpu().double()).abs()
-        }
+        errors = values.detach().cpu().double() - labels.detach().cpu().double()
+        return {self.monitor: errors.abs()}
 
     @property
     def pair_score(self) -> str:
@@ -57,7 +55,7 @@ class Scalar(Task):
         """Mean, median and root of the mean square of the absolute error."""
         errors = scores[self.monitor]
         need_samples(errors)
-        numbers = errors.mean(), torch.quantile(errors, 0.5), errors.square().mean().sqrt()
+        numbers = (errors.mean(), torch.quantile(errors, 0.5), errors.square().mean().sqrt())
         return dict(zip(self.metrics(), (number.item() for number in numbers), strict=True))
 
     def stored(

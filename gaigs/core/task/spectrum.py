@@ -19,9 +19,7 @@ SSIM_WINDOW = 7
 """Edge of scikit-image's default uniform window [pixels]."""
 
 MIN_MAX = "min-max of each spectrum's amplitude"
-"""Normalisation of the measured sets: (s - min s) / (max s - min s) over the pixels of one spectrum
-s.
-"""
+"""Normalisation of the measured sets: (s - min s) / (max s - min s) over one spectrum s."""
 
 
 @register("task", "spectrum")
@@ -29,8 +27,8 @@ class Spectrum(Task):
     """Amplitudes in [0, 1], one a pixel: row = elevation, column = azimuth.
 
     Args:
-        elevations: Of the rows, in the array's frame [rad].
-        azimuths: Of the columns, in the array's frame [rad].
+        elevations: Elevations of the rows in the array's frame [rad].
+        azimuths: Azimuths of the columns in the array's frame [rad].
         normalisation: Scale of the labels, in words of docs/data.md; by default each spectrum has a
             pixel of 0 and one of 1.
 
@@ -86,11 +84,11 @@ class Spectrum(Task):
         below the window's size are a ``ValueError``.
         """
         if min(self.shape) < SSIM_WINDOW:
-            raise ValueError(
-                f"SSIM needs at least {SSIM_WINDOW} x {SSIM_WINDOW} pixels, got {self.shape}"
-            )
+            window = f"{SSIM_WINDOW} x {SSIM_WINDOW}"
+            raise ValueError(f"SSIM needs at least {window} pixels, got {self.shape}")
         check_values(labels, values, self.shape, "spectra")
-        labels, values = labels.detach().cpu().double(), values.detach().cpu().double()
+        labels = labels.detach().cpu().double()  # (k, rows, columns)
+        values = values.detach().cpu().double()
         pairs = zip(labels.numpy(), values.numpy(), strict=True)
         ssim = [structural_similarity(label, value, data_range=1.0) for label, value in pairs]
         return {
@@ -108,51 +106,48 @@ class Spectrum(Task):
         return {"ssim": 2 * shares / (1 + shares), "mae": scores["mae"] / math.sqrt(2)}
 
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
-        """Median, mean and percentiles of SSIM over the samples (linear interpolation), and the
-        mean of MAE.
+        """Median, mean and percentiles of SSIM over the samples, and the mean of MAE.
+
+        Percentiles are interpolated linearly.
         """
-        ssim, mae = scores["ssim"], scores["mae"]
+        ssim = scores["ssim"]
         need_samples(ssim)
         p10, median, p90 = torch.quantile(ssim, ssim.new_tensor([0.1, 0.5, 0.9])).tolist()
-        numbers = median, ssim.mean().item(), p10, p90, mae.mean().item()
+        numbers = (median, ssim.mean().item(), p10, p90, scores["mae"].mean().item())
         return dict(zip(self.metrics(), numbers, strict=True))
 
     def thinning(self, stride: int = 1, rays: int | None = None) -> Thinning:
-        """Every ``stride``-th row and column, with random first ones, or ``rays`` random pixels for
-        all links alike.
+        """Every ``stride``-th row and column, or ``rays`` random pixels for all links alike.
 
-        Neighbouring pixels of a spectrum are far closer than the array resolves. Of a small grid at
-        least three rows and columns stay.
+        The first row and column are random. Neighbouring pixels of a spectrum are far closer than
+        the array resolves. At least three rows and columns of a small grid stay.
         """
         rows, columns = self.shape
         if stride < 1:
             raise ValueError(f"training.thinning.stride must be at least 1, got {stride}")
-        stride = max(
-            1, min(stride, min(rows, columns) // 3)
-        )  # which leaves the SSIM loss its smallest window
-        if rays is not None and not (1 <= rays <= rows * columns and stride == 1):
-            most = rows * columns
+        # Three rows and columns are the smallest window of the SSIM loss.
+        stride = max(1, min(stride, min(rows, columns) // 3))
+        pixels = rows * columns
+        if rays is not None and not (1 <= rays <= pixels and stride == 1):
             raise ValueError(
-                f"training.thinning.rays must be in 1..{most} with stride=1, got {rays}, stride "
-                f"{stride}"
+                f"training.thinning.rays must be in 1..{pixels} with stride=1, "
+                f"got {rays}, stride {stride}"
             )
 
         def grid(batch: Batch, generator: torch.Generator) -> Batch:
             row, column = torch.randint(stride, (2,), generator=generator).tolist()
-            own = slice(row, None, stride), slice(column, None, stride)
-            return replace(
-                batch, directions=batch.directions.thin(*own), labels=batch.labels[:, *own]
-            )
+            every_row = slice(row, None, stride)
+            every_column = slice(column, None, stride)
+            directions = batch.directions.thin(every_row, every_column)
+            labels = batch.labels[:, every_row, every_column]
+            return replace(batch, directions=directions, labels=labels)
 
         def scattered(batch: Batch, generator: torch.Generator) -> Batch:
-            chosen = torch.randperm(rows * columns, generator=generator)[:rays].to(
-                batch.labels.device
-            )
-            return replace(
-                batch,
-                directions=batch.directions.flatten()[chosen],
-                labels=batch.labels.flatten(1)[:, chosen],
-            )
+            order = torch.randperm(pixels, generator=generator)
+            chosen = order[:rays].to(batch.labels.device)  # (rays,)
+            directions = batch.directions.flatten()[chosen]
+            labels = batch.labels.flatten(1)[:, chosen]  # (k, rays)
+            return replace(batch, directions=directions, labels=labels)
 
         return grid if rays is None else scattered
 

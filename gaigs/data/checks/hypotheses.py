@@ -81,6 +81,8 @@ def sample_at(links: Any, index: Int[Tensor, " n"]) -> Sample:
         positions=torch.stack([pose.position for pose in poses]).double(),
         rotations=torch.stack([pose.rotation for pose in poses]).double(),
         elements=tuple(receiver.array.elements.double() for receiver in links.receivers),
-        frequencies=getattr(links.task, "frequencies", torch.zeros(0)).double(),
+        frequencies=(
+            torch.zeros(0) if links.task.frequencies is None else links.task.frequencies
+        ).double(),
         labels=labels.to(torch.complex128 if labels.is_complex() else torch.float64),
     )

@@ -32,7 +32,7 @@ from gaigs.io.yaml import read_mapping, to_vector
 from gaigs.registry import register
 
 
-@register("data", "rssi_wide")
+@register("data", "rssi_wide", task="rssi", split="random")
 def read(
     file: str | Path,
     gateways: str | Path | None = None,

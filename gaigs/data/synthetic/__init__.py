@@ -54,7 +54,7 @@ REGION = (0.3, 0.3, 0.3), (6.7, 4.7, 2.0)
 """Corners of the box in which transmitters stand [m]."""
 
 
-@register("data", "synthetic")
+@register("data", "synthetic", task="spectrum", split="official")
 def furnished_room(
     spectrum: str = "band",
     transmitters: int = 500,

@@ -6,30 +6,27 @@ from collections.abc import Iterator
 from typing import Any
 
 _switching = threading.Lock()
-_callers: list[Any] = []  # the default dtype that each call found
+_callers: list[Any] = []  # the default dtype before each call
 
 
 @contextlib.contextmanager
 def usual_modes() -> Iterator[None]:
-    """Float32 as torch's default dtype, and no inference mode, while gaigs computes; also a
-    decorator.
+    """Float32 as torch's default dtype, and no inference mode, while gaigs computes.
 
-    Threads share the default dtype: the first one in sets it, the last one out restores it.
-    Lightning changes it.
+    It is also a decorator. Threads share the default dtype: the first one in sets it, the last one
+    out restores it. Lightning changes it.
     """
     import torch  # slow to import
 
+    # Leaving an inference mode that was off would switch gradients on.
+    is_inference = torch.is_inference_mode_enabled()
+    no_inference = torch.inference_mode(False) if is_inference else contextlib.nullcontext()
     with _switching:
         _callers.append(torch.get_default_dtype())
         if len(_callers) == 1:
             torch.set_default_dtype(torch.float32)
     try:
-        # Leaving an inference mode that is none would switch gradients on.
-        with (
-            torch.inference_mode(False)
-            if torch.is_inference_mode_enabled()
-            else contextlib.nullcontext()
-        ):
+        with no_inference:
             yield
     finally:
         with _switching:

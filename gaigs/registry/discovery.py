@@ -1,0 +1,251 @@
+"""The owners of registered names, found without an import."""
+
+import functools
+import hashlib
+import itertools
+import os
+import re
+import sys
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from importlib import metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from gaigs.registry.source import (
+    PACKAGE,
+    Definition,
+    Registration,
+    UnclearSource,
+    read_options,
+    registrations,
+)
+
+ROOMS = {
+    "task": "core/task",
+    "placement": "splatting/placement",
+    "tokenizer": "splatting/tokenizer",
+    "deformation": "splatting/deformation",
+    "projection": "splatting/projection",
+    "rasterizer": "splatting/rasterizer",
+    "pooling": "splatting/pooling",
+    "loss": "splatting/loss",
+}
+"""Folders in gaigs of the kinds that have none of their own there."""
+
+
+@dataclass(frozen=True)
+class Holder:
+    """The owner of a name.
+
+    Attributes:
+        where: File or distribution, for errors.
+        target: ``module`` that registers the component by decorator, or ``module:attribute``.
+        file: File of the module if the name was read from it.
+        root: Folder that the import needs on ``sys.path``; None if it is there.
+    """
+
+    kind: str
+    name: str
+    where: str
+    target: str
+    file: Path | None = None
+    root: Path | None = None
+
+    @property
+    def package(self) -> str:
+        """The top-level package of the target."""
+        return re.split("[.:]", self.target)[0]
+
+    def owns(self, component: object) -> bool:
+        """True if a component comes from the holder's file or, for an entry point, its package."""
+        module = getattr(component, "__module__", "")
+        return module == self.target if self.file else module.split(".")[0] == self.package
+
+    @property
+    def folder(self) -> Path | None:
+        """Folder of an entry point's top-level package, which is not imported; None without one."""
+        if self.root is not None:
+            return self.root / self.package
+        spec = find_spec(self.package)  # imports nothing, as the name has no dots
+        return next(map(Path, (spec and spec.submodule_search_locations) or ()), None)
+
+    @property
+    def digest(self) -> str:
+        """Digest of the sources: the file in ./plugins or the package, with imported plug-ins."""
+        place = self.file or self.folder
+        if self.file is not None and self.root is not None:
+            plugins = self.root / "plugins"
+            place = plugins / self.file.relative_to(plugins).parts[0]
+            place = self.file if self.file.parent == plugins else place
+        digest = hashlib.sha256()
+        for file in sorted(_with_imports(place)) if place else ():
+            digest.update(file.read_bytes())
+        return digest.hexdigest()
+
+    @property
+    def registration(self) -> Registration | None:
+        """The decorator of the component; None without one, as entry points may be."""
+        file = self.file or self._module_file(self.target.partition(":")[0])
+        for one in registrations(file) if file else ():
+            if (one.kind, one.name) == (self.kind, self.name):
+                return one
+        return None
+
+    def read_options(self, given: tuple[str, ...]) -> dict[str, Any]:
+        """The options of the component with their defaults, from its source.
+
+        Args:
+            given: Parameters that are no options.
+
+        Raises:
+            UnclearSource: The source does not tell them.
+        """
+        module, _, attribute = self.target.partition(":")
+        file = self.file or self._module_file(module)
+        registration = self.registration
+        definition: str | Definition = attribute.strip()
+        if registration is not None:
+            definition = registration.definition
+        if file is None or not definition:
+            raise UnclearSource
+        return read_options(file, definition, given)
+
+    def _module_file(self, module: str) -> Path | None:
+        """The file of an entry point's module; None if it is not found."""
+        if self.folder is None:
+            return None
+        place = self.folder.joinpath(*module.strip().split(".")[1:])
+        files = (place / "__init__.py", place.with_suffix(".py"))
+        return next((file for file in files if file.is_file()), None)
+
+
+def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:
+    """The holders of a kind's names, or of one name: gaigs, installed packages, ./plugins.
+
+    The second list has the unreadable files, each with the cause.
+    """
+    installed = _installed_holders(kind)
+    dropped, unreadable = _dropped_holders(kind)
+    targets = {(holder.name, holder.target) for holder in installed}
+    holders = _built_in_holders(kind) + installed
+    # A package in ./plugins may be installed as well.
+    holders += [holder for holder in dropped if (holder.name, holder.target) not in targets]
+    return [holder for holder in holders if name in (None, holder.name)], unreadable
+
+
+def plugin_packages(kinds: Iterable[str]) -> list[Path]:
+    """Folders of the packages with an entry point of gaigs, installed or in ./plugins."""
+    holders, _ = _dropped_holders()
+    installed = map(_installed_holders, kinds)
+    holders = [*itertools.chain(*installed), *holders]
+    folders = [holder.folder for holder in holders if holder.file is None]
+    return [folder for folder in folders if folder is not None]
+
+
+@functools.cache  # gaigs's own files stay as they are
+def _built_in_holders(kind: str) -> list[Holder]:
+    """The components of gaigs: ``<kind>/<name>.py``, or a file in ``<kind>/<name>/``."""
+    holders = []
+    room = PACKAGE / ROOMS.get(kind, kind)
+    for place in sorted(room.glob("[!_.]*")):
+        name = place.stem
+        for file in sorted(place.glob("*.py")) if place.is_dir() else [place]:
+            if file.suffix != ".py" or f'\n@register("{kind}", "{name}"' not in file.read_text():
+                continue
+            where = str(file.relative_to(PACKAGE.parent))
+            words = file.relative_to(PACKAGE.parent).with_suffix("").parts
+            module = ".".join(words).removesuffix(".__init__")
+            holders.append(Holder(kind, name, where, module, file))
+    return holders
+
+
+def _installed_holders(kind: str) -> list[Holder]:
+    # An installation changes a folder of sys.path.
+    path = tuple(
+        (folder, os.stat(folder or ".").st_mtime_ns)
+        for folder in sys.path
+        if os.path.isdir(folder or ".")
+    )
+    holders = []
+    for point in _entry_points(path).select(group=f"gaigs.{kind}"):
+        where = f"distribution {point.dist.name} {point.dist.version}"
+        holders.append(Holder(kind, point.name, where, point.value))
+    return holders
+
+
+@functools.lru_cache
+def _entry_points(_: tuple) -> Any:
+    """All entry points, from a file of each package on ``sys.path``: reading is slow."""
+    return metadata.entry_points()
+
+
+def _dropped_holders(kind: str | None = None) -> tuple[list[Holder], list[str]]:
+    """Holders of a kind, or of all kinds, in ./plugins, and the files that cannot be read."""
+    holders: list[Holder] = []
+    unreadable = []
+    root = Path.cwd()
+    for module, file in _plugin_files(root / "plugins", "plugins"):
+        where = str(file.relative_to(root))
+        try:
+            if file.name == "pyproject.toml":
+                (source,) = sources(root / "plugins", file.parent.name)
+                points = _project_entry_points(tomllib.loads(file.read_text(encoding="utf-8")))
+                for group, name, target in points:
+                    holders.append(Holder(group, name, where, target, root=source))
+            else:
+                for one in registrations(file):
+                    holders.append(Holder(one.kind, one.name, where, module, file, root))
+        except Exception as error:  # any error of a parser
+            unreadable.append(f"{where}: {str(error) or type(error).__name__}")
+    return [holder for holder in holders if kind in (None, holder.kind)], unreadable
+
+
+def _project_entry_points(project: Mapping) -> Iterator[tuple[str, str, str]]:
+    """Kind, name and target of each entry point of gaigs in a pyproject.toml."""
+    groups = project.get("project", {}).get("entry-points", {})
+    for group, points in groups.items():
+        if group.startswith("gaigs."):
+            for name, target in points.items():
+                yield group.removeprefix("gaigs."), name, str(target)
+
+
+def _plugin_files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
+    """Modules with their files in a folder and its packages; of a project its pyproject.toml."""
+    for path in sorted(folder.glob("[!_.]*")):
+        if path.suffix == ".py":
+            yield f"{package}.{path.stem}", path
+        elif (path / "pyproject.toml").is_file():
+            yield path.name, path / "pyproject.toml"
+        elif (path / "__init__.py").is_file():
+            yield f"{package}.{path.name}", path / "__init__.py"
+            yield from _plugin_files(path, f"{package}.{path.name}")
+
+
+def sources(folder: Path, project: str = "[!_.]*") -> list[Path]:
+    """The folders with the packages of the projects in a folder: ``src`` if it exists."""
+    places = [file.parent for file in sorted(folder.glob(f"{project}/pyproject.toml"))]
+    return [place / "src" if (place / "src").is_dir() else place for place in places]
+
+
+def _with_imports(place: Path) -> set[Path]:
+    """The source files of a module or package, and of those in ./plugins that they import."""
+    plugins = Path.cwd() / "plugins"
+    roots = [plugins, *sources(plugins)]
+    known: set[Path] = set()
+    places = [place]
+    while places:
+        place = places.pop()
+        files = {place} if place.is_file() else {*place.rglob("*.py")}
+        for file in files - known:
+            text = file.read_text(errors="replace")
+            words: set[str] = set()
+            for line in re.findall(r"^\s*(?:from|import)\s(.*)", text, re.M):
+                words |= {*re.findall(r"(?:plugins\.)?(\w+)", line)}
+            for root in roots:
+                names = [*words, *(f"{word}.py" for word in words)]
+                places += [root / name for name in names if (root / name).exists()]
+        known |= files
+    return known
