@@ -27,10 +27,11 @@ from gaigs.data.synthetic.image_source import TABULATED, conductivity
 from gaigs.io.files import atomic_write, write_text
 from gaigs.model import Model, Wrapper
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.planes import export
-from gaigs.planes.learnt_room import LearntPlane
+from gaigs.planes.learnt_room import LearntPlane, outline_planes
 from gaigs.planes.materials import Material, materials
-from gaigs.planes.sheets import Sheet, fit_sheets
+from gaigs.planes.obstacle_surfaces import Sheet, fit_sheets
+from gaigs.planes.room_files import wavefront_obj
+from gaigs.planes.room_paths import trace_paths
 from gaigs.processes import only_run
 from gaigs.registry import name_of
 
@@ -71,8 +72,8 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
             )
         frequency = float(frequency)
         check_carrier("frequency", frequency)
-    found = export.trace_paths(own.placement, own.traced)
-    planes = export.outlines(own.placement, found)
+    found = trace_paths(own.placement, own.traced)
+    planes = outline_planes(own.placement, found)
     corners = np.concatenate([found.ends, *(plane.corners for plane in planes)])
     sheets, rest = fit_sheets(own.placement, own.traced, corners.min(0), corners.max(0))
     meshes = [
@@ -80,7 +81,7 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
         *(mesh_of_sheet(number, sheet) for number, sheet in enumerate(sheets)),
     ]
     if suffix == ".obj":
-        write_text(file, export.wavefront_obj(own.placement, found, sheets))
+        write_text(file, wavefront_obj(own.placement, found, sheets))
         return [file]
     if frequency is None or suffix != ".xml":
         extras = [

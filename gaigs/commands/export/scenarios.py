@@ -14,7 +14,7 @@ from gaigs.core.query import Query
 from gaigs.data import deepmimo
 from gaigs.io.tables import check_empty, number_places
 from gaigs.model import Model
-from gaigs.planes import export
+from gaigs.planes.room_paths import trace_paths
 from gaigs.processes import only_run
 
 log = logging.getLogger(__name__)
@@ -67,7 +67,7 @@ def write_scenario(
         sizes = np.abs(gains)
         gains = np.where(sizes > FAINT * sizes.max(1, keepdims=True), unit * gains, 0)
         bounces = (
-            export.trace_paths(own.placement, query).bounces[:, :, ::-1].astype(float)
+            trace_paths(own.placement, query).bounces[:, :, ::-1].astype(float)
         )  # from the receiver on
         stations.append((receiver.pose.position.double().numpy(), gains, bounces))
     folder.mkdir(parents=True, exist_ok=True)

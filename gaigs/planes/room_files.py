@@ -1,0 +1,125 @@
+"""The learnt room of mirrored Gaussians as tables and files."""
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import torch
+
+from gaigs.core.query import Query
+from gaigs.io.files import write_text
+from gaigs.planes.learnt_room import LearntPlane, other_offset, outline_planes, tabulate_planes
+from gaigs.planes.obstacle_surfaces import Sheet
+from gaigs.planes.room_paths import TracedPaths, trace_paths
+from gaigs.splatting.gaussians import write_ply
+from gaigs.splatting.placement.mirrored.paths import Mirrored
+
+
+def summarize(placement: Mirrored, query: Query) -> dict[str, list]:
+    """Tables of planes, strongest first, and of paths by their bounces, for ``metrics.json``.
+
+    Shares are those of the kept paths in the received power, means over the links of the query.
+    ``unseen`` has a sentence for each axis that places do not span, see ``Scene.flat_axes``.
+    """
+    traced = trace_paths(placement, query)
+    facts: dict[str, list] = {
+        "planes": _summarize_planes(placement, traced),
+        "paths": _summarize_paths(traced),
+    }
+    unseen = [str(flat) for flat in placement.scene.flat_axes]
+    if unseen:
+        facts["unseen"] = unseen
+    return facts
+
+
+def _summarize_planes(placement: Mirrored, traced: TracedPaths) -> list[dict]:
+    table = tabulate_planes(placement, traced.ends)
+    planes = []
+    for number, share in traced.plane_shares.items():
+        plane = {
+            "number": number,
+            "normal": [round(part, 4) for part in table.normals[number].tolist()],
+            "offset_m": round(table.offsets[number].item(), 4),
+            "loss_db": round(table.losses[number].item(), 2),
+            "share": round(share, 5),
+            "paths": int((traced.sequences == number).any(1).sum()),
+        }
+        other = other_offset(placement.scene, table, number)
+        if other is not None:
+            plane["other_offset_m"] = round(other, 4)
+        planes.append(plane)
+    return planes
+
+
+def _summarize_paths(traced: TracedPaths) -> list[dict]:
+    counts = (traced.sequences >= 0).sum(1)
+    means = traced.shares.mean(0)
+    paths = []
+    for bounces in range(traced.sequences.shape[1] + 1):
+        chosen = counts == bounces
+        share = round(means[chosen].sum().item(), 5)
+        paths.append({"bounces": bounces, "kept": int(chosen.sum()), "share": share})
+    return paths
+
+
+@torch.no_grad()
+def write_room(placement: Mirrored, query: Query, folder: Path) -> None:
+    """Writes ``planes.obj``, as far as the query's paths reach, and ``obstacles.ply`` for any."""
+    write_text(folder / "planes.obj", wavefront_obj(placement, trace_paths(placement, query)))
+    blobs = placement.obstacles
+    if blobs is None:
+        return
+    # Grey, and as opaque as the share of power lost through the middle of an obstacle of its mean
+    # width.
+    depths = blobs.densities * math.sqrt(2 * math.pi) * blobs.widths.log().mean(1).exp()
+    parts = {
+        "means": blobs.centres + placement.middle,
+        "quats": torch.tensor([1.0, 0, 0, 0]).expand(len(blobs), 4),
+        "log_scales": blobs.log_widths,
+        # log((1 - t) / t) with t = exp(-2 depth), without a difference of nearly equal numbers.
+        "opacity_logits": 2 * depths + torch.log(-torch.expm1(-2 * depths)),
+        "signal": torch.zeros(len(blobs), 3, 1),
+    }
+    comment = "gaigs: obstacles; places in metres; opacity: share of power lost through the middle"
+    write_ply(folder / "obstacles.ply", parts, comment)
+
+
+def wavefront_obj(placement: Mirrored, traced: TracedPaths, sheets: Sequence[Sheet] = ()) -> str:
+    """The planes, and sheets of obstacles, as objects of a Wavefront OBJ file [m].
+
+    A plane is one face, counterclockwise as seen from outside.
+    """
+    table = tabulate_planes(placement, traced.ends)
+    lines = [
+        "# Planes learnt by gaigs; coordinates in metres, z up, the world frame of the data.",
+        "# loss: of a reflection at normal incidence; "
+        "share: of the plane's paths in the received power.",
+        *(f"# {flat}" for flat in placement.scene.flat_axes),
+    ]
+    count = 0
+    for plane in outline_planes(placement, traced):
+        number = plane.number
+        normal = " ".join(f"{part:.4f}" for part in plane.normal)
+        other = other_offset(placement.scene, table, number)
+        words = "" if other is None else f" or {other:.3f} m"
+        lines += [
+            f"# normal {normal}, offset {table.offsets[number]:.3f} m{words}, "
+            f"loss {table.losses[number]:.1f} dB",
+            f"# share {100 * plane.share:.2f} %",
+            f"o plane_{number}",
+            *_plane_lines(plane, count),
+        ]
+        count += len(plane.corners)
+    for number, sheet in enumerate(sheets):
+        lines += [f"# loss {sheet.loss_db:.1f} dB", f"o obstacle_{number}"]
+        lines += ["v {:.4f} {:.4f} {:.4f}".format(*corner) for corner in sheet.vertices.tolist()]
+        lines += ["f {} {} {}".format(*face) for face in (sheet.faces + count + 1).tolist()]
+        count += len(sheet.vertices)
+    return "\n".join(lines) + "\n"
+
+
+def _plane_lines(plane: LearntPlane, count: int) -> list[str]:
+    """Corners of a plane, and its face, behind ``count`` corners."""
+    corners = ["v {:.4f} {:.4f} {:.4f}".format(*corner) for corner in plane.corners]
+    numbers = range(count + 1, count + len(plane.corners) + 1)
+    return [*corners, "f " + " ".join(map(str, numbers))]
