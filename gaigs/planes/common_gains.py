@@ -102,7 +102,7 @@ class CommonGains:
         self,
         parts: list[ReceiverChannels],
         planes: Float[Tensor, "w 4"],
-        lines: Float[Tensor, "k 4"],
+        lines: Float[Tensor, "c 4"],
         by_chance: float,
     ) -> Float[Tensor, "v 4"]:
         """The planes, and those of lines that explain most of what is left, more than by chance."""
@@ -202,8 +202,8 @@ class CommonGains:
         self,
         parts: list[ReceiverChannels],
         residuals: list[Complex[Tensor, "b k"]],
-        line: Float[Tensor, "k 4"],
-    ) -> Float[Tensor, " k"]:
+        line: Float[Tensor, "c 4"],
+    ) -> Float[Tensor, " c"]:
         """Share of power that one more image explains with a common gain, for planes of a line."""
         total, size = line.new_zeros(2, len(line))
         for receiver, rest in zip(parts, residuals, strict=True):
