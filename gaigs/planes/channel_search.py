@@ -2,7 +2,6 @@
 
 import logging
 import math
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,13 +21,6 @@ from gaigs.splatting.gaussians import fibonacci_lattice
 from gaigs.splatting.placement.mirrored.reflections import distinct
 
 log = logging.getLogger(__name__)
-
-
-class Trial(NamedTuple):
-    """A room, and the mean log of what its strengths leave."""
-
-    error: float
-    room: SlabRoom
 
 
 class ChannelSearch:
@@ -165,8 +157,8 @@ class ChannelSearch:
         resolved = torch.zeros(len(planes), dtype=torch.bool)
         sample = self.data.sample(planes)
 
-        def rated(room: SlabRoom) -> Trial:
-            return Trial(self.score.measure(sample, room, resolved).item(), room)
+        def measure(room: SlabRoom) -> tuple[float, SlabRoom]:
+            return self.score.measure(sample, room, resolved).item(), room
 
         # Reaches [m] and tilts [rad] of the three rounds: the first also turns planes square.
         for reach, tilt, slabs in (
@@ -186,12 +178,12 @@ class ChannelSearch:
                     for plane, material in propose_by_phases(
                         self.data, variant, number, reach, tilt, slabs
                     ):
-                        trials.append(rated(room.replace_plane(number, plane, material)))
-                trials.sort(key=lambda trial: trial.error)
+                        trials.append(measure(room.replace_plane(number, plane, material)))
+                trials.sort(key=lambda trial: trial[0])
                 if resolved.all():
-                    for trial in trials[:3]:
-                        trials.append(rated(self.score.polish(trial.room, 12, 5e-4, number)))
-                room = min(trials, key=lambda trial: trial.error).room
+                    for _, trial in trials[:3]:
+                        trials.append(measure(self.score.polish(trial, 12, 5e-4, number)))
+                room = min(trials, key=lambda trial: trial[0])[1]
         return self.score.refine(room)
 
     def square_variants(

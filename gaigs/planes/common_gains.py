@@ -18,14 +18,6 @@ class CommonFit(NamedTuple):
     residuals: list[Complex[Tensor, "b k"]]
 
 
-class RatedPlane(NamedTuple):
-    """Share of power that a plane explains, the plane, and its number."""
-
-    share: float
-    plane: Float[Tensor, "4"]
-    number: int
-
-
 class CommonGains:
     """Planes square to the axes of coordinates, one after the other: a matching pursuit.
 
@@ -89,13 +81,12 @@ class CommonGains:
         waiting = list(range(len(self.start)))
         while waiting:
             placed = planes[[number for number in range(len(planes)) if number not in waiting]]
-            trials = [
-                RatedPlane(*self.move(parts, placed, planes[number], by_chance), number)
-                for number in waiting
-            ]
-            best = max(trials, key=lambda trial: trial.share)
-            planes[best.number] = best.plane
-            waiting.remove(best.number)
+            trials = {
+                number: self.move(parts, placed, planes[number], by_chance) for number in waiting
+            }
+            best = max(waiting, key=lambda number: trials[number][0])
+            planes[best] = trials[best][1]
+            waiting.remove(best)
         return planes
 
     def _pursue(

@@ -27,7 +27,7 @@ def reflection(
     return polarised(normals, *fresnel(MATERIAL, cosines.clamp_min(1e-3)))
 
 
-class ReceivedPaths(NamedTuple):
+class ArrayPaths(NamedTuple):
     """Paths as an array receives them.
 
     Attributes:
@@ -179,7 +179,7 @@ class ReceiverLags:
         planes: Float[Tensor, "w 4"],
         sequences: Int[Tensor, "n order"],
         passing: Tensor | None = None,
-    ) -> ReceivedPaths:
+    ) -> ArrayPaths:
         """All paths at planes.
 
         ``passing`` (b, w + 1) is the share of the direct path's field that obstacles let through,
@@ -201,9 +201,9 @@ class ReceiverLags:
         fields = folded.reflected(torch.complex(gains, torch.zeros_like(gains)), reflections)
         phases = -self.wavenumber * lengths
         fields = fields * torch.polar(torch.ones_like(phases), phases)
-        return ReceivedPaths(fields, self.steer(directions), lengths)
+        return ArrayPaths(fields, self.steer(directions), lengths)
 
-    def covariances(self, paths: ReceivedPaths, bandwidth: float) -> Complex[Tensor, "b l"]:
+    def covariances(self, paths: ArrayPaths, bandwidth: float) -> Complex[Tensor, "b l"]:
         """Lags of interfering paths, as of ``LagPooling``; powers are averaged over a band [Hz]."""
         fields, steering, lengths = paths
         if bandwidth:
@@ -219,7 +219,7 @@ class ReceiverLags:
         sums = flat.new_zeros(len(flat), len(self.counts))
         return sums.index_add(1, self.array.lags[1], flat) / self.counts
 
-    def further_wave(self, paths: ReceivedPaths, bandwidth: float) -> FurtherWave:
+    def further_wave(self, paths: ArrayPaths, bandwidth: float) -> FurtherWave:
         """Interference of one more path with known ones."""
         slopes = self.slopes(self.covariances(paths, bandwidth))
         weights = (slopes @ paths.steering.mT).mT * paths.fields[..., None]  # (b, n, e)

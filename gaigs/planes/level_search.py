@@ -18,7 +18,7 @@ from gaigs.core.query import Query
 from gaigs.data import Links
 from gaigs.planes.lag_score import LagOptions, LinkPaths
 from gaigs.planes.lag_search import frame_of, group_links, list_bandwidths
-from gaigs.planes.lags import FurtherWave, ReceivedPaths, ReceiverLags, reflection
+from gaigs.planes.lags import ArrayPaths, FurtherWave, ReceiverLags, reflection
 from gaigs.planes.periodogram import TilePeak
 from gaigs.planes.search import Score
 from gaigs.splatting.placement.mirrored.paths import Mirrored
@@ -70,12 +70,16 @@ class LevelRoom(NamedTuple):
         passing: Share of the direct path's field, and of the field at each plane, that obstacles
             let through at each link (b, w + 1).
         gain: Fall of the errors by the plane located last [standard errors].
+        number: Of this plane.
+        bandwidth: Over which powers were averaged [Hz].
     """
 
     planes: Float[Tensor, "w 4"]
     located: Bool[Tensor, " w"]
     passing: Float[Tensor, "b v"]
     gain: float = 0.0
+    number: int = 0
+    bandwidth: float = 0.0
 
 
 class LevelScore(Score[LevelRoom]):
@@ -108,10 +112,10 @@ class LevelScore(Score[LevelRoom]):
             weights = slopes * paths.fields * known * passing[:, number + 1, None]
             waves.append(FurtherWave(weights[..., None], paths.lengths))
         located = room.located.index_fill(0, torch.tensor(number), True)
-        best = room._replace(gain=0.0)
+        best = room._replace(gain=0.0, number=number, bandwidth=self.paths.bandwidth)
         for peak in self._find_peaks(room.planes, waves, number)[: self.options.maxima]:
             parts = (room.planes[:number], peak.plane[None], room.planes[number + 1 :])
-            trial = room._replace(planes=torch.cat(parts), located=located)
+            trial = best._replace(planes=torch.cat(parts), located=located)
             trial = trial._replace(gain=self._measure_gain(trial, before, sequences))
             best = min(best, trial, key=self.error)
         return best
@@ -144,9 +148,7 @@ class LevelScore(Score[LevelRoom]):
         deviation, mean = torch.std_mean(torch.cat(gains))
         return mean.item() / max(deviation.item(), 1e-12) * math.sqrt(len(room.passing))
 
-    def add_powers(
-        self, paths: ReceivedPaths, phased: Bool[Tensor, " n"]
-    ) -> Complex[Tensor, "b 1"]:
+    def add_powers(self, paths: ArrayPaths, phased: Bool[Tensor, " n"]) -> Complex[Tensor, "b 1"]:
         """Powers of paths, of which some interfere."""
         waves = paths.fields[:, phased]
         lengths = paths.lengths[:, phased]
@@ -181,14 +183,6 @@ class LevelScore(Score[LevelRoom]):
                 if largest > enough:
                     return largest
         return largest
-
-
-class Located(NamedTuple):
-    """A room with one more located plane, its number, and the bandwidth [Hz]."""
-
-    room: LevelRoom
-    number: int
-    bandwidth: float
 
 
 class LevelSearch:
@@ -267,50 +261,43 @@ class LevelSearch:
                 return numbers
             room = self.room_of(placement)
             is_unknown = self.known_bandwidth is None and not room.located.any()
-            best = self.locate_one(room, waiting, self._bandwidths(placement, is_unknown))
+            bandwidths = list_bandwidths(None, self.frame, self.lag_options)
+            if not is_unknown:
+                learnt = placement.log_bandwidth
+                bandwidths = [0.0 if learnt is None else learnt.exp().item()]
+            best = self.locate_one(room, waiting, bandwidths)
             if best is None:
                 return numbers
-            gain = best.room.gain
-            if gain >= self.options.clear and not least:
+            if best.gain >= self.options.clear and not least:
                 chance = self.options.chance
-                least = chance * self.score.measure_chance(room, waiting, gain / chance)
-            if gain < max(self.options.clear, least):
+                least = chance * self.score.measure_chance(room, waiting, best.gain / chance)
+            if best.gain < max(self.options.clear, least):
                 return numbers
             if is_unknown:
                 placement.log_bandwidth.fill_(math.log(best.bandwidth))
             number = self.numbers[best.number]
-            plane = best.room.planes[best.number]
+            plane = best.planes[best.number]
             placement.place(number, self.frame.to_world(plane.double()))
             placement.locate(number)
             numbers.append(number)
-            log.info("%s, by %.1f standard errors", self.frame.describe(plane), gain)
+            log.info("%s, by %.1f standard errors", self.frame.describe(plane), best.gain)
 
     def locate_one(
         self, room: LevelRoom, numbers: list[int], bandwidths: list[float]
-    ) -> Located | None:
+    ) -> LevelRoom | None:
         """The room with the clearest of some planes; None if the time is up.
 
         ``bandwidth`` of the paths is the best one from then on.
         """
         trials = []
-        for bandwidth, number in stages.track(
-            [*itertools.product(bandwidths, numbers)], "search of planes"
-        ):
+        pairs = [*itertools.product(bandwidths, numbers)]
+        for self.paths.bandwidth, number in stages.track(pairs, "search of planes"):
             if stages.is_up():
                 return None
-            self.paths.bandwidth = bandwidth
-            trials.append(Located(self.score.move(room, number), number, bandwidth))
-        best = min(trials, key=lambda trial: self.score.error(trial.room))
+            trials.append(self.score.move(room, number))
+        best = min(trials, key=self.score.error)
         self.paths.bandwidth = best.bandwidth
         return best
-
-    def _bandwidths(self, placement: Mirrored, is_unknown: bool) -> list[float]:
-        """The bandwidth that a placement has learnt, or those to try [Hz]."""
-        if is_unknown:
-            return list_bandwidths(None, self.frame, self.lag_options)
-        if placement.log_bandwidth is None:
-            return [0.0]
-        return [placement.log_bandwidth.exp().item()]
 
     def room_of(self, placement: Mirrored) -> LevelRoom:
         """The room of a placement: located planes, and the others at their start."""

@@ -14,13 +14,6 @@ from gaigs.planes.strengths import fit_free
 from gaigs.splatting.placement.mirrored.reflections import polarised, reflect, tangents
 
 
-class SlabPlane(NamedTuple):
-    """A plane (4,) and its slab (3,) as in ``SLABS``."""
-
-    plane: Float[Tensor, "4"]
-    slab: Float[Tensor, "3"]
-
-
 class Phasors(NamedTuple):
     """Single reflections at a plane, at the places where they are strongest.
 
@@ -35,7 +28,7 @@ class Phasors(NamedTuple):
     cosines: Float[Tensor, " b"]
 
 
-class Peak(NamedTuple):
+class SlabPeak(NamedTuple):
     """Maximum of the periodogram over both tilts, at one offset."""
 
     height: float
@@ -50,7 +43,7 @@ def propose_by_phases(
     reach: float,
     tilt: float,
     slabs: Float[Tensor, "m 3"],
-) -> list[SlabPlane]:
+) -> list[tuple[Float[Tensor, "4"], Float[Tensor, "3"]]]:
     """Planes near one of some planes, and slabs, with which its reflections have like phases.
 
     Args:
@@ -62,7 +55,8 @@ def propose_by_phases(
         slabs: Slabs that are tried.
 
     Returns:
-        At most eight half-spaces and eight slabs, highest maxima of the periodogram first.
+        Planes (4,) and slabs (3,): at most eight half-spaces and eight slabs, highest maxima of the
+        periodogram first.
     """
     plane = planes[number]
     axes = tangents(plane[:3])
@@ -76,7 +70,7 @@ def propose_by_phases(
     for axis, grid in enumerate(grids):
         turns = 2 * math.pi / data.wavelength * slopes[:, axis, None] * grid  # (b, steps)
         waves.append(torch.polar(torch.ones_like(turns), turns))
-    peaks: list[Peak] = []
+    peaks: list[SlabPeak] = []
     for material in slabs:
         permittivity, thickness = materials_of(material)
         te, tm = slab(permittivity, cosines, thickness / data.wavelength)
@@ -94,10 +88,10 @@ def propose_by_phases(
                 first = grids[1][at[step] // len(grids[2])]
                 second = grids[2][at[step] % len(grids[2])]
                 shift = torch.stack((grids[0][step], first, second))
-                peaks.append(Peak(highest[step].item(), shift, material))
+                peaks.append(SlabPeak(highest[step].item(), shift, material))
     peaks.sort(key=lambda peak: -peak.height)
     return [
-        SlabPlane(_shifted(plane, axes, peak.shift), peak.slab)
+        (_shifted(plane, axes, peak.shift), peak.slab)
         for peak in _distinct_peaks(peaks, data.wavelength / 6)
     ]
 
@@ -155,9 +149,9 @@ def _phasors(
     return Phasors(values[strongest], slopes[strongest], cosines[strongest])
 
 
-def _distinct_peaks(peaks: list[Peak], least: float) -> list[Peak]:
+def _distinct_peaks(peaks: list[SlabPeak], least: float) -> list[SlabPeak]:
     """The best half-space and the best slab of each lobe; lobes are ``least`` apart [m]."""
-    distinct: list[Peak] = []
+    distinct: list[SlabPeak] = []
     for peak in peaks:
         alike = [other for other in distinct if (other.slab[2] < 0) == (peak.slab[2] < 0)]
         is_apart = all((peak.shift - other.shift)[0].abs() > least for other in alike)
