@@ -45,10 +45,10 @@ log = logging.getLogger(__name__)
 class MirroredSplatting(GaussianSplatting):
     """The splatting pipeline with Gaussians at mirror images, learnt from coarse to fine.
 
-    ``ChannelSearch`` locates planes of channels before the training, ``LagSearch`` those of
-    spectra. Of signal strength powers come first, which teach obstacles; then ``LevelSearch``
-    locates planes by phases. Where frequencies are unknown, powers add to the end. Labels that none
-    of them can read start from the faces of the box; each plane is then turned square to the others
+    ``ChannelSearch`` locates planes of channels before the training, and ``LagSearch`` planes of
+    spectra. Powers of signal strength come first, which teach obstacles; then ``LevelSearch``
+    locates planes by phases. Where frequencies are unknown, powers add to the end. Labels that no
+    search can read start from the faces of the box; each plane is then turned square to the others
     and moved along its normal to the least error.
 
     Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that
@@ -98,7 +98,7 @@ class MirroredSplatting(GaussianSplatting):
         """Fits the pipeline, and keeps some links for the report of the paths' powers.
 
         Spectra start from planes that ``LagSearch`` finds in them, channels without a trend from
-        those of ``ChannelSearch``.
+        planes of ``ChannelSearch``.
         """
         super().fit(links)
         self.places = thin_links(links.query[links.split.train])
@@ -218,7 +218,7 @@ class MirroredSplatting(GaussianSplatting):
         adds_waves = not isinstance(self.pooling, LagPooling)
         if placement.is_bare:
             placement.enable_reflections()
-        # Of planes that a search has found early, too: each path costs time in every step.
+        # Early, too, if a search has found the planes: each path costs time in every step.
         if number == len(self.revisions) - 1 or (number == 1 and placement.found):
             return prune(placement, [train] if validation is None else [train, validation], loss)
         if number < 2 and not adds_waves:
@@ -265,7 +265,7 @@ class MirroredSplatting(GaussianSplatting):
     def margins(self, query: Query) -> Complex[Tensor, "b n e s"]:
         """Channels by which each path of links to one receiver may deviate, for kriging.
 
-        They are those of ``PathFields.margins``.
+        Paths deviate by ``PathFields.margins``.
         """
         with self.placement.holding():
             self.placement.held = self.placement.margins(query)

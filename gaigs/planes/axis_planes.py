@@ -47,7 +47,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
     def grow_along(
         self, room: SlabRoom, most: int, others: Float[Tensor, "v 4"] | None = None
     ) -> SlabRoom:
-        """The room with further planes along its axes, or near others where there are none."""
+        """The room with further planes along its axes, or else near others."""
         count = len(room.planes)
 
         def extend(room: SlabRoom) -> SlabRoom | None:
@@ -76,7 +76,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         """Planes with these normals that explain more than a share of the rest, the best first.
 
         At most four walls, which have all places on one side, and four planes amid the places:
-        these score higher by what is left of others.
+        these explain more of the rest.
         """
         walls: list[Candidate] = []
         amid: list[Candidate] = []

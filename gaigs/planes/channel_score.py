@@ -35,9 +35,9 @@ class NeighbourLinks(NamedTuple):
 class ChannelScore(Score[SlabRoom]):
     """Planes by the phases of reflections at slabs, with real strengths that are not negative.
 
-    A true plane's strengths vary little from place to place, so the error is that of channels
-    predicted with the strengths of the nearest places, and a price of each plane. A false plane
-    that explains one place by chance fails at the next.
+    A true plane's strengths vary little from place to place, so channels are predicted with the
+    strengths of the nearest places. The error is what the prediction leaves, and a price of each
+    plane. A false plane that explains one place by chance fails at the next.
 
     Args:
         data: Training channels.
@@ -183,7 +183,7 @@ class ChannelScore(Score[SlabRoom]):
     def polish(self, room: SlabRoom, steps: int, rate: float, only: int | None = None) -> SlabRoom:
         """The room after a descent on ``measure`` with all planes, or with one.
 
-        ``rate`` is that of ``search.descend`` [m].
+        ``rate`` as in ``search.descend`` [m].
         """
         moves = torch.ones(len(room.planes), dtype=torch.bool)
         if only is not None:

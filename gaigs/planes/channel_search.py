@@ -71,7 +71,7 @@ class ChannelSearch:
 
     @torch.no_grad()
     def run(self) -> SlabRoom:
-        """Planes of the world, first those of the start, and their slabs as in ``SLABS``."""
+        """Planes in the world's frame, the start's first, and their slabs as in ``SLABS``."""
         room = self.find_room()
         return SlabRoom(self.frame.to_world(room.planes), room.slabs)
 
@@ -83,8 +83,8 @@ class ChannelSearch:
             best = self.prune(self.resolve(self.free.descend(planes, 300, 5e-3)))
         if stages.is_up():
             return best
-        # Free strengths may find tilted planes in place of upright ones, or none, and move known
-        # walls away.
+        # Free strengths may find tilted planes in place of upright ones, or no plane, and move
+        # known walls away.
         is_doubtful = len(self.start) or not is_square(best.planes)
         if not len(best.planes) or (self.has_few_numbers and is_doubtful):
             walls = self.find_axis_walls()

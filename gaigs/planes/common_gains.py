@@ -96,7 +96,7 @@ class CommonGains:
         lines: Float[Tensor, "c 4"],
         by_chance: float,
     ) -> Float[Tensor, "v 4"]:
-        """The planes, and those of lines that explain most of what is left, more than by chance."""
+        """The planes, and planes of lines that explain most of the rest, more than by chance."""
         while len(planes) < self.most:
             known = self.fit(parts, half_spaces(planes))
             shares = self.rate(parts, known.residuals, lines)
@@ -145,7 +145,7 @@ class CommonGains:
     ) -> tuple[float, Float[Tensor, "4"]]:
         """Largest share that a plane explains near its place, beside others; the plane there.
 
-        The place itself has a bonus, as a share of what the others leave.
+        The place itself has a bonus, as a share of the rest.
         """
         known = self.fit(parts, half_spaces(others))
         error = self.data.options.drawing_error

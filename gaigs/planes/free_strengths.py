@@ -174,7 +174,7 @@ class _ProfileTable:
     ) -> Float[Tensor, "b k"]:
         """Power of profiles summed over the elements with the phases of an image's wave.
 
-        ``heights`` are those of the places above planes with one normal [m].
+        ``heights`` of the places are above planes with one normal [m].
         """
         moves = 2 * heights[..., None].float() * normal.float()
         points = self.places[:, None] - moves  # (b, k, 3)

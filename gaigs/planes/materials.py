@@ -1,4 +1,4 @@
-"""Materials of learnt planes: those of ITU-R P.2040 that reflect most alike."""
+"""Materials of ITU-R P.2040 that reflect as learnt planes do."""
 
 import math
 from typing import NamedTuple

@@ -50,7 +50,7 @@ class SurfaceOptions:
 class Sheet(NamedTuple):
     """A closed surface of even density of matter, as a thin material that absorbs.
 
-    It is far thinner than the wavelength. ``conductance`` is that of a square, over free space's.
+    It is far thinner than the wavelength. ``conductance`` is relative to free space.
     With c the cosine of the angle of incidence, the field falls to 1 / (1 + conductance / (2 c))
     for TE and to 1 / (1 + c conductance / 2) for TM. Its phase does not turn.
 
@@ -194,7 +194,7 @@ def find_crossings(
     gradients = points * (each @ weights) - each @ (weights * obstacles.centres.double())
     normals = functional.normalize(gradients)
     cosines = (normals * functional.normalize(unit)).sum(1).abs().clamp_min(1e-3)
-    # The surface is that of the sample inside; a point of the grid farther out counts, too.
+    # The sample inside tells the surface; a point of the grid farther out counts, too.
     inside = legs.start[leg] + (step + (after > before))[:, None] * unit
     numbers = matter.number_surfaces(density)
     numbers = np.where(numbers, numbers, ndimage.grey_dilation(numbers, 3))
@@ -256,8 +256,8 @@ def choose_densities(paths: AttenuatedPaths, count: int) -> list[float]:
 class SheetFit:
     """Conductances of sheets that attenuate paths most as obstacles do.
 
-    The error is that of a link's fields in decibels, in the mean over links: neither deep shadow
-    nor the best links decide.
+    Errors of a link's fields count in decibels, in the mean over links: neither deep shadow nor the
+    best links decide.
 
     Args:
         paths: With obstacles.
@@ -293,7 +293,7 @@ class SheetFit:
     ) -> tuple[float, Tensor]:
         """Least error [dB]; logarithms of ``sizes`` conductances of each density, and the gain.
 
-        A single conductance of a density is that of all its surfaces.
+        A single conductance of a density holds for all its surfaces.
         """
         values = start.clone().requires_grad_()
         descent = torch.optim.LBFGS([values], max_iter=50, line_search_fn="strong_wolfe")

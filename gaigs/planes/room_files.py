@@ -18,7 +18,7 @@ from gaigs.splatting.placement.mirrored.paths import Mirrored
 def summarize(placement: Mirrored, query: Query) -> dict[str, list]:
     """Tables of planes, strongest first, and of paths by their bounces, for ``metrics.json``.
 
-    Shares are those of the kept paths in the received power, means over the links of the query.
+    Shares in the received power are means of the kept paths over the links of the query.
     ``unseen`` has a sentence for each axis that places do not span, see ``Scene.flat_axes``.
     """
     traced = trace_paths(placement, query)

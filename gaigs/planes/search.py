@@ -41,20 +41,22 @@ class GridRatings(NamedTuple):
 class Score(Generic[R]):
     """How well planes explain labels of one kind: all that ``PlaneSearch`` knows of the labels.
 
-    Labels of a new kind need a class of rooms (a NamedTuple with ``planes`` and what is fitted
-    beside them) and a subclass of this with the methods of the steps that its search takes:
+    Labels of a new kind need two classes: rooms, a NamedTuple with ``planes`` and what is fitted
+    beside them, such as materials; and a subclass of this. The subclass implements the methods of
+    the steps that its search takes, and no method changes a room:
 
-    ======== ==================================================================
-    step     methods
-    ======== ==================================================================
-    sweep    ``move``
-    extend   ``error``, ``rate``, ``add``
-    grow     those of the function that adds a plane
-    prune    ``error``, ``remove``, ``refine``
-    ======== ==================================================================
+    * ``PlaneSearch.sweep`` needs ``move``;
+    * ``PlaneSearch.extend`` needs ``error``, ``rate`` and ``add``;
+    * ``PlaneSearch.prune`` needs ``error``, ``remove`` and ``refine``.
 
-    Planes are rows (unit normal, offset [m]) about the middle of the room. No method changes a
-    room.
+    Planes are rows (unit normal, offset [m]) in the ``RoomFrame``. A search then reads
+
+        search = PlaneSearch(frame, score)
+        room = search.sweep(start, range(len(start.planes)))
+        room = search.grow(room, most, lambda room: search.extend(room, grid))
+        room = search.prune(room, fewest=0)
+
+    ``LagScore`` and ``LagSearch`` are the shortest example.
     """
 
     def error(self, room: R) -> float:

@@ -75,6 +75,6 @@ def log_share(
 def align_phases(
     channels: Complex[Tensor, "b k"], known: Complex[Tensor, "b k"]
 ) -> Complex[Tensor, "b k"]:
-    """Channels, each turned to the phase of what is known of it; unchanged where that is 0."""
+    """Channels, each turned to the phase of its known part; unchanged where this is 0."""
     turns = (known * channels.conj()).sum(1, keepdim=True).sgn()
     return torch.where(turns == 0, channels, channels * turns)

@@ -29,7 +29,7 @@ class MovablePlanes(Placement):
     Attributes:
         middle: Of the room [m].
         diagonal: Of the box that holds transmitters and receivers [m].
-        turn: Rotation from the world's axes to those of the first planes.
+        turn: Rotation from the world's axes to the first planes' axes.
         origin: Normals and offsets at the start, or at the last change of ``step`` (w, 4);
             ``shifts`` are added.
         step: Size of a unit of ``shifts``; it follows the wavelength once phases count.
@@ -65,7 +65,7 @@ class MovablePlanes(Placement):
         super().__init__()
         self._check_number("planes", planes, self.faces)
         self._check_number("order", order, 0)
-        most = 100_000  # sequences, each with parameters: of 10 planes those of order 5
+        most = 100_000  # sequences, each with parameters: 10 planes of order 5
         highest = largest_order(planes, most)
         if order > highest:
             raise ValueError(
@@ -203,8 +203,8 @@ def upright_turn(
         places: Transmitters [m].
         smaller: Largest area over that along the world's axes, whose box is kept otherwise.
         width: Least width over the length: places along a line say nothing of the room's walls.
-        enough: Fewest places: of 40 that fill a room along the axes chance turns next to none, of
-            10 a quarter.
+        enough: Fewest places: chance turns hardly any room along the axes that 40 places fill, a
+            quarter of rooms with 10.
     """
     turn = torch.eye(3, dtype=torch.float64)
     if len(places.unique(dim=0)) < enough:

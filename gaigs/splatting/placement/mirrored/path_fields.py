@@ -89,7 +89,7 @@ class PathFields(MovablePlanes):
         self._add_receiver_parameters()
         half = (self.box[1] - self.box[0]) / 2
         self.obstacles = Obstacles(obstacles, -half, half, self.is_complex) if obstacles else None
-        # Of a spectrum even faint paths show: where obstacles block the others.
+        # Spectra show even faint paths, where obstacles block the others.
         self.skips_faint = not self.is_complex and scene.task.directions is None
 
     def _add_plane_parameters(self, planes: int) -> None:
@@ -132,7 +132,7 @@ class PathFields(MovablePlanes):
     ) -> None:
         """Puts one of the ``planes``.
 
-        A material is that of a slab: logarithms of the permittivity's real part over 1, of its
+        A material is a slab's: logarithms of the permittivity's real part over 1, of its
         imaginary part, and of the thickness [m].
         """
         super().place(number, plane)

@@ -25,7 +25,7 @@ class Mirrored(PathFields):
 
     In projective geometric algebra a plane is a vector, and its sandwich product mirrors. All paths
     and receivers share the planes, so direction, path length and spreading follow from geometry;
-    their fields are those of ``PathFields``.
+    ``PathFields`` has their fields.
 
     Paths add as powers until ``enable_phases``. Channels start from free space until
     ``enable_reflections``.
@@ -43,7 +43,7 @@ class Mirrored(PathFields):
         planes: Largest number of planes; six at the start; the searches of spectra and channels
             find others.
         order: Largest number of reflections of a path; at most 100,000 sequences of planes.
-        obstacles: Number of Gaussians of matter in the room; 0 for none.
+        obstacles: Number of Gaussians of matter in the room.
         walls: File whose largest planes are the first ones: a floor plan ``.csv`` of consecutive
             vertices x,y [m], or a Wavefront ``.obj`` [m]. None: the box's faces. A checkpoint does
             not need the file.

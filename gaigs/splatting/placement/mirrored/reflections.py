@@ -110,7 +110,7 @@ def images(
 ) -> list[Float[Tensor, "b n 3"]]:
     """Images of transmitters [m] in the first 0, 1, ..., order planes of each sequence.
 
-    Sequences are those of ``all_sequences``. Each transmitter may have offsets of its own.
+    Sequences come from ``all_sequences``. Each transmitter may have offsets of its own.
     """
     seen = [points[:, None].expand(-1, len(sequences), -1)]
     for first, column in zip(_firsts(sequences), sequences.unbind(1), strict=True):
