@@ -50,7 +50,8 @@ class SurfaceOptions:
 class Sheet(NamedTuple):
     """A closed surface of even density of matter, as a thin material that absorbs.
 
-    It is far thinner than the wavelength. ``conductance`` is relative to free space.
+    It is far thinner than the wavelength. ``conductance`` is the sheet's over the admittance of free
+    space.
     With c the cosine of the angle of incidence, the field falls to 1 / (1 + conductance / (2 c))
     for TE and to 1 / (1 + c conductance / 2) for TM. Its phase does not turn.
 
