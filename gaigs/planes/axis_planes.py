@@ -30,7 +30,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         super().__init__(data.frame, score)
         self.data = data
 
-    def seed(self, room: SlabRoom) -> SlabRoom:
+    def find_upright(self, room: SlabRoom) -> SlabRoom:
         """The upright plane along the axes of a room that explains most alone, if there is any."""
         axes = room_axes(room.planes)
         nothing = SlabRoom(room.planes[:0], room.slabs[:0])
@@ -41,7 +41,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
                 # Level directions alone, with a normal of length 1.
                 upright = moved * moved.new_tensor([1.0, 1.0, 0.0, 1.0]) / moved[:2].norm()
                 trials.append(SlabRoom(upright[None], material[None]))
-        polished = [self.score.refine(trial) for trial in self.score.best(trials)]
+        polished = [self.score.refine(trial) for trial in self.score.choose_best(trials)]
         return min(polished, key=self.score.error, default=nothing)
 
     def grow_along(
@@ -99,7 +99,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
             for moved, material in self._propose_by_phases(planes, number, 1e-4):
                 if not self.frame.is_like(room.planes, moved).any():
                     trials.append(room.with_plane(moved, material))
-        best = self.score.best(trials)
+        best = self.score.choose_best(trials)
         return self.score.polish(best[0], 12, 5e-4, number) if best else room
 
     def settle(self, room: SlabRoom, polishes: bool = False) -> SlabRoom:
@@ -108,7 +108,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         room = self.sweep(room, range(len(room.planes)), move=move)
         if stages.is_up():
             return room
-        return self.score.best([room, self.score.polish(room, 30, 3e-4)])[0]
+        return self.score.choose_best([room, self.score.polish(room, 30, 3e-4)])[0]
 
     def _propose_by_phases(self, planes: Float[Tensor, "w 4"], number: int, tilt: float) -> list:
         """Planes near one of some planes, with every third slab."""

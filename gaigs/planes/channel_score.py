@@ -90,7 +90,7 @@ class ChannelScore(Score[SlabRoom]):
     @cached_property
     def neighbours(self) -> list[NeighbourLinks]:
         """Predicted places of each receiver."""
-        found = []
+        neighbours = []
         most = max(8, self.options.predicted // len(self.data.receivers))
         for links in self.data.receivers:
             receiver = links.of_unique_places()
@@ -100,7 +100,7 @@ class ChannelScore(Score[SlabRoom]):
             count = min(self.options.neighbours, gaps.shape[1])
             gaps, near = gaps.topk(count, largest=False)
             rows = torch.cat((targets, near.flatten())).unique()
-            found.append(
+            neighbours.append(
                 NeighbourLinks(
                     receiver.at(rows),
                     torch.searchsorted(rows, targets),
@@ -108,7 +108,7 @@ class ChannelScore(Score[SlabRoom]):
                     gaps.isfinite(),
                 )
             )
-        return found
+        return neighbours
 
     def remove(self, room: SlabRoom, number: int) -> SlabRoom:
         others = torch.arange(len(room.planes)) != number
@@ -123,7 +123,7 @@ class ChannelScore(Score[SlabRoom]):
     def move_and_polish(self, room: SlabRoom, number: int) -> SlabRoom:
         """``move`` after a descent with each of the best: an ill slab may hide the best offset."""
         best = self._best_moves(room, number)
-        return self.best(best + [self.polish(trial, 12, 5e-4, number) for trial in best])[0]
+        return self.choose_best(best + [self.polish(trial, 12, 5e-4, number) for trial in best])[0]
 
     def _best_moves(self, room: SlabRoom, number: int) -> list[SlabRoom]:
         trials = [room]
@@ -131,11 +131,11 @@ class ChannelScore(Score[SlabRoom]):
             self.data, room.planes, number, self.data.reach, 0.006, SLABS
         ):
             trials.append(room.replace_plane(number, plane, material))
-        return self.best(trials)
+        return self.choose_best(trials)
 
     # --- residuals ---
 
-    def best(self, rooms: list[SlabRoom]) -> list[SlabRoom]:
+    def choose_best(self, rooms: list[SlabRoom]) -> list[SlabRoom]:
         """At most three rooms that leave least, the best first. Few places choose these three."""
         if not rooms:
             return []

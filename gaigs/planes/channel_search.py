@@ -95,7 +95,9 @@ class ChannelSearch:
         if not len(best.planes):
             return best
         if not is_square(best.planes):
-            first = half_spaces(self.start) if len(self.start) else self.along_axes.seed(best)
+            first = (
+                half_spaces(self.start) if len(self.start) else self.along_axes.find_upright(best)
+            )
             upright = self.prune(self.along_axes.grow_along(first, self.most, best.planes))
             if self.score.error(upright) < self.score.error(best):
                 return upright
@@ -140,10 +142,10 @@ class ChannelSearch:
         def replace(room: FreeRoom, number: int) -> FreeRoom:
             others = self.free.remove(room, number)
             plane = room.planes[number, None]
-            last = self.free.room(torch.cat((others.planes, plane)))
+            last = self.free.evaluate(torch.cat((others.planes, plane)))
             return min([*search.list_extensions(others, grid), last], key=self.free.error)
 
-        room = search.grow(self.free.room(known), self.most, extend)
+        room = search.grow(self.free.evaluate(known), self.most, extend)
         # The first of the new planes once more, as others are known now; it becomes the last.
         turns = [len(known)] * (len(room.planes) - len(known))
         return search.sweep(room, turns, "search of planes", replace).planes
@@ -200,7 +202,7 @@ class ChannelSearch:
         profiles = []
         for receiver in self.free.links:
             rest = self.data.fit_free(receiver, planes[is_other]).residual
-            profiles.append(self.free.profile(receiver, rest))
+            profiles.append(self.free.compute_profile(receiver, rest))
         variants = []
         for axis in axes:
             steps = 0.1 * self.frame.diagonal * torch.linspace(-1, 1, 81).double()

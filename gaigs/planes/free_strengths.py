@@ -47,7 +47,7 @@ class FreeScore(Score[FreeRoom]):
         # Profiles of a gigabyte at most, also in a hall with a large band.
         self.links = data.draw(min(200, 60_000_000 // size))
 
-    def room(self, planes: Float[Tensor, "w 4"], share: float = 0.0) -> FreeRoom:
+    def evaluate(self, planes: Float[Tensor, "w 4"], share: float = 0.0) -> FreeRoom:
         """A room with its error: the mean log of the share of power that free strengths leave."""
         shares = []
         for receiver in self.links:
@@ -60,7 +60,7 @@ class FreeScore(Score[FreeRoom]):
 
     def rate(self, room: FreeRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
         profiles = [
-            self.profile(receiver, self.data.fit_free(receiver, room.planes).residual)
+            self.compute_profile(receiver, self.data.fit_free(receiver, room.planes).residual)
             for receiver in self.links
         ]
         few = [receiver.at(slice(None, None, 3)) for receiver in self.links]
@@ -81,17 +81,17 @@ class FreeScore(Score[FreeRoom]):
         if candidate.rating < max(options.faint_share, by_chance):
             return None
         planes = torch.cat((room.planes, candidate.plane[None]))
-        larger = self.room(self.descend(planes, 30, 1e-2), candidate.rating)
+        larger = self.evaluate(self.descend(planes, 30, 1e-2), candidate.rating)
         is_certain = candidate.rating >= options.certain_share
         if is_certain or room.error - larger.error >= options.certain_fall:
             return larger
         return None
 
     def remove(self, room: FreeRoom, number: int) -> FreeRoom:
-        return self.room(torch.cat((room.planes[:number], room.planes[number + 1 :])))
+        return self.evaluate(torch.cat((room.planes[:number], room.planes[number + 1 :])))
 
     def refine(self, room: FreeRoom) -> FreeRoom:
-        return self.room(self.descend(room.planes, 60, 1e-2), room.share)
+        return self.evaluate(self.descend(room.planes, 60, 1e-2), room.share)
 
     def descend(
         self, planes: Float[Tensor, "w 4"], steps: int, rate: float
@@ -111,7 +111,7 @@ class FreeScore(Score[FreeRoom]):
 
         return descend(loss, self.data.receivers, planes, [], steps, rate)[0]
 
-    def profile(
+    def compute_profile(
         self, receiver: ReceiverChannels, rest: Complex[Tensor, "b k"]
     ) -> Float[Tensor, "b e t 2"]:
         """Delay profiles of a residual at each element, over the root of the channel's power.

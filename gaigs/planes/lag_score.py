@@ -115,7 +115,7 @@ class LinkPaths:
             powers.append(thinned.paths(planes, sequences).fields.abs().square())
         return torch.cat(powers).mean(0)
 
-    def by_strength(self, planes: Float[Tensor, "w 4"]) -> list[int]:
+    def sort_by_strength(self, planes: Float[Tensor, "w 4"]) -> list[int]:
         """Numbers of planes, the strongest single reflection first."""
         singles = all_sequences(len(planes), 1)[1:]
         return self.powers(planes, singles).argsort(descending=True).tolist()

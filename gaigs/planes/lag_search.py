@@ -166,7 +166,7 @@ class LagSearch:
         """Sets the bandwidth; the start with all planes moved."""
         best = choices[0]
         if len(choices) > 1:
-            strongest = self.paths.by_strength(start.planes)[0]
+            strongest = self.paths.sort_by_strength(start.planes)[0]
             trials = []
             for choice in choices:
                 self.paths.bandwidth = choice
@@ -181,7 +181,7 @@ class LagSearch:
 
     def move_around(self, room: LagRoom) -> LagRoom:
         """Each plane moved, the strongest first; then all together."""
-        numbers = self.paths.by_strength(room.planes)
+        numbers = self.paths.sort_by_strength(room.planes)
         room = self.search.sweep(room, numbers, "search of planes")
         return self.score.refine(room)
 

@@ -193,8 +193,8 @@ def periodogram(
     def total(
         part: Float[Tensor, "b m"], first: Float[Tensor, "b t"], second: Float[Tensor, "b t"]
     ) -> Float[Tensor, "m t t"]:
-        left = (part[:, :, None] * first[:, None]).flatten(1)  # (b, m t)
-        return (second.T @ left).view(size).movedim(0, 2)
+        products = (part[:, :, None] * first[:, None]).flatten(1)  # (b, m t)
+        return (second.T @ products).view(size).movedim(0, 2)
 
     even = total(moved.real, cos, other_cos)
     odd = total(moved.real, sin, other_sin)

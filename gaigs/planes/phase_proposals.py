@@ -76,9 +76,9 @@ def propose_by_phases(
         te, tm = slab(permittivity, cosines, thickness / data.wavelength)
         expected = polarised(plane[:3], te, tm)  # (b,)
         # sum_b Re(a_b Gamma_b* exp(j k L_b(offset, tilts))) on the grid, as a product of matrices.
-        left = (values * expected.conj())[:, None] * waves[0]  # (b, o)
-        left = left[:, :, None] * waves[1][:, None]  # (b, o, t)
-        sums = (left.flatten(1).mT @ waves[2]).real  # (o t, u)
+        products = (values * expected.conj())[:, None] * waves[0]  # (b, o)
+        products = products[:, :, None] * waves[1][:, None]  # (b, o, t)
+        sums = (products.flatten(1).mT @ waves[2]).real  # (o t, u)
         sums = sums.unflatten(0, (len(grids[0]), -1)).flatten(1)  # (o, t u)
         highest, at = sums.max(1)
         highest = highest / (values.abs() * expected.abs()).sum()
