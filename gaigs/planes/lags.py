@@ -44,8 +44,9 @@ class ArrayPaths(NamedTuple):
 class FurtherWave(NamedTuple):
     """Weights of one more path beside known ones (b, n, e), and the lengths of these (b, n) [m].
 
-    The real part of the sum over known paths and elements, times the further path's field, is twice
-    the fall of the error. Without a bandwidth the sum over known paths is taken: n is 1.
+    The sum of the further wave's conjugate times the weights, over known paths and elements, has
+    half the fall of the error as its real part. Without a bandwidth the sum over known paths is
+    taken: n is 1.
     """
 
     weights: Complex[Tensor, "b n e"]
