@@ -25,8 +25,8 @@ from gaigs.core.query import Query
 from gaigs.data import Links
 from gaigs.data.synthetic.image_source import respond
 from gaigs.model.kriging import Kriging
-from gaigs.planes.export import facts
 from gaigs.planes.materials import materials
+from gaigs.planes.room_files import summarize
 from gaigs.report.table import markdown
 from gaigs.runs import links_of, load
 
@@ -79,7 +79,7 @@ def main(folder: Path) -> None:
     bounces = int((placement.sequences[placement.kept] >= 0).sum(1).max())
     lines = [("plane", "normal", "offset [m]", "share of the power", "material", "slab")]
     chosen = materials(placement, own.traced, carrier)
-    for plane in facts(placement, own.traced)["planes"]:
+    for plane in summarize(placement, own.traced)["planes"]:
         material, thickness = chosen[plane["number"]]
         normal = " ".join(f"{part:.2f}" for part in plane["normal"])
         slab = f"{1e3 * thickness:.3g} mm" if thickness < 1 else "half-space"

@@ -27,7 +27,8 @@ from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.io.files import atomic_write
 from gaigs.model import checkpoint
-from gaigs.planes.channel_search import SLABS, ChannelSearch
+from gaigs.planes.channel_links import SLABS, SlabRoom
+from gaigs.planes.channel_search import ChannelSearch
 from gaigs.processes import Stopped, stopping
 from gaigs.registry import registry
 from gaigs.report.curves import read_curves
@@ -642,7 +643,7 @@ def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path, m
         "baselines=[{name: friis}]", "trainer.max_steps=6", "trainer.val_check_interval=3", *SMALL[9:11],
         "training.learning_rates={planes: 10, paths: 10, obstacles: 10}", "placement.planes=6", "placement.order=1",
     )  # fmt: skip
-    found = torch.eye(4)[:3].double(), SLABS[:3]  # instead of a search
+    found = SlabRoom(torch.eye(4)[:3].double(), SLABS[:3])  # instead of a search
     monkeypatch.setattr(ChannelSearch, "run", lambda _: found)
     metrics = runs.run(gaigs.compose(*options), tmp_path)
     own, free_space = (metrics["validation"][name] for name in ("mirrored", "friis"))

@@ -76,10 +76,8 @@ def estimate_place(
     low = low - low.new_tensor([margin, margin, 0])
     high = high + low.new_tensor([margin, margin, prior.above])
     apart = torch.cdist(places, places)
-    shadowing = []
-    for length, share in prior.correlations:
-        shadowing.append(share * (-apart / length).exp())
-    shadowing = torch.stack(shadowing)  # (c, n, n)
+    parts = [share * (-apart / length).exp() for length, share in prior.correlations]
+    shadowing = torch.stack(parts)  # (c, n, n)
     shadowing.diagonal(dim1=1, dim2=2).fill_(1)
     factors = torch.linalg.cholesky(shadowing)
     lower, upper = low, high

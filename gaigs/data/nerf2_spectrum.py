@@ -84,7 +84,7 @@ def read(
     array = Array.single()
     if elements is not None and frequencies is not None:
         wavelength = speed_of_light / frequencies.double().max().item()
-        array = Array.planar(*elements, pitch=wavelength / 2)
+        array = Array.planar(elements[0], elements[1], wavelength / 2)
     elif elements is not None:
         remarks.append(
             "the array counts as a single antenna, since without a frequency its extent is unknown"

@@ -430,7 +430,7 @@ class OptionalMethods(Protocol):
 
     def learnt_paths(self, query: Query) -> object:
         """The strongest paths of some links together, a list of
-        ``gaigs.planes.learnt_room.LearntPath``.
+        ``gaigs.planes.room_paths.LearntPath``.
         """
 
     def export(self, folder: Path) -> None:

@@ -1,17 +1,56 @@
-"""Planes, obstacles and paths of a learnt room, for figures."""
+"""The learnt room of mirrored Gaussians: planes as polygons, obstacles and paths, for figures."""
 
+import math
 from typing import NamedTuple
 
+import numpy as np
+import torch
 from jaxtyping import Float
 from numpy import ndarray
 
+from gaigs.core.propagation import fresnel
+from gaigs.core.scene import Scene
+from gaigs.data import Links
+from gaigs.planes.room_paths import (
+    LearntPath,
+    TracedPaths,
+    list_paths,
+    spread_links,
+    thin_links,
+    trace_paths,
+)
+from gaigs.splatting.placement.mirrored.paths import Mirrored
+
+NEPER = 20 / math.log(10)
+"""One neper of a field [dB]."""
+
+
+class PlaneTable(NamedTuple):
+    """All learnt planes, float64.
+
+    Attributes:
+        normals: Unit normals out of the room.
+        offsets: Along the normals from the world's origin [m].
+        losses: Least losses of a reflection at normal incidence [dB].
+        middles: Points with the least losses [m].
+        extents: Standard deviations of the reflecting areas along the world's axes [m].
+    """
+
+    normals: Float[ndarray, "w 3"]
+    offsets: Float[ndarray, " w"]
+    losses: Float[ndarray, " w"]
+    middles: Float[ndarray, "w 3"]
+    extents: Float[ndarray, "w 3"]
+
 
 class LearntPlane(NamedTuple):
-    """The drawn part of a learnt plane: its number in ``metrics.json``, its share of the received
-    power.
+    """The drawn part of a learnt plane.
 
-    ``corners`` are a convex polygon, counterclockwise as seen from outside the room [m]; the unit
-    normal points out.
+    Attributes:
+        number: As in ``metrics.json``.
+        corners: A convex polygon, counterclockwise as seen from outside the room [m].
+        normal: Unit normal out of the room.
+        share: Share of the paths at the plane in the received power.
     """
 
     number: int
@@ -21,22 +60,17 @@ class LearntPlane(NamedTuple):
 
 
 class Matter(NamedTuple):
-    """Obstacles: centres [m], standard deviations along the world's axes [m], densities at the
-    centres [dB/m].
+    """Obstacles.
+
+    Attributes:
+        centres: [m].
+        widths: Standard deviations along the world's axes [m].
+        densities: At the centres [dB/m].
     """
 
     centres: Float[ndarray, "k 3"]
     widths: Float[ndarray, "k 3"]
     densities: Float[ndarray, " k"]
-
-
-class LearntPath(NamedTuple):
-    """Transmitter, bounces and receiver of a path [m], and its power relative to the strongest path
-    [dB].
-    """
-
-    points: Float[ndarray, "p 3"]
-    power_db: float
 
 
 class LearntRoom(NamedTuple):
@@ -45,3 +79,187 @@ class LearntRoom(NamedTuple):
     planes: list[LearntPlane]
     matter: Matter | None
     paths: list[LearntPath]
+
+
+@torch.no_grad()
+def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
+    """The room by the training links, and the strongest paths of the first test transmitter.
+
+    Without links it is the room by ``spread_links``, without paths.
+    """
+    if links is None:
+        query = spread_links(placement.scene)
+    else:
+        query = thin_links(links.query[links.split.train])
+    planes = outline_planes(placement, trace_paths(placement, query))
+    matter = None
+    if placement.obstacles is not None:
+        blobs = placement.obstacles
+        parts = (blobs.centres + placement.middle, blobs.widths, NEPER * blobs.densities)
+        matter = Matter(*(part.cpu().double().numpy() for part in parts))
+    paths: list[LearntPath] = []
+    if links is not None:
+        test = links.query[links.split.test]
+        first = (test.transmitters == test.transmitters[:1]).all(1)
+        if test.frequencies is not None:
+            first &= test.frequencies == test.frequencies[:1]
+        paths = list_paths(placement, test[first])
+    return LearntRoom(planes, matter, paths)
+
+
+@torch.no_grad()
+def tabulate_planes(placement: Mirrored, ends: Float[ndarray, "k 3"]) -> PlaneTable:
+    """All planes of a placement; the room is on the side of the middle of the paths' ends."""
+    real = 1 + placement.log_permittivities.exp()
+    permittivities = torch.complex(real, -placement.log_conductivities.exp())
+    reflected, _ = fresnel(permittivities, torch.ones_like(real))
+    gains = reflected.abs().log() + placement.plane_gains  # [Np]
+    middles = placement.middles + placement.middle.double()
+    parts = placement.normals, placement.planes[:, 3], gains, middles, placement.log_extents.exp()
+    normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in parts)
+    # The middle of the reflecting area need not lie on the plane: take the plane's point with the
+    # least loss.
+    steep = extents**2 * normals
+    spread = (steep * normals).sum(1)
+    apart = offsets - (normals * middles).sum(1)
+    middles = middles + (apart / spread)[:, None] * steep
+    losses = NEPER * (apart**2 / spread / 2 - gains)
+    centre = (ends.min(0) + ends.max(0)) / 2
+    signs = np.where(normals @ centre > offsets, -1.0, 1.0)
+    return PlaneTable(signs[:, None] * normals, signs * offsets, losses, middles, extents)
+
+
+def other_offset(scene: Scene, planes: PlaneTable, number: int) -> float | None:
+    """Offset at which a plane would reflect paths of the same lengths [m], see ``FlatAxis``.
+
+    None if there is no such offset.
+    """
+    normal = planes.normals[number]
+    for flat in scene.flat_axes:
+        if abs(normal[flat.axis]) > 0.99:
+            heights = flat.transmitters + flat.receivers
+            return float(normal[flat.axis] * heights - planes.offsets[number])
+    return None
+
+
+class HalfSpace(NamedTuple):
+    """Points x with normal . x <= offset [m]."""
+
+    normal: Float[ndarray, "3"]
+    offset: np.floating
+
+
+def outline_planes(placement: Mirrored, traced: TracedPaths) -> list[LearntPlane]:
+    """The planes as convex polygons, strongest first.
+
+    A wall has all transmitters and receivers on one side. It reaches to the other walls, to the
+    edge of its reflecting area, or to the box around the paths' ends, whichever is nearest. Any
+    other plane, such as furniture, is the rectangle around its bounces, within walls and box.
+    Planes without paths, or outside the box, are left out.
+    """
+    table = tabulate_planes(placement, traced.ends)
+    plane_shares = traced.plane_shares
+    shares = traced.shares
+    # Bounces with at least a hundredth of a link's power count as points of their planes.
+    bounces = traced.bounces[shares >= 0.01].reshape(-1, 3)
+    points = np.concatenate((traced.ends, bounces))
+    points = points[~np.isnan(points).any(1)]
+    lower, upper = points.min(0), points.max(0)
+    diagonal = np.linalg.norm(upper - lower)
+    margin = 0.1 * diagonal  # so large that planes meet within the box
+    box = _sides(lower - margin, upper + margin)
+    tolerance = 0.02 * diagonal  # places and walls are uncertain
+    walls = [
+        number
+        for number in plane_shares
+        if (traced.ends @ table.normals[number] - table.offsets[number] <= tolerance).all()
+    ]
+    drawn = []
+    for number, share in plane_shares.items():
+        if not ((traced.sequences == number).any(1) & (shares > 0)).any():
+            continue
+        normal = table.normals[number]
+        # Walls that face the same way, such as one behind another, do not cut each other.
+        sides = box + [
+            HalfSpace(table.normals[wall], table.offsets[wall])
+            for wall in walls
+            if wall != number and table.normals[wall] @ normal < 0.9
+        ]
+        if number in walls:
+            edge = 2 * table.extents[number]  # there it reflects 17 dB less than in its middle
+            sides += _sides(table.middles[number] - edge, table.middles[number] + edge)
+            corners = _wall_corners(table, number, (lower + upper) / 2, diagonal)
+        else:
+            corners = _furniture_corners(table, number, traced, tolerance)
+        for side in sides:
+            corners = _cut(corners, side)
+        if len(corners):
+            drawn.append(LearntPlane(number, corners, normal, share))
+    return drawn
+
+
+def _wall_corners(
+    table: PlaneTable, number: int, centre: Float[ndarray, "3"], diagonal: np.floating
+) -> Float[ndarray, "4 3"]:
+    """A square on a wall, twice as wide as the room's diagonal on either side of its centre."""
+    normal = table.normals[number]
+    middle = centre - (centre @ normal - table.offsets[number]) * normal
+    return _rectangle(middle, normal, np.full(2, -2 * diagonal), np.full(2, 2 * diagonal))
+
+
+def _furniture_corners(
+    table: PlaneTable, number: int, traced: TracedPaths, tolerance: np.floating
+) -> Float[ndarray, "4 3"]:
+    """The rectangle around a plane's bounces, weak ones of its paths left out."""
+    shares = traced.shares
+    link, path, step = np.nonzero((traced.sequences == number) & (shares > 0)[..., None])
+    share = shares[link, path]
+    points = traced.bounces[link, path, step][share >= 0.01 * share.max()]
+    normal = table.normals[number]
+    middle = table.offsets[number] * normal
+    flat = (points - middle) @ _basis(normal)
+    return _rectangle(middle, normal, flat.min(0) - tolerance, flat.max(0) + tolerance)
+
+
+def _basis(normal: Float[ndarray, "3"]) -> Float[ndarray, "3 2"]:
+    """Two unit vectors of a plane, right-handed with its normal; the first is level."""
+    level = np.cross((0.0, 0.0, 1.0), normal)
+    length = np.linalg.norm(level)
+    level = level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
+    return np.stack((level, np.cross(normal, level)), 1)
+
+
+def _rectangle(
+    middle: Float[ndarray, "3"],
+    normal: Float[ndarray, "3"],
+    low: Float[ndarray, "2"],
+    high: Float[ndarray, "2"],
+) -> Float[ndarray, "4 3"]:
+    """Corners on a plane between bounds from its middle, counterclockwise against the normal."""
+    flat = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
+    return middle + flat @ _basis(normal).T
+
+
+def _sides(lower: Float[ndarray, "3"], upper: Float[ndarray, "3"]) -> list[HalfSpace]:
+    """The six sides of a box [m]."""
+    axes = np.eye(3)
+    above = [HalfSpace(axis, offset) for axis, offset in zip(axes, upper, strict=True)]
+    below = [HalfSpace(-axis, -offset) for axis, offset in zip(axes, lower, strict=True)]
+    return above + below
+
+
+def _cut(corners: Float[ndarray, "c 3"], side: HalfSpace) -> Float[ndarray, "k 3"]:
+    """The part of a convex polygon in a half-space.
+
+    Source: Sutherland and Hodgman, Reentrant polygon clipping, 1974.
+    """
+    heights = corners @ side.normal - side.offset
+    remaining = []
+    for k in range(len(corners)):
+        here, there = corners[k - 1], corners[k]
+        above, below = heights[k - 1], heights[k]
+        if (above > 0) != (below > 0):  # the edge crosses the side
+            remaining.append(here + above / (above - below) * (there - here))
+        if below <= 0:
+            remaining.append(there)
+    return np.array(remaining).reshape(-1, 3)

@@ -1,38 +1,48 @@
-"""Search for planes in received levels: interference with known paths, one plane after the other."""
+"""Search for planes in received levels: interference with known paths, one plane at a time."""
 
 import itertools
 import logging
 import math
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
 from scipy.constants import speed_of_light
 from torch import Tensor
 
+from gaigs.core import stages
 from gaigs.core.geometry import sinc
 from gaigs.core.query import Query
-from gaigs.core.stages import is_up, track
 from gaigs.data import Links
-from gaigs.planes.lag_search import LagSearch, ReceiverLags, reflection
+from gaigs.planes.lag_score import LagOptions, LinkPaths
+from gaigs.planes.lag_search import frame_of, group_links, list_bandwidths
+from gaigs.planes.lags import ArrayPaths, FurtherWave, ReceiverLags, reflection
+from gaigs.planes.periodogram import TilePeak
+from gaigs.planes.search import Score
 from gaigs.splatting.placement.mirrored.paths import Mirrored
-from gaigs.splatting.placement.mirrored.reflections import seen_from, square_normals
+from gaigs.splatting.placement.mirrored.reflections import square_normals
 
 log = logging.getLogger(__name__)
 
-SCALE = 3.0
-"""Error of a level beyond which it hardly counts [dB]."""
 
-CLEAR = 3.0
-"""Least fall of the errors by a plane whose phases count [standard errors]."""
+@dataclass(frozen=True)
+class LevelOptions:
+    """Options of the search for planes in received levels.
 
-CHANCE, SHUFFLES = 1.1, 4
-"""Least ratio of this fall to the largest one by chance, and how often that is tried: with errors
-that have changed their links. Of few links some plane always explains much."""
+    Attributes:
+        clear: Least fall of the errors by a plane whose phases count [standard errors].
+        chance: Least ratio of this fall to the largest one by chance: of few links some plane
+            always explains much.
+        shuffles: How often chance is tried: with errors that have changed their links.
+        maxima: Maxima of the periodograms whose errors are compared.
+    """
 
-TRIED = 4
-"""Maxima of the periodograms whose errors are compared."""
+    clear: float = 3.0
+    chance: float = 1.1
+    shuffles: int = 4
+    maxima: int = 4
 
 
 @dataclass(frozen=True)
@@ -45,20 +55,141 @@ class ReceiverLevels(ReceiverLags):
         return 10 * self.lags[:, 0].real.log10()
 
     def errors(self, lags: Complex[Tensor, "b 1"]) -> Float[Tensor, " b"]:
-        """Log of 1 + the squared error of each level over ``SCALE``; the receiver's gain does not
-        count.
-        """
+        """Log of 1 + the squared error of each level; the receiver's gain drops out."""
+        scale = 3.0  # [dB]; larger errors hardly count
         errors = 10 * lags[:, 0].real.clamp_min(1e-12).log10() - self.levels
-        return ((errors - errors.detach().median()) / SCALE).square().log1p()
+        return ((errors - errors.detach().median()) / scale).square().log1p()
 
 
-class LevelSearch(LagSearch):
+class LevelRoom(NamedTuple):
+    """Planes of the room, and what a model knows of them from powers.
+
+    Attributes:
+        planes: Normals and offsets (w, 4) [m].
+        located: True for planes whose paths interfere (w,).
+        passing: Share of the direct path's field, and of the field at each plane, that obstacles
+            let through at each link (b, w + 1).
+        gain: Fall of the errors by the plane located last [standard errors].
+        number: Of this plane.
+        bandwidth: Over which powers were averaged [Hz].
+    """
+
+    planes: Float[Tensor, "w 4"]
+    located: Bool[Tensor, " w"]
+    passing: Float[Tensor, "b v"]
+    gain: float = 0.0
+    number: int = 0
+    bandwidth: float = 0.0
+
+
+class LevelScore(Score[LevelRoom]):
+    """Planes by levels: only paths at located planes interfere, the others add as powers.
+
+    A wrong phase would be worse than an unknown one. The error is the negative gain of the plane
+    located last.
+    """
+
+    def __init__(self, paths: LinkPaths, options: LevelOptions):
+        self.paths = paths
+        self.options = options
+
+    def error(self, room: LevelRoom) -> float:
+        return -room.gain
+
+    def move(self, room: LevelRoom, number: int) -> LevelRoom:
+        """The room with a plane where errors fall most clearly if its phases count."""
+        sequences = self.paths.sequences(room.planes)
+        phased = is_phased(sequences, room.located)
+        waves = []
+        before = []
+        for receiver, passing in self.paths.split(room.passing):
+            paths = receiver.paths(room.planes, sequences, passing)
+            before.append(self.add_powers(paths, phased))
+            # The wave of one more path beside those that interfere, as far as the plane's paths
+            # pass.
+            slopes = receiver.slopes(before[-1])[:, 0]
+            known = phased & ~(sequences == number).any(1)
+            weights = slopes * paths.fields * known * passing[:, number + 1, None]
+            waves.append(FurtherWave(weights[..., None], paths.lengths))
+        located = room.located.index_fill(0, torch.tensor(number), True)
+        best = room._replace(gain=0.0, number=number, bandwidth=self.paths.bandwidth)
+        for peak in self._find_peaks(room.planes, waves, number)[: self.options.maxima]:
+            parts = (room.planes[:number], peak.plane[None], room.planes[number + 1 :])
+            trial = best._replace(planes=torch.cat(parts), located=located)
+            trial = trial._replace(gain=self._measure_gain(trial, before, sequences))
+            best = min(best, trial, key=self.error)
+        return best
+
+    def _find_peaks(
+        self, planes: Float[Tensor, "w 4"], waves: list[FurtherWave], number: int
+    ) -> list[TilePeak]:
+        """Maxima of the periodograms about normals near a plane's, highest first."""
+        peaks = []
+        for normal in square_normals(planes[:, :3], number):
+            peaks += self.paths.periodogram.find_peaks(
+                waves, self.paths.bandwidth, normal, planes[number]
+            )
+        return sorted(peaks, key=lambda peak: -peak.height)
+
+    def _measure_gain(
+        self,
+        room: LevelRoom,
+        before: list[Complex[Tensor, "b 1"]],
+        sequences: Int[Tensor, "n order"],
+    ) -> float:
+        """Mean fall of the errors against powers ``before``, over its standard error."""
+        phased = is_phased(sequences, room.located)
+        gains = []
+        for (receiver, passing), old in zip(self.paths.split(room.passing), before, strict=True):
+            new = self.add_powers(receiver.paths(room.planes, sequences, passing), phased)
+            # Half of the interference: errors then follow its phase more than its strength, which
+            # is uncertain.
+            gains.append(receiver.errors(old) - receiver.errors((old + new) / 2))
+        deviation, mean = torch.std_mean(torch.cat(gains))
+        return mean.item() / max(deviation.item(), 1e-12) * math.sqrt(len(room.passing))
+
+    def add_powers(self, paths: ArrayPaths, phased: Bool[Tensor, " n"]) -> Complex[Tensor, "b 1"]:
+        """Powers of paths, of which some interfere."""
+        waves = paths.fields[:, phased]
+        lengths = paths.lengths[:, phased]
+        gaps = lengths[:, :, None] - lengths[:, None]  # (b, n, n)
+        likeness = sinc(self.paths.bandwidth / speed_of_light * gaps)
+        interfering = ((likeness * waves[:, None]).sum(2) * waves.conj()).sum(1)
+        powers = (paths.fields[:, ~phased].abs().square()).sum(1) + interfering
+        return powers[:, None]
+
+    def measure_chance(self, room: LevelRoom, numbers: list[int], enough: float) -> float:
+        """Largest gain of some planes where the errors of each receiver's links are shuffled.
+
+        The first gain above ``enough`` ends the trials; if the time is up, it is infinite.
+        """
+        sequences = self.paths.sequences(room.planes)
+        phased = is_phased(sequences, room.located)
+        generator = torch.Generator().manual_seed(0)
+        largest = 0.0
+        for _ in stages.track(range(self.options.shuffles), "search of planes"):
+            shuffled = []
+            for receiver, passing in self.paths.split(room.passing):
+                paths = receiver.paths(room.planes, sequences, passing)
+                powers = self.add_powers(paths, phased)
+                errors = receiver.lags / powers.real.clamp_min(1e-12)
+                errors = errors[torch.randperm(len(errors), generator=generator)]
+                shuffled.append(replace(receiver, lags=powers * errors))
+            score = LevelScore(self.paths.with_receivers(shuffled), self.options)
+            for number in numbers:
+                if stages.is_up():
+                    return math.inf
+                largest = max(largest, score.move(room, number).gain)
+                if largest > enough:
+                    return largest
+        return largest
+
+
+class LevelSearch:
     """Planes whose reflections interfere in received levels.
 
     A level is one number, so phases say nothing before a model knows from powers what obstacles let
-    through. Then planes are located one after the other, the clearest first, by the periodogram of
-    ``LagSearch``. Only paths at located planes interfere; the others add as powers, because a wrong
-    phase would be worse than none.
+    through. Then planes are located one after the other, the clearest first (``LevelScore``).
 
     Args:
         links: Their training links count; of the task ``rssi``. Readings at one place count as one.
@@ -66,8 +197,9 @@ class LevelSearch(LagSearch):
         trend: Levels on which the paths' powers stand [dB].
         planes: Normals and offsets at the start (w, 4) [m]. Each is searched near its start.
         numbers: Of these planes in the placement.
-        order: As of ``LagSearch``.
+        order: Largest number of reflections of a path; more than 2 count as 2.
         most: Links that count, of all receivers together.
+        options: Of the search.
 
     Source: ours.
     """
@@ -81,160 +213,118 @@ class LevelSearch(LagSearch):
         numbers: list[int],
         order: int,
         most: int = 1500,
+        options: LevelOptions | None = None,
     ):
-        self.order, self.numbers, self.known = min(order, 2), numbers, links.scene.bandwidth
+        self.options = options or LevelOptions()
+        self.lag_options = LagOptions()
+        self.numbers = numbers
+        self.known_bandwidth = links.scene.bandwidth
         self.queries: list[Query] = []
-        for own, carrier, pose, receiver in self.parts(links, frequencies, most):
-            places, which = links.query.transmitters[own].unique(dim=0, return_inverse=True)
-            values = (links.labels - trend)[own]
-            levels = values.new_zeros(len(places)).index_add(0, which, values) / which.bincount()
+        self.frame = frame_of(links)
+        self.wavelength = speed_of_light / frequencies.max().item()
+        receivers: list[ReceiverLags] = []
+        values = links.labels - trend
+        for group in group_links(links, frequencies, self.frame, most, self.lag_options.pairs):
+            rows = group.rows
+            transmitters = links.query.transmitters[rows]
+            places, which = transmitters.unique(dim=0, return_inverse=True)
+            # The mean of the readings at a place.
+            sums = values.new_zeros(len(places)).index_add(0, which, values[rows])
+            levels = sums / which.bincount()
             powers = 10 ** ((levels - levels.median()) / 10)
-            point = replace(receiver.array, elements=receiver.array.elements.new_zeros(1, 3))
+            array = group.receiver.array
+            point = replace(array, elements=array.elements.new_zeros(1, 3))
             lags = powers[:, None].to(torch.complex64)
-            self.receivers.append(ReceiverLevels(places - self.middle, lags, carrier, pose, point))
-            first = own.new_zeros(len(places)).index_copy(0, which.flip(0), own.flip(0))
+            places = places - self.frame.middle
+            receivers.append(ReceiverLevels(places, lags, group.carrier, group.pose, point))
+            # The last write counts: flipped, the first link of each place.
+            first = rows.new_zeros(len(places)).index_copy(0, which.flip(0), rows.flip(0))
             self.queries.append(links.query[first])
-        self.start = seen_from(planes.double(), self.middle).float()
+        self.paths = LinkPaths(
+            self.frame, receivers, self.wavelength, order, self.lag_options.faint
+        )
+        self.score = LevelScore(self.paths, self.options)
+        self.start = self.frame.from_world(planes).float()
 
     @torch.no_grad()
     def locate(self, placement: Mirrored) -> list[int]:
-        """Puts planes where they are clear, and lets paths at them interfere; the result are their
-        numbers.
+        """Puts planes where they are clear, and lets paths at them interfere.
+
+        Returns:
+            Numbers of these planes in the placement.
         """
-        found: list[int] = []
+        numbers: list[int] = []
         least = 0.0
-        while left := [k for k, number in enumerate(self.numbers) if not placement.located[number]]:
-            located = placement.located[self.numbers].cpu()
-            own = seen_from(placement.planes[self.numbers].cpu(), self.middle).float()
-            planes = torch.where(located[:, None], own, self.start)
-            passing = self.passing(placement, planes)
-            is_unknown = self.known is None and not located.any()
-            learnt = (
-                0.0 if placement.log_bandwidth is None else placement.log_bandwidth.exp().item()
-            )
-            bandwidths = self.bandwidths(None if is_unknown else learnt)
-            trials = []
-            for self.bandwidth, k in track(
-                [*itertools.product(bandwidths, left)], "search of planes"
-            ):
-                if is_up():
-                    return found
-                trials.append((*self.clearest(planes, passing, located, k), self.bandwidth, k))
-            gain, plane, self.bandwidth, k = max(trials, key=lambda trial: trial[0])
-            if gain >= CLEAR and not least:
-                least = CHANCE * self.by_chance(planes, passing, located, left, gain / CHANCE)
-            if gain < max(CLEAR, least):
-                break
+        while True:
+            waiting = [k for k, number in enumerate(self.numbers) if not placement.located[number]]
+            if not waiting:
+                return numbers
+            room = self.room_of(placement)
+            is_unknown = self.known_bandwidth is None and not room.located.any()
+            bandwidths = list_bandwidths(None, self.frame, self.lag_options)
+            if not is_unknown:
+                learnt = placement.log_bandwidth
+                bandwidths = [0.0 if learnt is None else learnt.exp().item()]
+            best = self.locate_one(room, waiting, bandwidths)
+            if best is None:
+                return numbers
+            if best.gain >= self.options.clear and not least:
+                chance = self.options.chance
+                least = chance * self.score.measure_chance(room, waiting, best.gain / chance)
+            if best.gain < max(self.options.clear, least):
+                return numbers
             if is_unknown:
-                placement.log_bandwidth.fill_(math.log(self.bandwidth))
-            placement.place(self.numbers[k], seen_from(plane.double(), -self.middle))
-            placement.locate(self.numbers[k])
-            found.append(self.numbers[k])
-            log.info("%s, by %.1f standard errors", self.words(plane), gain)
-        return found
+                placement.log_bandwidth.fill_(math.log(best.bandwidth))
+            number = self.numbers[best.number]
+            plane = best.planes[best.number]
+            placement.place(number, self.frame.to_world(plane.double()))
+            placement.locate(number)
+            numbers.append(number)
+            log.info("%s, by %.1f standard errors", self.frame.describe(plane), best.gain)
+
+    def locate_one(
+        self, room: LevelRoom, numbers: list[int], bandwidths: list[float]
+    ) -> LevelRoom | None:
+        """The room with the clearest of some planes; None if the time is up.
+
+        ``bandwidth`` of the paths is the best one from then on.
+        """
+        trials = []
+        pairs = [*itertools.product(bandwidths, numbers)]
+        for self.paths.bandwidth, number in stages.track(pairs, "search of planes"):
+            if stages.is_up():
+                return None
+            trials.append(self.score.move(room, number))
+        best = min(trials, key=self.score.error)
+        self.paths.bandwidth = best.bandwidth
+        return best
+
+    def room_of(self, placement: Mirrored) -> LevelRoom:
+        """The room of a placement: located planes, and the others at their start."""
+        located = placement.located[self.numbers].cpu()
+        placed = self.frame.from_world(placement.planes[self.numbers].cpu()).float()
+        planes = torch.where(located[:, None], placed, self.start)
+        return LevelRoom(planes, located, self.passing(placement, planes))
 
     def passing(self, placement: Mirrored, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b v"]:
-        """Field of the direct path and of that at each plane in a model, over what this search
-        expects; at most 1.
+        """A model's fields of the direct path and at each plane, over those that planes alone give.
 
-        Near Brewster's angle the search expects next to nothing, which another plane would
+        At most 1: near Brewster's angle planes reflect next to nothing, which another plane would
         multiply.
         """
+        columns = [0, *(number + 1 for number in self.numbers)]
         parts = []
-        for receiver, query in zip(self.receivers, self.queries, strict=True):
-            expected = reflection(planes[:, :3], receiver.single(planes)[3].abs()).abs()
+        for receiver, query in zip(self.paths.receivers, self.queries, strict=True):
+            cosines = receiver.reflect_once(planes).cosines.abs()
+            expected = reflection(planes[:, :3], cosines).abs()
             expected = torch.cat((torch.ones_like(expected[:, :1]), expected), 1)
-            own = placement.passing(query.to(placement.origin.device)).cpu().float()
-            own = own[:, [0, *(number + 1 for number in self.numbers)]]
-            parts.append(torch.where(own > 0, own / expected.clamp_min(1e-6), 1).clamp_max(1))
+            fields = placement.passing(query.to(placement.origin.device)).cpu().float()[:, columns]
+            shares = torch.where(fields > 0, fields / expected.clamp_min(1e-6), 1)
+            parts.append(shares.clamp_max(1))
         return torch.cat(parts)
 
-    def by_chance(
-        self,
-        planes: Float[Tensor, "w 4"],
-        passing: Float[Tensor, "b v"],
-        located: Bool[Tensor, " w"],
-        left: list[int],
-        enough: float,
-    ) -> float:
-        """Largest gain of ``clearest`` where the errors of each receiver's links are shuffled.
 
-        The first gain above ``enough`` ends the trials; if the time is up, it is infinite.
-        """
-        real, sequences, largest = self.receivers, self.sequences(planes), 0.0
-        generator = torch.Generator().manual_seed(0)
-        for _ in track(range(SHUFFLES), "search of planes"):
-            shuffled = []
-            for receiver, own in self.each(passing):
-                powers = self.received(
-                    receiver.paths(planes, sequences, own), self.phased(sequences, located)
-                )
-                errors = receiver.lags / powers.real.clamp_min(1e-12)
-                errors = errors[torch.randperm(len(errors), generator=generator)]
-                shuffled.append(replace(receiver, lags=powers * errors))
-            for k in left:
-                if is_up():
-                    return math.inf
-                self.receivers = shuffled
-                largest = max(largest, self.clearest(planes, passing, located, k)[0])
-                self.receivers = real
-                if largest > enough:
-                    return largest
-        return largest
-
-    def clearest(
-        self,
-        planes: Float[Tensor, "w 4"],
-        passing: Float[Tensor, "b v"],
-        located: Bool[Tensor, " w"],
-        k: int,
-    ) -> tuple[float, Float[Tensor, "4"]]:
-        """Where plane k makes the errors fall most clearly if its phases count, and by how many
-        standard errors.
-        """
-        sequences = self.sequences(planes)
-        phased = self.phased(sequences, located)
-        known, before, waves = phased & ~(sequences == k).any(1), [], []
-        for receiver, own in self.each(passing):
-            fields, _, lengths = paths = receiver.paths(planes, sequences, own)
-            before.append(self.received(paths, phased))
-            slopes = receiver.slopes(before[-1])[:, 0]
-            waves.append(((slopes * fields * known * own[:, k + 1, None])[..., None], lengths))
-        peaks = [
-            peak
-            for normal in square_normals(planes[:, :3], k)
-            for peak in self.peaks(waves, normal, planes[k])
-        ]
-        peaks.sort(key=lambda peak: -peak.score)
-        phased, found = (
-            self.phased(sequences, located.index_fill(0, torch.tensor(k), True)),
-            [(0.0, planes[k])],
-        )
-        for peak in peaks[:TRIED]:
-            moved, gains = torch.cat((planes[:k], peak.plane[None], planes[k + 1 :])), []
-            for (receiver, own), old in zip(self.each(passing), before, strict=True):
-                new = self.received(receiver.paths(moved, sequences, own), phased)
-                # Half of the interference: errors then follow its phase more than its strength,
-                # which is uncertain.
-                gains.append(receiver.errors(old) - receiver.errors((old + new) / 2))
-            mean, deviation = (part.item() for part in reversed(torch.std_mean(torch.cat(gains))))
-            found.append((mean / max(deviation, 1e-12) * math.sqrt(len(passing)), peak.plane))
-        return max(found, key=lambda trial: trial[0])
-
-    def phased(
-        self, sequences: Int[Tensor, "n order"], located: Bool[Tensor, " w"]
-    ) -> Bool[Tensor, " n"]:
-        """True for paths whose planes are all located."""
-        return torch.cat((located, located.new_ones(1)))[sequences].all(1)  # -1 is the last one
-
-    def received(
-        self, paths: tuple[Tensor, Tensor, Tensor], phased: Bool[Tensor, " n"]
-    ) -> Complex[Tensor, "b 1"]:
-        """Powers of paths, of which some interfere."""
-        fields, _, lengths = paths
-        waves, ways = fields[:, phased], lengths[:, phased]
-        likeness = sinc(self.bandwidth / speed_of_light * (ways[:, :, None] - ways[:, None]))
-        powers = (fields[:, ~phased].abs().square()).sum(1) + (
-            (likeness * waves[:, None]).sum(2) * waves.conj()
-        ).sum(1)
-        return powers[:, None]
+def is_phased(sequences: Int[Tensor, "n order"], located: Bool[Tensor, " w"]) -> Bool[Tensor, " n"]:
+    """True for paths whose planes are all located."""
+    columns = torch.cat((located, located.new_ones(1)))  # number -1, no plane, is the last one
+    return columns[sequences].all(1)

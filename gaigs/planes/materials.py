@@ -1,10 +1,12 @@
-"""Materials of learnt planes: those of ITU-R P.2040 that reflect most alike."""
+"""Materials of ITU-R P.2040 that reflect as learnt planes do."""
 
 import math
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from scipy.constants import epsilon_0, speed_of_light
+from torch import Tensor
 
 from gaigs.core.propagation import slab
 from gaigs.core.query import Query
@@ -23,6 +25,14 @@ class Material(NamedTuple):
     thickness: float
 
 
+class SlabOption(NamedTuple):
+    """A material, its complex relative permittivity, and a thickness for each plane [m]."""
+
+    name: str
+    permittivity: complex
+    thicknesses: Float[Tensor, " w"]
+
+
 @torch.no_grad()
 def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, Material]:
     """Material and thickness of each plane that a query's paths meet, at a carrier [Hz].
@@ -35,38 +45,47 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
 
     Source: ITU-R P.2040-3, table 3; outside 1 to 40 GHz its formulas are extrapolated.
     """
-    sequences, normals = placement.sequences[placement.kept], placement.normals
+    sequences = placement.sequences[placement.kept]
+    normals = placement.normals
     gains = placement.path_gains[placement.kept] - placement.path_gains[0]
-    gains = (gains / (sequences >= 0).sum(1).clamp_min(1)).exp()
+    gains = (gains / (sequences >= 0).sum(1).clamp_min(1)).exp()  # of each bounce
     compared = torch.abs if placement.path_phases is not None else torch.Tensor.clone
-    half_space = torch.full((len(normals),), HALF_SPACE).to(normals)
-    learnt = half_space if placement.log_thicknesses is None else placement.log_thicknesses.exp()
-    permittivities = {
-        name: complex(real, -conductivity(name, frequency) / (2 * math.pi * epsilon_0 * frequency))
-        for name, (real, _, _) in TABULATED.items()
-    }
-    options = [
-        (name, thicknesses) for name in permittivities for thicknesses in (half_space, learnt)
-    ]
-    errors, weights = normals.new_zeros(len(options), len(normals)), normals.new_zeros(len(normals))
+    options = _list_slabs(placement, frequency)
+    errors = normals.new_zeros(len(options), len(normals))
+    weights = normals.new_zeros(len(normals))
     for part in query.parts(64):  # links at a time
         part = part.to(normals.device)
         powers = placement(None, part).gains.abs().square()
         _, _, folded = placement.folded(part)
-        planes, path = folded.planes, folded.path[: len(folded.planes)]
-        wanted = compared(placement.coefficients(part, folded) * gains[path])
+        planes = folded.planes
+        path = folded.path[: len(planes)]
+        learnt = compared(placement.coefficients(part, folded) * gains[path])
         weights.index_add_(0, planes, powers[:, path].sum(0))
-        for option, (name, thicknesses) in enumerate(options):
-            te, tm = slab(
-                permittivities[name],
-                folded.cosines,
-                thicknesses[planes] * (frequency / speed_of_light),
-            )
-            error = (compared(polarised(folded.normals, te, tm)) - wanted).abs().square()
-            errors[option].index_add_(0, planes, (powers[:, path] * error).sum(0))
-    chosen = errors.argmin(0).tolist()
+        for number, option in enumerate(options):
+            depths = option.thicknesses[planes] * (frequency / speed_of_light)
+            te, tm = slab(option.permittivity, folded.cosines, depths)
+            error = (compared(polarised(folded.normals, te, tm)) - learnt).abs().square()
+            errors[number].index_add_(0, planes, (powers[:, path] * error).sum(0))
+    best = [options[number] for number in errors.argmin(0).tolist()]
     met = (weights > 0).nonzero()[:, 0].tolist()
     return {
-        plane: Material(options[chosen[plane]][0], options[chosen[plane]][1][plane].item())
-        for plane in met
+        plane: Material(best[plane].name, best[plane].thicknesses[plane].item()) for plane in met
     }
+
+
+def _list_slabs(placement: Mirrored, frequency: float) -> list[SlabOption]:
+    """Each material as a half-space and with the learnt thicknesses."""
+    half_space = torch.full((len(placement.normals),), HALF_SPACE).to(placement.normals)
+    learnt = half_space
+    if placement.log_thicknesses is not None:
+        learnt = placement.log_thicknesses.exp()
+    options = []
+    for name, (real, _, _) in TABULATED.items():
+        # epsilon = epsilon' - j sigma / (2 pi f epsilon_0)
+        loss = conductivity(name, frequency) / (2 * math.pi * epsilon_0 * frequency)
+        permittivity = complex(real, -loss)
+        options += [
+            SlabOption(name, permittivity, half_space),
+            SlabOption(name, permittivity, learnt),
+        ]
+    return options

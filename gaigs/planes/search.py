@@ -1,165 +1,233 @@
-"""Planes moved by the phases of waves, and planes and paths to drop."""
+"""One search for planes, and the score that a kind of labels brings to it."""
 
-import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
+from torch.nn import functional
 
-from gaigs.core.geometry import FAINTEST, Grid
-from gaigs.core.query import Batch
-from gaigs.core.stages import track
-from gaigs.planes.channel_search import log_share
-from gaigs.planes.lag_search import WIDEST
-from gaigs.splatting.placement.mirrored.paths import Mirrored
-from gaigs.splatting.placement.mirrored.reflections import square_normals
-
-log = logging.getLogger(__name__)
-
-NEGLIGIBLE = 1e-6
-"""Power of a path over the strongest one's below which it is dropped in any case: hundreds would
-take long.
-"""
-
-Loss = Callable[[Batch], float]
-"""Loss of the model as it stands, on a batch."""
+from gaigs.core import stages
+from gaigs.planes.frame import RoomFrame, mean_bounces
+from gaigs.splatting.placement.mirrored.reflections import tangents
 
 
-def thinned(batch: Batch, rows: int) -> Batch:
-    """A batch with about ``rows`` of its labels' rows, and columns in proportion."""
-    labels, directions = batch.labels, batch.directions
-    if isinstance(directions, Grid):
-        every = slice(None, None, max(1, round(directions.shape[0] / rows)))
-        labels, directions = labels[:, every, every], directions.thin(every, every)
-    return Batch(batch.query, directions, labels)
+@runtime_checkable
+class SearchedRoom(Protocol):
+    """Planes in the frame (w, 4), and what a score fits beside them, such as materials."""
+
+    @property
+    def planes(self) -> Float[Tensor, "w 4"]: ...
 
 
-@torch.no_grad()
-def move_planes(model, batch: Batch, wavelength: float, least: float) -> list[float]:
-    """Moves each used plane along its normal, or one that is square to the others, to the least
-    error.
+R = TypeVar("R", bound=SearchedRoom)
 
-    The strongest plane comes first. ``least`` is the least distance searched on either side [m], up
-    to ``WIDEST`` wavelengths. The result are the moves [m]. If a map is drawn, which takes long,
-    planes keep their normals.
+
+class Candidate(NamedTuple):
+    """A plane (4,) that a room may lack, and its rating."""
+
+    plane: Float[Tensor, "4"]
+    rating: float
+
+
+class GridRatings(NamedTuple):
+    """Ratings of a grid of planes (n, k), and a function that rates other planes (c,)."""
+
+    ratings: Float[Tensor, "n k"]
+    rate: Callable[[Float[Tensor, "c 4"]], Float[Tensor, " c"]]
+
+
+class Score(Generic[R]):
+    """How well planes explain labels of one kind: all that ``PlaneSearch`` knows of the labels.
+
+    Labels of a new kind need two classes: rooms, a NamedTuple with ``planes`` and what is fitted
+    beside them, such as materials; and a subclass of this. The subclass implements the methods of
+    the steps that its search takes, and no method changes a room:
+
+    * ``PlaneSearch.sweep`` needs ``move``;
+    * ``PlaneSearch.extend`` needs ``error``, ``rate`` and ``add``;
+    * ``PlaneSearch.prune`` needs ``error``, ``remove`` and ``refine``.
+
+    Planes are rows (unit normal, offset [m]) in the ``RoomFrame``. A search then reads
+
+        search = PlaneSearch(frame, score)
+        room = search.sweep(start, range(len(start.planes)))
+        room = search.grow(room, most, lambda room: search.extend(room, grid))
+        room = search.prune(room, fewest=0)
+
+    ``LagScore`` and ``LagSearch`` are the shortest example.
     """
-    placement: Mirrored = model.placement
-    placement.enable_phases(wavelength)  # adds the steps so far to the planes
-    some, reach = thinned(batch, 12), max(4.0 * wavelength, min(least, WIDEST * wavelength))
-    if least > reach:  # steps cannot be coarser than a fraction of the wavelength
-        log.info(
-            "planes are searched within %.3g m, not %.3g m; placement.walls can start nearer",
-            reach,
-            least,
-        )
-    planes = by_strength(placement, batch)
-    moves = track(planes, "search of planes")
-    return [_move(model, plane, reach, wavelength, some, model.takes_paths) for plane in moves]
+
+    def error(self, room: R) -> float:
+        """What a room leaves unexplained: usually the mean over links of the log of a share.
+
+        The search takes the room with the least error, so a price of each plane belongs to it.
+        """
+        raise NotImplementedError
+
+    def rate(self, room: R, grid: Float[Tensor, "n k 4"]) -> GridRatings:
+        """Ratings of planes by what one more reflection at each explains beside the room.
+
+        Ratings need no unit; 0 stands for nothing. The grid has thousands of planes, k offsets of
+        each of n normals, so its ratings may be rough; a few planes near its maxima are rated again
+        by the function.
+        """
+        raise NotImplementedError
+
+    def add(self, room: R, candidate: Candidate) -> R | None:
+        """The room with one more plane at its best place nearby; None if it explains too little."""
+        raise NotImplementedError
+
+    def move(self, room: R, number: int) -> R:
+        """The room with one plane at its best place nearby, as the others are known now."""
+        raise NotImplementedError
+
+    def remove(self, room: R, number: int) -> R:
+        """The room without one plane."""
+        raise NotImplementedError
+
+    def refine(self, room: R) -> R:
+        """The room after a descent with all planes."""
+        raise NotImplementedError
 
 
-def _move(model, plane: int, reach: float, wavelength: float, batch: Batch, square: bool) -> float:
-    """Moves a plane along its normal, or along one of ``square_normals``, to the least error;
-    returns the move [m].
+class PlaneSearch(Generic[R]):
+    """Steps of a search for planes: candidates, growth, sweeps and pruning.
+
+    Args:
+        frame: Transmitters and receivers.
+        score: What planes explain in the labels.
+
+    Source: Hough, Method and means for recognizing complex patterns, 1962, for the candidates.
     """
-    placement: Mirrored = model.placement
-    origin = placement.origin[plane]
-    step = wavelength / 10  # a reflected path changes by twice of it
-    moves = step * torch.arange(-round(reach / step), round(reach / step) + 1).to(origin)
-    moves = moves[moves.abs().argsort(stable=True)]  # of equal errors the least move
-    tried = []
-    used = placement.used.tolist()
-    for normal in (
-        square_normals(placement.normals[used], used.index(plane))
-        if square
-        else (origin[:3].clone(),)
-    ):
-        origin[:3] = normal
-        errors = _errors_of_moves(model, batch, plane, moves)
-        best = int(errors.argmin())
-        tried.append((errors[best].item(), moves[best].item(), normal))
-    _, move, origin[:3] = min(tried, key=lambda found: found[0])
-    origin[3] += move
-    return move
+
+    def __init__(self, frame: RoomFrame, score: Score[R]):
+        self.frame = frame
+        self.score = score
+
+    def propose(self, room: R, lines: Float[Tensor, "n k 4"]) -> list[Candidate]:
+        """At most three planes apart from the room's: the highest maxima of a grid, sharpened."""
+        rough = self.score.rate(room, lines)
+        grid = lines.flatten(0, 1)  # (n k, 4)
+        ratings = rough.ratings.flatten().clone()
+        for plane in room.planes:
+            ratings[self.frame.is_like(grid, plane)] = 0
+        starts: list[Tensor] = []
+        while len(starts) < 8 and ratings.max() > 0:
+            starts.append(grid[ratings.argmax()])
+            ratings[self.frame.is_like(grid, starts[-1])] = 0
+        if not starts:
+            return []
+        planes = torch.stack(starts)
+        # A random search about each maximum, over half the distance in each round.
+        turn, shift = 0.06, 0.02 * self.frame.diagonal
+        for _ in range(4):
+            noise = torch.randn(len(planes), 24, 4, generator=self.frame.generator).to(planes)
+            noise[:, 0] = 0  # the plane itself
+            normals = planes[:, None, :3] + turn * noise[..., :3]
+            turned = functional.normalize(normals, dim=-1)
+            offsets = planes[:, None, 3:] + shift * noise[..., 3:]
+            near = torch.cat((turned, offsets), 2)  # (starts, 24, 4)
+            highest, at = rough.rate(near.flatten(0, 1)).view(near.shape[:2]).max(1)
+            planes = near[torch.arange(len(planes)), at]
+            turn, shift = turn / 2, shift / 2
+        candidates: list[Candidate] = []
+        for number in highest.argsort(descending=True).tolist():
+            known = [*room.planes, *(candidate.plane for candidate in candidates)]
+            is_known = any(self.frame.is_like(planes[number, None], plane) for plane in known)
+            if len(candidates) < 3 and not is_known:
+                candidates.append(Candidate(planes[number], highest[number].item()))
+        return candidates
+
+    def list_extensions(self, room: R, grid: Float[Tensor, "n k 4"]) -> list[R]:
+        """The room with each candidate that explains enough."""
+        larger = [self.score.add(room, candidate) for candidate in self.propose(room, grid)]
+        return [trial for trial in larger if trial is not None]
+
+    def extend(self, room: R, grid: Float[Tensor, "n k 4"]) -> R | None:
+        """The room with the best candidate; None without one."""
+        return min(self.list_extensions(room, grid), key=self.score.error, default=None)
+
+    def grow(self, room: R, most: int, extend: Callable[[R], R | None]) -> R:
+        """The room with planes one after the other, ``most`` in all.
+
+        ``extend`` gives the room with one more plane, or None to end.
+        """
+        for _ in stages.track(range(most - len(room.planes)), "search of planes"):
+            if stages.is_up():
+                break
+            larger = extend(room)
+            if larger is None:
+                break
+            room = larger
+        return room
+
+    def sweep(
+        self,
+        room: R,
+        numbers: Iterable[int],
+        title: str = "",
+        move: Callable[[R, int], R] | None = None,
+    ) -> R:
+        """The room with each of some planes moved, as the others are known by then."""
+        for number in stages.track(numbers, title):
+            if stages.is_up():
+                break
+            room = (move or self.score.move)(room, number)
+        return room
+
+    def prune(self, room: R, fewest: int) -> R:
+        """The room without planes whose absence lowers the error, worst first.
+
+        The first ``fewest`` planes stay.
+        """
+        while len(room.planes) > fewest and not stages.is_up():
+            smaller = [
+                self.score.remove(room, number) for number in range(fewest, len(room.planes))
+            ]
+            best = min(smaller, key=self.score.error)
+            if self.score.error(best) > self.score.error(room):
+                break
+            room = self.score.refine(best)
+        return room
 
 
-def _errors_of_moves(
-    model, batch: Batch, plane: int, moves: Float[Tensor, " m"]
-) -> Float[Tensor, " m"]:
-    """Mean absolute error, of channels log share, with a plane moved along its normal [m] and
-    strengths held.
+@torch.enable_grad()
+def descend(
+    loss: Callable[..., Tensor],
+    receivers: list,
+    planes: Float[Tensor, "w 4"],
+    others: list[Tensor],
+    steps: int,
+    rate: float,
+) -> list[Tensor]:
+    """Adam on planes, which turn about their ``mean_bounces``, and on other arguments of a loss.
+
+    ``rate`` is the first step of a plane [m]; steps fall to 3 % of it.
     """
-    placement, query, labels, count = model.placement, batch.query, batch.labels, len(batch.query)
-    errors = []
-    with placement.holding():
-        model.excite(query)
-        held = placement.held
-        numbers = max(1000, labels[0].numel())
-        for some in moves.split(max(1, 2_000_000 // (count * numbers))):
-            rows = torch.arange(count, device=moves.device).repeat(len(some))
-            placement.held, placement.tried = held[rows], placement.offsets.repeat(len(rows), 1)
-            placement.tried[:, plane] += some.repeat_interleave(count)
-            moved = Batch(query[rows], batch.directions)
-            value = model.respond(
-                model.excite(moved.query), torch.arange(len(rows), device=rows.device), moved
-            ).value
-            label = model.scene.task.align(labels[rows], value)
-            error, label = (part.reshape(len(rows), -1) for part in (value - label, label))
-            if (
-                error.is_complex()
-            ):  # a loud channel must not rule, and a weak one has no squares in float32
-                largest = label.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
-                apart = log_share(error / largest, label / largest)
-            else:
-                apart = error.abs().mean(1)
-            errors.append(apart.view(len(some), count).mean(1))
-    return torch.cat(errors)
+    if not len(planes):
+        return [planes, *others]
+    pivots = mean_bounces(receivers, planes)
+    heights = planes[:, 3] - (planes[:, :3] * pivots).sum(1)
+    axes = torch.stack([torch.stack(tangents(normal)) for normal in planes[:, :3]])  # (w, 2, 3)
+    shifts = (0 * planes[:, :3]).clone().requires_grad_()  # one along the normal, two turns
+    others = [part.clone().requires_grad_() for part in others]
 
+    def moved() -> Float[Tensor, "w 4"]:
+        # Lengths change by about twice a shift [m], and by some metres times a turn [rad].
+        turns = 0.4 * (shifts[:, 1:, None] * axes).sum(1)  # (w, 3)
+        normals = functional.normalize(planes[:, :3] + turns, dim=1)
+        offsets = (normals * pivots).sum(1) + heights + shifts[:, 0]
+        return torch.cat((normals, offsets[:, None]), 1)
 
-def prune(placement: Mirrored, batches: list[Batch], loss: Loss) -> str:
-    """Drops planes, then paths, that hardly lower any batch's loss, weakest first; returns a
-    sentence for the log.
-    """
-    planes, paths = len(placement.used), int(placement.kept.sum())
-    before = [loss(batch) for batch in batches]
-
-    def is_good(kept: Bool[Tensor, " n"]) -> bool:
-        placement.kept.copy_(kept)
-        return all(
-            loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True)
-        )
-
-    best = placement.kept.clone()
-    shares = torch.stack([_shares(placement, batch) for batch in batches]).amax(0)
-    best[best.nonzero()[:, 0][shares < NEGLIGIBLE * shares.max()]] = False
-    for plane in reversed(by_strength(placement, batches[0])):
-        without = best & ~(placement.sequences == plane).any(1)
-        best = without if is_good(without) else best
-    placement.kept.copy_(best)
-    weakest = best.nonzero()[:, 0][_shares(placement, batches[0]).argsort()]
-    low, high = 0, len(weakest) - 1
-    while low < high:  # the largest number of them that may go, by bisection
-        middle = (low + high + 1) // 2
-        without = best.index_fill(0, weakest[:middle], False)
-        low, high = (middle, high) if is_good(without) else (low, middle - 1)
-    placement.kept.copy_(best.index_fill(0, weakest[:low], False))
-    return (
-        f"{planes - len(placement.used)} of {planes} planes and {paths - int(placement.kept.sum())} of {paths} "
-        f"paths dropped; loss {before[0]:.4f} -> {loss(batches[0]):.4f}"
-    )
-
-
-def by_strength(placement: Mirrored, batch: Batch) -> list[int]:
-    """Used planes, strongest received power first."""
-    shares, sequences = _shares(placement, batch), placement.sequences[placement.kept]
-    return sorted(
-        placement.used.tolist(), key=lambda plane: -shares[(sequences == plane).any(1)].sum().item()
-    )
-
-
-def _shares(placement: Mirrored, batch: Batch) -> Float[Tensor, " n"]:
-    """Mean share of each kept path in a link's received power; 0 for a link without power."""
-    query, _ = batch.query.unique(with_receivers=True)
-    powers = placement(None, query).gains.abs().square()
-    total = powers.sum(1, keepdim=True)
-    return (powers / torch.where(total > 0, total, 1)).mean(0)
+    optimizer = torch.optim.Adam([{"params": [shifts]}, {"params": others}])
+    for step in stages.track(range(steps)):
+        if stages.is_up():
+            break
+        for group, highest in zip(optimizer.param_groups, (rate, 2e-2), strict=True):
+            group["lr"] = highest * 0.03 ** (step / steps)
+        optimizer.zero_grad()
+        loss(moved(), *others).backward()
+        optimizer.step()
+    return [part.detach() for part in (moved(), *others)]

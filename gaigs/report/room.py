@@ -15,7 +15,8 @@ from matplotlib.patheffects import Normal, Stroke
 from numpy import ndarray
 
 from gaigs.data import Links
-from gaigs.planes.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
+from gaigs.planes.learnt_room import LearntPlane, LearntRoom, Matter
+from gaigs.planes.room_paths import LearntPath
 from gaigs.report.style import BLUE, GREEN, ORANGE, STYLE
 from gaigs.splatting.gaussians import SH_DC, Gaussians
 

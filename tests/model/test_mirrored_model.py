@@ -21,7 +21,7 @@ from gaigs.data.synthetic.image_source import permittivity
 from gaigs.model.friis import Friis
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.planes import search
+from gaigs.planes import revision
 from gaigs.testing import check_model, example_links
 
 CARRIER, BANDWIDTH = 6.4896e9, 499.2e6
@@ -320,7 +320,7 @@ def test_phases_come_with_planes_that_move():
     batch = replace(batch, labels=model(batch).value)
     placement.origin[2, 3] += 0.02
     wrong = loss(batch)
-    (moved,) = search.move_planes(model, batch, speed_of_light / CARRIER, 0.0)
+    (moved,) = revision.move_planes(model, batch, speed_of_light / CARRIER, 0.0)
     assert abs(moved + 0.02) < speed_of_light / CARRIER / 10
     assert loss(batch) < 0.2 * wrong
     assert model.revise(4, batch, batch, loss).endswith(f"-> {loss(batch):.4f}")
@@ -336,7 +336,7 @@ def test_tilted_plane_is_turned_square_to_the_others():
         planes[0, :3] + torch.tensor([0.0, 0.06, 0.04]), dim=0
     )
     planes[0, 3] += 0.05
-    search.move_planes(model, batch, wavelength, 0.0)
+    revision.move_planes(model, batch, wavelength, 0.0)
     torch.testing.assert_close(planes, right, rtol=0, atol=wavelength / 20)
 
 
@@ -355,17 +355,19 @@ def test_plane_of_channels_moves_to_its_phases(phase):
     model.placement.receiver_gains.fill_(math.log(1e-21))
     right = model.placement.origin.clone()
     model.placement.origin[2, 3] += 0.02
-    search.move_planes(model, links.batch(torch.arange(24)), speed_of_light / CARRIER, 0.0)
+    revision.move_planes(model, links.batch(torch.arange(24)), speed_of_light / CARRIER, 0.0)
     torch.testing.assert_close(model.placement.origin, right, rtol=0, atol=0.006)
 
 
 def test_a_search_by_phases_is_bounded_in_a_large_room(monkeypatch, caplog):
     links = room_spectra("band", 6)
     model, reaches = build(links), []
-    monkeypatch.setattr(search, "_move", lambda *arguments: reaches.append(arguments[2]) or 0.0)
+    monkeypatch.setattr(
+        revision, "move_plane", lambda *arguments: reaches.append(arguments[2]) or 0.0
+    )
     caplog.set_level("INFO")
     for least in (0.2, 1000.0):
-        search.move_planes(model, links.batch(torch.arange(4)), 0.06, least)
+        revision.move_planes(model, links.batch(torch.arange(4)), 0.06, least)
     assert {*reaches} == {4 * 0.06, 50 * 0.06}
     assert "planes are searched within 3 m, not 1e+03 m" in caplog.text
 

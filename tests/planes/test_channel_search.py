@@ -9,20 +9,29 @@ import torch
 from scipy.constants import speed_of_light
 from scipy.optimize import nnls
 
+from gaigs.core import stages
 from gaigs.core.antenna import Array, Receiver
 from gaigs.core.geometry import Pose
 from gaigs.core.query import Query
 from gaigs.core.task.csi import Csi
 from gaigs.data import Links, Split
-from gaigs.planes import channel_search
-from gaigs.planes.channel_search import ChannelSearch, project, real_residual
+from gaigs.planes.channel_links import (
+    SLABS,
+    ChannelOptions,
+    ReceiverChannels,
+    SlabRoom,
+    half_spaces,
+)
+from gaigs.planes.channel_search import ChannelSearch
+from gaigs.planes.common_gains import CommonGains
+from gaigs.planes.strengths import fit_free, real_residual
 from gaigs.splatting.placement.mirrored.reflections import seen_from
 
 FREQUENCIES = 5.5e9 + np.linspace(-2.5e8, 2.5e8, 16)
 PLANES = np.array([[1.0, 0, 0, -0.4], [0.6, -0.78, 0.18, -3.5]])
 """Normals and offsets [m]; the second one is not upright to any axis."""
 PLANES /= np.linalg.norm(PLANES[:, :3], axis=1, keepdims=True)
-SLABS = ((3.0 - 0.3j, 1.0), (5.0 - 0.4j, 1.0))
+MATERIALS = ((3.0 - 0.3j, 1.0), (5.0 - 0.4j, 1.0))
 """Relative permittivities and thicknesses [m]."""
 
 
@@ -43,7 +52,7 @@ def channels(places, elements, planes):
     waves = lambda points: np.exp(-2j * np.pi * FREQUENCIES / speed_of_light * points) / points
     apart = lambda points: np.linalg.norm(points[:, None] - elements, axis=-1)[..., None]
     found = waves(apart(places))
-    for (*normal, offset), slab in zip(planes, SLABS, strict=False):
+    for (*normal, offset), slab in zip(planes, MATERIALS, strict=False):
         images = places - 2 * (places @ normal - offset)[:, None] * normal
         ways = images - elements.mean(0)
         cosines = np.abs(ways @ normal) / np.linalg.norm(ways, axis=1)
@@ -81,9 +90,10 @@ def room(moved=0.0, receivers=1, count=60, walls=PLANES):
     return links, torch.from_numpy(walls)
 
 
-def search(links, sign=-1, common=True):
+def search(links, sign=-1, common=True, options=None, start=(), order=1, most=2):
     torch.manual_seed(0)
-    return ChannelSearch(links, sign, common, order=1, most=2, start=torch.zeros(0, 4))
+    start = torch.as_tensor(start).reshape(-1, 4)
+    return ChannelSearch(links, sign, common, order, most, start, options)
 
 
 def turned(labels):
@@ -132,18 +142,17 @@ def test_planes_are_found(case):
 def test_a_search_whose_time_is_up_gives_the_planes_that_it_has(monkeypatch):
     links, _ = room()
     own, calls = search(links), []
-    one_more = own.with_one_more
-    monkeypatch.setattr(own, "with_one_more", lambda *parts: calls.append(0) or one_more(*parts))
-    monkeypatch.setattr(channel_search, "is_up", lambda: bool(calls))
+    rate = own.free.rate
+    monkeypatch.setattr(own.free, "rate", lambda *parts: calls.append(0) or rate(*parts))
+    monkeypatch.setattr(stages, "is_up", lambda: bool(calls))
     planes, slabs = own.run()
     assert len(calls) == len(planes) == len(slabs) == 1
 
 
-def test_no_plane_is_found_in_free_space(monkeypatch):
-    monkeypatch.setattr(channel_search, "LEAST", 1e-6)
-    monkeypatch.setattr(channel_search, "FAINTEST", 1e-6)
+def test_no_plane_is_found_in_free_space():
+    options = ChannelOptions(certain_share=1e-6, faint_share=1e-6)
     links, _ = room(walls=PLANES[:0])
-    planes, slabs = search(links).run()
+    planes, slabs = search(links, options=options).run()
     assert len(planes) == len(slabs) == 0
 
 
@@ -161,14 +170,14 @@ def test_no_plane_is_found_in_noise(count):
 def test_false_plane_is_dropped(monkeypatch):
     links, walls = room(walls=PLANES[1:])
     misled, found = search(links), []
-    false = seen_from(torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double(), misled.middle)
-    true = seen_from(walls, misled.middle)
+    false = seen_from(torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double(), misled.frame.middle)
+    true = seen_from(walls, misled.frame.middle)
 
     def find(known):
         found.append(known)
         return torch.cat((known, true[len(known) :], false[len(found) - 1 :]))
 
-    monkeypatch.setattr(misled, "find", find)
+    monkeypatch.setattr(misled, "find_free", find)
     planes, _ = misled.run()
     torch.testing.assert_close(planes, walls, rtol=0, atol=0.01)
     torch.testing.assert_close(found[1], true, rtol=0, atol=0.05)
@@ -179,24 +188,24 @@ def test_a_plane_that_a_false_one_moved_returns(monkeypatch):
     """By half a wavelength, to another lobe of its phases."""
     links, walls = room(walls=PLANES[1:])
     own = search(links)
-    true, resolve = seen_from(walls, own.middle), own.resolve
+    true, resolve = seen_from(walls, own.frame.middle), own.resolve
     found = torch.cat((true, torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double()))
 
     def resolved(planes):
         planes, slabs = resolve(planes)
-        return planes + torch.tensor([0, 0, 0, own.wavelength / 2 * (len(planes) > 1)]), slabs
+        lobe = torch.tensor([0, 0, 0, own.data.wavelength / 2 * (len(planes) > 1)])
+        return SlabRoom(planes + lobe, slabs)
 
-    monkeypatch.setattr(own, "find", lambda known: found)
-    monkeypatch.setattr(own, "refine", lambda planes, *options: planes)
+    monkeypatch.setattr(own, "find_free", lambda known: found)
+    monkeypatch.setattr(own.free, "descend", lambda planes, *options: planes)
     monkeypatch.setattr(own, "resolve", resolved)
     torch.testing.assert_close(own.run()[0], walls, rtol=0, atol=5e-3)
 
 
 def test_the_only_plane_may_be_false():
     own = search(room(walls=PLANES[:0])[0])
-    planes, slabs = own.without_false(
-        torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double(), torch.zeros(1, 3).double()
-    )
+    plane = torch.tensor([[0.0, 0.28, 0.96, 3.1]]).double()
+    planes, slabs = own.prune(SlabRoom(plane, torch.zeros(1, 3).double()))
     assert len(planes) == len(slabs) == 0
 
 
@@ -204,10 +213,10 @@ def test_tilted_plane_is_turned_square():
     links, walls = room(walls=np.array([[1.0, 0, 0, -0.4], [0, 1.0, 0, -0.7]]))
     tilted, level = torch.tensor([[0.99, -0.13, 0.05, -0.2], [0, 0, 1.0, 3.1]]).double()
     own = search(links)
-    turned = own.squared(
-        seen_from(torch.stack((tilted / tilted[:3].norm(), walls[1], level)), own.middle), 0
+    turned = own.square_variants(
+        seen_from(torch.stack((tilted / tilted[:3].norm(), walls[1], level)), own.frame.middle), 0
     )
-    true = seen_from(walls[0], own.middle)
+    true = seen_from(walls[0], own.frame.middle)
     assert any((plane[0] - true).abs().max() < 0.03 for plane in turned)
 
 
@@ -244,7 +253,7 @@ def test_links_that_are_partly_silent_or_repeated_show_no_wall():
     often = torch.arange(120).repeat(5)
     query, split = links.query[often], links.split.only(torch.arange(600))
     own = search(replace(links, query=query, labels=labels[often], split=split))
-    planes = seen_from(own.aligned()[0], -own.middle)
+    planes = own.frame.to_world(own.find_axis_walls().planes)
     torch.testing.assert_close(planes, walls, rtol=0, atol=5e-3)
 
 
@@ -255,18 +264,19 @@ def test_drawn_walls_that_phases_do_not_show_stay():
     noise = torch.randn(
         links.labels.shape, dtype=torch.complex64, generator=torch.Generator().manual_seed(1)
     )
-    own = search(replace(links, labels=links.labels + 0.1 * links.labels.abs().mean() * noise))
+    links = replace(links, labels=links.labels + 0.1 * links.labels.abs().mean() * noise)
     drawn = torch.cat((walls, torch.tensor([[0, 1.0, 0, 5.2], PARALLEL]).double()))
-    own.order, own.most, own.start = 2, 3, seen_from(drawn, own.middle)
+    own = search(links, start=drawn, order=2, most=3)
     torch.testing.assert_close(own.run()[0], drawn, rtol=0, atol=5e-3)
 
 
 def test_walls_find_the_right_lobe():
     links, walls = room(count=120, walls=np.array([WALL, FLOOR]))
     own = search(few(links))
-    true = seen_from(walls, own.middle)
-    beside = true + torch.tensor([0, 0, 0, own.wavelength / 2])
-    planes = own.in_best_lobes(own.drawn(120), beside, 0.05)
+    true = seen_from(walls, own.frame.middle)
+    beside = true + torch.tensor([0, 0, 0, own.data.wavelength / 2])
+    gains = CommonGains(own.data, own.start, own.most)
+    planes = gains.choose_lobes(own.data.draw(120), beside, 0.05)
     torch.testing.assert_close(planes, true, rtol=0, atol=2e-3)
 
 
@@ -276,13 +286,12 @@ def test_walls_of_a_drawing_stand_where_phases_agree(error, monkeypatch):
     are drawn beside.
     """
     links, walls = room(walls=np.array([WALL, FLOOR]))
-    own = search(few(links))
-    own.start = seen_from(walls, own.middle) + torch.tensor([0, 0, 0, error])
-    monkeypatch.setattr(own, "find", lambda start: start)
+    own = search(few(links), start=walls + torch.tensor([0, 0, 0, error]))
+    monkeypatch.setattr(own, "find_free", lambda start: start)
     monkeypatch.setattr(
-        own, "refine", lambda planes, *options: planes + torch.tensor([0, 0, 0, 0.3])
+        own.free, "descend", lambda planes, *options: planes + torch.tensor([0, 0, 0, 0.3])
     )
-    monkeypatch.setattr(own, "resolve", channel_search.half_spaces)
+    monkeypatch.setattr(own, "resolve", half_spaces)
     planes, _ = own.run()
     torch.testing.assert_close(planes, walls, rtol=0, atol=5e-3)
 
@@ -292,8 +301,9 @@ def test_room_grows_by_planes_along_its_axes(walls):
     links, walls = room(walls=np.array(walls))
     first = torch.tensor([[math.log(2.0), math.log(0.3), 0.0]]).double()
     own = search(links)
-    planes, slabs = own.grown(seen_from(walls, own.middle)[:1], first)
-    planes = seen_from(planes, -own.middle)
+    known = SlabRoom(seen_from(walls, own.frame.middle)[:1], first)
+    planes, slabs = own.along_axes.grow_along(known, own.most)
+    planes = seen_from(planes, -own.frame.middle)
     assert len(slabs) == len(walls)
     torch.testing.assert_close(planes, walls, rtol=0, atol=0.01)
 
@@ -305,17 +315,14 @@ def test_room_grows_by_planes_along_its_axes(walls):
 def test_planes_along_axes_replace_a_tilted_one(walls, known, tilt, monkeypatch):
     """As free strengths of an array that tells no heights apart may find it."""
     links, walls = room(walls=np.array(walls))
-    own = search(links)
-    own.start = seen_from(walls[:known], own.middle)
+    own = search(links, start=walls[:known])
     tilted = torch.tensor([[math.cos(tilt), 0, math.sin(tilt), -0.4]]).double()
     monkeypatch.setattr(
-        own, "find", lambda start: torch.cat((start, seen_from(tilted, own.middle)))
+        own, "find_free", lambda start: torch.cat((start, seen_from(tilted, own.frame.middle)))
     )
-    monkeypatch.setattr(own, "refine", lambda planes, *options: planes)
-    monkeypatch.setattr(
-        own, "resolve", lambda planes: (planes, channel_search.SLABS[: len(planes)])
-    )
-    monkeypatch.setattr(own, "without_false", lambda *room: room)
+    monkeypatch.setattr(own.free, "descend", lambda planes, *options: planes)
+    monkeypatch.setattr(own, "resolve", lambda planes: SlabRoom(planes, SLABS[: len(planes)]))
+    monkeypatch.setattr(own, "prune", lambda room: room)
     planes, _ = own.run()
     order = planes[:, 2].abs().argsort()
     torch.testing.assert_close(
@@ -332,19 +339,18 @@ def draw(*shape):
 
 def test_projection_is_least_squares():
     waves, labels = draw(3, 4, 20), draw(3, 20)
-    rest, strengths = project(torch.from_numpy(waves), torch.from_numpy(labels), ridge=0.0)
+    rest, strengths = fit_free(torch.from_numpy(waves), torch.from_numpy(labels), ridge=0.0)
     for k in range(3):
         expected = np.linalg.lstsq(waves[k].T, labels[k], rcond=None)[0]
         np.testing.assert_allclose(strengths[k], expected, rtol=1e-9)
         np.testing.assert_allclose(rest[k], labels[k] - expected @ waves[k], rtol=0, atol=1e-9)
 
 
-def test_real_strengths_are_not_negative_unless_signed(monkeypatch):
-    monkeypatch.setattr(channel_search, "RIDGE", 0.0)
+def test_real_strengths_are_not_negative_unless_signed():
     waves, signed = draw(6, 4, 200), np.array([False, False, True, False])
     strengths = np.random.default_rng(0).uniform(0.5, 1, (6, 4)) * [1, -1, -1, 1]
     labels = (strengths[:, None] @ waves)[:, 0] + 0.1 * draw(6, 200)
-    rest = real_residual(*map(torch.from_numpy, (waves, labels, signed)))
+    rest = real_residual(*map(torch.from_numpy, (waves, labels, signed)), ridge=0.0)
     for k in range(6):
         columns = np.concatenate((waves[k], -waves[k][signed]))
         parts = (np.concatenate((part.real, part.imag), -1) for part in (columns, labels[k]))
@@ -357,42 +363,41 @@ def test_walls_are_tried_beside_planes_amid_the_places(monkeypatch):
     """Here three planes amid the places have higher scores than the wall."""
     links, _ = room()
     own, normal = search(links), torch.tensor([[1.0, 0, 0]]).double()
-    wall = float(own.points[:, 0].max()) + 0.3
+    wall = float(own.frame.points[:, 0].max()) + 0.3
     peaks = torch.tensor([[-1.5, 1.0], [0.0, 0.9], [1.5, 0.8], [wall, 0.5]]).double()
-    share = lambda _, __, grid: (
+    share = lambda _, grid: (
         peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()
     ).sum(-1)
-    monkeypatch.setattr(own, "added_shares", share)
-    walls, amid = own.along(torch.zeros(0, 4).double(), torch.zeros(0, 3).double(), normal, 0.1)
+    monkeypatch.setattr(own.score, "added_shares", share)
+    walls, amid = own.along_axes.propose_along(half_spaces(torch.zeros(0, 4).double()), normal, 0.1)
     assert [plane[3].item() for plane in walls] == pytest.approx([wall], abs=0.03)
     assert [plane[3].item() for plane in amid] == pytest.approx([-1.5, 0.0], abs=0.03)
 
 
 @pytest.mark.parametrize("few", [0, 1000])
-def test_an_image_counts_by_what_it_adds_to_known_paths(few, monkeypatch):
+def test_an_image_counts_by_what_it_adds_to_known_paths(few):
     """Least squares with and without the image, of two receivers with different arrays and some of
     the places each.
 
     Known paths have complex strengths, or real ones with the phase of the direct path.
     """
-    monkeypatch.setattr(channel_search, "FEW", few)
     links, planes = room(walls=np.array([WALL, FLOOR]), receivers=2, count=61)
     links.labels[:, :, 5:] *= 1j
-    own = ChannelSearch(links, -1, True, order=2, most=2, start=torch.zeros(0, 4))
-    planes = seen_from(planes, own.middle)
+    own = search(links, options=ChannelOptions(fewest_free=few), order=2)
+    planes = seen_from(planes, own.frame.middle)
     others = planes.new_tensor([[0.6, 0.8, 0.0, -3.0], [0.0, 1.0, 0.0, 0.0]])
     tried = torch.cat((planes[1:], others, planes.repeat(32, 1)))
-    known_room = channel_search.half_spaces(planes[:1])
-    shares, expected = own.added_shares(*known_room, tried), []
+    known_room = half_spaces(planes[:1])
+    shares, expected = own.score.added_shares(known_room, tried), []
     stacked = lambda x: x if few == 0 else np.concatenate((x.real, x.imag), -1)
-    for part, turn in zip(*own.some(planes[:1]), strict=True):
+    for part, turn in zip(*own.data.sample(planes[:1]), strict=True):
         waves = lambda images, part=part: part.waves(images.float()).to(torch.complex128).numpy()
         places, normals = part.places.double(), tried[:, :3]
         heights = places @ normals.mT - tried[:, 3]
         outside = heights * (normals @ part.position.double() - tried[:, 3]) > 0
         images = places[:, None] - 2 * heights[..., None] * normals
         known, images = (
-            part.reflected(*known_room, own.sequences(planes[:1])).to(torch.complex128),
+            part.reflected(known_room, own.data.sequences(planes[:1])).to(torch.complex128),
             waves(images),
         )
         known = stacked(known.numpy())
@@ -412,25 +417,25 @@ def test_an_image_counts_by_what_it_adds_to_known_paths(few, monkeypatch):
 
 
 @pytest.mark.parametrize("phases", [False, True])
-def test_cost_is_what_neighbours_do_not_predict(phases, monkeypatch):
+def test_error_is_what_neighbours_do_not_predict(phases):
     """Non-negative least squares over the eight nearest places that are a wavelength away, by
     numpy; and a price.
     """
-    monkeypatch.setattr(channel_search, "RIDGE", 1e-7)
     links, planes = room(walls=np.array([WALL]), receivers=2, count=61)
     if phases:
         links = replace(links, labels=turned(links.labels))
     links.query.transmitters[4] = links.query.transmitters[2] + 0.01
-    own = ChannelSearch(links, -1, not phases, order=1, most=2, start=torch.zeros(0, 4))
-    known_room = channel_search.half_spaces(seen_from(planes, own.middle))
-    found, shares = own.phases(known_room[0], own.receivers), []
-    for receiver, turn in zip(own.receivers, found, strict=True):
-        waves = receiver.reflected(*known_room, own.sequences(known_room[0])).numpy()
+    options = ChannelOptions(ridge=1e-7)
+    own = search(links, common=not phases, options=options)
+    known_room = half_spaces(seen_from(planes, own.frame.middle))
+    found, shares = own.data.reference_phases(known_room.planes, own.data.receivers), []
+    for receiver, turn in zip(own.data.receivers, found, strict=True):
+        waves = receiver.reflected(known_room, own.data.sequences(known_room.planes)).numpy()
         channels = (receiver.flat * turn[:, None].conj()).numpy()
         places = receiver.places.numpy()
         for k, own_channel in enumerate(channels):
             apart = np.linalg.norm(places - places[k], axis=1)
-            near = np.argsort(np.where(apart < own.wavelength, np.inf, apart))[:8]
+            near = np.argsort(np.where(apart < own.data.wavelength, np.inf, apart))[:8]
             size = np.linalg.norm(channels[near], axis=1)[:, None]
             columns, right = (
                 (waves[near] / size[..., None]).swapaxes(0, 1).reshape(2, -1),
@@ -443,18 +448,18 @@ def test_cost_is_what_neighbours_do_not_predict(phases, monkeypatch):
             if phases:
                 own_channel = own_channel * np.exp(1j * np.angle(np.vdot(own_channel, predicted)))
             left = np.linalg.norm(own_channel - predicted) ** 2 / np.linalg.norm(own_channel) ** 2
-            shares.append(np.log(left + channel_search.FLOOR))
-    assert own.cost(known_room) == pytest.approx(np.mean(shares) + channel_search.PRICE, abs=1e-3)
+            shares.append(np.log(left + 1e-3))
+    assert own.score.error(known_room) == pytest.approx(np.mean(shares) + options.price, abs=1e-3)
 
 
 def test_neighbours_may_be_silent_at_the_subcarriers_that_count(monkeypatch):
     """Then nothing speaks for a plane."""
-    monkeypatch.setattr(channel_search, "thinned", lambda receiver: slice(0, None, 2))
+    monkeypatch.setattr(ReceiverChannels, "few_subcarriers", slice(0, None, 2))
     links, planes = room(walls=np.array([WALL]))
     links.labels[:, :, ::2] = 0
     own = search(links)
     wall, none = (
-        own.cost(channel_search.half_spaces(seen_from(some, own.middle)))
+        own.score.error(half_spaces(seen_from(some, own.frame.middle)))
         for some in (planes, planes[:0])
     )
-    assert wall == pytest.approx(none + channel_search.PRICE, abs=1e-6)
+    assert wall == pytest.approx(none + ChannelOptions.price, abs=1e-6)

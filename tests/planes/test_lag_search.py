@@ -18,7 +18,10 @@ from gaigs.core.query import Query
 from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Split
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.planes.lag_search import MATERIAL, Found, LagSearch, periodogram
+from gaigs.planes.lag_score import LagRoom
+from gaigs.planes.lag_search import LagSearch, list_bandwidths
+from gaigs.planes.lags import MATERIAL
+from gaigs.planes.periodogram import periodogram
 from gaigs.splatting.placement.mirrored.reflections import all_sequences, seen_from
 from gaigs.testing import example_links
 
@@ -47,9 +50,9 @@ def search():
     )
     made = LagSearch(links, query.frequencies, ones, 2)
     own = made.receivers[0]
-    lags = own.sums(*own.paths(seen_from(WALLS, made.middle), all_sequences(3, 2)), 0.0)
-    made.receivers = [replace(own, lags=7 * lags)]
-    made.bandwidth = 0.0
+    walls = seen_from(WALLS, made.frame.middle)
+    lags = own.covariances(own.paths(walls, all_sequences(3, 2)), 0.0)
+    made.use([replace(own, lags=7 * lags)], 2)
     return made
 
 
@@ -79,20 +82,19 @@ def test_an_unknown_band_is_a_carrier_where_waves_of_all_planes_interfere(search
         (WALLS, torch.tensor([(-1.0, 0, 0, 0.2), (0, -1.0, 0, -4.6), (0, 0, -1.0, -2.9)]))
     )
     own = search.receivers[0]
-    lags = own.sums(
-        *own.paths(seen_from(walls.double(), search.middle).float(), all_sequences(6, 2)), 0.0
-    )
-    search.receivers = [replace(own, lags=lags)]
+    paths = own.paths(search.frame.from_world(walls).float(), all_sequences(6, 2))
+    search.use([replace(own, lags=own.covariances(paths, 0.0))], 2)
     off = torch.tensor([0.3, -0.3, 0.25, 0.35, -0.4, 0.3])
     found = search.run(walls + off[:, None] * torch.tensor([0.0, 0, 0, 1]), None, 6)
-    assert search.bandwidth == min(search.bandwidths(None))
+    assert search.bandwidth == min(list_bandwidths(None, search.frame, search.options))
     assert (found - walls)[:, 3].abs().max() < 0.1
 
 
 def test_a_missing_plane_is_found_though_half_of_the_links_lack_it(search):
     own = search.receivers[0]
-    without = own.sums(*own.paths(seen_from(WALLS[:2], search.middle), all_sequences(2, 2)), 0.0)
-    search.receivers = [replace(own, lags=torch.cat((own.lags[:75], 7 * without[75:])))]
+    paths = own.paths(seen_from(WALLS[:2], search.frame.middle), all_sequences(2, 2))
+    without = own.covariances(paths, 0.0)
+    search.use([replace(own, lags=torch.cat((own.lags[:75], 7 * without[75:])))], 2)
     found = search.run(WALLS[:2], 0.0, 3)
     assert len(found) == 3
     assert (found[2] * found[2, 2].sign() - WALLS[2]).abs().max() < 0.01
@@ -101,13 +103,12 @@ def test_a_missing_plane_is_found_though_half_of_the_links_lack_it(search):
 def test_a_plane_stays_where_nothing_shows_it(search):
     """A wall without power: the covariances are those of the direct path alone."""
     own = search.receivers[0]
-    lags = own.sums(*own.paths(WALLS[:0], all_sequences(0, 2)), 0.0)
+    lags = own.covariances(own.paths(WALLS[:0], all_sequences(0, 2)), 0.0)
     noise = torch.randn(lags.shape, dtype=lags.dtype, generator=torch.Generator().manual_seed(0))
-    search.receivers = [replace(own, lags=lags + 0.3 * lags.abs() * noise)]
+    search.use([replace(own, lags=lags + 0.3 * lags.abs() * noise)], 2)
     far, count = torch.tensor([[0.0, 0.0, 1.0, 40.0]]), len(own.places)
-    assert (
-        search.moved(Found(far, torch.ones(count, 2).bool(), torch.zeros(count)), 0).planes is far
-    )
+    room = LagRoom(far, torch.ones(count, 2).bool(), torch.zeros(count))
+    assert search.score.move(room, 0).planes is far
 
 
 @pytest.mark.parametrize(
@@ -124,25 +125,25 @@ def test_azimuths_that_the_direct_path_contradicts_are_named(search, turn, flip,
     frame = torch.eye(3)
     frame[:2, :2] = torch.linalg.matrix_power(torch.tensor([[0.0, -1.0], [1.0, 0.0]]), turn)
     frame[1] *= flip
-    fields, _, lengths = own.paths(WALLS[:0], all_sequences(0, 2))
-    ways, _ = own.seen(own.places[:, None])
-    lags = own.sums(fields, own.steering(ways @ frame.T), lengths, 0.0)
+    paths = own.paths(WALLS[:0], all_sequences(0, 2))
+    ways, _ = own.look_at(own.places[:, None])
+    lags = own.covariances(paths._replace(steering=own.steer(ways @ frame.T)), 0.0)
     lags = lags / lags[:, lags.shape[1] // 2, None].real
-    found = replace(own, lags=lags).doubts("door")
+    found = replace(own, lags=lags).describe_doubts("door")
     assert [words in doubt for doubt in found] == [True] * (words is not None)
 
 
 def test_no_plane_and_no_power_move_nothing(search):
     assert len(search.run(WALLS[:0], 0.0, 3)) == 0
-    search.receivers = []
+    search.use([], 2)
     torch.testing.assert_close(search.run(WALLS, 0.0, 3), WALLS, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize("bandwidth", [0.0, 2e8])
 def test_the_covariances_are_the_sums_of_waves_over_the_band(search, bandwidth):
-    own = search.receivers[0].some(slice(4))
+    own = search.receivers[0].at(slice(4))
     fields, _, lengths = (part.numpy() for part in own.paths(WALLS, all_sequences(3, 1)))
-    found = own.sums(*own.paths(WALLS, all_sequences(3, 1)), bandwidth).numpy()
+    found = own.covariances(own.paths(WALLS, all_sequences(3, 1)), bandwidth).numpy()
     position, rotation = own.pose.position.numpy(), own.pose.rotation.numpy()
     places, elements, frequency = (
         own.places.double().numpy(),

@@ -15,7 +15,7 @@ from gaigs.core.propagation import fresnel
 from gaigs.core.query import Query
 from gaigs.data import Split
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.planes.lag_search import MATERIAL
+from gaigs.planes.lags import MATERIAL
 from gaigs.planes.level_search import LevelSearch
 from gaigs.testing import example_links
 

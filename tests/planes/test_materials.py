@@ -7,8 +7,8 @@ import torch
 
 import gaigs
 from gaigs.data.synthetic.image_source import permittivity
-from gaigs.planes.export import all_over
 from gaigs.planes.materials import HALF_SPACE, materials
+from gaigs.planes.room_paths import spread_links
 from gaigs.splatting.placement.mirrored.paths import Mirrored
 
 FREQUENCY = 6.4896e9
@@ -38,7 +38,7 @@ def test_a_plane_has_the_material_it_is_made_of(placement):
     for plane, name in enumerate(names):
         paint(placement, plane, permittivity(name, FREQUENCY))
     paint(placement, 4, permittivity("plasterboard", FREQUENCY), 0.0125)
-    found = materials(placement, all_over(placement.scene), FREQUENCY)
+    found = materials(placement, spread_links(placement.scene), FREQUENCY)
     assert [found[plane].name for plane in range(6)] == names
     assert [found[plane].thickness for plane in (0, 1, 4)] == pytest.approx([1.0, 1.0, 0.0125])
 
@@ -56,6 +56,6 @@ def test_gains_of_planes_and_paths_count_as_material(placement):
         placement.plane_gains[0] = gain / 2
         placement.path_gains += 0.3  # of all paths: the level of the labels
         placement.path_gains[alone] += gain / 2
-    found = materials(placement, all_over(placement.scene), FREQUENCY)
+    found = materials(placement, spread_links(placement.scene), FREQUENCY)
     assert found.keys() == {0}
     assert found[0].name in ("glass", "marble")

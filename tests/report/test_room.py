@@ -12,7 +12,8 @@ from gaigs.core.geometry import Pose
 from gaigs.core.query import Query
 from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links, Split
-from gaigs.planes.learnt_room import LearntPath, LearntPlane, LearntRoom, Matter
+from gaigs.planes.learnt_room import LearntPlane, LearntRoom, Matter
+from gaigs.planes.room_paths import LearntPath
 from gaigs.report.room import paths, room
 from gaigs.splatting.gaussians import SH_DC, Gaussians
 from gaigs.testing import example_links

@@ -17,7 +17,8 @@ from gaigs.core.task.rssi import Rssi
 from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Split
 from gaigs.model import Model
-from gaigs.planes.learnt_room import LearntPath, LearntRoom
+from gaigs.planes.learnt_room import LearntRoom
+from gaigs.planes.room_paths import LearntPath
 from gaigs.report import csi, figures, run_figures, scalar, spectrum
 from gaigs.report.run_figures import figures_of, write_figures
 from gaigs.splatting.gaussians import Gaussians

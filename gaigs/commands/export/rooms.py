@@ -25,9 +25,11 @@ from gaigs.io.gltf import write_gltf
 from gaigs.io.meshes import Mesh
 from gaigs.model import Model, Wrapper
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.planes import export
+from gaigs.planes.learnt_room import outline_planes
 from gaigs.planes.materials import Material, materials
-from gaigs.planes.sheets import Sheet, fit_sheets
+from gaigs.planes.obstacle_surfaces import Sheet, fit_sheets
+from gaigs.planes.room_files import to_meshes, wavefront_obj
+from gaigs.planes.room_paths import trace_paths
 from gaigs.processes import only_run
 from gaigs.registry import name_of
 
@@ -52,14 +54,14 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
     suffix = file.suffix.lower()
     if suffix == ".xml":
         frequency = _carrier(mirrored, frequency)
-    paths = export.trace_paths(placement, mirrored.traced)
-    planes = export.outlines(placement, paths)
+    paths = trace_paths(placement, mirrored.traced)
+    planes = outline_planes(placement, paths)
     corners = np.concatenate([paths.ends, *(plane.corners for plane in planes)])
     sheets, rest = fit_sheets(placement, mirrored.traced, corners.min(0), corners.max(0))
     if suffix == ".obj":
-        write_text(file, export.wavefront_obj(placement, paths, sheets))
+        write_text(file, wavefront_obj(placement, paths, sheets))
         return [file]
-    meshes = export.to_meshes(planes, sheets)
+    meshes = to_meshes(planes, sheets)
     if frequency is None or suffix != ".xml":
         extras = [{"share": plane.share} for plane in planes]
         extras += [{"loss_db": sheet.loss_db} for sheet in sheets]

@@ -17,7 +17,7 @@ from gaigs.io import deepmimo
 from gaigs.io.tables import check_empty, number_places
 from gaigs.model import Model
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.planes import export
+from gaigs.planes.room_paths import trace_paths
 from gaigs.processes import only_run
 
 log = logging.getLogger(__name__)
@@ -56,7 +56,7 @@ def write_scenario(
     for number, receiver in enumerate(receivers):
         numbers = torch.full((len(users),), number)
         query = Query(users, numbers, carrier.to(users).expand(len(users)))
-        bounces = export.trace_paths(mirrored.placement, query).bounces  # (users, paths, order, 3)
+        bounces = trace_paths(mirrored.placement, query).bounces  # (users, paths, order, 3)
         stations.append(
             deepmimo.Station(
                 position=receiver.pose.position.double().numpy(),

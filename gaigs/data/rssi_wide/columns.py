@@ -143,7 +143,7 @@ def refuse_cells(
 ) -> None:
     """Raises a ``ValueError`` that names the first wrong cell of each row."""
     cells = {}
-    for row in wrong.any(1).nonzero()[0].tolist():
+    for row in np.flatnonzero(wrong.any(1)).tolist():
         cells[row + 2] = table.cell(row, columns[int(wrong[row].argmax())])
     tables.refuse(table.file, cells, expected)
 

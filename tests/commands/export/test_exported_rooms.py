@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import replace
+from functools import partial
 from xml.etree import ElementTree
 
 import numpy as np
@@ -10,13 +11,13 @@ import torch
 import trimesh
 
 import gaigs
+from gaigs.commands.export import rooms
 from gaigs.commands.export.rooms import itu_bsdf, mirrored_of, sheet_bsdf, write_scene
 from gaigs.io.meshes import Mesh, positions, read_obj, read_ply
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
-from gaigs.planes import sheets
 from gaigs.planes.materials import Material
-from gaigs.planes.sheets import Sheet
+from gaigs.planes.obstacle_surfaces import Sheet, SurfaceOptions, fit_sheets
 from gaigs.splatting.placement.mirrored.obstacles import Obstacles
 
 SIZE = 7.0, 5.0, 3.0
@@ -146,8 +147,8 @@ def test_the_ray_tracer_passes_a_sheet_without_a_turn_or_a_reflection(frequency,
 
 
 def test_obstacles_are_surfaces_and_the_gain_of_channels_is_told(mirrored, tmp_path, monkeypatch):
-    for limit, value in (("VOXELS", 50_000), ("CANDIDATES", 3), ("PATHS", 300)):
-        monkeypatch.setattr(sheets, limit, value)
+    options = SurfaceOptions(voxels=50_000, candidates=3, paths=300)
+    monkeypatch.setattr(rooms, "fit_sheets", partial(fit_sheets, options=options))
     placement = mirrored.placement
     placement.obstacles = Obstacles(1, -placement.middle, placement.middle)
     with torch.no_grad():

@@ -1,6 +1,7 @@
 """Obstacles: Gaussians of matter in the room that attenuate paths."""
 
 import math
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Inexact
@@ -24,6 +25,8 @@ class Obstacles(nn.Module):
     Source: Wilson and Patwari, Radio Tomographic Imaging, 2010, for the idea.
     """
 
+    pairs = 2**16
+    """Segments times obstacles at a time: a CPU keeps them in its cache, without fresh memory."""
     origin: Tensor
     unit: Tensor
 
@@ -39,9 +42,8 @@ class Obstacles(nn.Module):
         diagonal = float(edges.norm())
         low, high = lower - 0.05 * edges, upper + 0.05 * edges
         self.register_buffer("origin", (low + high) / 2)
-        self.register_buffer(
-            "unit", torch.tensor(diagonal * 0.12)
-        )  # so that learning rates suit rooms of any size
+        # So that learning rates suit rooms of any size.
+        self.register_buffer("unit", torch.tensor(diagonal * 0.12))
         self.places = nn.Parameter((torch.rand(count, 3) - 0.5) * (high - low) / self.unit)
         # As large as furniture; a path through one is attenuated by a fraction of a decibel.
         self.log_widths = nn.Parameter(torch.full((count, 3), math.log(0.05 * diagonal)))
@@ -69,28 +71,26 @@ class Obstacles(nn.Module):
         self, start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]
     ) -> Inexact[Tensor, "*batch"]:
         """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad]."""
-        legs = start.reshape(-1, 3), end.reshape(-1, 3)
-        size = max(1, PAIRS // len(self)) if start.device.type == "cpu" else len(legs[0]) or 1
-        columns = (
-            [self.densities]
-            if self.turns is None
-            else [self.densities, self.densities * self.turns]
-        )
-        own = self.centres, self.log_widths, torch.stack(columns, 1)
+        starts = start.reshape(-1, 3)
+        ends = end.reshape(-1, 3)
+        size = len(starts) or 1
+        if start.device.type == "cpu":
+            size = max(1, self.pairs // len(self))
+        columns = [self.densities]
+        if self.turns is not None:
+            columns = [self.densities, self.densities * self.turns]
+        shapes = (self.centres, self.log_widths, torch.stack(columns, 1))
         parts = [
-            _Depth.apply(*part, *own)
-            for part in zip(*(ends.split(size) for ends in legs), strict=True)
+            _Depth.apply(*legs, *shapes)
+            for legs in zip(starts.split(size), ends.split(size), strict=True)
         ]
-        depths = torch.cat(parts)
-        return (depths[:, 0] if self.turns is None else torch.view_as_complex(depths)).view(
-            start.shape[:-1]
-        )
+        depths = torch.cat(parts)  # (segments, 1 or 2)
+        depths = depths[:, 0] if self.turns is None else torch.view_as_complex(depths)
+        return depths.view(start.shape[:-1])
 
 
-PAIRS = 2**16
-"""Pairs of a segment and an obstacle at a time: a CPU keeps them in its cache, and asks for no
-fresh memory.
-"""
+_FAINTEST = -80.0
+"""Smallest exponent: float32's exponential takes four times as long at an underflow."""
 
 
 class _Depth(torch.autograd.Function):
@@ -103,17 +103,16 @@ class _Depth(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, start, end, centres, log_widths, densities):
-        parts = *_, r, near, inside, length = _parts(start, end, centres, log_widths)
-        each = near * inside * r
+        parts = _measure_legs(start, end, centres, log_widths)
+        each = parts.near * parts.inside * parts.r  # (segments, obstacles)
         ctx.save_for_backward(start, end, centres, log_widths, densities, *parts)
-        return (each @ densities) * (math.sqrt(math.pi) * length)[:, None]
+        return (each @ densities) * (math.sqrt(math.pi) * parts.length)[:, None]
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
-        start, end, centres, log_widths, densities, a, b, r, near, inside, length = (
-            ctx.saved_tensors
-        )
+        start, end, centres, log_widths, densities, *parts = ctx.saved_tensors
+        a, b, r, near, inside, length = parts
         gradient = gradient * (math.sqrt(math.pi) * length)[:, None]
         # In place where it can be: fresh memory costs more than the sums.
         rate = near * r  # of E
@@ -123,8 +122,8 @@ class _Depth(torch.autograd.Function):
         rate.mul_(weights)
         each.mul_(weights)
         slope = rate.mul_(r).mul_(2 / math.sqrt(math.pi))
-        e1 = (a + b).mul_(r).square_().neg_().clamp_min_(FAINTEST).exp_().mul_(slope)
-        e0 = (b * r).square_().neg_().clamp_min_(FAINTEST).exp_().mul_(slope)
+        e1 = (a + b).mul_(r).square_().neg_().clamp_min_(_FAINTEST).exp_().mul_(slope)
+        e0 = (b * r).square_().neg_().clamp_min_(_FAINTEST).exp_().mul_(slope)
         # r = (2 A)^-1/2, so d r = -r / (2 A) dA; d of the exponent: -dC/2 + (B/A) dB - (B/A)²/2 dA.
         ratio = b / a
         d_b = (e1 - e0).addcmul_(each, ratio)
@@ -135,48 +134,52 @@ class _Depth(torch.autograd.Function):
         # A = sum ray² w, B = sum ray (start - c) w, C = sum (start - c)² w: sums are products of
         # matrices. With the narrow one on the left they take a CPU a third to a sixth of the time.
         narrow = torch.cat((widths, centres * widths), 1).T
-        rows, columns = zip(
-            *((narrow @ part.T).T.split(3, 1) for part in (d_a, d_b, d_c)), strict=True
-        )
-        d_ray = 2 * ray * rows[0] + start * rows[1] - columns[1]
-        d_offset = ray * rows[1] + 2 * (start * rows[2] - columns[2])
+        row_a, _ = (narrow @ d_a.T).T.split(3, 1)
+        row_b, column_b = (narrow @ d_b.T).T.split(3, 1)
+        row_c, column_c = (narrow @ d_c.T).T.split(3, 1)
+        d_ray = 2 * ray * row_a + start * row_b - column_b
+        d_offset = ray * row_b + 2 * (start * row_c - column_c)
         unit = ray / length.clamp_min(1e-30)[:, None]  # 0 for a leg of length 0
         d_length = (each.sum(-1) / length.clamp_min(1e-30))[:, None] * unit
         d_end = d_ray + d_length
         d_start = d_offset - d_end
-        by_ray, by_start, ones = (ray.T @ d_b).T, (start.T @ d_c).T, d_c.sum(0)[:, None]
+        by_ray = (ray.T @ d_b).T
+        by_start = (start.T @ d_c).T
+        ones = d_c.sum(0)[:, None]
         d_centres = -(by_ray + 2 * (by_start - centres * ones)) * widths
-        # d log width: -2 (A's, B's and C's share of the axis)
+        # d log width: -2 (A's, B's and C's share of the axis).
         squares = (ray.square().T @ d_a + (ray * start).T @ d_b + start.square().T @ d_c).T
         squares = squares - by_ray * centres - 2 * centres * by_start + centres.square() * ones
         return d_start, d_end, d_centres, -2 * squares * widths, d_densities
 
 
-SHORTEST = 1e-8
-"""Smallest squared length of a ray [squared widths]: within 1e-4 of a width nothing changes."""
+class _Legs(NamedTuple):
+    """A, B, r, g and E of each segment and obstacle (s, k), and the segments' lengths (s,) [m]."""
 
-FAINTEST = -80.0
-"""Smallest exponent: exp(-80) is negligible, and float32's exponential takes four times as long at
-an underflow.
-"""
+    a: Tensor
+    b: Tensor
+    r: Tensor
+    near: Tensor
+    inside: Tensor
+    length: Tensor
 
 
-def _parts(start, end, centres, log_widths):
-    """A, B, r, g, E of each segment and obstacle (s, k), and the segments' lengths (s,)."""
-    # Contiguous columns: an outer product of others takes a CPU four times as long.
-    columns = lambda values: values.T.contiguous()
+def _measure_legs(start: Tensor, end: Tensor, centres: Tensor, log_widths: Tensor) -> _Legs:
     ray = end - start
-    inverse, places, starts, ways = (
-        columns(values) for values in ((-log_widths).exp(), centres, start, ray)
-    )
+    # Contiguous columns: an outer product of others takes a CPU four times as long.
+    inverse = (-log_widths).exp().T.contiguous()
+    places = centres.T.contiguous()
+    starts = start.T.contiguous()
+    ways = ray.T.contiguous()
     # C - B²/A is the squared distance of a line from a centre: small differences of large numbers
     # unless about centres.
     offsets = [(starts[axis, :, None] - places[axis]).mul_(inverse[axis]) for axis in range(3)]
     rays = [ways[axis, :, None] * inverse[axis] for axis in range(3)]
-    a = (ray.square() @ inverse.square()).clamp_min_(SHORTEST)
+    # The least squared length [squared widths]: within 1e-4 of a width nothing changes.
+    a = (ray.square() @ inverse.square()).clamp_min_(1e-8)
     b = (rays[0] * offsets[0]).addcmul_(rays[1], offsets[1]).addcmul_(rays[2], offsets[2])
     c = offsets[0].square_().addcmul_(offsets[1], offsets[1]).addcmul_(offsets[2], offsets[2])
     r = (2 * a).rsqrt_()
-    near = (b * b).div_(a).sub_(c).clamp_(2 * FAINTEST, 0).div_(2).exp_()
+    near = (b * b).div_(a).sub_(c).clamp_(2 * _FAINTEST, 0).div_(2).exp_()
     inside = (a + b).mul_(r).erf_().sub_((b * r).erf_())
-    return a, b, r, near, inside, ray.norm(dim=-1)
+    return _Legs(a, b, r, near, inside, ray.norm(dim=-1))

@@ -51,14 +51,12 @@ class Folded(NamedTuple):
     def parts(
         self, values: Inexact[Tensor, "b w *s"]
     ) -> Iterator[tuple[int, Inexact[Tensor, "b k *s"]]]:
-        """Values of the last bounces, of the last but one, and so on, each with the first sequence
-        that has one.
+        """Values of the last bounces, of the last but one, and so on.
+
+        Each comes with the first sequence that has such a bounce.
         """
-        return zip(
-            self.firsts,
-            values.split([self.exists.shape[1] - first for first in self.firsts], 1),
-            strict=True,
-        )
+        counts = [self.exists.shape[1] - first for first in self.firsts]
+        return zip(self.firsts, values.split(counts, 1), strict=True)
 
 
 def seen_from(planes: Float[Tensor, "*w 4"], origin: Float[Tensor, "3"]) -> Float[Tensor, "*w 4"]:
@@ -68,25 +66,28 @@ def seen_from(planes: Float[Tensor, "*w 4"], origin: Float[Tensor, "3"]) -> Floa
 
 
 def largest_order(planes: int, most: int) -> int:
-    """Largest order for which ``all_sequences`` of two planes or more has at most ``most`` of them."""
-    order, count, longest = 0, 1, planes
+    """Largest order with at most ``most`` sequences of two planes or more."""
+    order = 0
+    count = 1
+    longest = planes  # sequences of the next order
     while count + longest <= most:
-        order, count, longest = order + 1, count + longest, longest * (planes - 1)
+        order += 1
+        count += longest
+        longest *= planes - 1
     return order
 
 
 def all_sequences(planes: int, order: int) -> Int[Tensor, "n order"]:
-    """All sequences of at most ``order`` planes as a wave meets them, no plane twice in a row;
-    shorter ones first.
+    """All sequences of at most ``order`` planes as a wave meets them, shorter ones first.
 
-    Shorter ones have -1 in front.
+    No plane comes twice in a row. Shorter ones have -1 in front.
     """
-    found = []
+    sequences = []
     for length in range(order + 1):
         for sequence in itertools.product(range(planes), repeat=length):
             if all(a != b for a, b in itertools.pairwise(sequence)):
-                found.append([-1] * (order - length) + list(sequence))
-    return torch.tensor(found, dtype=torch.long).view(len(found), order)
+                sequences.append([-1] * (order - length) + list(sequence))
+    return torch.tensor(sequences, dtype=torch.long).view(len(sequences), order)
 
 
 def reflect(
@@ -94,8 +95,9 @@ def reflect(
     normals: Float[Tensor, "*#batch 3"],
     offsets: Float[Tensor, "*#batch"],
 ) -> Float[Tensor, "*batch 3"]:
-    """Images of points [m] in planes n . x = d: the closed form of the sandwich product with a
-    plane's vector.
+    """Images of points [m] in planes n . x = d: x - 2 (n . x - d) n.
+
+    It is the closed form of the sandwich product with a plane's vector.
     """
     return points - 2 * ((points * normals).sum(-1) - offsets)[..., None] * normals
 
@@ -106,17 +108,16 @@ def images(
     normals: Float[Tensor, "w 3"],
     offsets: Float[Tensor, "*#b w"],
 ) -> list[Float[Tensor, "b n 3"]]:
-    """Images of transmitters [m] in the first 0, 1, ..., order planes of each sequence of
-    ``all_sequences``.
+    """Images of transmitters [m] in the first 0, 1, ..., order planes of each sequence.
 
-    Each transmitter may have offsets of its own.
+    Sequences come from ``all_sequences``. Each transmitter may have offsets of its own.
     """
-    found = [points[:, None].expand(-1, len(sequences), -1)]
+    seen = [points[:, None].expand(-1, len(sequences), -1)]
     for first, column in zip(_firsts(sequences), sequences.unbind(1), strict=True):
         here = column[first:]
-        moved = reflect(found[-1][:, first:], normals[here], offsets[..., here])
-        found.append(torch.cat((found[-1][:, :first], moved), 1))
-    return found
+        moved = reflect(seen[-1][:, first:], normals[here], offsets[..., here])
+        seen.append(torch.cat((seen[-1][:, :first], moved), 1))
+    return seen
 
 
 def _firsts(sequences: Int[Tensor, "n order"]) -> list[int]:
@@ -131,8 +132,7 @@ def fold(
     normals: Float[Tensor, "w 3"],
     offsets: Float[Tensor, " w"],
 ) -> Folded:
-    """Folds straight lines from the receivers to the last of ``images`` back into the room, plane
-    by plane.
+    """Folds straight lines from the receivers to the last of ``images`` back into the room.
 
     A line that does not cross its plane is bent at the end nearer to it; such a path does not
     exist. Nor does a path with an end on the plane, so no path meets two coincident planes in a
@@ -141,25 +141,32 @@ def fold(
     here = receivers[:, None].expand(-1, len(sequences), -1)
     numbers = torch.arange(len(sequences), device=here.device)
     exists = torch.ones(here.shape[:2], dtype=torch.bool, device=here.device)
-    firsts, rounding = _firsts(sequences)[::-1], torch.finfo(here.dtype).eps
-    starts, ends, path, planes, cosines = [], [], [], [numbers[:0]], [receivers[:, :0]]
+    firsts = _firsts(sequences)[::-1]
+    rounding = torch.finfo(here.dtype).eps
+    starts: list[Tensor] = []
+    ends: list[Tensor] = []
+    path: list[Tensor] = []
+    planes = [numbers[:0]]
+    cosines = [receivers[:, :0]]
+    # From the last plane to the first, each with the sequences that have one so far back.
     for back, first in enumerate(firsts, 1):
         plane = sequences[first:, -back]
-        n, d = normals[plane], offsets[plane]
+        n = normals[plane]
+        d = offsets[plane]
         begin = here[:, first:]
-        way = seen[-back][:, first:] - begin
-        height, rise, length = (begin * n).sum(-1) - d, (way * n).sum(-1), way.norm(dim=-1)
+        way = seen[-back][:, first:] - begin  # (b, sequences, 3)
+        height = (begin * n).sum(-1) - d
+        rise = (way * n).sum(-1)
+        length = way.norm(dim=-1)
         with torch.no_grad():
             beyond = height + rise
             # An end within 4 roundings of the distances of both ends and of the plane is on the
             # plane.
             least = 4 * rounding * (begin.norm(dim=-1) + length + d.abs())
-            exists[:, first:] &= (
-                (height * beyond < 0) & (height.abs() > least) & (beyond.abs() > least)
-            )
-        share = -height / torch.where(
-            rise.abs() > 1e-9, rise, -1e-9
-        )  # [m]; a line along the plane does not meet it
+            is_apart = (height.abs() > least) & (beyond.abs() > least)
+            exists[:, first:] &= (height * beyond < 0) & is_apart
+        # A line along the plane, which rises by less than 1e-9 m, does not meet it.
+        share = -height / torch.where(rise.abs() > 1e-9, rise, -1e-9)
         at = begin + share.clamp(0, 1)[..., None] * way
         cosines.append(rise.abs() / length.clamp_min(torch.finfo(length.dtype).tiny))
         planes.append(plane)
@@ -167,43 +174,42 @@ def fold(
         ends.append(begin)
         path.append(numbers[first:])
         here = torch.cat((here[:, :first], at), 1)
-    start, end = torch.cat((*starts, seen[0]), 1), torch.cat((*ends, here), 1)
     plane = torch.cat(planes)
     return Folded(
-        start,
-        end,
-        torch.cat((*path, numbers)),
-        firsts,
-        plane,
-        normals[plane],
-        torch.cat(cosines, 1),
-        exists,
+        start=torch.cat((*starts, seen[0]), 1),
+        end=torch.cat((*ends, here), 1),
+        path=torch.cat((*path, numbers)),
+        firsts=firsts,
+        planes=plane,
+        normals=normals[plane],
+        cosines=torch.cat(cosines, 1),
+        exists=exists,
     )
 
 
 def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "3"]]:
     """Normals whose cosines are apart from 1 by more than ``least``."""
-    found: list[Tensor] = []
+    apart: list[Tensor] = []
     for normal in normals:
-        if all((normal @ other).abs() < 1 - least for other in found):
-            found.append(normal)
-    return found
+        if all((normal @ other).abs() < 1 - least for other in apart):
+            apart.append(normal)
+    return apart
 
 
 def square_normals(normals: Float[Tensor, "w 3"], plane: int) -> list[Float[Tensor, "3"]]:
-    """A plane's normal, and those within 18 degrees that are level, upright, or square to another
-    plane.
+    """A plane's normal, and normals within 18 degrees that make a room square.
 
-    Powers locate planes to some degrees, and phases of a tilted plane match at few places.
+    These are level, upright, or square to another plane. Powers locate planes to some degrees, and
+    phases of a tilted plane match at few places.
     """
-    up, own = normals.new_tensor([0.0, 0.0, 1.0]), normals[plane]
+    up = normals.new_tensor([0.0, 0.0, 1.0])
+    normal = normals[plane]
     others = normals[torch.arange(len(normals)) != plane]
-    square = torch.cat(
-        (up[None], own[None] * (1 - up), others, torch.linalg.cross(others, up.expand_as(others)))
-    )
+    across = torch.linalg.cross(others, up.expand_as(others))
+    square = torch.cat((up[None], normal[None] * (1 - up), others, across))
     square = functional.normalize(square[square.norm(dim=1) > 0.5], dim=1)
-    square = square * (square @ own).sign()[:, None]
-    return distinct(torch.cat((own[None], square[square @ own > 0.95])), 2e-5)
+    square = square * (square @ normal).sign()[:, None]
+    return distinct(torch.cat((normal[None], square[square @ normal > 0.95])), 2e-5)
 
 
 def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
@@ -217,23 +223,27 @@ def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tens
 def reflection_points(
     starts: Float[Tensor, "b 3"], ends: Float[Tensor, "b 3"], planes: Float[Tensor, "w 4"]
 ) -> Float[Tensor, "b w 3"]:
-    """Points at which planes reflect waves from starts to ends [m]; of ends on two sides, as if
-    they were on one.
+    """Points at which planes reflect waves from starts to ends [m].
+
+    Ends on two sides of a plane count as if they were on one.
     """
     normals, offsets = planes[:, :3], planes[:, 3]
-    own, other = (point @ normals.T - offsets for point in (starts, ends))
-    feet = [
-        p[:, None] - height[..., None] * normals for p, height in ((starts, own), (ends, other))
-    ]
-    own, other = (height.abs().clamp_min(1e-6)[..., None] for height in (own, other))
-    return (feet[0] * other + feet[1] * own) / (own + other)
+    start_heights = starts @ normals.T - offsets  # (b, w)
+    end_heights = ends @ normals.T - offsets
+    start_feet = starts[:, None] - start_heights[..., None] * normals  # (b, w, 3)
+    end_feet = ends[:, None] - end_heights[..., None] * normals
+    # The bounce divides the line of the feet as the heights.
+    start_heights = start_heights.abs().clamp_min(1e-6)[..., None]
+    end_heights = end_heights.abs().clamp_min(1e-6)[..., None]
+    return (start_feet * end_heights + end_feet * start_heights) / (start_heights + end_heights)
 
 
 def polarised(
     normals: Float[Tensor, "*#n 3"], te: Complex[Tensor, "*n"], tm: Complex[Tensor, "*n"]
 ) -> Complex[Tensor, "*n"]:
-    """Reflection coefficients for vertical polarisation: TE at upright planes, TM at level ones, a
-    mean in between.
+    """Reflection coefficients for vertical polarisation.
+
+    TE counts at upright planes, TM at level ones, a mean in between.
     """
     level = normals[..., 2].square()
     return (1 - level) * te + level * tm

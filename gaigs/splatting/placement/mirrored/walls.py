@@ -5,6 +5,7 @@ import logging
 import math
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -17,12 +18,12 @@ from gaigs.io.tables import read_walls
 
 log = logging.getLogger(__name__)
 
-SHORTEST = 1e-3
-"""Least length of a wall and of the edges of a face [m]."""
-
 
 def read_planes(
-    file: Path, lower: Float[Tensor, "3"], upper: Float[Tensor, "3"]
+    file: Path,
+    lower: Float[Tensor, "3"],
+    upper: Float[Tensor, "3"],
+    shortest: float = 1e-3,
 ) -> Float[Tensor, "k 4"]:
     """Planes of a room as rows (normal, offset [m]), the largest area first.
 
@@ -31,6 +32,7 @@ def read_planes(
             or ``.obj`` with the faces of a mesh [m].
         lower, upper: Corners of the box of transmitters and receivers, with floor and ceiling of a
             floor plan unless all stand at one height.
+        shortest: Least length of a wall and of the edges of a face [m].
     """
     if not file.is_file():
         raise FileNotFoundError(
@@ -45,40 +47,46 @@ def read_planes(
         level = torch.tensor([[0.0, 0.0, 1.0, upper[2]], [0.0, 0.0, -1.0, -lower[2]]])
         if upper[2] - lower[2] < 0.01:  # [m]; floor and ceiling would hold all places
             level = level[:0]
-        walls = _merged(
-            normals[lengths > SHORTEST], ends[lengths > SHORTEST, 0], lengths[lengths > SHORTEST]
-        )
+        is_long = lengths > shortest
+        walls = _merged(normals[is_long], ends[is_long, 0], lengths[is_long])
         # A room has floor and ceiling before a fifth wall.
         planes = torch.cat((walls[:4], level, walls[4:])) if len(walls) else walls
     elif file.suffix.lower() == ".obj":
         vertices, groups = read_obj(file)
         points = torch.from_numpy(vertices).float()
-        planes = _merged(*_faces(points, itertools.chain(*groups.values())))
+        planes = _merged(*_faces(points, itertools.chain(*groups.values()), shortest))
     else:
         raise ValueError(f"placement.walls must be a .csv or .obj, got {file.name}")
     if not len(planes):
-        raise ValueError(f"{file} must have a wall longer than {SHORTEST} m")
+        raise ValueError(f"{file} must have a wall longer than {shortest} m")
     for finding in check_walls(points, torch.stack((lower, upper))):
         log.warning("placement.walls: %s", finding)
     return planes
 
 
-def _faces(
-    vertices: Float[Tensor, "v 3"], faces: Iterable[Face]
-) -> tuple[Float[Tensor, "f 3"], Float[Tensor, "f 3"], Float[Tensor, " f"]]:
-    """Normals, a point and area of each triangle of a mesh."""
+class _Faces(NamedTuple):
+    """Normals, a point and area of triangles."""
+
+    normals: Float[Tensor, "f 3"]
+    points: Float[Tensor, "f 3"]
+    areas: Float[Tensor, " f"]
+
+
+def _faces(vertices: Float[Tensor, "v 3"], faces: Iterable[Face], shortest: float) -> _Faces:
+    """Triangles of a mesh."""
     corners = vertices[torch.tensor(triangles(faces), dtype=torch.long).reshape(-1, 3)]
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = normals.norm(dim=1) / 2
-    large = areas > SHORTEST**2
-    return normals[large], corners[large, 0], areas[large]
+    large = areas > shortest**2
+    return _Faces(normals[large], corners[large, 0], areas[large])
 
 
 def _merged(
     normals: Float[Tensor, "f 3"], points: Float[Tensor, "f 3"], sizes: Float[Tensor, " f"]
 ) -> Float[Tensor, "k 4"]:
-    """Coplanar faces (within 0.02 rad and 0.02 m) as the plane of the largest of them, largest
-    total area first.
+    """Coplanar faces as the plane of the largest of them, largest total area first.
+
+    Coplanar are faces within 0.02 rad and 0.02 m.
     """
     sizes, order = sizes.sort(descending=True, stable=True)
     normals = functional.normalize(normals[order], dim=1)
@@ -87,13 +95,13 @@ def _merged(
     totals: list[float] = []
     while len(sizes):
         cosines = normals @ normals[0]
-        near = (cosines.abs() > math.cos(0.02)) & (
-            (offsets * cosines.sign() - offsets[0]).abs() < 0.02
-        )
+        gaps = (offsets * cosines.sign() - offsets[0]).abs()
+        near = (cosines.abs() > math.cos(0.02)) & (gaps < 0.02)
         rows.append([*normals[0].tolist(), offsets[0].item()])
         totals.append(sizes[near].sum().item())
         far = slice(1, None) if near.sum() == 1 else ~near  # a slice is no copy
-        normals, offsets, sizes = normals[far], offsets[far], sizes[far]
-    return torch.tensor(rows).reshape(-1, 4)[
-        torch.tensor(totals).argsort(descending=True, stable=True)
-    ]
+        normals = normals[far]
+        offsets = offsets[far]
+        sizes = sizes[far]
+    order = torch.tensor(totals).argsort(descending=True, stable=True)
+    return torch.tensor(rows).reshape(-1, 4)[order]

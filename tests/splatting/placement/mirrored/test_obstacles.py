@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from gaigs.splatting.placement.mirrored import obstacles as module
 from gaigs.splatting.placement.mirrored.obstacles import Obstacles
 
 LOWER, UPPER = torch.tensor([0.0, 0.0, 0.0]), torch.tensor([6.0, 4.0, 3.0])
@@ -65,11 +64,11 @@ def test_pieces_of_a_segment_add_up_and_its_direction_does_not_matter(obstacles)
     )
 
 
-def test_segments_taken_in_parts_have_the_same_depths_and_gradients(obstacles, monkeypatch):
+def test_segments_taken_in_parts_have_the_same_depths_and_gradients(obstacles):
     starts, ends = segments(9)
     results = []
     for pairs in (1000, 15, 1):
-        monkeypatch.setattr(module, "PAIRS", pairs)
+        obstacles.pairs = pairs
         depths = obstacles(starts, ends)
         results.append(
             (depths, *torch.autograd.grad(depths.abs().square().sum(), [*obstacles.parameters()]))

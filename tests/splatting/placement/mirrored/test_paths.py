@@ -18,8 +18,8 @@ from gaigs.data.synthetic import POSE, REGION
 from gaigs.data.synthetic.image_source import Room, permittivity, trace
 from gaigs.model.mirrored import MirroredSplatting
 from gaigs.splatting.gaussians import SH_DC
-from gaigs.splatting.placement.mirrored import paths
-from gaigs.splatting.placement.mirrored.paths import Mirrored, upright_turn
+from gaigs.splatting.placement.mirrored.movable_planes import upright_turn
+from gaigs.splatting.placement.mirrored.paths import Mirrored
 from gaigs.testing import check_placement, example_links
 from gaigs.testing.placement import example_gaussians
 
@@ -283,11 +283,11 @@ def test_obstacles_attenuate_paths_along_their_legs():
 
 
 @pytest.mark.parametrize("task", [Rssi(), Csi(16, torch.tensor([FREQUENCY]))])
-def test_obstacles_dim_all_paths_but_faint_ones_of_levels(task, monkeypatch):
+def test_obstacles_dim_all_paths_but_faint_ones_of_levels(task):
     query, placement = ask(), walled(make(obstacles=4, task=task))
     found, clear = placement(None, query).gains, walled(make(task=task))(None, query).gains
     shares = (clear.abs() / clear.abs().square().sum(1, keepdim=True).sqrt()).square()
-    monkeypatch.setattr(paths, "FAINT", 0.0)
+    placement.faint = 0.0
     dimmed = placement(None, query).gains
     # Shares of ``_depths`` are before the element's pattern, which takes power away.
     skipped = (found != dimmed).nonzero().tolist()

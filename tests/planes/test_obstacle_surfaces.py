@@ -7,7 +7,8 @@ import torch
 
 import gaigs
 from gaigs.core.query import Query
-from gaigs.planes import sheets
+from gaigs.planes import obstacle_surfaces as surfaces
+from gaigs.planes.obstacle_surfaces import SurfaceOptions
 from gaigs.splatting.placement.mirrored.obstacles import Obstacles
 from gaigs.splatting.placement.mirrored.paths import Mirrored
 
@@ -32,29 +33,28 @@ def placement_of(obstacles):
 
 
 @torch.no_grad()
-def test_crossings_of_a_ball(monkeypatch):
-    monkeypatch.setattr(sheets, "VOXELS", 50_000)
+def test_crossings_of_a_ball():
     placement = placement_of([((0.0, 0.0, 0.0), 0.5, 2.0)])
     steps = torch.linspace(-2, 2, 192).double()
     radius = 0.5 * math.sqrt(2 * math.log(2.0))  # at half of the density
     starts = torch.tensor([[-2.0, 0.0, 0.0], [-2.0, radius / 2, 0.0], [-2.0, 0.0, 2.0]]).double()
     levels = 2 * (-2 * (steps**2 + starts[:, 1:].square().sum(1)[:, None])).exp()
     along = torch.tensor([[4.0, 0, 0]]).double().expand(3, 3)
-    matter = sheets.sample(placement.obstacles, -np.ones(3), np.ones(3))
-    found = sheets.cross(
-        placement.obstacles, matter, 1.0, sheets.Legs(starts, along, torch.arange(3), levels)
+    matter = surfaces.sample_matter(placement.obstacles, -np.ones(3), np.ones(3), 50_000)
+    found = surfaces.find_crossings(
+        placement.obstacles, matter, 1.0, surfaces.Legs(starts, along, torch.arange(3), levels)
     )
     assert found.paths.tolist() == [0, 0, 1, 1]
     assert found.surfaces.tolist() == [0] * 4
     torch.testing.assert_close(
         found.cosines, torch.tensor([1, 1, 0.75**0.5, 0.75**0.5]).double(), atol=2e-3, rtol=0
     )
-    vertices, _ = matter.surface(1.0, 1)
+    vertices, _ = matter.mesh(1.0, 1)
     np.testing.assert_allclose(np.linalg.norm(vertices, axis=1), radius, atol=2e-3)
 
 
 def test_losses_of_a_sheet():
-    crossings = sheets.Crossings(
+    crossings = surfaces.Crossings(
         torch.tensor([0.5, 0.5]),
         torch.tensor([0.0, 1.0]),
         torch.tensor([0, 1]),
@@ -64,15 +64,14 @@ def test_losses_of_a_sheet():
     torch.testing.assert_close(losses, torch.tensor([math.log(3.0), math.log(1.5), 0.0]))
 
 
-def test_sheets_dim_paths_as_two_unlike_obstacles_do(monkeypatch):
-    monkeypatch.setattr(sheets, "VOXELS", 50_000)
-    monkeypatch.setattr(sheets, "CANDIDATES", 4)
+def test_sheets_dim_paths_as_two_unlike_obstacles_do():
+    options = SurfaceOptions(voxels=50_000, candidates=4)
     placement = placement_of([((1.5, 0.5, 0.0), 0.3, 8.0), ((-1.0, -0.5, 0.3), 0.3, 2.0)])
     places = torch.cartesian_prod(
         torch.linspace(0.5, 6.5, 16), torch.linspace(0.5, 4.5, 10), torch.linspace(0.2, 2.8, 5)
     )
     query = Query(places, torch.zeros(len(places), dtype=torch.long))
-    found, rest = sheets.fit_sheets(placement, query, *CORNERS)
+    found, rest = surfaces.fit_sheets(placement, query, *CORNERS, options)
     at = [sheet.vertices.mean(0)[0] - float(placement.middle[0]) for sheet in found]
     thin, dense = (
         sum(sheet.loss_db for sheet, x in zip(found, at, strict=True) if abs(x - y) < 0.2)
@@ -84,9 +83,10 @@ def test_sheets_dim_paths_as_two_unlike_obstacles_do(monkeypatch):
     assert abs(rest) < 0.05
 
 
-def test_clear_rooms_have_no_sheets(monkeypatch):
-    monkeypatch.setattr(sheets, "VOXELS", 1_000)
+def test_clear_rooms_have_no_sheets():
+    options = SurfaceOptions(voxels=1_000)
     query = Query(torch.tensor([[2.0, 2.0, 1.5]]), torch.zeros(1, dtype=torch.long))
-    assert sheets.fit_sheets(placement_of([]), query, *CORNERS) == ([], 0.0)
-    found, _ = sheets.fit_sheets(placement_of([((0.0, 0.0, 0.0), 0.01, 1e-9)]), query, *CORNERS)
+    assert surfaces.fit_sheets(placement_of([]), query, *CORNERS, options) == ([], 0.0)
+    clear = placement_of([((0.0, 0.0, 0.0), 0.01, 1e-9)])
+    found, _ = surfaces.fit_sheets(clear, query, *CORNERS, options)
     assert found == []

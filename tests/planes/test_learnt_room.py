@@ -12,7 +12,9 @@ from gaigs.core.geometry import Pose, semi_axes
 from gaigs.core.query import Query
 from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links, Split
-from gaigs.planes import export as room_export
+from gaigs.planes.learnt_room import build_room, outline_planes
+from gaigs.planes.room_files import summarize, write_room
+from gaigs.planes.room_paths import trace_paths
 from gaigs.splatting.placement.mirrored.paths import Mirrored
 
 SIZE = np.array([6.0, 4.0, 3.0])
@@ -75,9 +77,7 @@ def test_planes_face_outwards_with_their_loss_and_paths(links, build):
     placement = build()
     with torch.no_grad():
         placement.plane_gains[1] = -0.3
-    planes = {
-        plane["number"]: plane for plane in room_export.facts(placement, training(links))["planes"]
-    }
+    planes = {plane["number"]: plane for plane in summarize(placement, training(links))["planes"]}
     assert planes.keys() == set(range(6))
     root = np.sqrt(PERMITTIVITY)
     loss = -20 * np.log10(abs((root - 1) / (root + 1)))
@@ -97,7 +97,7 @@ def test_shares_are_those_of_image_sources(links, build):
     placement = build(order=1)
     with torch.no_grad():
         placement.kept.copy_((placement.sequences[:, 0] == 0) | (placement.sequences[:, 0] == -1))
-    found = room_export.facts(placement, training(links))
+    found = summarize(placement, training(links))
     direct, mirrored = [], []
     root = lambda cosine: np.sqrt(PERMITTIVITY - (1 - cosine**2))
     for place, receiver in zip(
@@ -124,9 +124,7 @@ def test_a_loss_is_that_where_the_plane_reflects_best(links, build):
     with torch.no_grad():
         placement.middles[6] = torch.tensor(middle) - placement.middle
         placement.log_extents[6] = torch.tensor(np.log(extents))
-    planes = {
-        plane["number"]: plane for plane in room_export.facts(placement, training(links))["planes"]
-    }
+    planes = {plane["number"]: plane for plane in summarize(placement, training(links))["planes"]}
     u, v = np.array([0.8, 0, -0.6]), np.array([0, 1.0, 0])
     steps = np.linspace(-4, 4, 801)
     points = 2.0 * np.array([0.6, 0, 0.8]) + steps[:, None, None] * u + steps[:, None] * v
@@ -137,7 +135,7 @@ def test_a_loss_is_that_where_the_plane_reflects_best(links, build):
 
 def test_walls_close_to_a_box(links, build):
     placement = build()
-    planes = room_export.outlines(placement, room_export.trace_paths(placement, training(links)))
+    planes = outline_planes(placement, trace_paths(placement, training(links)))
     assert [plane.share for plane in planes] == sorted(
         (plane.share for plane in planes), reverse=True
     )
@@ -157,8 +155,8 @@ def test_a_wall_without_others_ends_beyond_the_paths_ends(links, build):
     placement = build(order=1)
     with torch.no_grad():
         placement.kept.copy_((placement.sequences[:, 0] == 0) | (placement.sequences[:, 0] == -1))
-    found = room_export.trace_paths(placement, training(links))
-    (plane,) = room_export.outlines(placement, found)
+    found = trace_paths(placement, training(links))
+    (plane,) = outline_planes(placement, found)
     rim = plane.corners[:, 1:]
     np.testing.assert_allclose(plane.corners[:, 0], SIZE[0], atol=1e-4)
     assert (rim.min(0) < found.ends.min(0)[1:]).all()
@@ -168,8 +166,8 @@ def test_a_wall_without_others_ends_beyond_the_paths_ends(links, build):
 
 def test_a_plane_within_the_room_spans_its_bounces(links, build):
     placement = add(build(planes=7), [0.6, 0.8, 0.0], 3.2)
-    found = room_export.trace_paths(placement, training(links))
-    (plane,) = (plane for plane in room_export.outlines(placement, found) if plane.number == 6)
+    found = trace_paths(placement, training(links))
+    (plane,) = (plane for plane in outline_planes(placement, found) if plane.number == 6)
     np.testing.assert_allclose(
         plane.normal, [-0.6, -0.8, 0], atol=1e-6
     )  # away from the room's middle
@@ -183,7 +181,7 @@ def test_a_plane_within_the_room_spans_its_bounces(links, build):
         assert drawn.min() < np.quantile(met, 0.1)
         assert drawn.max() > np.quantile(met, 0.9)
     assert newell(plane.corners) @ plane.normal > 0
-    walls = [other for other in room_export.outlines(placement, found) if other.number != 6]
+    walls = [other for other in outline_planes(placement, found) if other.number != 6]
     assert sum(np.linalg.norm(newell(wall.corners)) for wall in walls) == pytest.approx(
         2 * (24 + 18 + 12), abs=0.01
     )
@@ -194,7 +192,7 @@ def test_a_window_ends_a_wall(links, build):
     with torch.no_grad():
         placement.middles[0] = torch.tensor([6.0, 1.5, 1.0]) - placement.middle
         placement.log_extents[0, 1] = np.log(0.4)
-    planes = room_export.outlines(placement, room_export.trace_paths(placement, training(links)))
+    planes = outline_planes(placement, trace_paths(placement, training(links)))
     (wall,) = (plane for plane in planes if plane.number == 0)
     np.testing.assert_allclose(wall.corners[:, 1].min(), 1.5 - 0.8, atol=1e-3)
     np.testing.assert_allclose(wall.corners[:, 1].max(), 1.5 + 0.8, atol=1e-3)
@@ -204,16 +202,14 @@ def test_a_plane_far_off_is_left_out(links, build):
     placement = add(build(planes=7), [1.0, 0.0, 0.0], 60.0)
     with torch.no_grad():
         placement.plane_gains[6] = -5
-    found = room_export.trace_paths(placement, training(links))
-    assert 6 in [
-        plane["number"] for plane in room_export.facts(placement, training(links))["planes"]
-    ]
-    assert {plane.number for plane in room_export.outlines(placement, found)} == set(range(6))
+    found = trace_paths(placement, training(links))
+    assert 6 in [plane["number"] for plane in summarize(placement, training(links))["planes"]]
+    assert {plane.number for plane in outline_planes(placement, found)} == set(range(6))
 
 
 def test_paths_are_as_long_as_to_their_images(links, build):
     placement = build(obstacles=3)
-    room = room_export.learnt_room(placement, links)
+    room = build_room(placement, links)
     first = links.query[links.split.test[:2]]  # one place, two receivers
     lengths = placement(None, first).lengths.detach().numpy().ravel()
     powers = [path.power_db for path in room.paths]
@@ -237,11 +233,11 @@ def test_paths_are_as_long_as_to_their_images(links, build):
 
 def test_the_direct_path_alone_makes_no_room(links, build):
     placement = build(order=0)
-    room = room_export.learnt_room(placement, links)
+    room = build_room(placement, links)
     assert room.planes == []
     assert room.matter is None
     assert [len(path.points) for path in room.paths] == [2, 2]
-    assert room_export.facts(placement, training(links)) == {
+    assert summarize(placement, training(links)) == {
         "planes": [],
         "paths": [{"bounces": 0, "kept": 1, "share": 1.0}],
     }
@@ -265,11 +261,11 @@ def parsed(text):
 
 def test_planes_are_written_as_wavefront_obj(links, build, tmp_path):
     placement = build()
-    room_export.export(placement, training(links), tmp_path)
+    write_room(placement, training(links), tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["planes.obj"]
     text = (tmp_path / "planes.obj").read_text()
     faces = parsed(text)
-    planes = room_export.outlines(placement, room_export.trace_paths(placement, training(links)))
+    planes = outline_planes(placement, trace_paths(placement, training(links)))
     assert [*faces] == [f"plane_{plane.number}" for plane in planes]
     for plane, corners in zip(planes, faces.values(), strict=True):
         np.testing.assert_allclose(corners, plane.corners, atol=1e-4)
@@ -283,7 +279,7 @@ def test_obstacles_are_written_as_splats(links, build, tmp_path):
     with torch.no_grad():
         blobs.log_densities.copy_(torch.tensor([-12.0, -1.0, 0.5, 5.0]))  # clear ... opaque
         blobs.log_widths.copy_(torch.tensor([[0.1, 0.2, 0.4]]).log().expand(4, 3))
-    room_export.export(placement, training(links), tmp_path)
+    write_room(placement, training(links), tmp_path)
     file = PlyData.read(str(tmp_path / "obstacles.ply"))
     vertices = file["vertex"]
     columns = lambda *names: torch.from_numpy(np.stack([vertices[name] for name in names], -1))

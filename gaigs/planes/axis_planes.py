@@ -1,0 +1,147 @@
+"""Planes along the axes of a room: growth of a room whose first planes are known."""
+
+import logging
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional
+
+from gaigs.core import stages
+from gaigs.planes.channel_links import SLABS, ChannelData, SlabRoom
+from gaigs.planes.channel_score import ChannelScore
+from gaigs.planes.phase_proposals import propose_by_phases
+from gaigs.planes.search import Candidate, PlaneSearch
+from gaigs.splatting.placement.mirrored.reflections import distinct
+
+log = logging.getLogger(__name__)
+
+
+class AxisPlanes(PlaneSearch[SlabRoom]):
+    """Search for planes along the axes of a room, near its known planes.
+
+    Only offsets are searched, so fainter planes stand out from noise, and walls behind the array
+    from the direct path. Walls go first. All planes move a little whenever there is one more.
+    """
+
+    score: ChannelScore
+
+    def __init__(self, data: ChannelData, score: ChannelScore):
+        super().__init__(data.frame, score)
+        self.data = data
+
+    def find_upright(self, room: SlabRoom) -> SlabRoom:
+        """The upright plane along the axes of a room that explains most alone, if there is any."""
+        axes = room_axes(room.planes)
+        nothing = SlabRoom(room.planes[:0], room.slabs[:0])
+        walls, amid = self.propose_along(nothing, axes[axes[:, 2].abs() < 0.01], 0.0)
+        trials = []
+        for candidate in walls + amid:
+            for moved, material in self._propose_by_phases(candidate[None], 0, 0.04):
+                # Level directions alone, with a normal of length 1.
+                upright = moved * moved.new_tensor([1.0, 1.0, 0.0, 1.0]) / moved[:2].norm()
+                trials.append(SlabRoom(upright[None], material[None]))
+        polished = [self.score.refine(trial) for trial in self.score.choose_best(trials)]
+        return min(polished, key=self.score.error, default=nothing)
+
+    def grow_along(
+        self, room: SlabRoom, most: int, others: Float[Tensor, "v 4"] | None = None
+    ) -> SlabRoom:
+        """The room with further planes along its axes, or else near others."""
+        count = len(room.planes)
+
+        def extend(room: SlabRoom) -> SlabRoom | None:
+            before = self.score.error(room)
+            walls, amid = self.propose_along(
+                room, room_axes(room.planes), self.data.options.added_share
+            )
+            near = [] if others is None else list(others)
+            new = [plane for plane in near if not self.frame.is_like(room.planes, plane).any()]
+            for candidates in (walls, amid, new):
+                if not candidates:
+                    continue
+                larger = self.add_best(room, candidates)
+                if self.score.error(larger) < before:
+                    larger = self.settle(larger)
+                    log.info("%s, square to others", self.frame.describe(larger.planes[-1]))
+                    return larger
+            return None
+
+        room = self.grow(room, most, extend)
+        return self.settle(room, polishes=True) if len(room.planes) > count else room
+
+    def propose_along(
+        self, room: SlabRoom, normals: Float[Tensor, "k 3"], least: float
+    ) -> tuple[list[Float[Tensor, "4"]], list[Float[Tensor, "4"]]]:
+        """Planes with these normals that explain more than a share of the rest, the best first.
+
+        At most four walls, which have all places on one side, and four planes amid the places:
+        these explain more of the rest.
+        """
+        walls: list[Candidate] = []
+        amid: list[Candidate] = []
+        lines = self.frame.grid(normals, 400, self.data.options.margin)
+        for line, shares in zip(lines, self.score.rate(room, lines).ratings, strict=True):
+            for plane in room.planes:
+                shares[self.frame.is_like(line, plane)] = 0
+            heights = self.frame.points.to(line) @ line[0, :3]
+            is_wall = (line[:, 3] < heights.min()) | (line[:, 3] > heights.max())
+            for kind, rated in ((walls, shares * is_wall), (amid, shares * ~is_wall)):
+                kind += [Candidate(line[at], rated[at].item()) for at in find_maxima(rated, 11)]
+        return _strongest(walls, least), _strongest(amid, least)
+
+    def add_best(self, room: SlabRoom, candidates: list[Float[Tensor, "4"]]) -> SlabRoom:
+        """The room with the best candidate, which may not move to a known plane; or the room."""
+        trials = []
+        number = len(room.planes)
+        for plane in candidates:
+            planes = torch.cat((room.planes, plane[None]))
+            for moved, material in self._propose_by_phases(planes, number, 1e-4):
+                if not self.frame.is_like(room.planes, moved).any():
+                    trials.append(room.with_plane(moved, material))
+        best = self.score.choose_best(trials)
+        return self.score.polish(best[0], 12, 5e-4, number) if best else room
+
+    def settle(self, room: SlabRoom, polishes: bool = False) -> SlabRoom:
+        """Each plane once more at its best offset and tilt, as the others are known now."""
+        move = self.score.move_and_polish if polishes else self.score.move
+        room = self.sweep(room, range(len(room.planes)), move=move)
+        if stages.is_up():
+            return room
+        return self.score.choose_best([room, self.score.polish(room, 30, 3e-4)])[0]
+
+    def _propose_by_phases(self, planes: Float[Tensor, "w 4"], number: int, tilt: float) -> list:
+        """Planes near one of some planes, with every third slab."""
+        return propose_by_phases(self.data, planes, number, self.data.reach, tilt, SLABS[::3])
+
+
+def _strongest(candidates: list[Candidate], least: float) -> list[Float[Tensor, "4"]]:
+    """Planes of at most four candidates whose ratings exceed ``least``, best first."""
+    candidates = sorted(candidates, key=lambda candidate: -candidate.rating)[:4]
+    return [candidate.plane for candidate in candidates if candidate.rating > least]
+
+
+def room_axes(planes: Float[Tensor, "w 4"]) -> Float[Tensor, "k 3"]:
+    """Normals of planes, and others that a room may have.
+
+    These are level, upright, and at right angles to upright ones.
+    """
+    normals = planes[:, :3]
+    up = planes.new_tensor([0.0, 0.0, 1.0])
+    upright = functional.normalize(normals[normals[:, 2].abs() < 0.5] * (1 - up), dim=1)
+    across = torch.linalg.cross(up.expand_as(upright), upright)
+    return torch.stack(distinct(torch.cat((normals, up[None], upright, across)), 2e-4))
+
+
+def is_square(planes: Float[Tensor, "w 4"]) -> bool:
+    """True if planes are level or upright, and parallel or at right angles, to a degree or so."""
+    normals = torch.cat((planes[:, :3], planes.new_tensor([[0.0, 0.0, 1.0]])))
+    cosines = (normals @ normals.mT).abs()
+    return bool(((cosines < 0.02) | (cosines > 0.9998)).all())
+
+
+def find_maxima(ratings: Float[Tensor, " k"], width: int) -> list[int]:
+    """Indices of at most two maxima over 0, each the largest of ``width`` neighbours."""
+    is_peak = functional.max_pool1d(ratings[None], width, 1, width // 2)[0] == ratings
+    at = (ratings * is_peak).topk(2).indices
+    return at[ratings[at] * is_peak[at] > 0].tolist()

@@ -1,0 +1,354 @@
+"""Training channels of a search for planes: links of each receiver, waves and materials."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Complex, Float, Int
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.core.propagation import NEAREST, slab
+from gaigs.core.query import evenly
+from gaigs.core.task.csi import Csi
+from gaigs.data import Links
+from gaigs.planes.frame import RoomFrame
+from gaigs.planes.strengths import FreeFit, fit_free
+from gaigs.splatting.placement.mirrored.reflections import all_sequences, fold, images, polarised
+
+SLABS = (
+    torch.tensor(
+        [(1.5, 0.3, 1.0), (4.0, 0.3, 1.0), *((2.0, 0.05, 0.005 * step) for step in range(1, 13))]
+    )
+    .double()
+    .log()
+)
+"""Slabs that are tried: logarithms of the relative permittivity's real part over 1 and imaginary
+part, and of the thickness [m]; a metre is a half-space."""
+
+
+@dataclass(frozen=True)
+class ChannelOptions:
+    """Options of the search for planes in channels.
+
+    Attributes:
+        ridge: Ridge of path strengths over their mean power.
+        fewest_numbers: Fewest numbers of a channel, elements times subcarriers: one path explains
+            any single number.
+        fewest_free: Numbers of a channel, elements times delays that its band resolves in the room,
+            below which free strengths explain it by any planes. A room of six has as many paths of
+            up to two reflections.
+        certain_share: Share of the power from which a plane is taken.
+        faint_share: The same if the rest falls by ``certain_fall``. Validation drops planes later;
+            a few too many cost time alone.
+        certain_fall: Fall of the mean log of the rest by a true plane behind others: false ones
+            reach 0.3.
+        price: Least fall of the mean log of what neighbours do not predict by a true plane. Walls
+            have 0.05 and more, false planes up to 0.02, furniture 0.01 to 0.06.
+        neighbours: Places whose strengths predict a place.
+        predicted: Most places that are predicted.
+        added_share: Least share of the rest that a candidate along the room's axes explains.
+        margin: Largest distance of a plane from all transmitters and receivers [diagonals].
+        offset_cells, tilt_cells: Most steps of the periodogram on either side. Steps follow the
+            wavelength, of a tilt over the room's diagonal. At 60 GHz they reach 2 cm, and 0.004 rad
+            in a room of 10 m; in a hall of 100 m 0.007 rad at 3.5 GHz.
+        most_waves: Most waves of ``find_axis_walls``, some seconds' work for each plane: offsets
+            times places times numbers.
+        drawing_error: Largest error of a wall in a floor plan [m].
+        chance: Share of the rest that the best of thousands of planes explains by chance, times the
+            number of places.
+    """
+
+    ridge: float = 1e-3
+    fewest_numbers: int = 8
+    fewest_free: int = 37
+    certain_share: float = 0.006
+    faint_share: float = 0.003
+    certain_fall: float = 0.5
+    price: float = 0.02
+    neighbours: int = 8
+    predicted: int = 250
+    added_share: float = 0.05
+    margin: float = 0.3
+    offset_cells: int = 64
+    tilt_cells: int = 40
+    most_waves: int = 100_000_000
+    drawing_error: float = 0.2
+    chance: float = 6.0
+
+
+class SlabRoom(NamedTuple):
+    """Planes in the frame of the room, and their slabs as in ``SLABS``."""
+
+    planes: Float[Tensor, "w 4"]
+    slabs: Float[Tensor, "w 3"]
+
+    def with_plane(self, plane: Float[Tensor, "4"], material: Float[Tensor, "3"]) -> "SlabRoom":
+        """The room with a plane behind the others."""
+        planes = torch.cat((self.planes, plane[None]))
+        return SlabRoom(planes, torch.cat((self.slabs, material[None])))
+
+    def replace_plane(
+        self, number: int, plane: Float[Tensor, "4"], material: Float[Tensor, "3"]
+    ) -> "SlabRoom":
+        """The room with another plane at a number."""
+        room = SlabRoom(self.planes.clone(), self.slabs.clone())
+        room.planes[number] = plane
+        room.slabs[number] = material
+        return room
+
+
+def half_spaces(planes: Float[Tensor, "w 4"]) -> SlabRoom:
+    """A room with walls without a far side."""
+    return SlabRoom(planes, SLABS[1].repeat(len(planes), 1))
+
+
+class SlabMaterials(NamedTuple):
+    """Complex relative permittivities, and thicknesses [m]."""
+
+    permittivities: Complex[Tensor, "*w"]
+    thicknesses: Float[Tensor, "*w"]
+
+
+def materials_of(slabs: Float[Tensor, "*w 3"]) -> SlabMaterials:
+    """Materials of rows as in ``SLABS``."""
+    real, imaginary, thicknesses = slabs.exp().unbind(-1)
+    return SlabMaterials(torch.complex(1 + real, -imaginary), thicknesses)
+
+
+@dataclass(frozen=True)
+class ReceiverChannels:
+    """The training channels of one receiver, thinned to some elements and subcarriers.
+
+    Attributes:
+        places: Transmitters (b, 3) [m].
+        channels: With phases as of exp(-j 2 pi f t) (b, e, s).
+        position: Middle of the array (3,) [m].
+        elements: World frame (e, 3) [m].
+        frequencies: (s,) [Hz].
+    """
+
+    places: Float[Tensor, "b 3"]
+    channels: Complex[Tensor, "b e s"]
+    position: Float[Tensor, "3"]
+    elements: Float[Tensor, "e 3"]
+    frequencies: Float[Tensor, " s"]
+
+    @classmethod
+    def of(
+        cls, links: Links, number: int, sign: int, elements: int = 16, subcarriers: int = 32
+    ) -> "ReceiverChannels":
+        receiver = links.receivers[number]
+        query = links.query
+        task: Csi = links.task
+        train = links.split.train
+        rows = train[query.receivers[train] == number]
+        which = evenly(torch.arange(len(receiver.array)), elements)
+        when = evenly(torch.arange(len(task.frequencies)), subcarriers)
+        channels = links.labels[rows][:, which][:, :, when].to(torch.complex128)  # (b, e, s)
+        is_received = channels.abs().amax((1, 2)) > 0
+        pose = receiver.pose.to(torch.zeros((), dtype=torch.float64))
+        return cls(
+            query.transmitters[rows][is_received].double(),
+            (channels.conj() if sign > 0 else channels)[is_received],
+            pose.position,
+            pose.world(receiver.array.elements[which].double()),
+            task.frequencies[when],
+        )
+
+    def about(self, middle: Float[Tensor, "3"]) -> "ReceiverChannels":
+        """The same seen from a point."""
+        points = {name: getattr(self, name) - middle for name in ("places", "position", "elements")}
+        return replace(self, **points)
+
+    def at(self, index: object, when: object = slice(None)) -> "ReceiverChannels":
+        """The channels of some places at some subcarriers."""
+        return replace(
+            self,
+            places=self.places[index],
+            channels=self.channels[index][:, :, when],
+            frequencies=self.frequencies[when],
+        )
+
+    def single(self) -> "ReceiverChannels":
+        """In single precision, for descents."""
+        parts = {
+            name: part.float()
+            for name, part in vars(self).items()
+            if isinstance(part, Tensor) and part.is_floating_point()
+        }
+        return replace(self, **parts, channels=self.channels.to(torch.complex64))
+
+    def of_unique_places(self) -> "ReceiverChannels":
+        """One link of each place that is received.
+
+        Links of one place have one channel, and would explain each other.
+        """
+        received = self.at(self.channels.abs().amax((1, 2)) > 0)
+        _, which = received.places.unique(dim=0, return_inverse=True)
+        first: dict[int, int] = {}
+        for row, place in enumerate(which.tolist()):
+            first.setdefault(place, row)
+        return received.at(torch.tensor(sorted(first.values()), dtype=torch.long))
+
+    @cached_property
+    def flat(self) -> Complex[Tensor, "b k"]:
+        """Channels with elements and subcarriers in one dimension."""
+        return self.channels.flatten(1)
+
+    @property
+    def few_subcarriers(self) -> slice:
+        """A fifth of the subcarriers, or as many as leave 64 numbers of a channel."""
+        return slice(None, None, min(5, max(1, self.flat.shape[1] // 64)))
+
+    def images(
+        self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"]
+    ) -> Float[Tensor, "b n 3"]:
+        """Images of the transmitters in sequences of planes [m]."""
+        return images(self.places, sequences, planes[:, :3], planes[:, 3])[-1]
+
+    def waves(self, points: Float[Tensor, "b n 3"]) -> Complex[Tensor, "b n k"]:
+        """Waves of unit sources at points: exp(-j 2 pi f L / c) / L at each element."""
+        ways = points[..., None, :] - self.elements  # (b, n, e, 3)
+        lengths = ways.norm(dim=-1).clamp_min(NEAREST)[..., None]  # (b, n, e, 1)
+        turns = lengths * (self.frequencies / speed_of_light)  # (b, n, e, s)
+        turns = turns - turns.detach().round()
+        waves = torch.polar((1 / lengths).expand_as(turns), -2 * math.pi * turns)
+        return waves.flatten(-2)
+
+    def reflected(
+        self,
+        room: SlabRoom,
+        sequences: Int[Tensor, "n order"],
+        at: Float[Tensor, " s"] | None = None,
+    ) -> Complex[Tensor, "b n k"]:
+        """Waves of all paths after their reflections; 0 for a path that does not meet its planes.
+
+        Slabs reflect as ``at`` some frequencies [Hz], by default at each subcarrier's. Half-spaces
+        reflect all alike.
+        """
+        at = self.frequencies if at is None else at
+        planes = room.planes.to(self.places)
+        normals, offsets = planes[:, :3], planes[:, 3]
+        points = images(self.places, sequences, normals, offsets)
+        receivers = self.position.expand(len(self.places), 3)
+        folded = fold(points, receivers, sequences, normals, offsets)
+        permittivities, thicknesses = materials_of(room.slabs.to(self.places))
+        depths = thicknesses[:, None] * at / speed_of_light  # (w, s) [wavelengths]
+        te, tm = slab(
+            permittivities[folded.planes, None],
+            folded.cosines[..., None].clamp(1e-3, 1),
+            depths[folded.planes],
+        )
+        gains = folded.exists[..., None].to(self.channels.dtype).expand(-1, -1, len(at))
+        gains = folded.reflected(gains, polarised(folded.normals[:, None], te, tm))  # (b, n, s)
+        waves = self.waves(points[-1]).unflatten(-1, (len(self.elements), -1))  # (b, n, e, s)
+        return (waves * gains[:, :, None]).flatten(-2)
+
+
+class ChannelSample(NamedTuple):
+    """Channels of each receiver at some places and subcarriers, and their reference phases."""
+
+    receivers: list[ReceiverChannels]
+    phases: list[Complex[Tensor, " c"]]
+
+    def every(self, step: int) -> "ChannelSample":
+        """Every ``step``-th place."""
+        receivers = [receiver.at(slice(None, None, step)) for receiver in self.receivers]
+        phases = [phase if len(phase) == 1 else phase[::step] for phase in self.phases]
+        return ChannelSample(receivers, phases)
+
+
+class ChannelData:
+    """All training channels of a search, in the frame of the room.
+
+    Args:
+        links: Their training links count; of the task ``csi``.
+        sign: Sign of the channels' phases.
+        has_common_phase: True if all channels have one phase in common.
+        order: Largest number of reflections of a path; more than 2 count as 2, as longer paths
+            hardly locate a plane.
+        options: Of the search.
+    """
+
+    def __init__(
+        self, links: Links, sign: int, has_common_phase: bool, order: int, options: ChannelOptions
+    ):
+        self.has_common_phase = has_common_phase
+        self.order = min(order, 2)
+        self.options = options
+        received = []
+        for number in links.query.receivers[links.split.train].unique().tolist():
+            receiver = ReceiverChannels.of(links, number, sign)
+            if len(receiver.places):
+                received.append(receiver)
+        ends = []
+        for receiver in received:
+            ends += [receiver.places, receiver.position[None]]
+        self.frame = RoomFrame(torch.cat(ends))
+        self.receivers = [receiver.about(self.frame.middle) for receiver in received]
+        self.wavelength = speed_of_light / float(self.receivers[0].frequencies.mean())
+        bands = [
+            float(receiver.frequencies.max() - receiver.frequencies.min())
+            for receiver in self.receivers
+        ]
+        # [m] Peaks of delay profiles are off by a part of the resolution, where paths are close.
+        self.reach = max(0.07, speed_of_light / 8 / max(*bands, 1.0))
+
+    def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
+        """Sequences of planes of all paths."""
+        return all_sequences(len(planes), self.order)
+
+    def draw(
+        self, count: int, subcarriers: int | None = None, fewest: int = 8
+    ) -> list[ReceiverChannels]:
+        """All receivers with about ``count`` random places together, ``fewest`` or more each."""
+        each = max(fewest, count // len(self.receivers))
+        parts = []
+        for receiver in self.receivers:
+            places = self._draw_rows(len(receiver.places), each)
+            when = self._draw_rows(len(receiver.frequencies), subcarriers)
+            parts.append(receiver.at(places, when))
+        return parts
+
+    def _draw_rows(self, size: int, most: int | None) -> Int[Tensor, " k"]:
+        return torch.randperm(size, generator=self.frame.generator)[:most].sort().values
+
+    def sample(self, planes: Float[Tensor, "w 4"]) -> ChannelSample:
+        """About a hundred places at some subcarriers, and their phases beside planes."""
+        receivers = []
+        phases = []
+        references = self.reference_phases(planes, self.receivers)
+        for receiver, phase in zip(self.receivers, references, strict=True):
+            step = max(1, len(receiver.places) * len(self.receivers) // 100)
+            thinned = receiver.at(slice(None, None, step), receiver.few_subcarriers)
+            receivers.append(thinned.single())
+            phases.append(phase if len(phase) == 1 else phase[::step])
+        return ChannelSample(receivers, phases)
+
+    def fit_free(
+        self, receiver: ReceiverChannels, planes: Float[Tensor, "w 4"], ridge: float | None = None
+    ) -> FreeFit:
+        """Free strengths of all paths at planes, by default with the ridge of the options."""
+        waves = receiver.waves(receiver.images(planes, self.sequences(planes)))
+        return fit_free(waves, receiver.flat, self.options.ridge if ridge is None else ridge)
+
+    def reference_phases(
+        self, planes: Float[Tensor, "w 4"], receivers: list[ReceiverChannels]
+    ) -> list[Complex[Tensor, " c"]]:
+        """Phase of each receiver's direct paths: one in common, or one for each place."""
+        phases = []
+        for receiver in receivers:
+            if not self.has_common_phase:
+                # One place alone does not separate direct paths from close ones: they share their
+                # power, and so a phase.
+                phases.append(self.fit_free(receiver, planes, 1e-2).strengths[:, 0].sgn())
+                continue
+            step = max(1, len(receiver.places) // 100)  # a hundred places suffice
+            thinned = receiver.at(slice(None, None, step))
+            direct = self.fit_free(thinned, planes, 1e-4).strengths[:, 0]
+            strong = direct.abs() >= direct.abs().median()
+            phases.append((direct.sgn() * strong).sum()[None].sgn())
+        return phases

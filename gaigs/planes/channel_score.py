@@ -1,0 +1,284 @@
+"""The score of planes by channels: real strengths of slabs, and neighbours that predict a place."""
+
+import math
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Complex, Float, Int
+from torch import Tensor
+
+from gaigs.core.query import evenly
+from gaigs.planes.channel_links import SLABS, ChannelData, ChannelSample, ReceiverChannels, SlabRoom
+from gaigs.planes.phase_proposals import propose_by_phases
+from gaigs.planes.search import GridRatings, Score, descend
+from gaigs.planes.strengths import align_phases, log_share, real_residual, real_strengths, ridged
+
+
+class NeighbourLinks(NamedTuple):
+    """Channels of one receiver, and the nearest places to those that are predicted.
+
+    Attributes:
+        receiver: Channels of targets and neighbours.
+        targets: Rows of the predicted places.
+        near: Rows of their nearest places (t, k).
+        counts: True for neighbours a wavelength away or farther: closer ones share the interference
+            of all paths.
+    """
+
+    receiver: ReceiverChannels
+    targets: Int[Tensor, " t"]
+    near: Int[Tensor, "t k"]
+    counts: Bool[Tensor, "t k"]
+
+
+class ChannelScore(Score[SlabRoom]):
+    """Planes by the phases of reflections at slabs, with real strengths that are not negative.
+
+    A true plane's strengths vary little from place to place, so channels are predicted with the
+    strengths of the nearest places. The error is what the prediction leaves, and a price of each
+    plane. A false plane that explains one place by chance fails at the next.
+
+    Args:
+        data: Training channels.
+        has_free_strengths: True if channels have numbers enough for complex strengths in ratings.
+
+    Source: Stone, Cross-validatory choice and assessment of statistical predictions, 1974.
+    """
+
+    def __init__(self, data: ChannelData, has_free_strengths: bool):
+        self.data = data
+        self.options = data.options
+        self.has_free_strengths = has_free_strengths
+
+    def error(self, room: SlabRoom) -> float:
+        sequences = self.data.sequences(room.planes)
+        shares = []
+        receivers = [links.receiver for links in self.neighbours]
+        phases = self.data.reference_phases(room.planes, receivers)
+        for links, phase in zip(self.neighbours, phases, strict=True):
+            shares.append(self._neighbour_errors(links, phase, room, sequences))
+        return torch.cat(shares).mean().item() + self.options.price * len(room.planes)
+
+    def _neighbour_errors(
+        self,
+        links: NeighbourLinks,
+        phase: Complex[Tensor, " c"],
+        room: SlabRoom,
+        sequences: Int[Tensor, "n order"],
+    ) -> Float[Tensor, " t"]:
+        """Log of the share of each target's power that its neighbours' strengths leave."""
+        receiver = links.receiver.at(slice(None), links.receiver.few_subcarriers).single()
+        channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
+        power = receiver.flat.abs().square().sum(1)[:, None, None]
+        waves = receiver.reflected(room, sequences)  # (b, n, k)
+        # Normal equations of each place over its power; summed over a target's neighbours.
+        weights = torch.where(power > 0, 1 / power, 0)  # silent at these subcarriers
+        counts = links.counts[..., None, None]
+        gram = weights * (waves.conj() @ waves.mT).real
+        gram = (counts * gram[links.near]).sum(1)  # (t, n, n)
+        right = weights * (waves.conj() @ channels[..., None]).real
+        right = (counts * right[links.near]).sum(1)  # (t, n, 1)
+        strengths = real_strengths(ridged(gram, self.options.ridge), right)
+        predicted = (strengths.mT.to(waves) @ waves[links.targets])[:, 0]
+        predicted = predicted * (power[links.targets, 0] > 0)  # a silent target says nothing
+        channels = channels[links.targets]
+        if not self.data.has_common_phase:
+            channels = align_phases(channels, predicted)
+        return log_share(channels - predicted, channels)
+
+    @cached_property
+    def neighbours(self) -> list[NeighbourLinks]:
+        """Predicted places of each receiver."""
+        neighbours = []
+        most = max(8, self.options.predicted // len(self.data.receivers))
+        for links in self.data.receivers:
+            receiver = links.of_unique_places()
+            targets = evenly(torch.arange(len(receiver.places)), most)
+            gaps = torch.cdist(receiver.places[targets], receiver.places)
+            gaps[gaps < self.data.wavelength] = math.inf
+            count = min(self.options.neighbours, gaps.shape[1])
+            gaps, near = gaps.topk(count, largest=False)
+            rows = torch.cat((targets, near.flatten())).unique()
+            neighbours.append(
+                NeighbourLinks(
+                    receiver.at(rows),
+                    torch.searchsorted(rows, targets),
+                    torch.searchsorted(rows, near),
+                    gaps.isfinite(),
+                )
+            )
+        return neighbours
+
+    def remove(self, room: SlabRoom, number: int) -> SlabRoom:
+        others = torch.arange(len(room.planes)) != number
+        return SlabRoom(room.planes[others], room.slabs[others])
+
+    def refine(self, room: SlabRoom) -> SlabRoom:
+        return self.polish(room, 60, 3e-4)
+
+    def move(self, room: SlabRoom, number: int) -> SlabRoom:
+        return self._best_moves(room, number)[0]
+
+    def move_and_polish(self, room: SlabRoom, number: int) -> SlabRoom:
+        """``move`` after a descent with each of the best: an ill slab may hide the best offset."""
+        best = self._best_moves(room, number)
+        return self.choose_best(best + [self.polish(trial, 12, 5e-4, number) for trial in best])[0]
+
+    def _best_moves(self, room: SlabRoom, number: int) -> list[SlabRoom]:
+        trials = [room]
+        for plane, material in propose_by_phases(
+            self.data, room.planes, number, self.data.reach, 0.006, SLABS
+        ):
+            trials.append(room.replace_plane(number, plane, material))
+        return self.choose_best(trials)
+
+    # --- residuals ---
+
+    def choose_best(self, rooms: list[SlabRoom]) -> list[SlabRoom]:
+        """At most three rooms that leave least, the best first. Few places choose these three."""
+        if not rooms:
+            return []
+        sample = self.data.sample(rooms[0].planes)
+        if len(rooms) > 3:
+            few = sample.every(3)
+            rooms = sorted(rooms, key=lambda room: self.measure(few, room).item())[:3]
+        return sorted(rooms, key=lambda room: self.measure(sample, room).item())
+
+    def measure(
+        self, sample: ChannelSample, room: SlabRoom, resolved: Bool[Tensor, " w"] | bool = True
+    ) -> Float[Tensor, ""]:
+        """Mean log of the share of power that real strengths leave.
+
+        Paths at planes that are not ``resolved`` have complex strengths.
+        """
+        shares = []
+        rests = self.residuals(sample, room, resolved)
+        for receiver, rest in zip(sample.receivers, rests, strict=True):
+            shares.append(log_share(rest, receiver.flat))
+        return torch.cat(shares).mean()
+
+    def residuals(
+        self, sample: ChannelSample, room: SlabRoom, resolved: Bool[Tensor, " w"] | bool = True
+    ) -> list[Complex[Tensor, "b k"]]:
+        """What the strengths of ``measure`` leave of each receiver's channels."""
+        sequences = self.data.sequences(room.planes)
+        resolved = torch.as_tensor(resolved).expand(len(room.planes))
+        is_free = torch.isin(sequences, (~resolved).nonzero()).any(1)
+        # A complex strength is two signed real ones, of the wave and of one a quarter turn ahead.
+        signed = torch.cat((is_free, is_free[is_free]))
+        rests = []
+        for receiver, phase in zip(sample.receivers, sample.phases, strict=True):
+            channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
+            waves = receiver.reflected(room, sequences)
+            waves = torch.cat((waves, 1j * waves[:, is_free]), 1)
+            rest = real_residual(waves, channels, signed, self.options.ridge)
+            if not self.data.has_common_phase:
+                # Once more with the phase of each place that explains most.
+                channels = align_phases(channels, channels - rest)
+                rest = real_residual(waves, channels, signed, self.options.ridge)
+            rests.append(rest)
+        return rests
+
+    def polish(self, room: SlabRoom, steps: int, rate: float, only: int | None = None) -> SlabRoom:
+        """The room after a descent on ``measure`` with all planes, or with one.
+
+        ``rate`` as in ``search.descend`` [m].
+        """
+        moves = torch.ones(len(room.planes), dtype=torch.bool)
+        if only is not None:
+            moves = torch.arange(len(room.planes)) == only
+        moves = moves[:, None]
+        receivers = self.data.receivers
+        references = self.data.reference_phases(room.planes, receivers)
+        generator = self.data.frame.generator
+
+        def loss(planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]) -> Float[Tensor, ""]:
+            trial = SlabRoom(
+                torch.where(moves, planes, room.planes), torch.where(moves, slabs, room.slabs)
+            )
+            parts = []
+            phases = []
+            for receiver, phase in zip(receivers, references, strict=True):
+                # Other links in each step: a stochastic gradient.
+                count = max(8, 40 // len(receivers))
+                index = torch.randperm(len(receiver.places), generator=generator)[:count]
+                when = torch.randperm(len(receiver.frequencies), generator=generator)[:6]
+                parts.append(receiver.at(index, when).single())
+                phases.append(phase if len(phase) == 1 else phase[index])
+            return self.measure(ChannelSample(parts, phases), trial)
+
+        planes, slabs = descend(loss, receivers, room.planes, [room.slabs], steps, rate)
+        return SlabRoom(
+            torch.where(moves, planes, room.planes), torch.where(moves, slabs, room.slabs)
+        )
+
+    # --- ratings ---
+
+    def rate(self, room: SlabRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
+        ratings = self.added_shares(room, grid.flatten(0, 1)).view(grid.shape[:2])
+        return GridRatings(ratings, lambda planes: self.added_shares(room, planes))
+
+    def added_shares(self, room: SlabRoom, planes: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
+        """Mean share, 0 to 1, of what known paths leave that one more image explains beside them.
+
+        The image in a wall behind the array resembles the direct path, so the residual hides it:
+        only the part of its wave that known paths do not explain counts, in power too. Strengths of
+        known paths are free, or real where free ones would explain channels of few numbers. 0 for a
+        plane between the ends.
+        """
+        total = planes.new_zeros(len(planes))
+        count = 0
+        sample = self.data.sample(room.planes)
+        for receiver, phase in zip(*sample, strict=True):
+            known = receiver.reflected(room, self.data.sequences(room.planes))  # (b, n, k)
+            unknowns = known.shape[1] if self.has_free_strengths else known.shape[1] / 2
+            if unknowns >= known.shape[2]:  # known paths explain any channel
+                continue
+            gram = self._taken(known.conj() @ known.mT)
+            inverse = torch.linalg.solve(ridged(gram, self.options.ridge), known.conj())
+            channels = (receiver.flat * phase[:, None].conj().to(receiver.flat))[..., None]
+            rest = channels - known.mT @ self._taken(inverse @ channels)  # (b, k, 1)
+            count += len(rest)
+            for rows in torch.arange(len(planes)).split(64):
+                total[rows] += self._added_of_receiver(receiver, known, inverse, rest, planes[rows])
+        return total / max(count, 1)
+
+    def _taken(self, values: Tensor) -> Tensor:
+        """The part of strengths or Gram matrices that is fitted: all, or the real one."""
+        return values if self.has_free_strengths else values.real.to(values)
+
+    def _added_of_receiver(
+        self,
+        receiver: ReceiverChannels,
+        known: Complex[Tensor, "b n k"],
+        inverse: Complex[Tensor, "b n k"],
+        rest: Complex[Tensor, "b k 1"],
+        planes: Float[Tensor, "c 4"],
+    ) -> Float[Tensor, " c"]:
+        """Sum over places of the share of a residual that an image in each plane explains.
+
+        ``inverse`` gives the strengths of known waves that explain another wave best.
+        """
+        power = rest.abs().square().sum((1, 2)).clamp_min(torch.finfo(torch.float32).tiny)
+        normals, offsets = planes[:, :3].float(), planes[:, 3].float()
+        heights = receiver.places @ normals.mT - offsets  # (b, c)
+        points = receiver.places[:, None] - 2 * heights[..., None] * normals  # (b, c, 3)
+        waves = receiver.waves(points)  # (b, c, k)
+        size = waves.abs().square().sum(2)
+        strengths = (inverse @ waves.mT).mT  # (b, c, n)
+        # The image's own phase is unknown: its wave and the one a quarter of a turn ahead, each
+        # without the part that known waves explain.
+        ahead = waves - self._taken(strengths) @ known
+        aside = 1j * waves - self._taken(1j * strengths) @ known
+        # Share of the rest by least squares of two waves:
+        # (bb a² - 2 ab a b + aa b²) / (aa bb - ab²).
+        aa = ahead.abs().square().sum(2) + self.options.ridge * size
+        bb = aside.abs().square().sum(2) + self.options.ridge * size
+        ab = (ahead.conj() * aside).real.sum(2)
+        a = (ahead.conj() @ rest)[..., 0].real
+        b = (aside.conj() @ rest)[..., 0].real
+        numerator = bb * a.square() - 2 * ab * a * b + aa * b.square()
+        share = numerator / (aa * bb - ab.square()) / power[:, None]
+        is_beside = heights * (normals @ receiver.position - offsets) > 0
+        return (share * is_beside).sum(0)

@@ -1,0 +1,217 @@
+"""Walls along the axes of coordinates, by paths with one gain for all places."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from gaigs.planes.channel_links import ChannelData, ReceiverChannels, SlabRoom, half_spaces
+from gaigs.planes.strengths import align_phases, real_strengths, ridged
+from gaigs.splatting.placement.mirrored.reflections import all_sequences
+
+
+class CommonFit(NamedTuple):
+    """Mean share of power that common gains leave, and the residuals of each receiver."""
+
+    share: float
+    residuals: list[Complex[Tensor, "b k"]]
+
+
+class CommonGains:
+    """Planes square to the axes of coordinates, one after the other: a matching pursuit.
+
+    Each image has one real gain for all places, as by a half-space. One gain explains hardly
+    anything by chance, so offsets show to millimetres also where free strengths at each place
+    explain any few numbers of a channel.
+
+    Args:
+        data: Training channels.
+        start: Known walls (w, 4).
+        most: Largest number of planes.
+
+    Source: Mallat and Zhang, Matching pursuits with time-frequency dictionaries, 1993.
+    """
+
+    def __init__(self, data: ChannelData, start: Float[Tensor, "w 4"], most: int):
+        self.data = data
+        self.start = start
+        self.most = most
+
+    def find_axis_walls(self) -> SlabRoom:
+        """The walls of the start, moved where phases agree, and others.
+
+        A wall of the start is moved along its normal if that explains more than by chance.
+        """
+        options = self.data.options
+        frame = self.data.frame
+        extent = frame.points.amax(0) - frame.points.amin(0) + 2 * options.margin * frame.diagonal
+        steps = 10 * extent / self.data.wavelength  # of each axis, a tenth of a wavelength apart
+        elements = max(len(receiver.elements) for receiver in self.data.receivers)
+        subcarriers = max(4, 32 // elements)
+        most = min(200, options.most_waves // (int(steps.sum()) * elements * subcarriers))
+        unique = [part.of_unique_places() for part in self.data.draw(most, subcarriers, 1)]
+        parts = [part for part in unique if len(part.places)]
+        if most < 50 or not parts:  # too few places for the many wavelengths of a large hall
+            return half_spaces(self.start[:0])
+        axes = torch.eye(3).to(frame.points).split(1)
+        lines = torch.cat(
+            [
+                frame.grid(axis, int(count), options.margin)[0]
+                for axis, count in zip(axes, steps, strict=True)
+            ]
+        )
+        by_chance = options.chance / sum(len(part.places) for part in parts)
+        planes = self._place_start(parts, by_chance)
+        planes = self._pursue(parts, planes, lines, by_chance)
+        for number in range(len(planes)):  # once more, as the others are known now
+            bonus = by_chance if number < len(self.start) else 0.0
+            planes[number] = self.move(parts, _without(planes, number), planes[number], bonus)[1]
+        planes = self.choose_lobes(parts, planes, by_chance)
+        for number in reversed(range(len(self.start), len(planes))):
+            others = _without(planes, number)
+            share = self.fit(parts, half_spaces(planes)).share
+            if self.fit(parts, half_spaces(others)).share < (1 + by_chance) * share:
+                planes = others
+        return half_spaces(planes)
+
+    def _place_start(self, parts: list[ReceiverChannels], by_chance: float) -> Float[Tensor, "w 4"]:
+        """Walls of a drawing where phases agree; those that explain most go first."""
+        planes = self.start.clone()
+        waiting = list(range(len(self.start)))
+        while waiting:
+            placed = planes[[number for number in range(len(planes)) if number not in waiting]]
+            trials = {
+                number: self.move(parts, placed, planes[number], by_chance) for number in waiting
+            }
+            best = max(waiting, key=lambda number: trials[number][0])
+            planes[best] = trials[best][1]
+            waiting.remove(best)
+        return planes
+
+    def _pursue(
+        self,
+        parts: list[ReceiverChannels],
+        planes: Float[Tensor, "w 4"],
+        lines: Float[Tensor, "c 4"],
+        by_chance: float,
+    ) -> Float[Tensor, "v 4"]:
+        """The planes, and planes of lines that explain most of the rest, more than by chance."""
+        while len(planes) < self.most:
+            known = self.fit(parts, half_spaces(planes))
+            shares = self.rate(parts, known.residuals, lines)
+            for plane in planes:
+                shares[self.data.frame.is_like(lines, plane)] = 0
+            if shares.max() < by_chance * known.share:
+                break
+            planes = torch.cat((planes, lines[shares.argmax(), None]))
+        return planes
+
+    def choose_lobes(
+        self, parts: list[ReceiverChannels], planes: Float[Tensor, "w 4"], by_chance: float
+    ) -> Float[Tensor, "w 4"]:
+        """The planes, each in the lobe of its phases where paths of all orders leave least.
+
+        Walls of the start move at most ``drawing_error`` in all, and only if that lowers the rest
+        by more than chance.
+        """
+        options = self.data.options
+        order = self.data.order
+        least = self.fit(parts, half_spaces(planes), order).share
+        for step in (1 / 16, 1 / 32, 1 / 64):
+            for number in range(len(planes)):
+                # Within the lobe, and to the neighbouring lobes half a wavelength apart.
+                moves = self.data.wavelength * planes.new_tensor(
+                    [-step, step, -0.5, 0.5, -1, 1, -1.5, 1.5]
+                )
+                is_known = number < len(self.start)
+                if is_known:
+                    gaps = planes[number, 3] + moves - self.start[number, 3]
+                    moves = moves[gaps.abs() <= options.drawing_error]
+                trials = planes.repeat(len(moves), 1, 1)
+                trials[:, number, 3] += moves
+                shares = [self.fit(parts, half_spaces(trial), order).share for trial in trials]
+                if shares and min(shares) < least * (1 - by_chance * is_known):
+                    least = min(shares)
+                    planes = trials[shares.index(least)]
+        return planes
+
+    def move(
+        self,
+        parts: list[ReceiverChannels],
+        others: Float[Tensor, "v 4"],
+        plane: Float[Tensor, "4"],
+        bonus: float,
+    ) -> tuple[float, Float[Tensor, "4"]]:
+        """Largest share that a plane explains near its place, beside others; the plane there.
+
+        The place itself has a bonus, as a share of the rest.
+        """
+        known = self.fit(parts, half_spaces(others))
+        error = self.data.options.drawing_error
+        grid = torch.arange(-error, error, self.data.wavelength / 16)
+        moves = torch.cat((torch.zeros(1), grid)).to(plane)
+        line = plane.repeat(len(moves), 1)
+        line[:, 3] += moves
+        shares = self.rate(parts, known.residuals, line)
+        shares[0] += bonus * known.share
+        return shares.max().item(), line[shares.argmax()]
+
+    def fit(self, parts: list[ReceiverChannels], room: SlabRoom, order: int = 1) -> CommonFit:
+        """Least squares of one real gain of each path for all places."""
+        sequences = all_sequences(len(room.planes), order)
+        waves = []
+        channels = []
+        powers = []
+        phases = self.data.reference_phases(room.planes[:0], parts)
+        for receiver, phase in zip(parts, phases, strict=True):
+            waves.append(receiver.single().reflected(room, sequences))
+            channels.append((receiver.flat * phase[:, None].conj()).to(torch.complex64))
+            powers.append(receiver.flat.abs().square().sum(1).float()[:, None, None])
+        residuals: list[Tensor] = []
+        for _ in range(1 if self.data.has_common_phase else 3):
+            gram = torch.zeros(1, 1)
+            right = torch.zeros(1, 1)
+            for wave, channel, power in zip(waves, channels, powers, strict=True):
+                gram = gram + ((wave.conj() @ wave.mT).real / power).sum(0, keepdim=True)
+                products = (wave.conj() @ channel[..., None]).real / power
+                right = right + products.sum(0, keepdim=True)
+            gains = real_strengths(ridged(gram, 1e-6), right)  # slabs have the signs
+            gains = gains.mT.to(waves[0])
+            known = [(gains @ wave)[:, 0] for wave in waves]
+            if not self.data.has_common_phase:
+                # Phases of the places follow the paths that are known of them.
+                channels = [align_phases(*pair) for pair in zip(channels, known, strict=True)]
+            residuals = [channel - part for channel, part in zip(channels, known, strict=True)]
+        shares = [
+            rest.abs().square().sum(1) / power[:, 0, 0]
+            for rest, power in zip(residuals, powers, strict=True)
+        ]
+        return CommonFit(torch.cat(shares).mean().item(), residuals)
+
+    def rate(
+        self,
+        parts: list[ReceiverChannels],
+        residuals: list[Complex[Tensor, "b k"]],
+        line: Float[Tensor, "c 4"],
+    ) -> Float[Tensor, " c"]:
+        """Share of power that one more image explains with a common gain, for planes of a line."""
+        total, size = line.new_zeros(2, len(line))
+        for receiver, rest in zip(parts, residuals, strict=True):
+            single = receiver.single()
+            middle = receiver.frequencies.mean().float()[None]
+            powers = receiver.flat.abs().square().sum(1, keepdim=True).float()
+            for rows in torch.arange(len(line)).split(64):
+                sequences = torch.arange(len(rows))[:, None]  # each plane alone
+                waves = single.reflected(half_spaces(line[rows]), sequences, middle)
+                products = (waves.conj() @ rest[..., None]).real[..., 0]  # (b, rows)
+                total[rows] += (products / powers).sum(0)
+                squares = torch.view_as_real(waves).square().sum((2, 3))
+                size[rows] += (squares / powers).sum(0)
+        # A gain that is not negative: (sum w . r)² / sum |w|².
+        shares = total.clamp_min(0).square() / size.clamp_min(torch.finfo(line.dtype).tiny)
+        return shares / sum(len(receiver.places) for receiver in parts)
+
+
+def _without(planes: Float[Tensor, "w 4"], number: int) -> Float[Tensor, "v 4"]:
+    return torch.cat((planes[:number], planes[number + 1 :]))

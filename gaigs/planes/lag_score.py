@@ -1,0 +1,269 @@
+"""The score of planes by spectra: lags of the array's elements, and which paths are open."""
+
+import copy
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from gaigs.planes.frame import RoomFrame
+from gaigs.planes.lags import FurtherWave, ReceiverLags
+from gaigs.planes.periodogram import PlanePeriodogram
+from gaigs.planes.search import Candidate, GridRatings, Score, descend
+from gaigs.splatting.placement.mirrored.reflections import all_sequences, square_normals
+
+
+@dataclass(frozen=True)
+class LagOptions:
+    """Options of the search for planes in spectra.
+
+    Attributes:
+        certain: Least fall of the mean error by which a plane moves [standard errors].
+        blocked: Rise of a link's log error by which a path counts as blocked there: without it, any
+            plane explains some links.
+        gain: Least fall of the mean log error by a further plane.
+        faint: Share of the power below which paths of several reflections are left out.
+        bands: Bandwidths that are tried, where it is unknown [speed of light over the diagonal]:
+            from a carrier to a band in which hardly two paths interfere.
+        strange: Share of a spectrum that its array cannot explain, from which on the search is left
+            out. Measured spectra have 0.001, powers in place of amplitudes 0.05.
+        margin: Largest distance of a plane from all transmitters and receivers [diagonals].
+        pairs: Most pairs of a receiver and a carrier: each costs a periodogram.
+    """
+
+    certain: float = 2.0
+    blocked: float = 0.1
+    gain: float = 0.03
+    faint: float = 1e-3
+    bands: tuple[float, ...] = (0.01, 1.0, 3.0, 10.0, 30.0, 100.0)
+    strange: float = 0.01
+    margin: float = 0.15
+    pairs: int = 16
+
+
+class LagRoom(NamedTuple):
+    """Planes of the room, and which paths are open at each link.
+
+    Attributes:
+        planes: Normals and offsets (w, 4) [m].
+        open: For each link the direct path, then all paths at each plane (b, w + 1).
+        errors: Of each link; ``LagOptions.blocked`` more than without the last plane that was moved
+            where this is not open (b,).
+    """
+
+    planes: Float[Tensor, "w 4"]
+    open: Bool[Tensor, "b v"]
+    errors: Float[Tensor, " b"]
+
+    def opened(self, column: int, value: Bool[Tensor, " b"] | bool) -> Bool[Tensor, "b v"]:
+        """``open`` with another column."""
+        changed = self.open.clone()
+        changed[:, column] = value
+        return changed
+
+
+class LinkPaths:
+    """Paths at planes at all receivers, and their periodogram.
+
+    Attributes:
+        bandwidth: Over which powers are averaged [Hz].
+    """
+
+    def __init__(
+        self,
+        frame: RoomFrame,
+        receivers: list[ReceiverLags],
+        wavelength: float,
+        order: int,
+        faint: float,
+    ):
+        self.receivers = receivers
+        self.periodogram = PlanePeriodogram(receivers, wavelength, frame.diagonal)
+        self.order = min(order, 2)  # longer paths hardly locate a plane
+        self.faint = faint
+        self.bandwidth = 0.0
+
+    def with_receivers(self, receivers: list[ReceiverLags]) -> "LinkPaths":
+        """The same with other labels of the receivers."""
+        other = copy.copy(self)
+        other.receivers = receivers
+        return other
+
+    def split(self, passing: Tensor) -> list[tuple[ReceiverLags, Tensor]]:
+        """Receivers, and the rows of their links in ``passing`` (b, v)."""
+        parts = passing.split([len(receiver.places) for receiver in self.receivers])
+        return list(zip(self.receivers, parts, strict=True))
+
+    def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
+        """All sequences but faint ones of several reflections."""
+        sequences = all_sequences(len(planes), self.order)
+        powers = self.powers(planes, sequences)
+        is_short = (sequences >= 0).sum(1) <= 1
+        return sequences[is_short | (powers > self.faint * powers.sum())]
+
+    def powers(
+        self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"]
+    ) -> Float[Tensor, " n"]:
+        """Mean power of paths, at every fourth link."""
+        powers = []
+        for receiver in self.receivers:
+            thinned = receiver.at(slice(None, None, 4))
+            powers.append(thinned.paths(planes, sequences).fields.abs().square())
+        return torch.cat(powers).mean(0)
+
+    def sort_by_strength(self, planes: Float[Tensor, "w 4"]) -> list[int]:
+        """Numbers of planes, the strongest single reflection first."""
+        singles = all_sequences(len(planes), 1)[1:]
+        return self.powers(planes, singles).argsort(descending=True).tolist()
+
+
+class LagScore(Score[LagRoom]):
+    """Planes by the spectra of an array, with one material and without obstacles.
+
+    A spectrum gives back the covariances of the array's elements (``Beamformer.lags``), so a model
+    is compared with it at once. At each link the paths at a plane may be blocked, for a price. A
+    plane is moved to a maximum of ``PlanePeriodogram``; the error decides between the maxima.
+    Further planes come by their power alone.
+
+    Source: ours; Van Trees, Optimum Array Processing, 2002, section 2.4, for the covariances.
+    """
+
+    def __init__(self, paths: LinkPaths, options: LagOptions):
+        self.paths = paths
+        self.options = options
+
+    def error(self, room: LagRoom) -> float:
+        return room.errors.mean().item()
+
+    def errors(
+        self,
+        planes: Float[Tensor, "w 4"],
+        open_: Bool[Tensor, "b v"],
+        sequences: Int[Tensor, "n order"] | None = None,
+        every: int = 1,
+    ) -> Float[Tensor, " c"]:
+        """Log of what paths leave of each link, or of every second one: no link must rule."""
+        sequences = self.paths.sequences(planes) if sequences is None else sequences
+        logs = []
+        for receiver, passing in self.paths.split(open_):
+            part = receiver.at(slice(None, None, every))
+            paths = part.paths(planes, sequences, passing[::every])
+            logs.append(part.errors(part.covariances(paths, self.paths.bandwidth)))
+        return torch.cat(logs)
+
+    # --- moves ---
+
+    def move(self, room: LagRoom, number: int) -> LagRoom:
+        """The room with a plane where the error is least.
+
+        The plane is near its own normal, or square to another plane. Its paths are open where that
+        lowers a link's error.
+        """
+        is_other = torch.arange(len(room.planes)) != number
+        known = room.planes[is_other]
+        open_ = room.open[:, torch.cat((is_other.new_ones(1), is_other))]
+        sequences = self.paths.sequences(known)
+        waves = self._further_waves(known, open_, sequences)
+        blocked = self.errors(known, open_, sequences) + self.options.blocked
+        trials = [room.planes]
+        for normal in square_normals(room.planes[:, :3], number):
+            for peak in self.paths.periodogram.find_peaks(
+                waves, self.paths.bandwidth, normal, room.planes[number]
+            ):
+                before, after = room.planes[:number], room.planes[number + 1 :]
+                trials.append(torch.cat((before, peak.plane[None], after)))
+        everywhere = room.opened(number + 1, True)
+        sequences = self.paths.sequences(room.planes)
+        errors = torch.stack([self.errors(trial, everywhere, sequences) for trial in trials])
+        least = torch.minimum(errors, blocked)  # (trials, b)
+        best = int(least.mean(1).argmin())
+        if not self._is_certain(least[0] - least[best]):
+            best = 0
+        open_ = room.opened(number + 1, errors[best] < blocked)
+        return LagRoom(trials[best], open_, least[best])
+
+    def _further_waves(
+        self,
+        planes: Float[Tensor, "w 4"],
+        open_: Bool[Tensor, "b v"],
+        sequences: Int[Tensor, "n order"],
+    ) -> list[FurtherWave]:
+        waves = []
+        for receiver, passing in self.paths.split(open_):
+            paths = receiver.paths(planes, sequences, passing)
+            waves.append(receiver.further_wave(paths, self.paths.bandwidth))
+        return waves
+
+    def refine(self, room: LagRoom) -> LagRoom:
+        """The room after a descent with all planes, if that lowers the error certainly.
+
+        The direct path is open where that lowers a link's error.
+        """
+        is_open, is_blocked = (
+            self.errors(room.planes, room.opened(0, value)) for value in (True, False)
+        )
+        room = room._replace(open=room.opened(0, is_open <= is_blocked + self.options.blocked))
+        sequences = self.paths.sequences(room.planes)
+
+        def loss(planes: Float[Tensor, "w 4"]) -> Float[Tensor, ""]:
+            return self.errors(planes, room.open, sequences, every=2).mean()
+
+        planes = descend(loss, self.paths.receivers, room.planes, [], 40, 3e-3)[0]
+        gains = self.errors(room.planes, room.open) - self.errors(planes, room.open)
+        return room._replace(planes=planes) if self._is_certain(gains) else room
+
+    def _is_certain(self, gains: Float[Tensor, " b"]) -> bool:
+        """True if the mean gain of two links or more exceeds its error clearly."""
+        if len(gains) < 2:
+            return False
+        return bool(gains.mean() > self.options.certain * gains.std() / math.sqrt(len(gains)))
+
+    # --- further planes ---
+
+    def rate(self, room: LagRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
+        side = torch.linspace(-1, 1, 33)
+        plane_waves = torch.cartesian_prod(side, side)  # sines of two angles (k, 2)
+        maps = []
+        sequences = self.paths.sequences(room.planes)
+        for receiver, passing in self.paths.split(room.open):
+            paths = receiver.paths(room.planes, sequences, passing)
+            slopes = receiver.slopes(receiver.covariances(paths, self.paths.bandwidth))
+            steering = receiver.steer(plane_waves)  # (k, e)
+            # Fall of the error by the power of a further plane wave: s' M s.
+            falls = ((steering.conj() @ slopes) * steering).sum(-1).real  # (b, k)
+            maps.append(falls.view(-1, 1, 33, 33))
+
+        def rate(planes: Float[Tensor, "c 4"]) -> Float[Tensor, " c"]:
+            return self._rate_powers(maps, planes)
+
+        flat = grid.flatten(0, 1)
+        ratings = torch.cat([rate(part) for part in flat.split(4000)])
+        return GridRatings(ratings.view(grid.shape[:2]), rate)
+
+    def _rate_powers(
+        self, maps: list[Float[Tensor, "b 1 k k"]], planes: Float[Tensor, "c 4"]
+    ) -> Float[Tensor, " c"]:
+        """Fall of the errors by the power of one more reflection, over the norm of that power."""
+        total, square = planes.new_zeros(2, len(planes))
+        for receiver, falls in zip(self.paths.receivers, maps, strict=True):
+            single = receiver.reflect_once(planes)
+            powers = single.gains.abs().square()
+            # ``grid_sample`` takes the column first.
+            at = single.directions[..., [1, 0]][:, None]  # (b, 1, c, 2)
+            sampled = functional.grid_sample(falls, at, align_corners=True)[:, 0, 0]  # (b, c)
+            total += (powers * sampled).sum(0)
+            _, direct = receiver.look_at(receiver.places)
+            square += (powers * direct.square()[:, None]).square().sum(0)
+        return total / square.sqrt().clamp_min(1e-6)
+
+    def add(self, room: LagRoom, candidate: Candidate) -> LagRoom | None:
+        before = self.errors(room.planes, room.open)
+        planes = torch.cat((room.planes, candidate.plane[None]))
+        everywhere = torch.ones_like(room.open[:, :1])
+        larger = LagRoom(planes, torch.cat((room.open, everywhere), 1), before)
+        larger = self.move(larger, len(room.planes))
+        return larger if (before - larger.errors).mean() >= self.options.gain else None

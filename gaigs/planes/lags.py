@@ -1,0 +1,265 @@
+"""Covariances of an array's elements at the training links of a receiver, and paths in them."""
+
+import itertools
+import math
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Complex, Float, Int
+from scipy.constants import speed_of_light
+from torch import Tensor
+
+from gaigs.core.antenna import Array
+from gaigs.core.geometry import Grid, Pose, sinc
+from gaigs.core.propagation import NEAREST, fresnel
+from gaigs.splatting.placement.mirrored.reflections import fold, images, polarised
+
+MATERIAL = complex(4.0, -0.3)
+"""Relative permittivity of all planes: between wood and concrete."""
+
+
+def reflection(
+    normals: Float[Tensor, "*#n 3"], cosines: Float[Tensor, "*n"]
+) -> Complex[Tensor, "*n"]:
+    """Reflection coefficients of planes of ``MATERIAL``."""
+    return polarised(normals, *fresnel(MATERIAL, cosines.clamp_min(1e-3)))
+
+
+class ArrayPaths(NamedTuple):
+    """Paths as an array receives them.
+
+    Attributes:
+        fields: At the middle of the array (b, n).
+        steering: Phases at the elements (b, n, e).
+        lengths: (b, n) [m].
+    """
+
+    fields: Complex[Tensor, "b n"]
+    steering: Complex[Tensor, "b n e"]
+    lengths: Float[Tensor, "b n"]
+
+
+class FurtherWave(NamedTuple):
+    """Weights of one more path beside known ones (b, n, e), and the lengths of these (b, n) [m].
+
+    The sum of the further wave's conjugate times the weights, over known paths and elements, has
+    half the fall of the error as its real part. Without a bandwidth the sum over known paths is
+    taken: n is 1.
+    """
+
+    weights: Complex[Tensor, "b n e"]
+    lengths: Float[Tensor, "b n"]
+
+
+class SingleReflections(NamedTuple):
+    """Paths of one reflection at planes (b, c).
+
+    Attributes:
+        directions: In the array's frame.
+        lengths: [m].
+        gains: Fields without a phase; 0 for places behind a plane.
+        cosines: Of the angles of incidence, negative behind a plane.
+    """
+
+    directions: Float[Tensor, "b c 3"]
+    lengths: Float[Tensor, "b c"]
+    gains: Complex[Tensor, "b c"]
+    cosines: Float[Tensor, "b c"]
+
+
+@dataclass(frozen=True)
+class ReceiverLags:
+    """Covariances of one receiver's elements at some training links of one carrier.
+
+    Attributes:
+        places: Transmitters (b, 3) [m].
+        lags: At each of ``array.lags``, over the power (b, l).
+        frequency: Of the carrier [Hz].
+        pose, array: Of the receiver.
+        directions: Directions in which spectra are compared: 4 x 4 elements resolve no more (k, 3).
+    """
+
+    places: Float[Tensor, "b 3"]
+    lags: Complex[Tensor, "b l"]
+    frequency: float
+    pose: Pose
+    array: Array
+    directions: Float[Tensor, "k 3"] = field(
+        default=Grid.degrees(range(4, 90, 8), range(0, 360, 15)).flatten().vectors(), repr=False
+    )
+
+    def at(self, index: object) -> "ReceiverLags":
+        """The same of some links."""
+        return replace(self, places=self.places[index], lags=self.lags[index])
+
+    @property
+    def position(self) -> Float[Tensor, "3"]:
+        return self.pose.position
+
+    @property
+    def wavenumber(self) -> float:
+        """[rad/m]."""
+        return 2 * math.pi / speed_of_light * self.frequency
+
+    @cached_property
+    def elements(self) -> Float[Tensor, "e 2"]:
+        """Elements in the plane of the array [m]."""
+        return self.array.elements[:, :2].to(self.places)
+
+    @cached_property
+    def counts(self) -> Float[Tensor, " l"]:
+        """Pairs of elements at each lag."""
+        return self.array.lags[2].to(self.places)
+
+    # --- errors ---
+
+    @cached_property
+    def shapes(self) -> Float[Tensor, "b k"]:
+        """Shapes of the training spectra."""
+        return self.shape_of(self.lags)
+
+    @cached_property
+    def basis(self) -> Float[Tensor, "m k"]:
+        """Contribution of each lag's real and imaginary part, from 0 on, to the power."""
+        half = len(self.counts) // 2
+        # Opposite lags are conjugate, so one of two counts twice.
+        weights = self.counts[half:] * torch.where(torch.arange(half + 1) > 0, 2, 1)
+        lags = self.array.lags[0][half:].to(self.places)
+        phases = self.wavenumber * (lags @ self.directions.to(self.places).T)  # (lags, k)
+        return torch.cat((phases.cos() * weights[:, None], phases.sin() * weights[:, None]))
+
+    def shape_of(self, lags: Complex[Tensor, "b l"]) -> Float[Tensor, "b k"]:
+        """Amplitudes with a mean of 0 and a norm of 1: labels have lost their scale."""
+        later = lags[:, lags.shape[1] // 2 :]
+        later = later / later[:, :1].real.clamp_min(1e-12)
+        powers = torch.cat((later.real, later.imag), 1) @ self.basis  # (b, k)
+        amplitudes = powers.clamp_min(1e-4).sqrt()  # of a mean power of e²
+        amplitudes = amplitudes - amplitudes.mean(1, keepdim=True)
+        return amplitudes / amplitudes.norm(dim=1, keepdim=True).clamp_min(1e-6)
+
+    def errors(self, lags: Complex[Tensor, "b l"]) -> Float[Tensor, " b"]:
+        """Log of the share of each spectrum's variance that a model's lags do not explain."""
+        floor = 0.01  # share below which an error hardly counts
+        alike = (self.shape_of(lags) * self.shapes).sum(1).clamp_min(0)
+        return (1 - alike.square() + floor).log()
+
+    def slopes(self, lags: Complex[Tensor, "b l"]) -> Complex[Tensor, "b e e"]:
+        """Negative gradient M of the errors by the covariances.
+
+        A further wave x lowers them by x' M x, and by 2 Re x' M y where it interferes with a wave y
+        of the model.
+        """
+        with torch.enable_grad():
+            lags = lags.detach().requires_grad_()
+            self.errors(lags).sum().backward()
+        half = len(self.counts) // 2
+        slopes = -lags.grad[:, half:]
+        slopes[:, 1:] /= 2  # ``shape_of`` reads one of two opposite lags
+        slopes = torch.cat((slopes[:, 1:].conj().flip(1), slopes), 1) / self.counts  # (b, l)
+        return slopes[:, self.array.lags[1]].view(-1, len(self.array), len(self.array))
+
+    # --- paths ---
+
+    def steer(self, directions: Float[Tensor, "*b d"]) -> Complex[Tensor, "*b e"]:
+        """Phases at the elements of waves from directions in the array's frame (x, y or more)."""
+        turns = self.wavenumber * (directions[..., :2] @ self.elements.T)
+        return torch.polar(torch.ones_like(turns), turns)
+
+    def look_at(
+        self, points: Float[Tensor, "*b 3"]
+    ) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b"]]:
+        """Directions to points in the array's frame, and distances [m]."""
+        ways = (points - self.pose.position) @ self.pose.rotation
+        lengths = ways.norm(dim=-1).clamp_min(NEAREST)
+        return ways / lengths[..., None], lengths
+
+    def paths(
+        self,
+        planes: Float[Tensor, "w 4"],
+        sequences: Int[Tensor, "n order"],
+        passing: Tensor | None = None,
+    ) -> ArrayPaths:
+        """All paths at planes.
+
+        ``passing`` (b, w + 1) is the share of the direct path's field that obstacles let through,
+        then the share at each plane; true and false for all and nothing.
+        """
+        normals, offsets = planes[:, :3], planes[:, 3]
+        points = images(self.places, sequences, normals, offsets)
+        receivers = self.pose.position.expand(len(self.places), 3)
+        folded = fold(points, receivers, sequences, normals, offsets)
+        directions, lengths = self.look_at(points[-1])
+        gains = folded.exists * self.array.gain(directions) / lengths  # (b, n)
+        if passing is not None:
+            # Number -1, no plane, is the last column.
+            columns = torch.cat((passing[:, 1:], torch.ones_like(passing[:, :1])), 1)
+            shares = columns[:, sequences].prod(2)  # (b, n)
+            shares[:, 0] = passing[:, 0]
+            gains = gains * shares
+        reflections = reflection(folded.normals, folded.cosines)
+        fields = folded.reflected(torch.complex(gains, torch.zeros_like(gains)), reflections)
+        phases = -self.wavenumber * lengths
+        fields = fields * torch.polar(torch.ones_like(phases), phases)
+        return ArrayPaths(fields, self.steer(directions), lengths)
+
+    def covariances(self, paths: ArrayPaths, bandwidth: float) -> Complex[Tensor, "b l"]:
+        """Lags of interfering paths, as of ``LagPooling``; powers are averaged over a band [Hz]."""
+        fields, steering, lengths = paths
+        if bandwidth:
+            # Over a band two paths stay alike by sinc(B (L - L') / c).
+            gaps = lengths[:, :, None] - lengths[:, None]  # (b, n, n)
+            likeness = sinc(bandwidth / speed_of_light * gaps)
+            together = fields[:, :, None] * fields[:, None].conj() * likeness
+            matrices = steering.mT @ together @ steering.conj()  # (b, e, e)
+        else:
+            waves = (fields[:, None] @ steering).mT  # (b, e, 1)
+            matrices = waves @ waves.mH
+        flat = matrices.flatten(1)
+        sums = flat.new_zeros(len(flat), len(self.counts))
+        return sums.index_add(1, self.array.lags[1], flat) / self.counts
+
+    def further_wave(self, paths: ArrayPaths, bandwidth: float) -> FurtherWave:
+        """Interference of one more path with known ones."""
+        slopes = self.slopes(self.covariances(paths, bandwidth))
+        weights = (slopes @ paths.steering.mT).mT * paths.fields[..., None]  # (b, n, e)
+        if bandwidth:
+            return FurtherWave(weights, paths.lengths)
+        return FurtherWave(weights.sum(1, keepdim=True), paths.lengths[:, :1])
+
+    def reflect_once(self, planes: Float[Tensor, "c 4"]) -> SingleReflections:
+        """Paths of one reflection at planes."""
+        normals, offsets = planes[:, :3], planes[:, 3]
+        here = self.pose.position @ normals.T - offsets  # (c,)
+        there = self.places @ normals.T - offsets  # (b, c)
+        directions, lengths = self.look_at(self.places[:, None] - 2 * there[..., None] * normals)
+        cosines = -(here + there) / lengths
+        gains = self.array.gain(directions) / lengths * (here * there > 0)
+        gains = gains * reflection(normals, cosines.abs())
+        return SingleReflections(directions, lengths, gains, cosines)
+
+    def describe_doubts(self, name: str) -> list[str]:
+        """A sentence if the direct path shows in another direction than geometry says."""
+        _, pairs, _ = self.array.lags
+        matrices = self.lags[:, pairs].view(-1, len(self.array), len(self.array))
+        directions, _ = self.look_at(self.places)
+        shares = {}
+        for turn, flip in itertools.product(range(4), (1, -1)):
+            flat = torch.view_as_complex(directions[:, :2].contiguous()) * 1j**turn
+            turned = torch.view_as_real(flat)
+            turned = torch.cat((turned[:, :1], flip * turned[:, 1:], directions[:, 2:]), -1)
+            steering = self.steer(turned)
+            # Power of a beam towards the path over the power of the spectrum: s' C s / e².
+            powers = torch.einsum("bi,bij,bj->b", steering.conj(), matrices, steering).real
+            shares[turn, flip] = (powers / len(self.array) ** 2).median().item()
+        (turn, flip), best = max(shares.items(), key=lambda item: item[1])
+        if best < 0.4 or shares[0, 1] > best - 0.2:
+            return []
+        words = f"turned by {90 * turn} degrees" if turn else ""
+        words += " and " * bool(turn and flip < 0) + "counted clockwise" * (flip < 0)
+        return [
+            f"the direct path explains {shares[0, 1]:.0%} of the spectra of {name}, "
+            f"{best:.0%} if azimuths were {words}\n"
+            "check the receiver's orientation and the azimuths of the data"
+        ]

@@ -1,0 +1,377 @@
+"""Surfaces of learnt obstacles, for ray tracers and 3-D programs.
+
+Thin sheets stand around the Gaussians of matter, where these have one density.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy import ndimage
+from skimage.measure import marching_cubes
+from torch import Tensor
+from torch.nn import functional
+
+from gaigs.core.query import Query
+from gaigs.splatting.placement.mirrored.obstacles import Obstacles
+from gaigs.splatting.placement.mirrored.paths import Mirrored
+
+
+@dataclass(frozen=True)
+class SurfaceOptions:
+    """Options of the fit of sheets.
+
+    Attributes:
+        densities: Number of densities with sheets: more are more exact, but a ray tracer counts
+            each crossing as an interaction.
+        candidates: Densities that are tried.
+        faint: Share of a link's power, obstacles apart, from which a path counts.
+        least_conductance: Conductance from which a sheet is used: 0.1 dB at normal incidence.
+        samples: Points of a leg at which the density is computed: 5 cm apart on a leg of 10 m.
+        paths: Largest number of paths to which sheets are fitted.
+        voxels: Points of the grid on which surfaces are found: 6 cm apart in a room of 100 m³.
+    """
+
+    densities: int = 3
+    candidates: int = 6
+    faint: float = 1e-4
+    least_conductance: float = 0.023
+    samples: int = 192
+    paths: int = 20_000
+    voxels: int = 500_000
+
+
+class Sheet(NamedTuple):
+    """A closed surface of even density of matter, as a thin material that absorbs.
+
+    It is far thinner than the wavelength. ``conductance`` is the sheet's over the admittance of free
+    space.
+    With c the cosine of the angle of incidence, the field falls to 1 / (1 + conductance / (2 c))
+    for TE and to 1 / (1 + c conductance / 2) for TM. Its phase does not turn.
+
+    Source: the limit of ITU-R P.2040-3, equation 43b, for a thin slab.
+    """
+
+    conductance: float
+    vertices: Float[ndarray, "v 3"]
+    faces: Int[ndarray, "f 3"]
+
+    @property
+    def loss_db(self) -> float:
+        """Loss of a wave that passes it at normal incidence [dB]."""
+        return 20 / math.log(10) * math.log1p(self.conductance / 2)
+
+
+class Legs(NamedTuple):
+    """Straight pieces of paths, from the middle of the room.
+
+    Attributes:
+        start: First ends [m].
+        along: From first to last ends [m].
+        paths: Number of each leg's path.
+        densities: Of matter, at points evenly spread over a leg [Np/m].
+    """
+
+    start: Float[Tensor, "s 3"]
+    along: Float[Tensor, "s 3"]
+    paths: Int[Tensor, " s"]
+    densities: Float[Tensor, "s k"]
+
+
+class AttenuatedPaths(NamedTuple):
+    """Fields of paths without obstacles, the share of each that obstacles pass, and the legs."""
+
+    fields: Float[Tensor, "b n"]
+    passed: Float[Tensor, "b n"]
+    legs: Legs
+
+
+class Crossings(NamedTuple):
+    """Points where paths cross surfaces.
+
+    Attributes:
+        cosines: Of the angles of incidence.
+        tm_shares: Shares of TM in vertical polarisation.
+        paths, surfaces: Numbers.
+    """
+
+    cosines: Float[Tensor, " c"]
+    tm_shares: Float[Tensor, " c"]
+    paths: Int[Tensor, " c"]
+    surfaces: Int[Tensor, " c"]
+
+    @property
+    def surface_count(self) -> int:
+        """Number of surfaces."""
+        return int(self.surfaces.max()) + 1
+
+    def losses(self, conductances: Float[Tensor, " k"], count: int) -> Float[Tensor, " p"]:
+        """Attenuation of each of ``count`` paths [Np]."""
+        conductance = conductances[self.surfaces]
+        te = 1 / (1 + conductance / (2 * self.cosines))
+        tm = 1 / (1 + conductance * self.cosines / 2)
+        losses = -torch.lerp(te, tm, self.tm_shares).log()
+        return te.new_zeros(count).index_add(0, self.paths, losses)
+
+
+@dataclass(frozen=True)
+class MatterGrid:
+    """Logarithm of the density of matter [Np/m] on a grid over a box and a little beyond.
+
+    ``corner`` is the grid's first point from the middle of the room, ``pitch`` the distance of its
+    points [m].
+    """
+
+    log_densities: Float[ndarray, "x y z"]
+    corner: Float[ndarray, "3"]
+    pitch: float
+
+    def number_surfaces(self, density: float) -> Int[ndarray, "x y z"]:
+        """Number of the surface of a density around each point, 0 outside."""
+        numbers, _ = ndimage.label(self.log_densities > math.log(density))
+        return numbers
+
+    def mesh(
+        self, density: float, number: int
+    ) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
+        """Corners from the middle of the room [m], and triangles, of a surface, closed by the box.
+
+        Source: Lewiner et al., Efficient implementation of marching cubes' cases with topological
+        guarantees, 2003.
+        """
+        least = math.log(density)
+        numbers = self.number_surfaces(density)
+        # Other surfaces lie at least a point apart.
+        is_near = (numbers == number) | (numbers == 0)
+        logs = np.where(is_near, np.minimum(self.log_densities, least + 9), least - 1)
+        logs = np.pad(np.maximum(logs, least - 9), 1, constant_values=least - 1)
+        vertices, faces, _, _ = marching_cubes(logs, least, spacing=(self.pitch,) * 3)
+        return vertices + (self.corner - self.pitch), faces
+
+
+def measure_densities(obstacles: Obstacles, points: Float[Tensor, "k 3"]) -> Float[Tensor, "k n"]:
+    """Density of each Gaussian at points, from the middle of the room [m]; [Np/m], float64."""
+    weights = (-2 * obstacles.log_widths.double()).exp()
+    centres = obstacles.centres.double()
+    points = points.double()
+    # sum w (x - c)² = sum w x² - 2 sum w x c + sum w c²: products of matrices.
+    squares = points.square() @ weights.T - 2 * points @ (weights * centres).T  # (k, n)
+    squares = squares + (weights * centres.square()).sum(1)
+    return (obstacles.log_densities.double() - squares / 2).exp()
+
+
+def sample_matter(
+    obstacles: Obstacles, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], voxels: int
+) -> MatterGrid:
+    """Matter in a box, whose corners are from the middle of the room [m]."""
+    pitch = float((np.prod(upper - lower) / voxels) ** (1 / 3))
+    corner = lower - 2 * pitch
+    shape = np.ceil((upper - corner) / pitch).astype(int) + 3
+    axes = [torch.from_numpy(corner[axis] + pitch * np.arange(shape[axis])) for axis in range(3)]
+    points = torch.cartesian_prod(*axes).to(obstacles.unit.device)
+    parts = [measure_densities(obstacles, part).sum(1) for part in points.split(65536)]
+    return MatterGrid(torch.cat(parts).log().view(*shape).cpu().numpy(), corner, pitch)
+
+
+def find_crossings(
+    obstacles: Obstacles, matter: MatterGrid, density: float, legs: Legs
+) -> Crossings:
+    """Crossings of legs with the surfaces of a density, counted from 0."""
+    is_inside = legs.densities > density
+    leg, step = (is_inside[:, 1:] != is_inside[:, :-1]).nonzero().T
+    before, after = legs.densities[leg, step], legs.densities[leg, step + 1]
+    unit = legs.along[leg] / (legs.densities.shape[1] - 1)  # [m] from one sample to the next
+    share = (density - before) / (after - before)
+    points = legs.start[leg] + (step + share)[:, None] * unit
+    # The gradient of the density: sum_i rho_i w_i (c_i - x), but for its sign.
+    each = measure_densities(obstacles, points)
+    weights = (-2 * obstacles.log_widths.double()).exp()
+    gradients = points * (each @ weights) - each @ (weights * obstacles.centres.double())
+    normals = functional.normalize(gradients)
+    cosines = (normals * functional.normalize(unit)).sum(1).abs().clamp_min(1e-3)
+    # The sample inside tells the surface; a point of the grid farther out counts, too.
+    inside = legs.start[leg] + (step + (after > before))[:, None] * unit
+    numbers = matter.number_surfaces(density)
+    numbers = np.where(numbers, numbers, ndimage.grey_dilation(numbers, 3))
+    cells = np.rint((inside.cpu().numpy() - matter.corner) / matter.pitch).astype(int)
+    cells = np.clip(cells, 0, np.array(numbers.shape) - 1)
+    surfaces = torch.from_numpy(numbers[tuple(cells.T)]).to(leg)
+    met = surfaces > 0  # the grid has no matter thinner than its pitch
+    return Crossings(
+        cosines[met], normals[met, 2].square(), legs.paths[leg[met]], surfaces[met] - 1
+    )
+
+
+def attenuate_paths(
+    placement: Mirrored, obstacles: Obstacles, query: Query, options: SurfaceOptions
+) -> AttenuatedPaths:
+    """Paths of a query's links, evenly thinned, and what obstacles pass."""
+    sequences = placement.sequences[placement.kept]
+    query = query[:: math.ceil(len(query) * len(sequences) / options.paths)]
+    query = query.to(placement.middle.device)
+    seen, receivers, folded = placement.folded(query)
+    strengths = placement.strengths(query, folded, blocked=False).abs()
+    fields = strengths / (seen[-1] - receivers[:, None]).norm(dim=-1)
+    fields = fields.double()
+    powers = fields.square()
+    fields[powers < options.faint * powers.sum(1, keepdim=True)] = 0
+    link, leg = (fields > 0)[:, folded.path].nonzero().T
+    paths = link * len(sequences) + folded.path[leg]
+    start = folded.start[link, leg].double()
+    along = folded.end[link, leg].double() - start
+    depths = obstacles(start.float(), (start + along).float()).real.double()
+    depths = fields.new_zeros(fields.numel()).index_add(0, paths, depths)  # of each path
+    steps = torch.linspace(0, 1, options.samples).to(along)[:, None]
+    samples = [
+        measure_densities(obstacles, first + steps * way).sum(1)
+        for first, way in zip(start, along, strict=True)
+    ]
+    legs = Legs(start, along, paths, torch.stack(samples))
+    return AttenuatedPaths(fields, (-depths).exp().view_as(fields), legs)
+
+
+def choose_densities(paths: AttenuatedPaths, count: int) -> list[float]:
+    """Densities of matter at which paths lose their fields, from a tenth to nine tenths [Np/m].
+
+    None if paths lose nothing.
+    """
+    densities = paths.legs.densities
+    # Each leg's loss, spread over its matter.
+    losses = (paths.fields * (1 - paths.passed)).flatten()[paths.legs.paths, None] * densities
+    losses = losses / densities.sum(1, keepdim=True).clamp_min(1e-300)
+    order = densities.flatten().argsort()
+    sums = losses.flatten()[order].cumsum(0)
+    if not sums[-1] > 0:
+        return []
+    at = torch.searchsorted(sums, sums[-1] * sums.new_tensor([0.1, 0.9]))
+    low, high = densities.flatten()[order[at]].log().tolist()
+    return torch.linspace(low, high, count).exp().tolist()
+
+
+class SheetFit:
+    """Conductances of sheets that attenuate paths most as obstacles do.
+
+    Errors of a link's fields count in decibels, in the mean over links: neither deep shadow nor the
+    best links decide.
+
+    Args:
+        paths: With obstacles.
+        crossings: Of each density.
+    """
+
+    def __init__(self, paths: AttenuatedPaths, crossings: list[Crossings]):
+        self.fields = paths.fields
+        self.passed = paths.passed
+        self.crossings = crossings
+        self.wanted = (self.fields * self.passed).square().sum(1)
+        if not (self.wanted > 0).any():
+            raise ValueError(
+                "obstacles absorb every path, so none shows their surfaces; train the model first"
+            )
+
+    def error(
+        self, chosen: Sequence[int], logs: Sequence[Tensor], gain: Tensor
+    ) -> Float[Tensor, ""]:
+        """Mean error of the links [dB], by logarithms of each surface's conductance."""
+        count = self.fields.numel()
+        losses = self.fields.new_zeros(count)
+        for number, log in zip(chosen, logs, strict=True):
+            losses = losses + self.crossings[number].losses(log.exp(), count)
+        passed = (gain - losses).exp().view_as(self.fields)
+        off = (self.fields * (passed - self.passed)).square().sum(1)
+        is_reached = self.wanted > 0
+        # Below -40 dB nothing is gained.
+        return 10 * (off[is_reached] / self.wanted[is_reached] + 1e-4).log10().mean()
+
+    def fit(
+        self, chosen: Sequence[int], sizes: Sequence[int], start: Tensor
+    ) -> tuple[float, Tensor]:
+        """Least error [dB]; logarithms of ``sizes`` conductances of each density, and the gain.
+
+        A single conductance of a density holds for all its surfaces.
+        """
+        values = start.clone().requires_grad_()
+        descent = torch.optim.LBFGS([values], max_iter=50, line_search_fn="strong_wolfe")
+
+        def measure() -> Tensor:
+            *logs, gain = values.split((*sizes, 1))
+            spread = [
+                log.expand(self.crossings[number].surface_count)
+                for number, log in zip(chosen, logs, strict=True)
+            ]
+            return self.error(chosen, spread, gain)
+
+        def step() -> Tensor:
+            descent.zero_grad()
+            error = measure()
+            error.backward()
+            return error
+
+        with torch.enable_grad():
+            descent.step(step)
+        return measure().item(), values.detach()
+
+
+@torch.no_grad()
+def fit_sheets(
+    placement: Mirrored,
+    query: Query,
+    lower: Float[ndarray, "3"],
+    upper: Float[ndarray, "3"],
+    options: SurfaceOptions | None = None,
+) -> tuple[list[Sheet], float]:
+    """Sheets that attenuate a query's paths most as the obstacles do.
+
+    Candidates are densities at which these paths lose their fields. All sets of
+    ``options.densities`` are fitted, each density with one conductance. In the best set each
+    surface gets a conductance of its own.
+
+    Args:
+        placement: With obstacles, or without any, which have no sheets.
+        query: Links.
+        lower, upper: Corners of the room [m].
+        options: Of the fit.
+
+    Returns:
+        The sheets, and the gain of all paths beside them [Np].
+
+    Raises:
+        ValueError: No path passes the obstacles.
+    """
+    options = options or SurfaceOptions()
+    obstacles = placement.obstacles
+    if obstacles is None:
+        return [], 0.0
+    paths = attenuate_paths(placement, obstacles, query, options)
+    candidates = choose_densities(paths, options.candidates)
+    if not candidates:
+        return [], 0.0
+    middle = placement.middle.cpu().numpy()
+    matter = sample_matter(obstacles, lower - middle, upper - middle, options.voxels)
+    crossings = [find_crossings(obstacles, matter, density, paths.legs) for density in candidates]
+    fit = SheetFit(paths, crossings)
+    crossed = [number for number, part in enumerate(crossings) if len(part.paths)]
+    size = min(options.densities, len(crossed))
+    trials = {
+        numbers: fit.fit(numbers, (1,) * size, paths.fields.new_zeros(size + 1))
+        for numbers in itertools.combinations(crossed, size)
+    }
+    chosen = min(trials, key=lambda numbers: trials[numbers][0])
+    values = trials[chosen][1]
+    sizes = [crossings[number].surface_count for number in chosen]
+    spread = [log.expand(size) for log, size in zip(values[:-1], sizes, strict=True)]
+    _, values = fit.fit(chosen, sizes, torch.cat([*spread, values[-1:]]))
+    sheets = []
+    for number, logs in zip(chosen, values[:-1].split(sizes), strict=True):
+        for surface, conductance in enumerate(logs.exp().tolist(), 1):
+            if conductance < options.least_conductance:
+                continue
+            vertices, faces = matter.mesh(candidates[number], surface)
+            sheets.append(Sheet(conductance, vertices + middle, faces))
+    return sheets, values[-1].item()

@@ -1,0 +1,208 @@
+"""The periodogram of a further reflection over the offset and two tilts of its plane."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Complex, Float
+from scipy.constants import speed_of_light
+from torch import Tensor
+from torch.nn import functional
+
+from gaigs.core.geometry import sinc
+from gaigs.planes.frame import mean_bounces
+from gaigs.planes.lags import FurtherWave, ReceiverLags
+from gaigs.splatting.placement.mirrored.reflections import reflect, tangents
+
+
+class Likeness(NamedTuple):
+    """Likeness of the reflection at each plane to a further wave.
+
+    Attributes:
+        values: Products of both waves, of about the same size at all links (c, b).
+        rates: Change of their phases if the plane moves [rad/m], or turns about its pivot towards
+            two axes [1] (c, b, 3).
+    """
+
+    values: Complex[Tensor, "c b"]
+    rates: Float[Tensor, "c b 3"]
+
+
+class TilePeak(NamedTuple):
+    """Maximum of a periodogram: its height, a plane, and the pivot of its turn [m]."""
+
+    height: float
+    plane: Float[Tensor, "4"]
+    pivot: Float[Tensor, "3"]
+
+
+class PlanePeriodogram:
+    """Search for the plane whose reflections are a further wave: its maxima near a known plane.
+
+    The slope of the error by the covariances, times the waves of known paths, is the wave of one
+    more path, and its phase follows from its length. Lengths are linear within a tile of offsets
+    and tilts, so the sum over links is a Fourier sum on each tile.
+
+    Args:
+        receivers: Training links.
+        wavelength: Shortest of them [m].
+        diagonal: Diagonal of the room [m].
+        reach: Distance over which a plane is moved on either side [diagonals].
+        widest: Largest distance [wavelengths]: a thousand errors for each normal.
+        tile: Half the width of a tile [rad]: over some metres, lengths are linear within it.
+        turn: Step of a turn [wavelengths over the places' mean distance from the pivot]: about 2
+            rad.
+    """
+
+    def __init__(
+        self,
+        receivers: list[ReceiverLags],
+        wavelength: float,
+        diagonal: float,
+        reach: float = 0.08,
+        widest: float = 50.0,
+        tile: float = 0.025,
+        turn: float = 0.16,
+    ):
+        self.receivers = receivers
+        self.wavelength = wavelength
+        self.reach = min(reach * diagonal, widest * wavelength)
+        self.tile = tile
+        self.turn = turn
+
+    def find_peaks(
+        self,
+        waves: list[FurtherWave],
+        bandwidth: float,
+        normal: Float[Tensor, "3"],
+        plane: Float[Tensor, "4"],
+    ) -> list[TilePeak]:
+        """At most six maxima with planes near a normal, in place of a known plane."""
+        (bounce,) = mean_bounces(self.receivers, plane[None])
+        half = min(self.wavelength, self.reach)  # of a tile [m]
+        moves = torch.linspace(-half, half, 19)
+        turns = self._turns(bounce)
+        every = torch.cat((-turns.flip(0)[:-1], turns))
+        axes = torch.stack(tangents(normal))
+        count = 2 * math.ceil(self.reach / half / 2) + 1
+        starts = normal @ bounce + torch.linspace(-self.reach, self.reach, count)
+        centres = torch.cat((normal.expand(count, 3), starts[:, None]), 1)  # (tiles, 4)
+        pivots = mean_bounces(self.receivers, centres)
+        values = []
+        rates = []
+        for receiver, wave in zip(self.receivers, waves, strict=True):
+            likeness = compare_with_wave(receiver, wave, bandwidth, centres, pivots, axes)
+            values.append(likeness.values)
+            rates.append(likeness.rates)
+        peaks = []
+        for pivot, value, rate in zip(
+            pivots, torch.cat(values, 1), torch.cat(rates, 1), strict=True
+        ):
+            sums = periodogram(value, rate, moves, turns)
+            best = sums.flatten().topk(2)
+            at = torch.unravel_index(best.indices, sums.shape)
+            for height, step, first, second in zip(best.values.tolist(), *at, strict=True):
+                turned = normal + every[first] * axes[0] + every[second] * axes[1]
+                turned = functional.normalize(turned, dim=0)
+                offset = turned @ pivot + moves[step]
+                peaks.append(TilePeak(height, torch.cat((turned, offset[None])), pivot))
+        peaks.sort(key=lambda peak: -peak.height)
+        return self._distinct(peaks)
+
+    def _turns(self, bounce: Float[Tensor, "3"]) -> Float[Tensor, " t"]:
+        """Turns of a tile from 0 up [rad], such that phases change by about 2 rad a step."""
+        gaps = torch.cat([receiver.places - bounce for receiver in self.receivers])
+        spread = gaps.norm(dim=1).mean().item()  # [m]
+        step = max(min(self.tile / 5, self.turn * self.wavelength / spread), self.tile / 20)
+        return torch.linspace(0, self.tile, math.ceil(self.tile / step) + 1)
+
+    def _distinct(self, peaks: list[TilePeak]) -> list[TilePeak]:
+        """At most six of sorted peaks above 0, each in a main lobe of its own."""
+        distinct: list[TilePeak] = []
+        for peak in peaks:
+            if peak.height <= 0 or len(distinct) == 6:
+                break
+            if all(self._is_apart(peak, other) for other in distinct):
+                distinct.append(peak)
+        return distinct
+
+    def _is_apart(self, peak: TilePeak, other: TilePeak) -> bool:
+        gap = peak.plane - other.plane
+        move = (gap[3] - gap[:3] @ peak.pivot).abs()
+        return bool(gap[:3].norm() > self.tile / 4 or move > self.wavelength / 4)
+
+
+def compare_with_wave(
+    receiver: ReceiverLags,
+    wave: FurtherWave,
+    bandwidth: float,
+    planes: Float[Tensor, "c 4"],
+    pivots: Float[Tensor, "c 3"],
+    axes: Float[Tensor, "2 3"],
+) -> Likeness:
+    """Likeness of the reflection at each plane to a further wave over a bandwidth [Hz]."""
+    single = receiver.reflect_once(planes)
+    directions = single.directions.transpose(0, 1)  # (c, b, 3)
+    lengths = single.lengths.transpose(0, 1)  # (c, b)
+    gains = single.gains.transpose(0, 1)
+    cosines = single.cosines.transpose(0, 1)
+    alike = sinc(bandwidth / speed_of_light * (wave.lengths - lengths[..., None]))  # (c, b, n)
+    weights = torch.einsum("cbn,bne->cbe", alike.to(wave.weights), wave.weights)
+    values = (receiver.steer(directions).conj() * weights).sum(2) * gains.conj()
+    values = values * torch.polar(torch.ones_like(lengths), receiver.wavenumber * lengths)
+    # Saturation at the median, so that no link rules.
+    sizes = values.abs()
+    medians = torch.where(sizes > 0, sizes, math.nan).nanmedian(1, keepdim=True).values
+    values = values / (sizes + medians.nan_to_num(1.0))
+    # A path of length L changes by 2 cos(theta) a move of its plane along the normal, and by the
+    # bounce's distance from the pivot a turn.
+    normals, offsets = planes[:, None, :3], planes[:, None, 3]
+    heights = (receiver.places * normals).sum(-1) - offsets  # (c, b)
+    ways = reflect(receiver.places, normals, offsets) - receiver.pose.position
+    units = functional.normalize(ways, dim=2)  # (c, b, 3)
+    aside = (receiver.places - pivots[:, None]) @ axes.T  # (c, b, 2)
+    turned = aside * cosines[..., None] + heights[..., None] * (units @ axes.T)
+    rates = 2 * receiver.wavenumber * torch.cat((cosines[..., None], -turned), 2)
+    return Likeness(values, rates)
+
+
+def periodogram(
+    values: Complex[Tensor, " b"],
+    rates: Float[Tensor, "b 3"],
+    moves: Float[Tensor, " m"],
+    turns: Float[Tensor, " t"],
+) -> Float[Tensor, "m 2*t-1 2*t-1"]:
+    """Sums of ``Likeness`` over links, at planes that are moved and turned.
+
+    Sums are Re sum_b v_b exp(j (r_b0 move + r_b1 turn + r_b2 turn')).
+
+    Args:
+        values, rates: As of ``Likeness``, of one plane.
+        moves: Along the normal [m].
+        turns: Towards two axes [rad], from 0 up. Their negatives are taken too; the result has them
+            in ascending order.
+    """
+    phases = rates[:, :1] * moves
+    moved = values[:, None] * torch.polar(torch.ones_like(phases), phases)  # (b, m)
+    # Turns to both sides have the same products of cosines and sines, but for their signs.
+    sides = rates[:, 1:, None] * turns  # (b, 2, t)
+    cos, other_cos = sides.cos().unbind(1)
+    sin, other_sin = sides.sin().unbind(1)
+    size = (len(turns), len(moves), len(turns))
+
+    def total(
+        part: Float[Tensor, "b m"], first: Float[Tensor, "b t"], second: Float[Tensor, "b t"]
+    ) -> Float[Tensor, "m t t"]:
+        products = (part[:, :, None] * first[:, None]).flatten(1)  # (b, m t)
+        return (second.T @ products).view(size).movedim(0, 2)
+
+    even = total(moved.real, cos, other_cos)
+    odd = total(moved.real, sin, other_sin)
+    first_odd = total(moved.imag, sin, other_cos)
+    second_odd = total(moved.imag, cos, other_sin)
+    rows = []
+    for sign in (-1, 1):
+        near = even - sign * first_odd  # even in the second turn
+        far = sign * odd + second_odd  # odd in the second turn
+        rows.append(torch.cat(((near + far).flip(2)[..., :-1], near - far), 2))
+    return torch.cat((rows[0].flip(1)[:, :-1], rows[1]), 1)

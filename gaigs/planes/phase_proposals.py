@@ -1,0 +1,160 @@
+"""Planes near a known one whose reflections have like phases at all places: a periodogram."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+from torch.nn import functional
+
+from gaigs.core.propagation import slab
+from gaigs.planes.channel_links import ChannelData, ReceiverChannels, materials_of
+from gaigs.planes.strengths import fit_free
+from gaigs.splatting.placement.mirrored.reflections import polarised, reflect, tangents
+
+
+class Phasors(NamedTuple):
+    """Single reflections at a plane, at the places where they are strongest.
+
+    Attributes:
+        values: Strengths over the channels' root power, with the phase against the direct path.
+        slopes: Change of the length by offset and two tilts (b, 3).
+        cosines: Cosines of the angles of incidence.
+    """
+
+    values: Complex[Tensor, " b"]
+    slopes: Float[Tensor, "b 3"]
+    cosines: Float[Tensor, " b"]
+
+
+class SlabPeak(NamedTuple):
+    """Maximum of the periodogram over both tilts, at one offset."""
+
+    height: float
+    shift: Float[Tensor, "3"]
+    slab: Float[Tensor, "3"]
+
+
+def propose_by_phases(
+    data: ChannelData,
+    planes: Float[Tensor, "w 4"],
+    number: int,
+    reach: float,
+    tilt: float,
+    slabs: Float[Tensor, "m 3"],
+) -> list[tuple[Float[Tensor, "4"], Float[Tensor, "3"]]]:
+    """Planes near one of some planes, and slabs, with which its reflections have like phases.
+
+    Args:
+        data: Training channels.
+        planes: All known planes.
+        number: The plane that is moved.
+        reach: Largest move along the normal [m].
+        tilt: Largest turn towards either side [rad].
+        slabs: Slabs that are tried.
+
+    Returns:
+        Planes (4,) and slabs (3,): at most eight half-spaces and eight slabs, highest maxima of the
+        periodogram first.
+    """
+    plane = planes[number]
+    axes = tangents(plane[:3])
+    grids = _grids(data, reach, tilt)
+    parts = []
+    references = data.reference_phases(planes, data.receivers)
+    for receiver, phase in zip(data.receivers, references, strict=True):
+        parts.append(_phasors(data, receiver, phase, planes, number))
+    values, slopes, cosines = (torch.cat(column) for column in zip(*parts, strict=True))
+    waves = []
+    for axis, grid in enumerate(grids):
+        turns = 2 * math.pi / data.wavelength * slopes[:, axis, None] * grid  # (b, steps)
+        waves.append(torch.polar(torch.ones_like(turns), turns))
+    peaks: list[SlabPeak] = []
+    for material in slabs:
+        permittivity, thickness = materials_of(material)
+        te, tm = slab(permittivity, cosines, thickness / data.wavelength)
+        expected = polarised(plane[:3], te, tm)  # (b,)
+        # sum_b Re(a_b Gamma_b* exp(j k L_b(offset, tilts))) on the grid, as a product of matrices.
+        products = (values * expected.conj())[:, None] * waves[0]  # (b, o)
+        products = products[:, :, None] * waves[1][:, None]  # (b, o, t)
+        sums = (products.flatten(1).mT @ waves[2]).real  # (o t, u)
+        sums = sums.unflatten(0, (len(grids[0]), -1)).flatten(1)  # (o, t u)
+        highest, at = sums.max(1)
+        highest = highest / (values.abs() * expected.abs()).sum()
+        for step in range(len(highest)):
+            # A maximum over five offsets: the neighbours are parts of the same lobe.
+            if highest[step] == highest[max(0, step - 2) : step + 3].max():
+                first = grids[1][at[step] // len(grids[2])]
+                second = grids[2][at[step] % len(grids[2])]
+                shift = torch.stack((grids[0][step], first, second))
+                peaks.append(SlabPeak(highest[step].item(), shift, material))
+    peaks.sort(key=lambda peak: -peak.height)
+    return [
+        (_shifted(plane, axes, peak.shift), peak.slab)
+        for peak in _distinct_peaks(peaks, data.wavelength / 6)
+    ]
+
+
+def _grids(data: ChannelData, reach: float, tilt: float) -> list[Float[Tensor, " k"]]:
+    """Offsets [m] and tilts [rad] of the periodogram."""
+    wavelength = data.wavelength
+    offset_step = min(wavelength / 16, reach / 4)
+    tilt_step = min(wavelength / 5 / data.frame.diagonal, tilt / 4)
+    offsets = min(round(reach / offset_step), data.options.offset_cells)
+    tilts = min(round(tilt / tilt_step), data.options.tilt_cells)
+    offset_grid = offset_step * torch.arange(-offsets, offsets + 1).double()
+    tilt_grid = tilt_step * torch.arange(-tilts, tilts + 1).double()
+    return [offset_grid, tilt_grid, tilt_grid]
+
+
+def _shifted(
+    plane: Float[Tensor, "4"],
+    axes: tuple[Float[Tensor, "3"], Float[Tensor, "3"]],
+    shift: Float[Tensor, "3"],
+) -> Float[Tensor, "4"]:
+    """A plane moved along its normal and turned towards two axes."""
+    turned = functional.normalize(plane[:3] + shift[1] * axes[0] + shift[2] * axes[1], dim=0)
+    return torch.cat((turned, (plane[3] + shift[0])[None]))
+
+
+def _phasors(
+    data: ChannelData,
+    receiver: ReceiverChannels,
+    phase: Complex[Tensor, " c"],
+    planes: Float[Tensor, "w 4"],
+    number: int,
+) -> Phasors:
+    """Single reflections at a plane beside all other paths, at some hundred places in all."""
+    sequences = data.sequences(planes)
+    is_single = sequences[:, :-1].lt(0).all(1) & (sequences[:, -1] == number)
+    path = int(is_single.nonzero())
+    waves = receiver.waves(receiver.images(planes, sequences))
+    channels = receiver.flat.to(torch.complex64)
+    strengths = fit_free(waves.to(torch.complex64), channels, 1e-4).strengths[:, path]
+    normal, offset = planes[number, :3], planes[number, 3]
+    axes = tangents(normal)
+
+    def length(shift: Float[Tensor, "3"]) -> Float[Tensor, " b"]:
+        plane = _shifted(planes[number], axes, shift)
+        ways = reflect(receiver.places, plane[:3], plane[3]) - receiver.position
+        return ways.norm(dim=1)
+
+    slopes = torch.autograd.functional.jacobian(length, torch.zeros(3).double())  # (b, 3)
+    ways = reflect(receiver.places, normal, offset) - receiver.position
+    cosines = (functional.normalize(ways, dim=1) @ normal).abs().clamp(1e-3, 1)
+    weights = strengths.abs() * waves[:, path].norm(dim=1) / receiver.flat.norm(dim=1)
+    values = weights * strengths.sgn() * phase.conj()
+    strongest = weights.argsort(descending=True)[: max(16, 120 // len(data.receivers))]
+    return Phasors(values[strongest], slopes[strongest], cosines[strongest])
+
+
+def _distinct_peaks(peaks: list[SlabPeak], least: float) -> list[SlabPeak]:
+    """The best half-space and the best slab of each lobe; lobes are ``least`` apart [m]."""
+    distinct: list[SlabPeak] = []
+    for peak in peaks:
+        alike = [other for other in distinct if (other.slab[2] < 0) == (peak.slab[2] < 0)]
+        is_apart = all((peak.shift - other.shift)[0].abs() > least for other in alike)
+        if len(alike) < 8 and is_apart:
+            distinct.append(peak)
+    return distinct

@@ -1,0 +1,194 @@
+"""Revisions of a room during the training: planes move, and weak planes and paths are dropped."""
+
+import logging
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gaigs.core.geometry import FAINTEST, Grid
+from gaigs.core.query import Batch
+from gaigs.core.stages import track
+from gaigs.planes.strengths import log_share
+from gaigs.splatting.placement.mirrored.paths import Mirrored
+from gaigs.splatting.placement.mirrored.reflections import square_normals
+
+log = logging.getLogger(__name__)
+
+Loss = Callable[[Batch], float]
+"""Loss of the model as it stands, on a batch."""
+
+
+def thin_batch(batch: Batch, rows: int) -> Batch:
+    """A batch with about ``rows`` of its labels' rows, and columns in proportion."""
+    labels = batch.labels
+    directions = batch.directions
+    if isinstance(directions, Grid):
+        every = slice(None, None, max(1, round(directions.shape[0] / rows)))
+        labels = labels[:, every, every]
+        directions = directions.thin(every, every)
+    return Batch(batch.query, directions, labels)
+
+
+@torch.no_grad()
+def move_planes(
+    model, batch: Batch, wavelength: float, least: float, widest: float = 50.0
+) -> list[float]:
+    """Moves each used plane to the least error, the strongest first.
+
+    It moves along its normal, or along one that is square to the others. If a map is drawn, which
+    takes long, planes keep their normals.
+
+    Args:
+        model: With a placement ``mirrored``.
+        batch: Links whose errors count.
+        wavelength: Of the carrier [m].
+        least: Least distance searched on either side [m].
+        widest: Largest distance [wavelengths].
+
+    Returns:
+        Moves along the normals [m].
+    """
+    placement: Mirrored = model.placement
+    placement.enable_phases(wavelength)  # adds the steps so far to the planes
+    thinned = thin_batch(batch, 12)
+    reach = max(4.0 * wavelength, min(least, widest * wavelength))
+    if least > reach:  # steps cannot be coarser than a fraction of the wavelength
+        log.info(
+            "planes are searched within %.3g m, not %.3g m; placement.walls can start nearer",
+            reach,
+            least,
+        )
+    planes = track(sort_by_strength(placement, batch), "search of planes")
+    turns = model.takes_paths
+    return [move_plane(model, plane, reach, wavelength, thinned, turns) for plane in planes]
+
+
+def move_plane(
+    model, plane: int, reach: float, wavelength: float, batch: Batch, turns: bool
+) -> float:
+    """Moves a plane along its normal to the least error; returns the move [m].
+
+    With ``turns`` it may take one of ``square_normals``.
+    """
+    placement: Mirrored = model.placement
+    origin = placement.origin[plane]
+    step = wavelength / 10  # a reflected path changes by twice of it
+    count = round(reach / step)
+    moves = step * torch.arange(-count, count + 1).to(origin)
+    moves = moves[moves.abs().argsort(stable=True)]  # of equal errors the least move
+    normals = [origin[:3].clone()]
+    if turns:
+        used = placement.used.tolist()
+        normals = square_normals(placement.normals[used], used.index(plane))
+    trials = []
+    for normal in normals:
+        origin[:3] = normal
+        errors = _measure_moves(model, batch, plane, moves)
+        best = int(errors.argmin())
+        trials.append((errors[best].item(), moves[best].item(), normal))
+    _, move, origin[:3] = min(trials, key=lambda trial: trial[0])
+    origin[3] += move
+    return move
+
+
+def _measure_moves(
+    model, batch: Batch, plane: int, moves: Float[Tensor, " m"]
+) -> Float[Tensor, " m"]:
+    """Mean error with a plane moved along its normal [m] and strengths held.
+
+    Absolute errors count, of channels the logarithms of ``log_share``.
+    """
+    placement = model.placement
+    count = len(batch.query)
+    errors = []
+    with placement.holding():
+        model.excite(batch.query)
+        held = placement.held
+        numbers = max(1000, batch.labels[0].numel())
+        for part in moves.split(max(1, 2_000_000 // (count * numbers))):
+            # Each link once for each move.
+            rows = torch.arange(count, device=moves.device).repeat(len(part))
+            placement.held = held[rows]
+            placement.tried = placement.offsets.repeat(len(rows), 1)
+            placement.tried[:, plane] += part.repeat_interleave(count)
+            moved = Batch(batch.query[rows], batch.directions)
+            numbered = torch.arange(len(rows), device=rows.device)
+            value = model.respond(model.excite(moved.query), numbered, moved).value
+            label = model.scene.task.align(batch.labels[rows], value)
+            each = _measure_links(value, label)
+            errors.append(each.view(len(part), count).mean(1))
+    return torch.cat(errors)
+
+
+def _measure_links(value: Tensor, label: Tensor) -> Float[Tensor, " b"]:
+    """Error of each link (b, ...)."""
+    error = (value - label).reshape(len(value), -1)
+    if not error.is_complex():
+        return error.abs().mean(1)
+    # A strong channel must not rule, and a weak one has no squares in float32.
+    label = label.reshape(len(value), -1)
+    largest = label.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
+    return log_share(error / largest, label / largest)
+
+
+def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: float = 1e-6) -> str:
+    """Drops planes, then paths, that hardly lower any batch's loss, weakest first.
+
+    A path whose power is ``negligible`` over the strongest one's goes in any case: hundreds would
+    take long.
+
+    Returns:
+        A sentence for the log.
+    """
+    planes = len(placement.used)
+    paths = int(placement.kept.sum())
+    before = [loss(batch) for batch in batches]
+
+    def is_good(kept: Bool[Tensor, " n"]) -> bool:
+        placement.kept.copy_(kept)
+        return all(
+            loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True)
+        )
+
+    best = placement.kept.clone()
+    shares = torch.stack([_path_shares(placement, batch) for batch in batches]).amax(0)
+    best[best.nonzero()[:, 0][shares < negligible * shares.max()]] = False
+    for plane in reversed(sort_by_strength(placement, batches[0])):
+        without = best & ~(placement.sequences == plane).any(1)
+        best = without if is_good(without) else best
+    placement.kept.copy_(best)
+    weakest = best.nonzero()[:, 0][_path_shares(placement, batches[0]).argsort()]
+    # The largest number of weak paths that may go, by bisection.
+    low, high = 0, len(weakest) - 1
+    while low < high:
+        middle = (low + high + 1) // 2
+        if is_good(best.index_fill(0, weakest[:middle], False)):
+            low = middle
+        else:
+            high = middle - 1
+    placement.kept.copy_(best.index_fill(0, weakest[:low], False))
+    return (
+        f"{planes - len(placement.used)} of {planes} planes and "
+        f"{paths - int(placement.kept.sum())} of {paths} "
+        f"paths dropped; loss {before[0]:.4f} -> {loss(batches[0]):.4f}"
+    )
+
+
+def sort_by_strength(placement: Mirrored, batch: Batch) -> list[int]:
+    """Used planes, strongest received power first."""
+    shares = _path_shares(placement, batch)
+    sequences = placement.sequences[placement.kept]
+    powers = {
+        plane: shares[(sequences == plane).any(1)].sum().item() for plane in placement.used.tolist()
+    }
+    return sorted(powers, key=lambda plane: -powers[plane])
+
+
+def _path_shares(placement: Mirrored, batch: Batch) -> Float[Tensor, " n"]:
+    """Mean share of each kept path in a link's received power; 0 for a link without power."""
+    query, _ = batch.query.unique(with_receivers=True)
+    powers = placement(None, query).gains.abs().square()
+    total = powers.sum(1, keepdim=True)
+    return (powers / torch.where(total > 0, total, 1)).mean(0)

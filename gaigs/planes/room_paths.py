@@ -1,0 +1,121 @@
+"""Paths through a learnt room: their powers, and the points where planes reflect them."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from gaigs.core.query import Query
+from gaigs.core.scene import Scene
+from gaigs.splatting.placement.mirrored.paths import Mirrored
+
+
+class TracedPaths(NamedTuple):
+    """Powers and bounces of the kept paths of some links.
+
+    Attributes:
+        sequences: Numbers of the planes of each path, -1 for a missing plane.
+        powers: Free space included; 0 for a path that does not exist.
+        bounces: Points on the planes of each sequence, NaN for a missing plane [m].
+        transmitters, receivers: Ends of the links [m].
+    """
+
+    sequences: Int[ndarray, "n order"]
+    powers: Float[ndarray, "b n"]
+    bounces: Float[ndarray, "b n order 3"]
+    transmitters: Float[ndarray, "b 3"]
+    receivers: Float[ndarray, "b 3"]
+
+    @property
+    def shares(self) -> Float[ndarray, "b n"]:
+        """Share of each path in its link's power; 0 for a link without power."""
+        total = self.powers.sum(1, keepdims=True)
+        return self.powers / np.where(total > 0, total, 1)
+
+    @property
+    def ends(self) -> Float[ndarray, "k 3"]:
+        """Transmitters and receivers [m]."""
+        return np.concatenate((self.transmitters, self.receivers))
+
+    @property
+    def plane_shares(self) -> dict[int, float]:
+        """Mean share of the paths at each used plane in the power, largest first."""
+        means = self.shares.mean(0)
+        numbers = np.unique(self.sequences[self.sequences >= 0]).tolist()
+        shares = {
+            number: means[(self.sequences == number).any(1)].sum().item() for number in numbers
+        }
+        return dict(sorted(shares.items(), key=lambda item: -item[1]))
+
+
+class LearntPath(NamedTuple):
+    """Transmitter, bounces and receiver of a path [m], and its power.
+
+    The power is relative to the strongest path's [dB].
+    """
+
+    points: Float[ndarray, "p 3"]
+    power_db: float
+
+
+def thin_links(query: Query) -> Query:
+    """At most 256 of the links, evenly spread."""
+    count = len(query)
+    return query[torch.linspace(0, count - 1, min(256, count)).long()]
+
+
+def spread_links(scene: Scene) -> Query:
+    """Links evenly spread over the training transmitters' box, the receivers and the carriers."""
+    number = torch.arange(256)
+    shares = torch.quasirandom.SobolEngine(3).draw(len(number)).to(scene.lower)
+    places = scene.lower + (scene.upper - scene.lower) * shares
+    carriers = None
+    if len(scene.frequencies):
+        carriers = scene.frequencies[number % len(scene.frequencies)]
+    return Query(places, number % len(scene.receivers), carriers)
+
+
+@torch.no_grad()
+def trace_paths(placement: Mirrored, query: Query) -> TracedPaths:
+    """Powers and bounces of the kept paths of some links, without a deformation."""
+    device = placement.sequences.device
+    sequences = placement.sequences[placement.kept]
+    powers = []
+    bounces = []
+    receivers = []
+    for part in query.parts(64):  # links at a time
+        part = part.to(device)
+        powers.append(placement(None, part).gains.abs().square())
+        _, stands, folded = placement.folded(part)
+        receivers.append(placement.scene.positions(stands)[part.receivers])
+        points = stands.new_full((len(part), *sequences.shape, 3), torch.nan)
+        # Folding begins at the last plane of a sequence.
+        for back, (first, met) in enumerate(folded.parts(folded.bounces), 1):
+            points[:, first:, -back] = met + placement.middle
+        bounces.append(points)
+    return TracedPaths(
+        sequences.cpu().numpy(),
+        torch.cat(powers).double().cpu().numpy(),
+        torch.cat(bounces).cpu().numpy(),
+        query.transmitters.cpu().numpy(),
+        torch.cat(receivers).cpu().numpy(),
+    )
+
+
+def list_paths(placement: Mirrored, query: Query) -> list[LearntPath]:
+    """At most 20 paths of some links together, within 30 dB of the strongest, which comes first."""
+    traced = trace_paths(placement, query)
+    powers = traced.powers / traced.powers.max(initial=np.finfo(float).tiny)
+    strongest = np.argsort(-powers, axis=None)[:20]
+    paths = []
+    for link, path in zip(*np.unravel_index(strongest, powers.shape), strict=True):
+        if powers[link, path] < 1e-3:
+            continue
+        bounces = traced.bounces[link, path][traced.sequences[path] >= 0]
+        ends = traced.transmitters[link, None], traced.receivers[link, None]
+        points = np.concatenate((ends[0], bounces, ends[1]))
+        paths.append(LearntPath(points, 10 * math.log10(powers[link, path])))
+    return paths

@@ -1,0 +1,80 @@
+"""Strengths of known waves in channels: least squares at each place, free, or real."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Complex, Float, Inexact
+from torch import Tensor
+
+
+class FreeFit(NamedTuple):
+    """Residual of channels (b, k) after the strengths of their waves (b, n)."""
+
+    residual: Complex[Tensor, "b k"]
+    strengths: Complex[Tensor, "b n"]
+
+
+def ridged(gram: Inexact[Tensor, "b n n"], ridge: float) -> Inexact[Tensor, "b n n"]:
+    """Gram matrices with a ridge over their mean power.
+
+    Images closer than the resolution then share their power.
+    """
+    power = gram.diagonal(dim1=1, dim2=2).real.mean(1)  # (b,)
+    power = torch.where(power > 0, power, 1)  # without any wave strengths are 0
+    return gram + ridge * power[:, None, None] * torch.eye(gram.shape[-1], dtype=gram.real.dtype)
+
+
+def fit_free(
+    waves: Complex[Tensor, "b n k"], channels: Complex[Tensor, "b k"], ridge: float
+) -> FreeFit:
+    """Complex strengths of waves that explain the channels best, at each place."""
+    gram = ridged(waves.conj() @ waves.mT, ridge)
+    right = waves.conj() @ channels[..., None]  # (b, n, 1)
+    strengths = torch.linalg.solve(gram, right)[..., 0]
+    return FreeFit(channels - (strengths[:, None] @ waves)[:, 0], strengths)
+
+
+def real_residual(
+    waves: Complex[Tensor, "b n k"],
+    channels: Complex[Tensor, "b k"],
+    signed: Bool[Tensor, " n"],
+    ridge: float,
+) -> Complex[Tensor, "b k"]:
+    """Residual after the best real strengths, of which only ``signed`` ones may be negative."""
+    gram = ridged((waves.conj() @ waves.mT).real, ridge)
+    strengths = real_strengths(gram, (waves.conj() @ channels[..., None]).real, signed)
+    return channels - (strengths.mT.to(waves) @ waves)[:, 0]
+
+
+def real_strengths(
+    gram: Float[Tensor, "b n n"],
+    right: Float[Tensor, "b n 1"],
+    signed: Bool[Tensor, " n"] | bool = False,
+) -> Float[Tensor, "b n 1"]:
+    """Solutions of linear systems without negative values, but for ``signed`` ones.
+
+    Values that would be negative are 0, and the others follow: one step of an active-set method.
+    """
+    is_active = torch.linalg.solve(gram, right) >= 0
+    active = (is_active | torch.as_tensor(signed)[..., None]).to(gram)  # (b, n, 1)
+    reduced = gram * active * active.mT + torch.diag_embed(1 - active[..., 0])
+    return torch.linalg.solve(reduced, right * active)
+
+
+def log_share(
+    rest: Complex[Tensor, "b k"], channels: Complex[Tensor, "b k"], floor: float = 1e-3
+) -> Float[Tensor, " b"]:
+    """Logarithm of the share of the channels' power in a residual.
+
+    The floor is the share below which a residual hardly counts: 30 dB.
+    """
+    power = channels.abs().square().sum(-1)
+    return (rest.abs().square().sum(-1) / torch.where(power > 0, power, 1) + floor).log()
+
+
+def align_phases(
+    channels: Complex[Tensor, "b k"], known: Complex[Tensor, "b k"]
+) -> Complex[Tensor, "b k"]:
+    """Channels, each turned to the phase of its known part; unchanged where this is 0."""
+    turns = (known * channels.conj()).sum(1, keepdim=True).sgn()
+    return torch.where(turns == 0, channels, channels * turns)

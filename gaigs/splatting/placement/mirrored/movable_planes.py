@@ -1,0 +1,222 @@
+"""Planes that a placement learns: where they start, how they move, and which paths use them."""
+
+import logging
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gaigs.core.scene import Scene
+from gaigs.data import Links
+from gaigs.splatting.placement import Placement
+from gaigs.splatting.placement.mirrored.reflections import (
+    all_sequences,
+    largest_order,
+    seen_from,
+)
+from gaigs.splatting.placement.mirrored.walls import read_planes
+
+log = logging.getLogger(__name__)
+
+
+class MovablePlanes(Placement):
+    """Planes about the middle of the room, and the sequences in which paths meet them.
+
+    Neither rounding nor a turn of a plane depends on the world's origin.
+
+    Attributes:
+        middle: Of the room [m].
+        diagonal: Of the box that holds transmitters and receivers [m].
+        turn: Rotation from the world's axes to the first planes' axes.
+        origin: Normals and offsets at the start, or at the last change of ``step`` (w, 4);
+            ``shifts`` are added.
+        step: Size of a unit of ``shifts``; it follows the wavelength once phases count.
+        sequences: Planes of each path, -1 for no plane (n, order).
+        kept, most: Paths that were not dropped (n,), and their number at the start.
+        is_new: True until the planes have learnt anything; set by ``fit``.
+
+    Args:
+        scene: Its box and receivers give the first planes.
+        planes: Largest number of planes; ``faces`` at the start.
+        order: Largest number of reflections of a path.
+        walls: File of the first planes, see ``read_planes``. None: the faces of the box.
+        fixed: True if planes stay at the start.
+    """
+
+    faces = 6
+    """Planes at the start: one beyond each face of the box, if it has this side."""
+    margin = 0.04
+    """Distance of these planes from the box [diagonals]."""
+    unit = 0.12
+    """Unit of plane offsets [diagonals]: learning rates suit rooms of any size."""
+
+    middle: Tensor
+    turn: Tensor
+    origin: Tensor
+    first: Tensor
+    step: Tensor
+    sequences: Tensor
+    kept: Tensor
+    most: Tensor
+
+    def __init__(self, scene: Scene, planes: int, order: int, walls: str | None, fixed: bool):
+        super().__init__()
+        self._check_number("planes", planes, self.faces)
+        self._check_number("order", order, 0)
+        most = 100_000  # sequences, each with parameters: 10 planes of order 5
+        highest = largest_order(planes, most)
+        if order > highest:
+            raise ValueError(
+                f"placement.order={order} gives more than {most:,} sequences of {planes} planes, "
+                "each with parameters\n"
+                f"set placement.order={highest} or less, or fewer placement.planes"
+            )
+        self.scene = scene
+        self.order = order
+        self.walls = walls
+        self.fixed = fixed
+        self.box = scene.box
+        self.is_new = False
+        lower, upper = self.box
+        half = (upper - lower) / 2
+        self.diagonal = 2 * float(half.norm())
+        self.register_buffer("middle", lower + half, persistent=False)
+        self.register_buffer("turn", torch.eye(3), persistent=False)
+        self.register_buffer("origin", self._first_planes(planes, half))
+        # A model that differs has learnt.
+        self.register_buffer("first", self.origin.clone(), persistent=False)
+        self.register_buffer("step", torch.ones(()))
+        self.register_buffer("sequences", all_sequences(planes, order), persistent=False)
+        self.register_buffer("kept", self._first_paths())
+        self.register_buffer("most", self.kept.sum())
+        self.shifts = nn.Parameter(torch.zeros(planes, 4), requires_grad=not fixed)
+
+    @staticmethod
+    def _check_number(option: str, value: int, least: int) -> None:
+        if value < least:
+            raise ValueError(f"placement.{option} must be at least {least}, got {value}")
+
+    def _first_planes(self, planes: int, half: Float[Tensor, "3"]) -> Float[Tensor, "w 4"]:
+        """Faces of a box, given by half of its edges [m], and further planes in its middle."""
+        further = planes - self.faces
+        axes = torch.eye(3)
+        normals = torch.cat((axes, -axes, axes.repeat(-(-further // 3), 1)))[:planes]
+        beyond = half + self.margin * self.diagonal
+        offsets = torch.cat((beyond, beyond, torch.zeros(further)))
+        # A random tilt: parallel planes would have equal gradients.
+        normals = normals + 0.05 * torch.randn(planes, 3)
+        return torch.cat((normals, offsets[:, None]), 1)
+
+    def _first_paths(self) -> Bool[Tensor, " n"]:
+        """Paths at the faces of the box.
+
+        Without faces beyond places that all stand at one height, or on one line: their distance is
+        unknown.
+        """
+        axes = [flat.axis for flat in self.scene.flat_axes if flat.is_common]
+        unseen = torch.tensor(axes, dtype=torch.long)
+        blind = torch.isin(torch.arange(self.faces) % 3, unseen).nonzero()[:, 0]
+        is_face = (self.sequences < self.faces).all(1)
+        return is_face & ~torch.isin(self.sequences, blind).any(1)
+
+    def fit(self, links: Links) -> None:
+        """Starts from the user's walls, or turns the faces of the box as the places lie."""
+        if self.walls is not None:
+            self._place_walls(Path(self.walls))
+            return
+        self.is_new = torch.equal(self.origin, self.first) and not self.shifts.any()
+        places = links.query.transmitters[links.split.train]
+        self.turn = upright_turn(places).to(self.origin)
+        if self.is_new and not torch.equal(self.turn, torch.eye(3).to(self.turn)):
+            faces = torch.cat((self.turn.mT, -self.turn.mT))
+            points = torch.cat((places, self.scene.positions(places))).to(self.origin)
+            farthest = ((points - self.middle) @ faces.mT).amax(0)
+            self.origin[: self.faces, :3] = self.first[: self.faces, :3] @ self.turn.mT
+            self.origin[: self.faces, 3] = farthest + self.margin * self.diagonal
+
+    def _place_walls(self, file: Path) -> None:
+        """Starts from the largest planes of a file."""
+        planes = read_planes(file, *self.box).to(self.origin)
+        most = len(self.origin)
+        if len(planes) > most:
+            log.warning(
+                "placement.planes: %s has %d planes, the first %d are taken",
+                file,
+                len(planes),
+                most,
+            )
+        planes = planes[:most]
+        for number, plane in enumerate(planes):
+            self.place(number, plane)
+        self.kept.copy_(self.sequences_of(torch.arange(len(planes))))
+        self.most.copy_(self.kept.sum())
+
+    @property
+    def normals(self) -> Float[Tensor, "w 3"]:
+        """Unit normals of all planes."""
+        return functional.normalize(self.origin[:, :3] + self.step * self.shifts[:, :3], dim=1)
+
+    @property
+    def offsets(self) -> Float[Tensor, " w"]:
+        """Offsets of all planes along their normals, from the middle of the room [m]."""
+        return self.origin[:, 3] + self.step * self.unit * self.diagonal * self.shifts[:, 3]
+
+    @property
+    def planes(self) -> Float[Tensor, "w 4"]:
+        """Normals and offsets of all planes in the world's frame [m]."""
+        return seen_from(torch.cat((self.normals, self.offsets[:, None]), 1).double(), -self.middle)
+
+    @property
+    def used(self) -> Int[Tensor, " k"]:
+        """Planes of the kept paths."""
+        numbers = self.sequences[self.kept].unique()
+        return numbers[numbers >= 0]
+
+    def sequences_of(self, planes: Int[Tensor, " k"]) -> Bool[Tensor, " n"]:
+        """True for each sequence of these planes alone."""
+        planes = torch.cat((planes, planes.new_tensor([-1]))).to(self.sequences.device)
+        return torch.isin(self.sequences, planes).all(1)
+
+    @torch.no_grad()
+    def place(self, number: int, plane: Float[Tensor, "4"]) -> None:
+        """Puts one of the ``planes``."""
+        self.origin[number] = seen_from(plane.double(), self.middle)
+        self.shifts[number] = 0
+
+    @torch.no_grad()
+    def move_by_wavelengths(self, wavelength: float) -> None:
+        """Lets planes move in fractions of the wavelength [m]."""
+        self.origin.copy_(torch.cat((self.normals, self.offsets[:, None]), 1))
+        self.shifts.zero_()
+        # 2.2 wavelengths: a usual step of 0.01 then turns a phase by a tenth of a radian.
+        self.step.fill_(min(1.0, 2.2 * wavelength / (self.unit * self.diagonal)))
+
+
+def upright_turn(
+    places: Float[Tensor, "n 3"], smaller: float = 0.85, width: float = 0.25, enough: int = 40
+) -> Float[Tensor, "3 3"]:
+    """Rotation about z to the axes of the upright box that holds all places and has the least area.
+
+    Args:
+        places: Transmitters [m].
+        smaller: Largest area over that along the world's axes, whose box is kept otherwise.
+        width: Least width over the length: places along a line say nothing of the room's walls.
+        enough: Fewest places: chance turns hardly any room along the axes that 40 places fill, a
+            quarter of rooms with 10.
+    """
+    turn = torch.eye(3, dtype=torch.float64)
+    if len(places.unique(dim=0)) < enough:
+        return turn.to(places)
+    angles = torch.arange(0, 90, dtype=torch.float64).deg2rad()
+    cos, sin = angles.cos(), angles.sin()
+    columns = torch.stack((cos, -sin), 1), torch.stack((sin, cos), 1)
+    axes = torch.stack(columns, 1)  # (angles, 2, 2)
+    along = places[:, :2].double() @ axes  # (angles, n, 2)
+    edges = along.amax(1) - along.amin(1)
+    areas = edges.prod(1)
+    best = int(areas.argmin())
+    if areas[best] < smaller * areas[0] and edges[best].min() > width * edges[best].max():
+        turn[:2, :2] = axes[best]
+    return turn.to(places)

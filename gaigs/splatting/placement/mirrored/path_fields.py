@@ -1,0 +1,266 @@
+"""Fields of reflection paths at learnt planes, after materials, obstacles and element patterns."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Complex, Float, Inexact
+from scipy.constants import speed_of_light
+from torch import Tensor, nn
+from torch.nn import functional
+
+from gaigs.core.antenna import Receiver
+from gaigs.core.propagation import NEAREST, fresnel, slab
+from gaigs.core.query import Query
+from gaigs.core.scene import Scene, carriers
+from gaigs.splatting.placement.mirrored.movable_planes import MovablePlanes
+from gaigs.splatting.placement.mirrored.obstacles import Obstacles
+from gaigs.splatting.placement.mirrored.reflections import Folded, fold, images, polarised
+
+
+class FoldedLinks(NamedTuple):
+    """Links with their paths through a room; positions are from its middle [m].
+
+    Attributes:
+        seen: Images of the transmitters, see ``reflections.images``.
+        receivers: Position of each link's receiver.
+        paths: Through the room.
+    """
+
+    seen: list[Float[Tensor, "b n 3"]]
+    receivers: Float[Tensor, "b 3"]
+    paths: Folded
+
+    @property
+    def ways(self) -> Float[Tensor, "b n 3"]:
+        """From the receivers to the last images [m]."""
+        return self.seen[-1] - self.receivers[:, None]
+
+
+class PathFields(MovablePlanes):
+    """Strengths of paths by sequences of planes, with learnt parameters.
+
+    The field of path k of length L is
+
+        a_k = F(u_k) / L_k  exp(g_k + g_r + j phi_k + j phi_r - tau_k - j 2 pi L_k / lambda)
+              prod_w exp(g_w) Gamma_w(theta)
+
+    with
+
+    * F: the element's pattern towards the image, times a learnt power of the cosine;
+    * g_k: the gain of a path; except of channels, phi_k: its phase;
+    * g_r: the gain of a receiver; of channels, phi_r: its phase;
+    * g_w: the gain of a plane, which falls off as a Gaussian about the plane's middle;
+    * Gamma_w: Fresnel's reflection with a learnt permittivity, of channels at a slab with a learnt
+      thickness. Polarisation is vertical: TE at upright planes, TM at level ones, weighted by n_z²
+      between;
+    * tau_k: the depth of the obstacles along the folded path, of channels with a phase.
+
+    A path that does not meet its planes in their order does not exist.
+
+    Attributes:
+        is_complex: True for channels.
+        is_bare: True while only the direct path counts, without obstacles.
+        known_blur: Logarithm of the standard deviation of a known path's phase at the start [rad].
+        unknown_blur: The same of a path that adds as power, whose coherence is 0.
+        faint: Largest share of a link's power, obstacles apart, of a path that skips the obstacles:
+            two of three paths.
+    """
+
+    known_blur = math.log(0.3)
+    unknown_blur = math.log(50.0)
+    faint = 1e-3
+    is_bare: Tensor
+
+    def __init__(
+        self,
+        scene: Scene,
+        planes: int,
+        order: int,
+        obstacles: int,
+        walls: str | None,
+        fixed: bool,
+    ):
+        super().__init__(scene, planes, order, walls, fixed)
+        self._check_number("obstacles", obstacles, 0)
+        self.is_complex = scene.task.dtype.is_complex
+        self._add_plane_parameters(planes)
+        self._add_path_parameters(planes)
+        self._add_receiver_parameters()
+        half = (self.box[1] - self.box[0]) / 2
+        self.obstacles = Obstacles(obstacles, -half, half, self.is_complex) if obstacles else None
+        # Spectra show even faint paths, where obstacles block the others.
+        self.skips_faint = not self.is_complex and scene.task.directions is None
+
+    def _add_plane_parameters(self, planes: int) -> None:
+        # Between wood and concrete: a relative permittivity of 4 - 0.3j.
+        self.log_permittivities = _filled(math.log(3.0), planes)
+        self.log_conductivities = _filled(math.log(0.3), planes)
+        self.plane_gains = _filled(0.0, planes)
+        self.middles = _filled(0.0, planes, 3)
+        # So wide that planes have no edges.
+        self.log_extents = _filled(math.log(2.0 * self.diagonal), planes, 3)
+
+    def _add_path_parameters(self, planes: int) -> None:
+        paths = len(self.sequences)
+        self.path_gains = _filled(0.0, paths)
+        # Channels have phases enough to locate planes: a free phase would only hide a plane half a
+        # wavelength off.
+        self.path_phases = None if self.is_complex else _filled(0.0, paths)
+        # [m]; a metre is a half-space.
+        self.log_thicknesses = _filled(0.0, planes) if self.is_complex else None
+        # [rad], far below the resolution of small arrays.
+        self.log_spreads = _filled(math.log(0.03), paths)
+        self.log_blurs = _filled(self.known_blur, paths)
+
+    def _add_receiver_parameters(self) -> None:
+        receivers = self.scene.receivers
+        self.receiver_gains = _filled(0.0, len(receivers))
+        self.directivity = _filled(0.0)
+        self.receiver_phases = _filled(0.0, len(receivers)) if self.is_complex else None
+        bandwidth = self.scene.bandwidth
+        self.log_bandwidth = None
+        if bandwidth != 0 and not self.is_complex:
+            self.log_bandwidth = _filled(math.log(bandwidth or speed_of_light / self.diagonal))
+        self.boresights = [torch.tensor([0.0, 0.0, 1.0])] * len(receivers)
+        if self.is_complex:
+            self.boresights = [boresight(receiver, self.middle) for receiver in receivers]
+
+    @torch.no_grad()
+    def place(
+        self, number: int, plane: Float[Tensor, "4"], material: Float[Tensor, "3"] | None = None
+    ) -> None:
+        """Puts one of the ``planes``.
+
+        A material is a slab's: logarithms of the permittivity's real part over 1, of its
+        imaginary part, and of the thickness [m].
+        """
+        super().place(number, plane)
+        if material is not None:
+            self.log_permittivities[number] = material[0]
+            self.log_conductivities[number] = material[1]
+            self.log_thicknesses[number] = material[2]
+
+    def folded(self, query: Query) -> FoldedLinks:
+        """The kept paths of links through the room."""
+        sequences = self.sequences[self.kept]
+        normals = self.normals
+        offsets = self.offsets
+        seen = images(query.transmitters - self.middle, sequences, normals, offsets)
+        receivers = (self.scene.positions(normals) - self.middle)[query.receivers]
+        paths = fold(seen, receivers, sequences, normals, offsets)
+        return FoldedLinks(seen, receivers, paths)
+
+    def strengths(
+        self, query: Query, folded: Folded, blocked: bool = True
+    ) -> Complex[Tensor, "b n"]:
+        """Field of each kept path over free space, after reflections and obstacles; 0 for no path.
+
+        ``blocked`` is False for the field without obstacles.
+        """
+        gains = self.path_gains[self.kept] + self.receiver_gains[query.receivers, None]
+        fields = torch.complex(gains.exp() * folded.exists, torch.zeros_like(gains))
+        fields = folded.reflected(fields, self.coefficients(query, folded))
+        if blocked and self.obstacles is not None and not self.is_bare:
+            fields = fields * (-self._depths(self.obstacles, folded, fields)).exp()
+        return fields
+
+    def coefficients(self, query: Query, folded: Folded) -> Complex[Tensor, "b w"]:
+        """Reflection coefficients at the bounces, with the gains of their planes."""
+        planes = folded.planes
+        cosines = folded.cosines
+        real = 1 + self.log_permittivities.exp()
+        permittivities = torch.complex(real, -self.log_conductivities.exp())[planes]
+        if self.log_thicknesses is None:
+            te, tm = fresnel(permittivities, cosines)
+        else:
+            wavelengths = speed_of_light / carriers(self.scene, query).to(cosines)[:, None]
+            te, tm = slab(permittivities, cosines, self.log_thicknesses[planes].exp() / wavelengths)
+        # A plane's gain falls off as a Gaussian about its middle.
+        aside = (folded.bounces - self.middles[planes]) * (-self.log_extents[planes]).exp()
+        gains = (self.plane_gains[planes] - aside.square().sum(-1) / 2).exp()
+        return polarised(folded.normals, te, tm) * gains
+
+    def _depths(
+        self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]
+    ) -> Inexact[Tensor, "b n"]:
+        """Depth of each path through the obstacles; 0 for no path and, of levels, a faint one."""
+        depths = torch.zeros_like(strengths.real if obstacles.turns is None else strengths)
+        with torch.no_grad():
+            is_blocked = strengths != 0
+            if self.skips_faint:
+                spans = (folded.end - folded.start).norm(dim=-1)
+                lengths = depths.real.index_add(1, folded.path, spans).clamp_min(NEAREST)
+                powers = (strengths.abs() / lengths).square()
+                is_blocked = powers > self.faint * powers.sum(1, keepdim=True)
+            legs = is_blocked[:, folded.path].flatten().nonzero()[:, 0]
+        starts = folded.start.flatten(0, 1).index_select(0, legs)
+        ends = folded.end.flatten(0, 1).index_select(0, legs)
+        count, n = strengths.shape
+        # Numbers of the legs' paths, of all links in a row.
+        paths = folded.path + n * torch.arange(count, device=legs.device)[:, None]
+        paths = paths.flatten()[legs]
+        return depths.flatten().index_add(0, paths, obstacles(starts, ends)).view(count, n)
+
+    def passing(self, query: Query) -> Float[Tensor, "b v"]:
+        """Field over free space of the direct path, then at each plane; 0 for no path."""
+        sequences = self.sequences[self.kept]
+        strengths = self.strengths(query, self.folded(query).paths).abs()
+        is_short = (sequences >= 0).sum(1) <= 1
+        fields = strengths.new_zeros(len(query), len(self.origin) + 1)
+        fields[:, sequences[is_short].amax(1) + 1] = strengths[:, is_short]
+        return fields / self.receiver_gains[query.receivers, None].exp()
+
+    def margins(self, query: Query) -> Complex[Tensor, "b n"]:
+        """Standard deviation of each kept path's field over free space, with the field's phase.
+
+        It holds before any residual is known: the path's field times the share that obstacles
+        block, and a tenth of the field without obstacles.
+        """
+        links = self.folded(query)
+        field = self.strengths(query, links.paths)
+        free = self.strengths(query, links.paths, blocked=False)
+        share = 1 - field.abs() / free.abs().clamp_min(torch.finfo(field.real.dtype).tiny)
+        return (share * field + 0.1 * free) * self.patterns(query, links.ways)
+
+    # --- receivers ---
+
+    def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+        """Field gain of a receiver's elements in its frame; of arrays times the learnt cos^q."""
+        array = self.scene.receivers[receiver].array
+        gain = array.gain(directions)
+        normal = self.boresights[receiver]
+        if len(array) == 1 or not normal.any():
+            return gain
+        cosines = directions @ normal.to(directions)
+        cosines = cosines.clamp_min(0.05)  # the logarithm has no bound at 0
+        return gain * cosines**self.directivity
+
+    def patterns(self, query: Query, ways: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
+        """Field gain of the receivers' elements towards points, ``ways`` from the receivers [m]."""
+        gains = torch.ones_like(ways[..., 0])
+        for number in query.receivers.unique().tolist():
+            receiver = self.scene.receivers[number]
+            if receiver.array.is_point:
+                continue
+            rows = query.receivers == number
+            directions = ways[rows] @ receiver.pose.rotation.to(ways)
+            gains[rows] = self.pattern(number, functional.normalize(directions, dim=-1))
+        return gains
+
+
+def _filled(value: float, *shape: int) -> nn.Parameter:
+    return nn.Parameter(torch.full(shape, value))
+
+
+def boresight(receiver: Receiver, middle: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
+    """Normal of a planar array in its own frame, towards a point of the world [m]; 0 for other
+    arrays.
+    """
+    elements = receiver.array.elements.double()
+    _, values, axes = torch.linalg.svd(elements - elements.mean(0), full_matrices=True)
+    flat = 1e-6 * values[0]  # float32 places elements no better
+    if len(values) < 3 or values[2] > flat or values[1] <= flat:
+        return torch.zeros(3)
+    normal = axes[2].float()
+    return normal if normal @ receiver.pose.to(middle).local(middle) >= 0 else -normal
