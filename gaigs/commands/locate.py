@@ -33,7 +33,6 @@ from gaigs.model.knn import COUNTS
 from gaigs.registry import call, check_instance, check_type
 from gaigs.report import style
 from gaigs.runs import links_of, load
-from gaigs.runs.evaluation import fold_count, is_trained, unseen
 from gaigs.split import rows_of
 
 POINTS, SECONDS, FEWEST = 20_000, 60.0, 1000
@@ -324,8 +323,8 @@ def fingerprints(
     )
     whole = mapped(model, known)
     tries: list[Any] = []
-    unknown = () if links is None else unseen(model, links)
-    for one, part, others in stages.track(unknown, "folds", fold_count(model)):
+    unknown = () if links is None else model.unseen(links)
+    for one, part, others in stages.track(unknown, "folds", model.fold_count):
         one.calibration = model.calibration
         rows = rows_of(links)  # those known links that share a transmission with the part
         asked, truth = received(links, known[torch.isin(rows[known], rows[part])])
@@ -738,7 +737,7 @@ def predicted(
     count, task = len(model.scene.receivers), model.scene.task
     found, deviations = [], []
     # A look-up reads its labels once a batch.
-    size = 8192 if not task.shape else 64 if is_trained(model) else 512
+    size = 8192 if not task.shape else 64 if model.is_trained else 512
     with warnings.catch_warnings(
         action="ignore", category=ExtrapolationWarning
     ):  # prior places may be outside

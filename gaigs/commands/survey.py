@@ -16,7 +16,7 @@ from gaigs.core.stages import track
 from gaigs.io.tables import read_points, write_csv
 from gaigs.kriging.kernel import LIMIT, Process, kernel
 from gaigs.kriging.links import chance_to_hear, coordinates, distances
-from gaigs.model import Model, call_optional
+from gaigs.model import Model
 from gaigs.registry import call, check_type
 from gaigs.report import style
 from gaigs.runs import load
@@ -331,10 +331,7 @@ def figure(plan: SurveyPlan) -> Figure:
 
 def processes_of(model: Model) -> list[Process]:
     """The processes of a model's receivers; raises a ``ValueError`` for a model without."""
-    found = [
-        call_optional(model, "process_at", receiver)
-        for receiver in range(len(model.scene.receivers))
-    ]
+    found = [model.process_at(receiver) for receiver in range(len(model.scene.receivers))]
     processes = [process for process in found if process is not None]
     if not processes:
         raise ValueError(

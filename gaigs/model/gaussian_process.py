@@ -112,6 +112,10 @@ class GaussianProcess(LookUp):
         kernel, noise and the choice of the trend."""
         self._fit(links, chooses=False)
 
+    def take_hyperparameters(self, other: Model) -> None:
+        if self.scalar and isinstance(other, GaussianProcess):
+            self.scalar[0].take(other.scalar[0])
+
     @torch.no_grad()
     def _fit(self, links: Links, chooses: bool) -> None:
         if self.scalar:

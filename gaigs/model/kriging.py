@@ -3,7 +3,7 @@
 import logging
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from gaigs.calibration.held_out import Unseen, validation_halves
 from gaigs.core import stages
 from gaigs.core.query import Batch, evenly, thin_labels
 from gaigs.core.scene import Scene
@@ -30,7 +31,8 @@ from gaigs.kriging.links import (
 )
 from gaigs.kriging.paths import Equations, PathField, PathProcess
 from gaigs.kriging.scalar import ScalarProcess
-from gaigs.model import LookUp, Model, Prediction, Wrapper, call_optional
+from gaigs.model import LookUp, Model, Prediction, Wrapper
+from gaigs.model.answers import predicted
 from gaigs.registry import name_of, register, registry
 
 log = logging.getLogger(__name__)
@@ -108,7 +110,7 @@ class Kriging(Wrapper):
         self.is_scalar = scene.task.is_scalar
         if self.is_scalar:
             self.process = ScalarProcess(scene)
-        self._make_fields(getattr(self.trend, "has_margins", False))
+        self._make_fields(self.trend.has_margins)
 
     def _make_fields(self, by_paths: bool) -> None:
         self.by_paths = by_paths
@@ -140,7 +142,7 @@ class Kriging(Wrapper):
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
         values, held = predicted(self.trend, links, links.split.known), links.split.validation
         self.fallback.fit(links)
-        has_paths = getattr(self.trend, "has_margins", False)
+        has_paths = self.trend.has_margins
         is_few = len(single_readings(links, held)) < FEWEST
         if by_paths or (has_paths and by_paths is None and is_few):
             return self._krige_paths(links, values, is_final)
@@ -294,11 +296,6 @@ class Kriging(Wrapper):
             self._log()
         self.fields.to(device)
         return validation_model.to(device)
-
-    @property
-    def scalar(self) -> list[ScalarProcess]:
-        """The process of labels of one real number, as ``GaussianProcess`` has it; none of others."""
-        return [self.process] if self.is_scalar else []
 
     def process_at(self, receiver: int) -> Process | None:
         """The process of one receiver; None for kriged paths, whose strengths are processes."""
@@ -492,6 +489,28 @@ class Kriging(Wrapper):
         return self._alone.at_frequencies(frequencies)
 
     @property
+    def fold_count(self) -> int:
+        return 2
+
+    def unseen(self, links: Links) -> Iterator[Unseen]:
+        """Kriging of the training links with each half of the validation links, by whose other half
+        its weights and hyperparameters are chosen; one group alone chooses, too.
+        """
+        if not len(links.split.validation):
+            return
+        for chooses, asked in validation_halves(links):
+            if stages.is_up():
+                return
+            kriged = Kriging(links.scene, self.trend, self.fallback_options).to(self.device)
+            half = replace(links, split=links.split.choosing(chooses))
+            kriged = kriged.krige(half, is_final=False, by_paths=self.by_paths)
+            yield Unseen(kriged, single_readings(links, asked), links.split.train)
+
+    def take_hyperparameters(self, other: Model) -> None:
+        if self.is_scalar and isinstance(other, Kriging):
+            self.process.take(other.process)
+
+    @property
     def _alone(self) -> Model:
         return self.trend if self.trend_weight > 0 else self.fallback
 
@@ -507,13 +526,13 @@ class Kriging(Wrapper):
         }
         if self.is_scalar:
             facts |= {**self.process.facts(), "links": len(self.process.places)}
-            return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
+            return self.trend.facts() | {"kriging": facts}
         facts |= self._hyperparameters.facts()
         places = [len(field.places) for field in self.fields]
         facts["links"] = sum(places)
         if not self.by_paths:
             facts["components"] = max(len(field.components) for field in self.fields)
-        return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
+        return self.trend.facts() | {"kriging": facts}
 
 
 def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -> Tensor:
@@ -532,16 +551,3 @@ def is_surely_better(
     """True if scores are higher by more than some standard errors; False of fewer than two."""
     gain = one - other
     return len(gain) > 1 and bool(gain.mean() > errors * gain.std() / math.sqrt(len(gain)))
-
-
-def predicted(
-    model: Model,
-    links: Links,
-    index: Int[Tensor, " k"],
-    frequencies: Float[Tensor, " s"] | None = None,
-) -> Tensor:
-    """Predictions of a model for some links, on the CPU; of channels at other subcarriers, if they
-    are given [Hz].
-    """
-    values = model.predict_batches(links.query[index], batch_size=64, frequencies=frequencies)
-    return torch.cat([part.cpu() for part in values])

@@ -15,7 +15,6 @@ from gaigs.data import Split
 from gaigs.kriging.paths import Equations, PathField, PathProcess, conjugate_gradients
 from gaigs.model.kriging import Kriging
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.runs.evaluation import unseen
 from gaigs.testing import example_links
 
 PROCESS = PathProcess(2.0, 0.1, 0.4)
@@ -210,4 +209,4 @@ def test_halves_of_the_validation_links_keep_what_all_of_them_chose(by_paths, mo
     model.krige(links, by_paths=by_paths)
     # Each half would choose the other.
     monkeypatch.setattr("gaigs.model.kriging.is_surely_better", lambda *_, **__: by_paths)
-    assert [one.by_paths for one, *_ in unseen(model, links)] == [by_paths] * 2
+    assert [one.by_paths for one, *_ in model.unseen(links)] == [by_paths] * 2

@@ -17,7 +17,7 @@ from gaigs.kriging.field import principal_components
 from gaigs.kriging.fit import Hyperparameters
 from gaigs.kriging.links import at_directions, coordinates, thinned
 from gaigs.kriging.scalar import Choice, ScalarProcess
-from gaigs.model import Model, Prediction, call_optional, kriging
+from gaigs.model import Model, Prediction, kriging
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging
 from gaigs.registry import registry
@@ -215,7 +215,7 @@ def test_facts_of_trend_and_kriging_are_reported(half):
     }
     assert model.facts() == {"kriging": facts}
     assert model.primitives is None
-    assert call_optional(model, "rendering", links.batch(links.split.test)) is None
+    assert model.rendering(links.batch(links.split.test)) is None
 
 
 def test_many_links_are_thinned_evenly(half, monkeypatch):
