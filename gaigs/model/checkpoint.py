@@ -126,9 +126,9 @@ def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Modul
         fresh = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         unset = {name for name, value in fresh.items() if not value.isfinite().all()}
         model.load_state_dict(weights)
-        _check_finite(
-            "weights", {name: value for name, value in weights.items() if name not in unset}
-        )
+        # The names are the model's: a checkpoint of before may have others.
+        state = model.state_dict()
+        _check_finite("weights", {name: state[name] for name in state if name not in unset})
         model.calibrate(content[KEY].get("calibration"))
         model.known_places = content[KEY].get("known_places")
     except Exception as error:  # any error of a constructor with damaged options

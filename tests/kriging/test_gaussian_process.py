@@ -14,21 +14,15 @@ from scipy.spatial.distance import cdist
 from gaigs.core.query import Query
 from gaigs.core.task.csi import Csi
 from gaigs.data import Split
-from gaigs.kriging import fit
 from gaigs.kriging.fit import NUGGETS, HeldOut, hold_out, negative_log_likelihood
 from gaigs.kriging.kernel import kriging_weights
-from gaigs.model import Model, gaussian_process
+from gaigs.model import Model
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.registry import registry
 from gaigs.testing import example_links
 
 TASKS = pytest.mark.parametrize("task", ["spectrum", "csi", "one channel"])
 BOX = torch.tensor([6.0, 4.0, 2.0])
-
-
-@pytest.fixture(autouse=True)
-def few_neighbours(monkeypatch):
-    monkeypatch.setattr(fit, "AROUND", 16)
 
 
 def make(task="rssi", count=60, carriers=()):
@@ -113,8 +107,8 @@ def test_the_variance_is_the_conditional_one():
 @TASKS
 def test_many_links_are_predicted_from_the_nearest(task, monkeypatch):
     links = make(task)
-    monkeypatch.setattr(gaussian_process, "LIMIT", 20)
-    monkeypatch.setattr(gaussian_process, "NEIGHBOURS", 7)
+    monkeypatch.setattr(GaussianProcess, "limit", 20)
+    monkeypatch.setattr(GaussianProcess, "neighbours", 7)
     model, asked = fitted(links), BOX * torch.rand(5, 3)
     found, expected = model.predict(asked, 1), kriged(model, links, 1, asked, nearest=7)
     assert found.dtype == links.task.dtype

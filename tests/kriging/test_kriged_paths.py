@@ -165,9 +165,9 @@ def test_variance_grows_away_from_known_places():
     variance = model.deviations(links.batch(torch.arange(5))).square()
     assert variance.shape == (5, *links.task.shape)
     assert (variance > 0).all()
-    process = PathProcess(*model.hyperparameters.tolist())
+    process = model.posterior.process
     places = links.query.transmitters[:5].double()
-    near, far = (model.fields[0].variances(at, process) for at in (places, places + 20))
+    near, far = (model.posterior.fields[0].variances(at, process) for at in (places, places + 20))
     assert (near < far).all()
     torch.testing.assert_close(far, torch.full_like(far, process.deviation**2), rtol=1e-2, atol=0)
     trend.double()
