@@ -339,7 +339,7 @@ def fewest(level: float) -> int:
 def nearest(
     query: Query, places: Float[Tensor, "k 3"], receivers: Int[Tensor, " k"]
 ) -> Float[Tensor, " b"]:
-    """Distance of each link to the nearest known place of its receiver [m]; infinite without one."""
+    """Distance of each link to its receiver's nearest known place [m]; infinite without one."""
     near = torch.full((len(query),), math.inf, dtype=torch.float64, device=places.device)
     for receiver in query.receivers.unique().tolist():
         asked = (query.receivers == receiver).nonzero()[:, 0]

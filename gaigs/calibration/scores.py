@@ -40,11 +40,14 @@ def interval_scores(
     density = torch.exp(-z.square() / 2) / math.sqrt(2 * math.pi)
     crps = std * (z * torch.erf(z / math.sqrt(2)) + 2 * density - 1 / math.sqrt(math.pi))
     nll = z.square() / 2 + std.log() + math.log(2 * math.pi) / 2
-    is_disc = most.radius is not None
+    if most.radius is not None:
+        width = 2 * most.radius
+    else:
+        width = most.upper - most.lower  # type: ignore[operator]
     parts = {
         "coverage_50": holds(half, labels),
         "coverage_90": holds(most, labels),
-        "width_90": 2 * most.radius if is_disc else most.upper - most.lower,  # type: ignore[operator]
+        "width_90": width,
         "crps": crps,
         "nll": nll,
     }

@@ -27,7 +27,7 @@ from gaigs.data import Links
 from gaigs.data.matching import check_fit
 from gaigs.io.files import write_text
 from gaigs.io.tables import find_file, read_table, refuse, shortened
-from gaigs.kriging.links import chance_to_hear, distances, folds_of
+from gaigs.kriging.links import distances, folds_of, reception_probability
 from gaigs.model import Model
 from gaigs.model.knn import COUNTS
 from gaigs.registry import call, check_instance, check_type
@@ -302,7 +302,7 @@ def fingerprints(
         values, deviations = predicted(one, made.places, frequency)
         axes, hears = torch.eye(values.shape[2]), torch.full(values.shape[:2], 0.5)
         if len(known) and tells:
-            hears = chance_to_hear(made.places, *heard_places(links, known), towards=0.5)
+            hears = reception_probability(made.places, *heard_places(links, known), prior=0.5)
         names = [receiver.name for receiver in scene.receivers]
         parts = scene.task, frequency, names, made, axes, values, deviations, hears
         return Fingerprints(*parts, frame=scene.frame)

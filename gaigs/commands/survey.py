@@ -15,7 +15,7 @@ from gaigs.core.query import Query, as_positions, evenly
 from gaigs.core.stages import track
 from gaigs.io.tables import read_points, write_csv
 from gaigs.kriging.kernel import LIMIT, Process, kernel
-from gaigs.kriging.links import chance_to_hear, coordinates, distances
+from gaigs.kriging.links import coordinates, distances, reception_probability
 from gaigs.model import Model
 from gaigs.registry import call, check_type
 from gaigs.report import style
@@ -397,7 +397,7 @@ def heard(processes: list[Process], asked: Float[Tensor, "g d"]) -> Float[Tensor
     for receiver, process in enumerate(processes):
         if len(process.places) >= LIMIT:  # a part of its readings, so their places do not tell
             hears[:, receiver] = 1
-    return chance_to_hear(asked, known, hears, hears.mean(0)).mT
+    return reception_probability(asked, known, hears, hears.mean(0)).mT
 
 
 def mean_of_heard(values: Float[Tensor, "r g"], hears: Float[Tensor, "r g"]) -> float:

@@ -83,7 +83,7 @@ def kernel(
 
 
 def covariance(places: Float[Tensor, "k d"], length: float, nugget: float) -> Float[Tensor, "k k"]:
-    """Covariances of noisy labels over the signal's variance; arguments as for ``kriging_weights``."""
+    """Covariances of noisy labels over the signal's variance, see ``kriging_weights``."""
     covariances = kernel(places, places, length)
     covariances.diagonal().add_(nugget)
     return covariances

@@ -102,8 +102,9 @@ class Readings(NamedTuple):
             count = min(self.count, len(known))
             for asked in (receivers == receiver).nonzero()[:, 0].split(size):
                 apart = distances(scaled(places[asked], scale), known_places)
-                if own is not None:
-                    apart = apart.masked_fill(own[asked, None] == folds[known], math.inf)  # type: ignore[index]
+                if own is not None and folds is not None:
+                    is_own = own[asked, None] == folds[known]
+                    apart = apart.masked_fill(is_own, math.inf)
                 farthest = int(apart.isfinite().sum(1).min())
                 if reach and farthest > self.count:
                     ranks = self._far_ranks(farthest)

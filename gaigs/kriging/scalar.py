@@ -15,9 +15,10 @@ from gaigs.core import stages
 from gaigs.core.query import Batch
 from gaigs.core.scene import Scene
 from gaigs.data import Links
+from gaigs.kriging.gross_errors import without_gross_errors
 from gaigs.kriging.kernel import SMOOTHNESSES, Process, matern, resize
 from gaigs.kriging.likelihood import Choice, conditional, covariances
-from gaigs.kriging.links import coordinates, distances, folds_of, scaled, without_gross_errors
+from gaigs.kriging.links import coordinates, distances, folds_of, scaled
 from gaigs.kriging.neighbours import HeldOutReadings, Readings
 from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar_fit import HeldOutCost, ScalarFit, ScalarOptions, maximise

@@ -89,7 +89,7 @@ class Model(nn.Module):
         >>> links = gaigs.links("synthetic", transmitters=20, order=0)
         >>> model = Nearest(links.scene)
         >>> model.fit(links)
-        >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]).shape  # places, receivers, rows, columns
+        >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]).shape  # places first
         torch.Size([2, 1, 90, 360])
     """
 
@@ -231,11 +231,13 @@ class Model(nn.Module):
             >>> few = gaigs.Grid.degrees(elevations=range(10, 90, 10), azimuths=range(0, 360, 10))
             >>> model.predict([1.0, 2.0, 1.5], receiver=0, directions=few).shape
             torch.Size([8, 36])
-            >>> channels = gaigs.train("friis", gaigs.links("synthetic_csi", transmitters=20, order=0))
+            >>> links = gaigs.links("synthetic_csi", transmitters=20, order=0)
+            >>> channels = gaigs.train("friis", links)
             >>> channels.predict([1.0, 2.0, 1.5], frequencies=[6.8e9, 6.9e9]).shape
             torch.Size([1, 16, 2])
-            >>> levels = gaigs.train("gaussian_process", gaigs.links("synthetic_rssi", transmitters=100))
-            >>> low, high = levels.predict([1.0, 2.0, 1.5], interval=0.9)[2:4]  # [dBm], of each receiver
+            >>> links = gaigs.links("synthetic_rssi", transmitters=100)
+            >>> levels = gaigs.train("gaussian_process", links)
+            >>> low, high = levels.predict([1.0, 2.0, 1.5], interval=0.9)[2:4]  # [dBm]
             >>> low.shape, bool((low < high).all())
             (torch.Size([4]), True)
         """

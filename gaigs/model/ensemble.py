@@ -1,4 +1,4 @@
-"""Ensembles: models that differ by their seed alone, whose differences show how certain they are."""
+"""Ensembles: models that differ by their seed alone, and so show how certain they are."""
 
 from collections.abc import Callable
 from dataclasses import replace

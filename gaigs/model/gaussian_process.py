@@ -16,6 +16,7 @@ from gaigs.core.stages import stage
 from gaigs.core.task.csi import Csi
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations
+from gaigs.kriging.gross_errors import without_gross_errors
 from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, kernel, kriging_weights
 from gaigs.kriging.links import (
     PART,
@@ -24,8 +25,7 @@ from gaigs.kriging.links import (
     distances,
     folds_of,
     known_links,
-    thinned,
-    without_gross_errors,
+    limit_known,
 )
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, build_trend
@@ -94,7 +94,8 @@ class GaussianProcess(LookUp):
         self.trends = tuple(build_trend(one, scene) for one in given)
         if any(built.is_trained for built in self.trends):
             raise ValueError(
-                f"model.trend cannot be trained, got {trend['name']}; take mean, path_loss or friis"  # type: ignore[index]
+                f"model.trend cannot be trained, got {name_of(self.trends[0])}; "
+                "take mean, path_loss or friis"
             )
         self.chosen = 0
         self.scalar = ScalarProcess(scene) if scene.task.is_scalar else None
@@ -142,7 +143,7 @@ class GaussianProcess(LookUp):
         for trend in self.trends if chooses else (self.trend,):
             trend.fit(links)
         if self.scalar is not None:
-            self._fit_scalar(self.scalar, thinned(links, self.limit), chooses)
+            self._fit_scalar(self.scalar, limit_known(links, self.limit), chooses)
         else:
             self._solve_known(chooses)
 
@@ -201,7 +202,7 @@ class GaussianProcess(LookUp):
         return self.trend.any_frequency
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
-        """The trend alone: its residuals at other frequencies do not correlate with the known ones."""
+        """The trend alone: residuals at other frequencies do not correlate with the known ones."""
         return self.trend.at_frequencies(frequencies)
 
     def facts(self) -> dict[str, object]:
@@ -266,7 +267,7 @@ class GaussianProcess(LookUp):
         return Solved(torch.cholesky_solve(residuals.to(wide), factor.to(wide)), None)
 
     def _residuals(self, index: Int[Tensor, " k"]) -> Iterator[Tensor]:
-        """Labels of some links, aligned to their trend, less this trend; ``PART`` links at a time."""
+        """Labels of links, aligned to their trend, less this trend; ``PART`` links at a time."""
         for part in index.split(PART):
             trend = self.trend(Batch(self.links.query[part], self.scene.task.directions)).value
             residuals = self.scene.task.align(self.links.labels[part], trend) - trend

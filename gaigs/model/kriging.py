@@ -20,7 +20,7 @@ from gaigs.data import Links
 from gaigs.kriging.field import FieldPosterior
 from gaigs.kriging.fit import FEWEST
 from gaigs.kriging.kernel import LIMIT, Process
-from gaigs.kriging.links import PART, single_readings, thinned
+from gaigs.kriging.links import PART, limit_known, single_readings
 from gaigs.kriging.paths import PathPosterior
 from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar import ScalarPosterior
@@ -29,9 +29,6 @@ from gaigs.model.answers import predicted
 from gaigs.registry import name_of, register, registry
 
 log = logging.getLogger(__name__)
-
-WEIGHTS = (1.0, 0.75, 0.5, 0.25, 0.0)
-"""Candidates of ``trend_weight`` and ``weight``; of equally good ones the first is taken."""
 
 
 @register("model", "kriging")
@@ -72,6 +69,8 @@ class Kriging(Wrapper):
 
     trend_weight: Tensor
     weight: Tensor
+    weights = (1.0, 0.75, 0.5, 0.25, 0.0)
+    """Candidates of ``trend_weight`` and ``weight``; of equally good ones the first is taken."""
 
     def __init__(self, scene: Scene, trend: dict | Model, fallback: dict | None = None):
         super().__init__(scene)
@@ -137,7 +136,7 @@ class Kriging(Wrapper):
         """
         links = self.posterior.cleaned(links)
         count = len(links.split.known)
-        links = thinned(links, self._most(links, most))
+        links = limit_known(links, self._most(links, most))
         if is_final and math.isfinite(stages.left()) and len(links.split.known) < count:
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
         values = predicted(self.trend, links, links.split.known)
@@ -220,7 +219,7 @@ class Kriging(Wrapper):
         return model
 
     def _validation_model(
-        self, links: Links, values: Tensor, weights: Sequence[float] = WEIGHTS
+        self, links: Links, values: Tensor, weights: Sequence[float] = weights
     ) -> "Kriging":
         """Fits weights and hyperparameters, the trend weight one of ``weights``; a model of the
         training links.
@@ -240,10 +239,10 @@ class Kriging(Wrapper):
             kriged = predicted(model, links, split.validation)
             trend = values[len(split.train) :]
             means = []
-            for weight in WEIGHTS:
+            for weight in self.weights:
                 blended = blend(links.task, kriged, trend, weight)
                 means.append(validation_scores(links, blended).mean().item())
-            self.weight.fill_(WEIGHTS[means.index(max(means))])
+            self.weight.fill_(self.weights[means.index(max(means))])
             model.weight.copy_(self.weight)
         return model
 
@@ -279,10 +278,10 @@ class Kriging(Wrapper):
             shape, dtype = self.scene.task.shape, self.scene.task.dtype
             residuals = torch.empty(len(rows), *shape, dtype=dtype)
             for part in torch.arange(len(rows)).split(PART):
-                some = rows[part]
-                fallback = predicted(self.fallback, links, index[some])
-                mean = blend(task, values[some], fallback, weight)
-                labels = links.labels[index[some]]
+                few = rows[part]
+                fallback = predicted(self.fallback, links, index[few])
+                mean = blend(task, values[few], fallback, weight)
+                labels = links.labels[index[few]]
                 residuals[part] = (task.align(labels, mean) - mean).to(residuals)
             return residuals
 
@@ -347,11 +346,7 @@ class Kriging(Wrapper):
         log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in facts))
 
     def forward(self, batch: Batch) -> Prediction:
-        task, trend_weight, weight = (
-            self.scene.task,
-            self.trend_weight.item(),
-            self.weight.item(),
-        )
+        task, trend_weight, weight = self.scene.task, self.trend_weight.item(), self.weight.item()
         # A part without weight is not evaluated: that would cost its time, and a NaN of it would
         # count.
         trend = self.trend(batch).value if trend_weight > 0 or weight < 1 else None

@@ -136,7 +136,8 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=50)
-        >>> result = gaigs.evaluate(gaigs.train("knn", links), links, baselines=["mean", "path_loss"])
+        >>> model = gaigs.train("knn", links)
+        >>> result = gaigs.evaluate(model, links, baselines=["mean", "path_loss"])
         >>> list(result.models)
         ['knn', 'mean', 'path_loss']
         >>> print(result)
@@ -146,7 +147,8 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
     """
     if not isinstance(model, Model) or not isinstance(links, Links):
         raise TypeError(
-            f"evaluate takes a model and links, got {type(model).__name__} and {type(links).__name__}"
+            f"evaluate takes a model and links, got {type(model).__name__} and "
+            f"{type(links).__name__}"
         )
     check_fit(links, model.scene)
     if not len(links.split.test):
@@ -156,8 +158,13 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
             links.query[part].place_keys for part in (links.split.known, links.split.test)
         )
         if seen := int((torch.isin(test, model.known_places) & ~torch.isin(test, known)).sum()):
-            words = "%s has learnt from the places of %d of %d test links\ntake links of the split and seed of its training"
-            log.warning(words, name_of(model), seen, len(test))
+            log.warning(
+                "%s has learnt from the places of %d of %d test links\n"
+                "take links of the split and seed of its training",
+                name_of(model),
+                seen,
+                len(test),
+            )
     task = (links.held_out or links).task
     own = name_of(model.trend if isinstance(model, Kriging) else model)
     models = {own: model} | ({f"{own}_trend": model.trend} if isinstance(model, Kriging) else {})
@@ -365,5 +372,6 @@ def device_name(device: torch.device) -> str:
     info = Path("/proc/cpuinfo")
     lines = info.read_text().splitlines() if info.is_file() else []
     names = [line.split(":")[1].strip() for line in lines if line.startswith("model name")]
+    name = names[0] if names else platform.processor() or platform.machine()
     threads = torch.get_num_threads()
-    return f"{names[0] if names else platform.processor() or platform.machine()}, {threads} thread{'s' * (threads > 1)}"
+    return f"{name}, {threads} thread{'s' * (threads > 1)}"

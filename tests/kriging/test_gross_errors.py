@@ -7,7 +7,7 @@ import torch
 
 import gaigs
 from gaigs.core.query import Batch
-from gaigs.kriging.links import without_gross_errors
+from gaigs.kriging.gross_errors import without_gross_errors
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model.gaussian_process import GaussianProcess

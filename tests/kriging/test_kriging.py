@@ -16,7 +16,7 @@ from gaigs.kriging import field, fit
 from gaigs.kriging.field import FieldPosterior, principal_components
 from gaigs.kriging.fit import Hyperparameters
 from gaigs.kriging.likelihood import Choice
-from gaigs.kriging.links import at_directions, coordinates, thinned
+from gaigs.kriging.links import at_directions, coordinates, limit_known
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model import Model, Prediction, kriging
@@ -221,7 +221,7 @@ def test_facts_of_trend_and_kriging_are_reported(half):
 
 def test_many_links_are_thinned_evenly(half):
     links = make("rssi", smooth=1.0)
-    few = thinned(links, 20)
+    few = limit_known(links, 20)
     assert [len(few.known(receiver)) for receiver in (0, 1)] == [20, 20]
     for part, whole in zip(few.split.parts().values(), links.split.parts().values(), strict=True):
         assert {*part.tolist()} <= {*whole.tolist()}
