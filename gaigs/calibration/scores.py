@@ -72,7 +72,9 @@ def scores_of_links(
         half = calibration.estimate(*arguments, 0.5)
         most = calibration.estimate(*arguments, 0.9)
         parts.append(interval_scores(links.labels[rows], half, most))
-    scores = {name: torch.cat([part[name] for part in parts]) for name in parts[0]}
+    scores = {}
+    for name in parts[0]:
+        scores[name] = torch.cat([part[name] for part in parts])
     scores["calibration_links"] = torch.full((len(query),), float(calibration.counts.sum()))
     scores["places"] = query.place_keys.unique(return_inverse=True)[1].double()
     return scores

@@ -201,9 +201,6 @@ class FieldPosterior(Posterior):
         sizes = {"links": sum(places), "components": max(components)}
         return {**self.process.facts(), **sizes}
 
-    def copy_hyperparameters(self, other: "FieldPosterior") -> None:
-        self.hyperparameters.copy_(other.hyperparameters)
-
     def _places(self, query: Query) -> Float[Tensor, "b d"]:
         return coordinates(self.scene, query, self.process.scale)
 

@@ -266,9 +266,6 @@ class PathPosterior(Posterior):
         places = [len(field.places) for field in self.fields]  # type: ignore[arg-type]
         return {**self.process.facts(), "links": sum(places)}
 
-    def copy_hyperparameters(self, other: "PathPosterior") -> None:
-        self.hyperparameters.copy_(other.hyperparameters)
-
 
 def conjugate_gradients(
     times: Callable[[Tensor], Tensor],

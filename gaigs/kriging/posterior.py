@@ -60,9 +60,5 @@ class Posterior(nn.Module):
         """The process of one receiver's labels; None if processes are not of labels."""
         return None
 
-    def copy_hyperparameters(self, other: Any) -> None:
-        """Takes the hyperparameters of another posterior of the same class, before ``solve``."""
-        self.load_state_dict(other.state_dict())
-
     def take_hyperparameters(self, other: Any) -> None:
         """Takes what ``deviations`` depend on from another posterior, by default nothing."""

@@ -248,15 +248,17 @@ class Model(nn.Module):
         if interval is None:
             values = torch.cat([*self._values(request, batch_size)])
             return request.arranged(values, self.scene)
-        estimates = self._estimates(request, batch_size, float(interval))
+        batches = self._estimates(request, batch_size, float(interval))
         fields = []
-        for parts in zip(*estimates, strict=True):
+        for parts in zip(*batches, strict=True):
             joined = None if parts[0] is None else torch.cat(parts)
             fields.append(None if joined is None else request.arranged(joined, self.scene))
         if not isinstance(fields[0], dict):
             return Estimate(*fields)
-        names = fields[0]
-        return {name: Estimate(*(part and part[name] for part in fields)) for name in names}
+        estimates = {}
+        for name in fields[0]:
+            estimates[name] = Estimate(*(part and part[name] for part in fields))
+        return estimates
 
     def predict_batches(
         self,

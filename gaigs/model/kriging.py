@@ -236,6 +236,7 @@ class Kriging(Wrapper):
         model._solve(training, values[: len(split.train)])
         model.to(self.weight.device)
         if len(split.validation) and self.posterior.chooses_weight:
+            # The likelihood alone would trust kriging too far where cubes of space are held out.
             kriged = predicted(model, links, split.validation)
             trend = values[len(split.train) :]
             means = []
@@ -250,7 +251,7 @@ class Kriging(Wrapper):
         """Takes weights and hyperparameters of another model."""
         self.trend_weight.copy_(other.trend_weight)
         self.weight.copy_(other.weight)
-        self.posterior.copy_hyperparameters(other.posterior)
+        self.posterior.load_state_dict(other.posterior.state_dict())
 
     def _candidates(
         self, links: Links, values: Tensor, weights: Sequence[float]
@@ -276,14 +277,14 @@ class Kriging(Wrapper):
 
         def residuals(rows: Int[Tensor, " k"]) -> Tensor:
             shape, dtype = self.scene.task.shape, self.scene.task.dtype
-            residuals = torch.empty(len(rows), *shape, dtype=dtype)
+            differences = torch.empty(len(rows), *shape, dtype=dtype)
             for part in torch.arange(len(rows)).split(PART):
                 few = rows[part]
                 fallback = predicted(self.fallback, links, index[few])
                 mean = blend(task, values[few], fallback, weight)
                 labels = links.labels[index[few]]
-                residuals[part] = (task.align(labels, mean) - mean).to(residuals)
-            return residuals
+                differences[part] = (task.align(labels, mean) - mean).to(differences)
+            return differences
 
         self.posterior.solve(links, residuals)
         self.posterior.to(self.weight.device)
@@ -302,17 +303,16 @@ class Kriging(Wrapper):
         self.posterior.fit_process()
         model = Kriging(self.scene, self.trend, self.fallback_options)
         model._make_posterior(True)
-        model.posterior.copy_hyperparameters(self.posterior)
-        rows = [
-            (query.receivers == receiver).nonzero()[:, 0]
-            for receiver in range(len(self.scene.receivers))
+        model.posterior.load_state_dict(self.posterior.state_dict())
+        # Training links come first among the known ones, of a receiver too.
+        training = [
+            known[: int((query.receivers[:count] == receiver).sum())]
+            for receiver, known in enumerate(equations)
         ]
-        model.posterior.solve_equations(
-            [known[own < count] for own, known in zip(rows, equations, strict=True)]
-        )
-        held = torch.cat(rows)
+        model.posterior.solve_equations(training)
         kriged = values[count:].clone()
-        for row in stages.track(held[held >= count].tolist(), "kriging"):
+        # A link at a time: the margins of all of them may take gigabytes.
+        for row in stages.track(range(count, len(index)), "kriging"):
             kriged[row - count] += model.posterior.mean_at(query[row : row + 1], device)
         helps = False
         if len(single_readings(links, split.validation)) >= FEWEST:

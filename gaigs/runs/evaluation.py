@@ -179,13 +179,14 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
 
 def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:
     """The numbers of a table, and those of intervals where a model has them."""
-    own = own_scores(scores)
-    return task.summarise(own) | summarise_intervals(
-        {name.removeprefix(INTERVALS): score for name, score in scores.items() if name not in own}
-    )
+    of_task = task_scores(scores)
+    of_intervals = {
+        name.removeprefix(INTERVALS): score for name, score in scores.items() if name not in of_task
+    }
+    return task.summarise(of_task) | summarise_intervals(of_intervals)
 
 
-def own_scores(scores: dict[str, Tensor]) -> dict[str, Tensor]:
+def task_scores(scores: dict[str, Tensor]) -> dict[str, Tensor]:
     """The scores of the task, without those of intervals."""
     return {name: score for name, score in scores.items() if not name.startswith(INTERVALS)}
 
@@ -204,7 +205,7 @@ def score(
     out, ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as an
     uplink is taken for a downlink.
     """
-    test = TestScores(links)
+    test = LinkScores(links)
     frequencies = None if links.held_out is None else test.task.frequencies
     states_intervals = has_intervals and frequencies is None
     first = next(iter([*models, *look_ups]), None)
@@ -250,7 +251,7 @@ def score(
     return test.scores
 
 
-class TestScores:
+class LinkScores:
     """Scores of the test links, and the content of ``predictions.npz``.
 
     Attributes:
@@ -260,8 +261,6 @@ class TestScores:
         scores: Scores of every test link by the names of model and score.
         content: Arrays by name.
     """
-
-    __test__ = False  # the name begins as that of a test
 
     def __init__(self, links: Links):
         asked = links.held_out or links
@@ -325,16 +324,16 @@ def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
     """The table's numbers for each receiver with test links, by the names of receiver and model."""
     receivers = links.query.receivers[links.split.test]
-    return {
-        receiver.name: {
-            name: links.task.summarise(
-                {key: score[receivers == i] for key, score in own_scores(values).items()}
-            )
-            for name, values in scores.items()
-        }
-        for i, receiver in enumerate(links.receivers)
-        if (receivers == i).any()
-    }
+    summaries: dict[str, dict] = {}
+    for number, receiver in enumerate(links.receivers):
+        rows = receivers == number
+        if not rows.any():
+            continue
+        summaries[receiver.name] = {}
+        for name, values in scores.items():
+            of_receiver = {key: score[rows] for key, score in task_scores(values).items()}
+            summaries[receiver.name][name] = links.task.summarise(of_receiver)
+    return summaries
 
 
 def inference_ms(model: Model, links: Links) -> float:

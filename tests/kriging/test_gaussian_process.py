@@ -203,6 +203,17 @@ def test_a_receiver_with_hardly_a_link_is_predicted(first, count):
     assert (found - labels.mean()).abs().max() <= (labels - found.mean()).abs().max() + 1e-6
 
 
+def test_a_state_whose_process_is_in_a_list_loads():
+    links = make("rssi")
+    model = fitted(links)
+    state = {
+        name.replace("scalar.", "scalar.0."): part for name, part in model.state_dict().items()
+    }
+    fresh = GaussianProcess(links.scene)
+    fresh.load_state_dict(state)
+    assert torch.equal(fresh.predict(links.query), model.predict(links.query))
+
+
 # --- faults ---
 
 

@@ -202,6 +202,18 @@ def test_predictions_are_the_formula(task, carriers, half, monkeypatch):
     torch.testing.assert_close(model.predict(query), parts)
 
 
+@TASKS
+def test_a_state_with_the_names_of_before_loads(task, half):
+    links = make(task, smooth=1.0)
+    model, _ = kriged(links)
+    state = {name.removeprefix("posterior."): part for name, part in model.state_dict().items()}
+    if task == "rssi":
+        state["hyperparameters"] = torch.full((3,), np.nan)
+    fresh = Kriging(links.scene, Trained(links.scene))
+    fresh.load_state_dict(state)
+    assert torch.equal(fresh.predict(links.query), model.predict(links.query))
+
+
 def test_facts_of_trend_and_kriging_are_reported(half):
     links = make("spectrum", smooth=1.0)
     model, _ = kriged(links)
