@@ -23,6 +23,7 @@ from gaigs import configuration
 from gaigs.algebra import Algebra
 from gaigs.core.geometry import ExtrapolationWarning
 from gaigs.core.propagation import bartlett
+from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.model.kriging import Kriging
@@ -43,8 +44,8 @@ PUBLIC = [name for name in gaigs.__all__ if name != "__version__"]
 def quick(files_read_once):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gaigs.runs.radio_map", Mock())
-        patch.setattr("gaigs.kriging.scalar.NEAREST", 4)
-        patch.setattr("gaigs.kriging.scalar.ITERATIONS", 2)
+        options = ScalarOptions(neighbours=4, iterations=2)
+        patch.setattr("gaigs.kriging.scalar.ScalarProcess.options", options)
         yield
 
 

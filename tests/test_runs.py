@@ -26,6 +26,8 @@ from gaigs.core.radio_maps import RadioMap
 from gaigs.data import load
 from gaigs.data.nerf2_spectrum import write
 from gaigs.io.files import atomic_write
+from gaigs.kriging.scalar import ScalarProcess
+from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model import checkpoint
 from gaigs.planes.channel_links import SLABS, SlabRoom
 from gaigs.planes.channel_search import ChannelSearch
@@ -851,7 +853,7 @@ def test_tensorboard_logs_beside_the_csv(tmp_path):
 @pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
 def test_the_first_page_names_every_key_of_the_metrics(tmp_path, monkeypatch, task):
     monkeypatch.setattr(runs, "radio_map", Mock())  # which takes long
-    monkeypatch.setattr("gaigs.kriging.scalar.ITERATIONS", 2)
+    monkeypatch.setattr(ScalarProcess, "options", ScalarOptions(iterations=2))
     words = [
         f"+experiment={'mirrored' if task == 'spectrum' else f'mirrored_{task}'}", "data.transmitters=16",
         "trainer.max_steps=1", "trainer.accelerator=cpu", "trainer.enable_progress_bar=false", "placement.order=1",

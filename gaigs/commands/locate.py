@@ -27,13 +27,12 @@ from gaigs.data import Links
 from gaigs.data.compatibility import check_fit
 from gaigs.io.files import write_text
 from gaigs.io.tables import find_file, read_table, refuse, shortened
-from gaigs.kriging.links import chance_to_hear, distances, folds_of
+from gaigs.kriging.links import distances, folds_of, reception_probability
 from gaigs.model import Model
 from gaigs.model.knn import COUNTS
 from gaigs.registry import call, check_instance, check_type
 from gaigs.report import style
 from gaigs.runs import links_of, load
-from gaigs.runs.evaluation import fold_count, is_trained, unseen
 from gaigs.split import rows_of
 
 POINTS, SECONDS, FEWEST = 20_000, 60.0, 1000
@@ -303,7 +302,7 @@ def fingerprints(
         values, deviations = predicted(one, made.places, frequency)
         axes, hears = torch.eye(values.shape[2]), torch.full(values.shape[:2], 0.5)
         if len(known) and tells:
-            hears = chance_to_hear(made.places, *heard_places(links, known), towards=0.5)
+            hears = reception_probability(made.places, *heard_places(links, known), prior=0.5)
         names = [receiver.name for receiver in scene.receivers]
         parts = scene.task, frequency, names, made, axes, values, deviations, hears
         return Fingerprints(*parts, frame=scene.frame)
@@ -324,8 +323,8 @@ def fingerprints(
     )
     whole = mapped(model, known)
     tries: list[Any] = []
-    unknown = () if links is None else unseen(model, links)
-    for one, part, others in stages.track(unknown, "folds", fold_count(model)):
+    unknown = () if links is None else model.unseen(links)
+    for one, part, others in stages.track(unknown, "folds", model.fold_count):
         one.calibration = model.calibration
         rows = rows_of(links)  # those known links that share a transmission with the part
         asked, truth = received(links, known[torch.isin(rows[known], rows[part])])
@@ -738,7 +737,7 @@ def predicted(
     count, task = len(model.scene.receivers), model.scene.task
     found, deviations = [], []
     # A look-up reads its labels once a batch.
-    size = 8192 if not task.shape else 64 if is_trained(model) else 512
+    size = 8192 if not task.shape else 64 if model.is_trained else 512
     with warnings.catch_warnings(
         action="ignore", category=ExtrapolationWarning
     ):  # prior places may be outside

@@ -15,8 +15,8 @@ from gaigs.core.query import Query, as_positions, evenly
 from gaigs.core.stages import track
 from gaigs.io.tables import read_points, write_csv
 from gaigs.kriging.kernel import LIMIT, Process, kernel
-from gaigs.kriging.links import chance_to_hear, coordinates, distances
-from gaigs.model import Model, call_optional
+from gaigs.kriging.links import coordinates, distances, reception_probability
+from gaigs.model import Model
 from gaigs.registry import call, check_type
 from gaigs.report import style
 from gaigs.runs import load
@@ -331,10 +331,7 @@ def figure(plan: SurveyPlan) -> Figure:
 
 def processes_of(model: Model) -> list[Process]:
     """The processes of a model's receivers; raises a ``ValueError`` for a model without."""
-    found = [
-        call_optional(model, "process_at", receiver)
-        for receiver in range(len(model.scene.receivers))
-    ]
+    found = [model.process_at(receiver) for receiver in range(len(model.scene.receivers))]
     processes = [process for process in found if process is not None]
     if not processes:
         raise ValueError(
@@ -400,7 +397,7 @@ def heard(processes: list[Process], asked: Float[Tensor, "g d"]) -> Float[Tensor
     for receiver, process in enumerate(processes):
         if len(process.places) >= LIMIT:  # a part of its readings, so their places do not tell
             hears[:, receiver] = 1
-    return chance_to_hear(asked, known, hears, hears.mean(0)).mT
+    return reception_probability(asked, known, hears, hears.mean(0)).mT
 
 
 def mean_of_heard(values: Float[Tensor, "r g"], hears: Float[Tensor, "r g"]) -> float:

@@ -1,14 +1,21 @@
-"""Kriged residuals of one receiver in a compact form: places, weights, and principal components."""
+"""Kriged residuals of labels of many numbers: places, weights, and principal components."""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
-from jaxtyping import Float, Inexact
+from jaxtyping import Float, Inexact, Int
 from torch import Tensor, nn
 
-from gaigs.core.query import Batch
+from gaigs.core import stages
+from gaigs.core.query import Batch, Query, thin_labels
 from gaigs.core.scene import Scene
-from gaigs.kriging.fit import Hyperparameters, local_deviations
-from gaigs.kriging.kernel import cholesky_factor, covariance, kernel, resize
-from gaigs.kriging.links import at_directions
+from gaigs.data import Links
+from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations
+from gaigs.kriging.kernel import Process, cholesky_factor, covariance, kernel, resize
+from gaigs.kriging.links import at_directions, coordinates, scaled
+from gaigs.kriging.posterior import Posterior
 
 
 class Field(nn.Module):
@@ -16,10 +23,10 @@ class Field(nn.Module):
     residuals.
 
     Attributes:
-        places: Of the links (k, d) [m], see ``coordinates``.
-        weights: The components' scores over the covariances of the links (k, q).
-        components: In half precision (q, *shape), complex ones as real and imaginary part in the
-            last dimension.
+        places: Places of the links (k, d) [m], see ``coordinates``.
+        weights: Scores of the components over the covariances of the links (k, q).
+        components: Components in half precision (q, *shape), complex ones as real and imaginary
+            part in the last dimension.
         widened: The components in the task's precision, in which products are fast.
     """
 
@@ -42,27 +49,33 @@ class Field(nn.Module):
         )
 
     def solve(
-        self, places: Float[Tensor, "k d"], residuals: Tensor, process: Hyperparameters
+        self,
+        places: Float[Tensor, "k d"],
+        residuals: Tensor,
+        process: Hyperparameters,
+        share: float = 5e-4,
     ) -> None:
-        """Takes residuals (k, *shape) at their places."""
-        residuals = residuals.reshape(len(residuals), -1)
-        components = principal_components(residuals)
+        """Takes residuals (k, *shape) at their places; components leave out a ``share`` of their
+        energy.
+        """
+        residuals = residuals.reshape(len(residuals), -1)  # (k, m)
+        components = principal_components(residuals, share)  # (q, m)
         if components.is_complex():
             components = torch.view_as_real(components)
         shape = (len(components), *self.components.shape[1:])
-        # All buffers have the strides of a loaded state: other layouts round products differently.
-        like_loaded = lambda own, values: own.new_empty(values.shape).copy_(values)
-        self.components = like_loaded(self.components, components.reshape(shape))
+        self.components = _like_loaded(self.components, components.reshape(shape))
         self._widen()
         # Scores of the rounded components, so that each component corrects the rounding of the
-        # others.
-        kept = self.widened.cpu().flatten(1)
-        wide = torch.promote_types(kept.dtype, torch.float64)
-        gram, cross = (kept @ kept.mH).to(wide), (residuals @ kept.mH).to(wide)
-        scores = torch.linalg.solve(gram, cross, left=False)
+        # others: least squares, residuals = scores @ rounded.
+        rounded = self.widened.cpu().flatten(1)  # (q, m)
+        wide = torch.promote_types(rounded.dtype, torch.float64)
+        gram = (rounded @ rounded.mH).to(wide)
+        cross = (residuals @ rounded.mH).to(wide)
+        scores = torch.linalg.solve(gram, cross, left=False)  # (k, q)
         factor = cholesky_factor(places, process.length, process.nugget)
-        self.weights = like_loaded(self.weights, torch.cholesky_solve(scores, factor.to(wide)))
-        self.places, self.signal = like_loaded(self.places, places), None
+        self.weights = _like_loaded(self.weights, torch.cholesky_solve(scores, factor.to(wide)))
+        self.places = _like_loaded(self.places, places)
+        self.signal = None
 
     def forward(self, places: Float[Tensor, "b d"], length: float, batch: Batch) -> Tensor:
         """Kriged residuals (b, *shape) at some places, in the directions of a batch."""
@@ -79,12 +92,13 @@ class Field(nn.Module):
     def size(self, process: Hyperparameters) -> Tensor:
         """Most likely standard deviation of the process, a mean over a label's numbers."""
         if self.signal is None:
+            # The mean of r' K^-1 r over numbers and links, with r the residuals of a number.
             covariances = covariance(self.places, process.length, process.nugget)
-            kept = self.widened.flatten(1)
-            products = self.weights.mH @ covariances.to(self.weights) @ self.weights
-            squares = (products.mT * (kept @ kept.mH).to(products)).sum().real / (
-                len(self.places) * kept.shape[1]
-            )
+            components = self.widened.flatten(1)  # (q, m)
+            products = self.weights.mH @ covariances.to(self.weights) @ self.weights  # (q, q)
+            gram = (components @ components.mH).to(products)  # (q, q)
+            count = len(self.places) * components.shape[1]
+            squares = (products.mT * gram).sum().real / count
             self.signal = squares.clamp_min(0).sqrt()
         return self.signal
 
@@ -101,40 +115,136 @@ class Field(nn.Module):
         self._widen()
 
 
-LEFT, MOST = 5e-4, 256
-"""Largest share of the residuals' energy that the components leave out, and their largest number;
-SSIM changes visibly at ten times the share."""
+class FieldPosterior(Posterior):
+    """Kriged residuals of labels of many numbers, a ``Field`` for each receiver.
 
-EXACT = 512
-"""Links or numbers of a label up to which components are exact; beyond it random projections are
-faster.
-"""
+    Hyperparameters are the same for all receivers and numbers. The trend weight is the likeliest of
+    its candidates. Residuals of channels are limited, see ``damping``.
+    """
+
+    chooses_weight = True
+    hyperparameters: Tensor
+    share = 5e-4
+    """Largest share of the residuals' energy that components leave out; SSIM changes visibly at ten
+    times the share."""
+
+    def __init__(self, scene: Scene):
+        super().__init__()
+        self.scene = scene
+        self.register_buffer("hyperparameters", torch.full((3,), math.nan, dtype=torch.float64))
+        self.fields = nn.ModuleList(Field(scene) for _ in scene.receivers)
+
+    @property
+    def process(self) -> Hyperparameters:
+        """The hyperparameters by name."""
+        return Hyperparameters(*self.hyperparameters.tolist())
+
+    def fit(self, links: Links, candidates: Mapping[float, Tensor]) -> float:
+        index = links.split.known
+        rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
+
+        def fitted(weight: float, most: int = 300) -> tuple[Hyperparameters, float]:
+            residuals = candidates[weight]
+            if residuals.is_complex():
+                labels = thin_labels(links.labels[index])
+                factors = damping(residuals, labels, links.query.receivers[index])
+                residuals = residuals * factors[:, None]
+            return fit_hyperparameters(
+                self.scene, links, lambda part: residuals[rows[part]], most=most
+            )
+
+        fits = {weight: fitted(weight) for weight in stages.track([*candidates], "kriging")}
+        best = min(candidates, key=lambda weight: fits[weight][1])
+        process, _ = fits[best]
+        if best:  # residuals of a good trend correlate weakly with position: few links overfit
+            process, _ = fitted(best, most=1000)
+        self.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
+        return best
+
+    def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
+        index = links.split.known
+        query, process = links.query[index], self.process
+        for receiver, field in enumerate(stages.track(self.fields, "kriging")):
+            rows = (query.receivers == receiver).nonzero()[:, 0]
+            values = residuals(rows)  # (k, *shape)
+            if values.is_complex():
+                labels = links.labels[index[rows]]
+                values = values * damping(values, labels, query.receivers[rows])[:, None, None]
+            field.solve(self._places(query[rows]), values, process, self.share)
+
+    def mean(self, batch: Batch, like: Tensor) -> Tensor:
+        mean = torch.zeros_like(like)
+        for receiver in batch.query.receivers.unique().tolist():
+            is_asked = batch.query.receivers == receiver
+            places = self._places(batch.query[is_asked])
+            mean[is_asked] = self.fields[receiver](places, self.process.length, batch).to(mean)
+        return mean
+
+    def deviations(self, batch: Batch) -> Tensor:
+        query, process = batch.query, self.process
+        places = self._places(query)
+        squares = places.new_zeros(len(query))
+        for receiver in query.receivers.unique().tolist():
+            is_asked = query.receivers == receiver
+            field: Any = self.fields[receiver]
+            squares[is_asked] = field.deviations(places[is_asked], process).square()
+        return squares.sqrt()
+
+    def process_at(self, receiver: int) -> Process:
+        field, process = self.fields[receiver], self.process
+        places = scaled(field.places, 1 / process.scale)  # of scale 1
+        return process.at(places, field.size(process).item() ** 2)
+
+    def facts(self) -> Mapping[str, float]:
+        places = [len(field.places) for field in self.fields]  # type: ignore[arg-type]
+        components = [len(field.components) for field in self.fields]  # type: ignore[arg-type]
+        sizes = {"links": sum(places), "components": max(components)}
+        return {**self.process.facts(), **sizes}
+
+    def _places(self, query: Query) -> Float[Tensor, "b d"]:
+        return coordinates(self.scene, query, self.process.scale)
 
 
-def principal_components(residuals: Inexact[Tensor, "k m"]) -> Inexact[Tensor, "q m"]:
-    """The fewest principal components that leave out at most ``LEFT`` of the energy, each scaled to
+def _like_loaded(buffer: Tensor, values: Tensor) -> Tensor:
+    """Values with the type and strides of a loaded buffer: other layouts round products
+    differently."""
+    return buffer.new_empty(values.shape).copy_(values)
+
+
+def principal_components(
+    residuals: Inexact[Tensor, "k m"], share: float = 5e-4, most: int = 256, exact: int = 512
+) -> Inexact[Tensor, "q m"]:
+    """The fewest principal components that leave out at most a share of the energy, each scaled to
     a maximum of 1.
 
     Residuals of 0 have none.
+
+    Args:
+        residuals: Residuals of links.
+        share: Largest share of the energy that the components leave out.
+        most: Largest number of components.
+        exact: Links or numbers of a label up to which components are exact; beyond it random
+            projections are faster.
     """
-    if min(residuals.shape) <= EXACT:
+    if min(residuals.shape) <= exact:
         # By the smaller matrix of products: a decomposition of the residuals themselves takes ten
         # times as long.
         is_flat = len(residuals) <= residuals.shape[1]
         gram = residuals @ residuals.mH if is_flat else residuals.mH @ residuals
-        squares, vectors = torch.linalg.eigh(
-            gram.to(torch.promote_types(gram.dtype, torch.float64))
-        )
-        squares, vectors = squares.flip(0).clamp_min(0), vectors.flip(1).mH.to(residuals)[:MOST]
+        wide = torch.promote_types(gram.dtype, torch.float64)
+        squares, vectors = torch.linalg.eigh(gram.to(wide))
+        squares = squares.flip(0).clamp_min(0)
+        vectors = vectors.flip(1).mH.to(residuals)[:most]
         components = vectors @ residuals if is_flat else vectors
     else:
-        with torch.random.fork_rng(
-            devices=[]
-        ):  # a resumed run must continue as an uninterrupted one
+        # The random state stays: a resumed run must continue as an uninterrupted one.
+        with torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            _, values, columns = torch.svd_lowrank(residuals, q=MOST + 16)
-        squares, components = values.square().double(), columns.mH
+            _, values, columns = torch.svd_lowrank(residuals, q=most + 16)
+        squares = values.square().double()
+        components = columns.mH
     energy = residuals.norm(dim=1).double().square().sum()
-    left = energy - squares.cumsum(0)
-    components = components[: min(int((left > LEFT * energy).sum()) + 1, MOST) if energy > 0 else 0]
+    missing = energy - squares.cumsum(0)  # with 1, 2, ... components
+    count = int((missing > share * energy).sum()) + 1
+    components = components[: min(count, most) if energy > 0 else 0]
     return components / components.abs().amax(1, keepdim=True)

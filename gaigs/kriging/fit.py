@@ -50,51 +50,50 @@ class Hyperparameters(NamedTuple):
         return Process(covariances, places, places.new_full((len(places),), noise), noise)
 
 
+FEWEST = 10
+"""Fewest validation links that choose hyperparameters, or whether paths are kriged, repeated
+readings as one: fewer ones overfit."""
+
+
 class HeldOut(NamedTuple):
-    """Held-out links of one receiver, and the links that predict them."""
+    """Held-out links of one receiver, and the links that predict them.
+
+    Attributes:
+        asked: Held-out links.
+        around: Links around each held-out link, one group after the other.
+        products: Products of the residuals of each held-out link and of those around it.
+    """
 
     asked: Query
-    around: Query  # links around each held-out link, one group after the other
-    products: Float[
-        Tensor, "b j+1 j+1"
-    ]  # of the residuals of each held-out link and those around it
-
-
-LOUDEST = 10.0
-"""Largest residual of a channel, in median channels. Residuals within decimetres of a receiver are
-that large; a reading that is far too loud must not spoil the whole room."""
+    around: Query
+    products: Float[Tensor, "b j+1 j+1"]
 
 
 def damping(
     residuals: Complex[Tensor, " k *shape"],
     labels: Complex[Tensor, " k *shape"],
     receivers: Int[Tensor, " k"],
+    most: float = 10.0,
 ) -> Float[Tensor, " k"]:
-    """Factors that limit the residuals of channels to ``LOUDEST`` times the median channel of each
+    """Factors that limit the residuals of channels to ``most`` times the median channel of each
     link's receiver.
+
+    Residuals within decimetres of a receiver are that large; a reading that is far too loud must
+    not spoil the whole room.
     """
-    sizes, usual = (
-        torch.cat(
-            [part.flatten(1).to(torch.complex128).norm(dim=1) for part in channels.split(PART)]
-        )
-        for channels in (residuals, labels)
-    )
+    sizes, levels = norms(residuals), norms(labels)
     factors = torch.ones_like(sizes)
     for receiver in receivers.unique():
-        own = receivers == receiver
-        most = LOUDEST * usual[own].quantile(0.5)
-        factors[own] = torch.where(sizes[own] > most, most / sizes[own], 1)
+        rows = receivers == receiver
+        limit = most * levels[rows].quantile(0.5)
+        factors[rows] = torch.where(sizes[rows] > limit, limit / sizes[rows], 1)
     return factors.float()
 
 
-NUGGETS = (1e-4, 1e2)
-"""Bounds of the nugget. The lower keeps matrices regular in float64 if places are measured twice.
-"""
-
-EDGES = 8
-"""Longest correlation length, in longest edges of the box of places: beyond it the kernel is a line
-in the box.
-"""
+def norms(channels: Complex[Tensor, " k *shape"]) -> Float[Tensor, " k"]:
+    """Norms of channels, in double precision."""
+    parts = channels.split(PART)
+    return torch.cat([part.flatten(1).to(torch.complex128).norm(dim=1) for part in parts])
 
 
 def fit_hyperparameters(
@@ -102,6 +101,8 @@ def fit_hyperparameters(
     links: Links,
     residuals: Callable[[Int[Tensor, " j"]], Float[Tensor, "j m"]],
     most: int = 300,
+    nuggets: tuple[float, float] = (1e-4, 1e2),
+    edges: float = 8.0,
 ) -> tuple[Hyperparameters, float]:
     """Hyperparameters with the largest likelihood, and ``negative_log_likelihood``; -inf if all
     residuals are 0.
@@ -111,21 +112,28 @@ def fit_hyperparameters(
         links: Known links of each receiver, and the split that says which links are held out.
         residuals: Function from indices of links to the residuals of their ``thin_labels``.
         most: Held-out links of all receivers together; 300 take seconds at most.
+        nuggets: Bounds of the nugget. The lower keeps matrices regular in float64 if places are
+            measured twice.
+        edges: Longest correlation length, in longest edges of the box of places: beyond it the
+            kernel is a line in the box.
     """
-    lengths = scene.spacing, EDGES * (scene.upper - scene.lower).max().item()
-    bounds = np.log([lengths, NUGGETS, *([scale_bounds(scene)] if scene.has_band else [])])
+    lengths = scene.spacing, edges * (scene.upper - scene.lower).max().item()
+    scales = [scale_bounds(scene)] if scene.has_band else []
+    bounds = np.log([lengths, nuggets, *scales])
     middle = bounds.mean(1)
     scale = math.exp(middle[2]) if scene.has_band else math.nan
     known = known_links(links)
     each = max(1, most // len(known))
-    each_receiver = (hold_out(scene, links, index, scale, residuals, each) for index in known)
-    held_out = [held for held in each_receiver if held is not None]
+    held_out = []
+    for index in known:
+        held = hold_out(scene, links, index, scale, residuals, each)
+        held_out += [] if held is None else [held]
+    if not held_out:
+        return Hyperparameters(*np.exp(middle).tolist()), -math.inf
 
     def value(logarithms: Tensor) -> Tensor:
-        return sum(
-            (negative_log_likelihood(scene, held, *logarithms.exp()) for held in held_out),
-            torch.zeros(()),
-        )
+        parts = (negative_log_likelihood(scene, held, *logarithms.exp()) for held in held_out)
+        return sum(parts, torch.zeros(()))
 
     def cost(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
         with torch.enable_grad():
@@ -134,24 +142,20 @@ def fit_hyperparameters(
             (gradient,) = torch.autograd.grad(total, leaf)
         return total.item(), gradient.numpy()
 
-    best, least = middle, -math.inf
-    if held_out:
-        # From the best point of a coarse grid: the likelihood may have several maxima.
-        axes = [low + (high - low) * np.array([1, 3, 5]) / 6 for low, high in bounds]
-        grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(bounds))
-        start = min(grid, key=lambda point: value(torch.from_numpy(point)).item())
-        options: dict = {"options": {"ftol": 1e-6}, "callback": end_in_time}
-        found = minimize(cost, start, jac=True, method="L-BFGS-B", bounds=bounds, **options)
-        best, least = found.x, float(found.fun)
-    return Hyperparameters(*np.exp(best).tolist()), least
-
-
-FEWEST = 10
-"""Fewest validation links that choose hyperparameters, or whether paths are kriged, repeated
-readings as one: fewer ones overfit."""
-
-AROUND = 64
-"""Training links that predict each held-out link while hyperparameters are fitted."""
+    # From the best point of a coarse grid: the likelihood may have several maxima.
+    axes = [low + (high - low) * np.array([1, 3, 5]) / 6 for low, high in bounds]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(bounds))
+    start = min(grid, key=lambda point: value(torch.from_numpy(point)).item())
+    result = minimize(
+        cost,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
+        options={"ftol": 1e-6},
+        callback=end_in_time,
+    )
+    return Hyperparameters(*np.exp(result.x).tolist()), float(result.fun)
 
 
 def hold_out(
@@ -161,39 +165,43 @@ def hold_out(
     scale: float,
     residuals: Callable[[Int[Tensor, " j"]], Float[Tensor, "j m"]],
     most: int,
+    neighbours: int = 64,
 ) -> HeldOut | None:
     """At most ``most`` held-out links of a receiver; None if their residuals are all 0 or no other
     place is known.
 
     Validation links are held out from the training links. With fewer than ``FEWEST`` of them,
-    training links are held out one by one, each with all that share its place.
+    training links are held out one by one, each with all that share its place. Each has so many
+    ``neighbours`` that predict it.
     """
     split, query = links.split, links.query
-    validation = (
-        split.validation
-        if len(single_readings(links, split.validation)) >= FEWEST
-        else split.validation[:0]
-    )
     receiver = query.receivers[known[0]]
-    train, held = (part[query.receivers[part] == receiver] for part in (split.train, validation))
+    train = split.train[query.receivers[split.train] == receiver]
     train = train if len(train) else known
+    held = split.validation[query.receivers[split.validation] == receiver]
+    if len(single_readings(links, split.validation)) < FEWEST:
+        held = held[:0]
     asked = evenly(held if len(held) else train, most)
-    apart = distances(*(coordinates(scene, query[part], scale) for part in (asked, train)))
+    apart = distances(
+        coordinates(scene, query[asked], scale), coordinates(scene, query[train], scale)
+    )
     if not len(held):
         here = (query.transmitters[asked][:, None] == query.transmitters[train]).all(-1)
         apart = apart.masked_fill(here, math.inf)
-    count = min(AROUND, int(apart.isfinite().sum(1).min()))
+    count = min(neighbours, int(apart.isfinite().sum(1).min()))
     if not count:
         return None
-    around = train[apart.topk(count, largest=False).indices]
-    used, place = torch.cat((asked[:, None], around), 1).unique(return_inverse=True)
-    left = residuals(used)
-    left = left.to(torch.promote_types(left.dtype, torch.float64))
-    products = (
-        torch.stack([(some @ some.mH).real for some in (left[row] for row in place)])
-        / left.shape[1]
-    )
-    return HeldOut(query[asked], query[around.flatten()], products) if products.any() else None
+    around = train[apart.topk(count, largest=False).indices]  # (b, j)
+    groups = torch.cat((asked[:, None], around), 1)  # (b, j + 1)
+    used, place = groups.unique(return_inverse=True)
+    numbers = residuals(used)
+    numbers = numbers.to(torch.promote_types(numbers.dtype, torch.float64))
+    products = []
+    for rows in place:
+        group = numbers[rows]  # (j + 1, m)
+        products.append((group @ group.mH).real)
+    means = torch.stack(products) / numbers.shape[1]
+    return HeldOut(query[asked], query[around.flatten()], means) if means.any() else None
 
 
 def negative_log_likelihood(
@@ -206,28 +214,32 @@ def negative_log_likelihood(
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """
-    asked, around = (coordinates(scene, query, scale) for query in (held.asked, held.around))
-    weights, variances = kriging_weights(
-        asked, around.unflatten(0, (len(asked), -1)), length, nugget
-    )
-    own, cross, others = held.products[:, 0, 0], held.products[:, 0, 1:], held.products[:, 1:, 1:]
-    errors = (
-        own - 2 * (weights * cross).sum(1) + torch.einsum("bi,bij,bj->b", weights, others, weights)
-    )
+    asked = coordinates(scene, held.asked, scale)  # (b, d)
+    around = coordinates(scene, held.around, scale).unflatten(0, (len(asked), -1))  # (b, j, d)
+    weights, variances = kriging_weights(asked, around, length, nugget)
+    squares = held.products[:, 0, 0]  # (b,)
+    cross = held.products[:, 0, 1:]  # (b, j)
+    others = held.products[:, 1:, 1:]  # (b, j, j)
+    # |r - w' r_around|^2, a mean over the label's numbers.
+    predicted = torch.einsum("bi,bij,bj->b", weights, others, weights)
+    errors = squares - 2 * (weights * cross).sum(1) + predicted
     # The difference of nearly equal numbers, rounded to float64's sixteen digits, may be negative.
-    errors = errors.clamp_min(1e-12 * own.mean())
+    errors = errors.clamp_min(1e-12 * squares.mean())
     return len(asked) * (errors / variances).mean().log() + variances.log().sum()
 
 
 def local_deviations(
-    asked: Float[Tensor, "b d"], known: Float[Tensor, "k d"], process: Hyperparameters
+    asked: Float[Tensor, "b d"],
+    known: Float[Tensor, "k d"],
+    process: Hyperparameters,
+    neighbours: int = 64,
 ) -> Float[Tensor, " b"]:
     """Standard deviations of noisy labels over the signal's, given the nearest known places; see
     ``coordinates``.
     """
-    count = min(AROUND, len(known))
-    found = [asked.new_zeros(0)]
+    count = min(neighbours, len(known))
+    variances = [asked.new_zeros(0)]
     for part in asked.split(1024):
-        near = known[distances(part, known).topk(count, largest=False).indices]
-        found.append(kriging_weights(part, near, process.length, process.nugget)[1])
-    return torch.cat(found).sqrt()
+        near = known[distances(part, known).topk(count, largest=False).indices]  # (b, j, d)
+        variances.append(kriging_weights(part, near, process.length, process.nugget)[1])
+    return torch.cat(variances).sqrt()

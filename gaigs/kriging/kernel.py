@@ -1,5 +1,9 @@
-"""The Matern-1/2 kernel exp(-d / l), and kriging weights with their variance."""
+"""Kernels of Gaussian processes, and kriging weights with their variance.
 
+Labels of many numbers and paths have ``kernel``, labels of one number ``matern``.
+"""
+
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -15,9 +19,9 @@ class Process:
     """The Gaussian process of one receiver's labels over places, and the readings that it knows.
 
     Attributes:
-        covariances: Of the process at two sets of places (m, d) and (n, d), in the label's unit
-            squared.
-        places: Of the known readings, ``coordinates`` of scale 1 (k, d) [m].
+        covariances: Function of two sets of places (m, d) and (n, d) to the covariances of the
+            process, in the label's unit squared.
+        places: Places of the known readings, ``coordinates`` of scale 1 (k, d) [m].
         noises: Variances of the noise of the known readings (k,).
         noise: Variance of the noise of a new reading.
     """
@@ -30,16 +34,17 @@ class Process:
     def whitened(
         self, asked: Float[Tensor, "g d"], rows: Int[Tensor, " j"] | slice = slice(None)
     ) -> tuple[Float[Tensor, "j g"], Float[Tensor, "j j"]]:
-        """Covariances of known readings, or some rows of them, with places over the readings'
-        Cholesky factor; and this factor. Squares of the first, summed over the readings, are what
-        they take off the variance at a place."""
+        """Covariances of known readings, or some rows of them, with places, divided by the
+        readings' Cholesky factor; and this factor.
+
+        Their squares, summed over the readings, are taken off the variance at a place.
+        """
         places = self.places[rows]
-        own = self.covariances(places, places)
-        own.diagonal().add_(self.noises[rows])
-        factor = torch.linalg.cholesky(own)
-        return torch.linalg.solve_triangular(
-            factor, self.covariances(places, asked), upper=False
-        ), factor
+        between = self.covariances(places, places)
+        between.diagonal().add_(self.noises[rows])
+        factor = torch.linalg.cholesky(between)
+        towards = self.covariances(places, asked)
+        return torch.linalg.solve_triangular(factor, towards, upper=False), factor
 
 
 def resize(module: nn.Module, state: Mapping[str, Tensor], prefix: str, *names: str) -> None:
@@ -54,6 +59,19 @@ def resize(module: nn.Module, state: Mapping[str, Tensor], prefix: str, *names: 
 LIMIT = 6000
 """Most known links of a receiver that enter one covariance matrix, for memory's sake."""
 
+SMOOTHNESSES = (0.5, 1.5)
+"""Kernels of ``matern`` that the process of one number chooses from."""
+
+
+def matern(apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
+    """Matern correlation of places at some distances [m], of smoothness 1/2 or 3/2.
+
+    Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, equations 4.16
+    and 4.17.
+    """
+    steps = apart * (-math.sqrt(2 * smoothness) / length)  # a division has a slower gradient
+    return steps.exp() if smoothness == 0.5 else (1 - steps) * steps.exp()
+
 
 def kernel(
     a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"], length: float | Tensor
@@ -65,7 +83,7 @@ def kernel(
 
 
 def covariance(places: Float[Tensor, "k d"], length: float, nugget: float) -> Float[Tensor, "k k"]:
-    """Covariances of noisy labels over the signal's variance; arguments as for ``kriging_weights``."""
+    """Covariances of noisy labels over the signal's variance, see ``kriging_weights``."""
     covariances = kernel(places, places, length)
     covariances.diagonal().add_(nugget)
     return covariances
@@ -97,7 +115,6 @@ def kriging_weights(
     identity = torch.eye(around.shape[1], dtype=around.dtype, device=around.device)
     covariances = kernel(around, around, length) + nugget * identity
     towards = kernel(around, asked[:, None], length)
-    weights = torch.linalg.solve(covariances, towards)[
-        ..., 0
-    ]  # its gradient takes a third of the Cholesky factor's
+    # The gradient of ``solve`` takes a third of the time of the Cholesky factor's.
+    weights = torch.linalg.solve(covariances, towards)[..., 0]  # (b, j)
     return weights, 1 + nugget - (weights * towards[..., 0]).sum(1)

@@ -2,26 +2,21 @@
 path.
 """
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene
 from gaigs.core.stages import track
-from gaigs.kriging.fit import AROUND
 from gaigs.kriging.kernel import kernel, resize
 from gaigs.kriging.links import distances
-
-JITTER = 1e-6
-"""Variance of the processes that is not shared by places, over their variance: for places that are
-measured twice.
-"""
-
-LEAST = 1e-4
-"""Power of a link's noise over the link's, where the fit leaves nothing."""
+from gaigs.kriging.posterior import Posterior
 
 
 class PathProcess(NamedTuple):
@@ -51,11 +46,11 @@ class Equations:
     The channel of a link is predicted as h + sum_i u_i m_i, with the field m_i of path i per unit
     of its process. With the residual r, and noise of ``nugget`` times p, the log likelihood is -|r
     - sum_i u_i m_i|² / (nugget p): a quadratic form. p is the mean power of the residual's numbers,
-    plus ``LEAST`` times that of the label's, which has the gain of the prediction: links in shadow
-    have far larger residuals than others.
+    plus a ten-thousandth of that of the label's, which has the gain of the prediction: links in
+    shadow have far larger residuals than others.
 
     Attributes:
-        places: (k, 3) [m].
+        places: Places (k, 3) [m].
         grams: Products of the m_i over p (k, n, n).
         sides: Products of the m_i with r over p (k, n).
     """
@@ -71,24 +66,24 @@ class Equations:
         margins: Callable[[slice], Complex[Tensor, "b n e s"]],
         labels: Complex[Tensor, "k e s"],
         residuals: Complex[Tensor, "k e s"],
+        least: float = 1e-4,
     ) -> "Equations":
         """From the fields m_i of each ``slice`` of the links, one after the other: all together may
         take gigabytes.
+
+        ``least`` is the power of a link's noise over the link's, where the fit leaves nothing.
         """
         grams, sides = [], []
         size = max(1, min(64, 300_000 // labels[0].numel()))
         for start in track(range(0, len(places), size), "kriging"):
             part = slice(start, start + size)
-            fields = margins(part).flatten(2).to(torch.complex128)
-            left, whole = (
-                channels[part].abs().double().square().mean((1, 2))
-                for channels in (residuals, labels)
-            )
-            powers = (left + LEAST * whole)[:, None, None]
-            grams.append(fields.conj() @ fields.mT / powers)
-            sides.append(
-                (fields.conj() @ residuals[part].flatten(1)[..., None].to(fields) / powers)[..., 0]
-            )
+            fields = margins(part).flatten(2).to(torch.complex128)  # (b, n, m)
+            noise = residuals[part].abs().double().square().mean((1, 2))  # (b,)
+            power = labels[part].abs().double().square().mean((1, 2))  # (b,)
+            powers = (noise + least * power)[:, None, None]
+            grams.append(fields.conj() @ fields.mT / powers)  # (b, n, n)
+            numbers = residuals[part].flatten(1)[..., None].to(fields)  # (b, m, 1)
+            sides.append((fields.conj() @ numbers / powers)[..., 0])
         return cls(places.double(), torch.cat(grams), torch.cat(sides))
 
     def __getitem__(self, index: object) -> "Equations":
@@ -99,10 +94,10 @@ class PathField(nn.Module):
     """Kriged strengths of the n paths to one receiver, from k known links.
 
     Attributes:
-        places: Of the known links (k, 3) [m].
-        weights: The mean of the processes at x are the covariances of x with the places times these
-            (k, n).
-        precisions: Of each path's strength from each link alone (k, n).
+        places: Places of the known links (k, 3) [m].
+        weights: Weights of the links (k, n): the mean of the processes at a place are its
+            covariances with the places times these.
+        precisions: Precision of each path's strength from each link alone (k, n).
     """
 
     places: Tensor
@@ -115,55 +110,161 @@ class PathField(nn.Module):
         self.register_buffer("weights", torch.zeros(0, 0, dtype=torch.complex128))
         self.register_buffer("precisions", torch.zeros(0, 0, dtype=torch.float64))
 
-    def solve(self, equations: Equations, process: PathProcess) -> None:
-        """Solves the strengths of all paths at all places together, by conjugate gradients."""
+    def solve(self, equations: Equations, process: PathProcess, jitter: float = 1e-6) -> None:
+        """Solves the strengths of all paths at all places together, by conjugate gradients.
+
+        ``jitter`` is the variance of the processes that places do not share, over their variance:
+        for places that are measured twice.
+        """
         identity = torch.eye(len(equations.places), dtype=torch.float64)
-        covariances = kernel(equations.places, equations.places, process.length) + JITTER * identity
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky(covariances))
-        grams, sides = (
-            equations.grams * (process.deviation**2 / process.nugget),
-            equations.sides / process.nugget,
-        )
-        own = inverse.diagonal()[:, None, None] * torch.eye(grams.shape[1], dtype=torch.float64)
-        precondition, inverse = torch.linalg.inv(grams + own), inverse.to(sides.dtype)
-        times = lambda u: inverse @ u + (grams @ u[..., None])[..., 0]
-        solution = conjugate_gradients(
-            times, lambda r: (precondition @ r[..., None])[..., 0], sides * process.deviation**2
-        )
-        self.places, self.weights = equations.places.clone(), inverse @ solution
+        between = kernel(equations.places, equations.places, process.length) + jitter * identity
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(between))
+        grams = equations.grams * (process.deviation**2 / process.nugget)  # (k, n, n)
+        sides = equations.sides / process.nugget  # (k, n)
+        # With u the strengths over their deviation: (K^-1 + G) u = s. The blocks of a place
+        # precondition it.
+        of_places = torch.eye(grams.shape[1], dtype=torch.float64)
+        blocks = grams + inverse.diagonal()[:, None, None] * of_places
+        precondition = torch.linalg.inv(blocks)
+        inverse = inverse.to(sides.dtype)
+
+        def times(strengths: Tensor) -> Tensor:
+            return inverse @ strengths + (grams @ strengths[..., None])[..., 0]
+
+        def preconditioned(rest: Tensor) -> Tensor:
+            return (precondition @ rest[..., None])[..., 0]
+
+        solution = conjugate_gradients(times, preconditioned, sides * process.deviation**2)
+        self.places = equations.places.clone()
+        self.weights = inverse @ solution
         self.precisions = equations.grams.diagonal(dim1=1, dim2=2).real / process.nugget
 
     def forward(self, places: Float[Tensor, "b d"], process: PathProcess) -> Complex[Tensor, "b n"]:
         """Mean of the processes at some places."""
         return kernel(places, self.places, process.length).to(self.weights) @ self.weights
 
-    def variances(self, places: Float[Tensor, "b d"], process: PathProcess) -> Float[Tensor, "b n"]:
+    def variances(
+        self, places: Float[Tensor, "b d"], process: PathProcess, most: int = 64
+    ) -> Float[Tensor, "b n"]:
         """Variances of the processes at some places, as if the elements resolved all paths.
 
-        The ``AROUND`` nearest known links of each place count: this kernel hides those behind them.
+        The ``most`` nearest known links of each place count: this kernel hides those behind them.
         """
-        near = (
-            distances(places, self.places)
-            .topk(min(AROUND, len(self.places)), largest=False)
-            .indices
-        )
-        around = self.places[near]
-        own, towards = (
-            kernel(around, other, process.length) for other in (around, places[:, None])
-        )
-        found = []
-        for precisions in self.precisions.unbind(1):
+        apart = distances(places, self.places)
+        near = apart.topk(min(most, len(self.places)), largest=False).indices  # (b, j)
+        around = self.places[near]  # (b, j, 3)
+        between = kernel(around, around, process.length)  # (b, j, j)
+        towards = kernel(around, places[:, None], process.length)  # (b, j, 1)
+        variances = []
+        for precisions in self.precisions.unbind(1):  # of one path
+            # k - c' (C + P^-1)^-1 c = k - b' (1 + R C R)^-1 b, with R the roots of P and b = R c.
             roots = (precisions[near] * process.deviation**2).sqrt()[..., None]
-            matrix = roots * own * roots.mT
+            matrix = roots * between * roots.mT
             matrix.diagonal(dim1=1, dim2=2).add_(1)
             factor = torch.linalg.cholesky(matrix)
             known = torch.linalg.solve_triangular(factor, roots * towards, upper=False)
-            found.append(1 - known.square().sum((1, 2)))
-        return process.deviation**2 * torch.stack(found, 1)
+            variances.append(1 - known.square().sum((1, 2)))
+        return process.deviation**2 * torch.stack(variances, 1)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
         resize(self, state_dict, prefix, "places", "weights", "precisions")
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+class PathPosterior(Posterior):
+    """Kriged strengths of paths, a ``PathField`` for each receiver; phases stay those of the
+    geometry.
+
+    The process is always the same.
+
+    Args:
+        scene: Receivers and task.
+        margins: Function from links to one receiver to the channels by which each of their paths
+            may deviate (b, n, e, s).
+    """
+
+    by_paths = True
+    hyperparameters: Tensor
+
+    def __init__(self, scene: Scene, margins: Callable[[Query], Tensor]):
+        super().__init__()
+        self.margins = margins
+        process = torch.full((3,), math.nan, dtype=torch.float64)
+        self.register_buffer("hyperparameters", process)
+        self.fields = nn.ModuleList(PathField() for _ in scene.receivers)
+        self.scene = scene
+
+    @property
+    def process(self) -> PathProcess:
+        """The hyperparameters by name."""
+        return PathProcess(*self.hyperparameters.tolist())
+
+    def fit_process(self) -> None:
+        """Takes the process of the scene's spacing."""
+        process = PathProcess.usual(self.scene.spacing)
+        self.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
+
+    def equations(
+        self,
+        query: Query,
+        labels: Complex[Tensor, "k e s"],
+        residuals: Complex[Tensor, "k e s"],
+        device: torch.device,
+    ) -> list[Equations]:
+        """Equations of each receiver, from links with their aligned labels and residuals; margins
+        are computed on the device.
+        """
+        equations = []
+        for receiver in range(len(self.fields)):
+            rows = (query.receivers == receiver).nonzero()[:, 0]
+
+            def margins(part: slice, rows: Tensor = rows) -> Tensor:
+                return self.margins(query[rows[part]].to(device)).cpu()
+
+            places = query.transmitters[rows]
+            equations.append(Equations.of(places, margins, labels[rows], residuals[rows]))
+        return equations
+
+    def solve_equations(self, equations: Sequence[Equations]) -> None:
+        """Takes the known links of all receivers."""
+        device = self.hyperparameters.device
+        for field, known in zip(self.fields, equations, strict=True):
+            field.solve(known, self.process)
+        self.fields.to(device)
+
+    def mean_at(self, query: Query, device: torch.device) -> Complex[Tensor, "e s"]:
+        """Mean residual of a single link, on the CPU; margins are computed on the device."""
+        field = self.fields[int(query.receivers)]
+        strengths = field(query.transmitters.double(), self.process)[0]  # (n,)
+        margins = self.margins(query.to(device)).cpu()[0]  # (n, e, s)
+        return torch.tensordot(strengths.to(margins), margins, 1)
+
+    def mean(self, batch: Batch, like: Tensor) -> Tensor:
+        query, mean = batch.query, torch.zeros_like(like)
+        for receiver in query.receivers.unique().tolist():
+            is_asked = query.receivers == receiver
+            strengths = self.fields[receiver](query.transmitters[is_asked].double(), self.process)
+            margins = self.margins(query[is_asked])  # (b, n, e, s)
+            mean[is_asked] = (strengths.to(like)[..., None, None] * margins).sum(1)
+        return mean
+
+    def deviations(self, batch: Batch) -> Tensor:
+        """Standard deviations of each number (b, e, s), without noise, as if the elements resolved
+        all paths."""
+        query, places = batch.query, batch.query.transmitters
+        squares = places.new_zeros(len(query), *self.scene.task.shape)
+        for receiver in query.receivers.unique().tolist():
+            is_asked = query.receivers == receiver
+            field: Any = self.fields[receiver]
+            variances = field.variances(places[is_asked].double(), self.process)  # (b, n)
+            powers = self.margins(query[is_asked]).abs().square()  # (b, n, e, s)
+            parts = variances.to(powers)[..., None, None] * powers
+            squares[is_asked] = parts.sum(1).to(squares)
+        return squares.sqrt()
+
+    def facts(self) -> Mapping[str, float]:
+        places = [len(field.places) for field in self.fields]  # type: ignore[arg-type]
+        return {**self.process.facts(), "links": sum(places)}
 
 
 def conjugate_gradients(
@@ -176,17 +277,23 @@ def conjugate_gradients(
 
     Source: Hestenes and Stiefel, Methods of Conjugate Gradients for Solving Linear Systems, 1952.
     """
-    dot = lambda a, b: (a.conj() * b).sum().real
-    x, rest = torch.zeros_like(right), right.clone()
-    way = near = precondition(rest)
-    slope = dot(rest, near)
+
+    def dot(a: Tensor, b: Tensor) -> Tensor:
+        return (a.conj() * b).sum().real
+
+    x = torch.zeros_like(right)
+    rest = right.clone()
+    direction = precondition(rest)
+    slope = dot(rest, direction)
     for _ in range(most):
         if rest.norm() <= 1e-6 * right.norm():
             break
-        ahead = times(way)
-        step = slope / dot(way, ahead)
-        x, rest = x + step * way, rest - step * ahead
+        ahead = times(direction)
+        step = slope / dot(direction, ahead)
+        x = x + step * direction
+        rest = rest - step * ahead
         near = precondition(rest)
-        slope, before = dot(rest, near), slope
-        way = near + slope / before * way
+        before, slope = slope, dot(rest, near)
+        # Directions are conjugate: times(one) is orthogonal to all others.
+        direction = near + slope / before * direction
     return x

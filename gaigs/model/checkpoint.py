@@ -57,7 +57,8 @@ def read(path: str | Path) -> dict:
     path = Path(path)
     if not os.path.isfile(path):  # False for a name that is too long
         raise FileNotFoundError(
-            f"no checkpoint at {path}, and no run; a run writes best.ckpt and last.ckpt into its folder"
+            f"no checkpoint at {path}, and no run; "
+            "a run writes best.ckpt and last.ckpt into its folder"
         )
     data = path.read_bytes()
     try:
@@ -101,7 +102,8 @@ def save(model: nn.Module, path: str | Path) -> None:
     state = model.state_dict()
     if not state:
         raise ValueError(
-            f"model {name_of(model)!r} has no state: keep what it learns in buffers, or use model.LookUp"
+            f"model {name_of(model)!r} has no state: "
+            "keep what it learns in buffers, or use model.LookUp"
         )
     part = {"version": VERSION, "scene": model.scene.state(), **described(model)}
     part["plugins"] = digests(part["model"], part["scene"]["task"])
@@ -127,9 +129,9 @@ def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Modul
         fresh = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         unset = {name for name, value in fresh.items() if not value.isfinite().all()}
         model.load_state_dict(weights)
-        _check_finite(
-            "weights", {name: value for name, value in weights.items() if name not in unset}
-        )
+        # The names are the model's: a checkpoint of before may have others.
+        state = model.state_dict()
+        _check_finite("weights", {name: state[name] for name in state if name not in unset})
         model.calibrate(content[KEY].get("calibration"))
         model.known_places = content[KEY].get("known_places")
     except Exception as error:  # any error of a constructor with damaged options
@@ -140,7 +142,10 @@ def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Modul
             if isinstance(error, ValueError | ImportError)
             else f"{type(error).__name__}: {error}"
         )
-        message = f"cannot make the model of {path}: {cause if cause.count(chr(10)) < 2 else ' '.join(cause.split())}"
+        is_short = cause.count("\n") < 2
+        message = (
+            f"cannot make the model of {path}: {cause if is_short else ' '.join(cause.split())}"
+        )
         raise (ImportError if isinstance(error, ImportError) else ValueError)(message) from error
     return model.eval()
 

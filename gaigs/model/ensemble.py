@@ -1,4 +1,4 @@
-"""Ensembles: models that differ by their seed alone, whose differences show how certain they are."""
+"""Ensembles: models that differ by their seed alone, and so show how certain they are."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from gaigs.core.query import Batch, evenly
 from gaigs.core.scene import Scene
 from gaigs.data import Links
-from gaigs.model import Model, Prediction, Wrapper, call_optional
+from gaigs.model import Model, Prediction, Wrapper
 from gaigs.registry import register, registry
 
 
@@ -53,7 +53,7 @@ class Ensemble(Wrapper):
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
         """That of all members, one after the other."""
-        parts = [call_optional(member, "rendering", batch) for member in self.members]  # type: ignore[arg-type]
+        parts = [member.rendering(batch) for member in self.members]  # type: ignore[operator]
         return None if None in parts else lambda: [part() for part in parts]
 
     @torch.no_grad()

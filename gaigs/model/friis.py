@@ -38,9 +38,8 @@ class Friis(Model):
     def __init__(self, scene: Scene):
         super().__init__(scene)
         self.task = check_elements("model 'friis'", scene, pads=True)
-        self.register_buffer(
-            "gains", torch.full((len(scene.receivers),), torch.nan, dtype=torch.complex64)
-        )
+        gains = torch.full((len(scene.receivers),), torch.nan, dtype=torch.complex64)
+        self.register_buffer("gains", gains)
         self.register_buffer("sign", torch.tensor(-1))
 
     @property
@@ -60,10 +59,9 @@ class Friis(Model):
         self.sign.fill_(sign or -1)
         self.gains.zero_()
         has_gain = sign != 0 or len(index) < TELLING * len(known)
-        for receiver, own in enumerate(known if has_gain else ()):
-            self.gains[receiver] = fit_gain(links.labels[own], self._waves(links.query[own])).to(
-                self.gains
-            )
+        for receiver, rows in enumerate(known if has_gain else ()):
+            gain = fit_gain(links.labels[rows], self._waves(links.query[rows]))
+            self.gains[receiver] = gain.to(self.gains)
 
     def forward(self, batch: Batch) -> Prediction:
         waves = self._waves(batch.query).to(self.gains)

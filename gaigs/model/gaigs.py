@@ -1,4 +1,4 @@
-"""The splatting pipeline: GAI-GS, its ablations and its neighbours, put together from registered parts."""
+"""The splatting pipeline: GAI-GS, its ablations and its neighbours, from registered parts."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -27,30 +27,46 @@ from gaigs.splatting.rasterizer import Rasterizer
 
 
 class Excited(NamedTuple):
-    """The Gaussians as places excite them: before the deformation, their changes, and their semi-axes after it."""
+    """The Gaussians as places excite them.
+
+    Attributes:
+        placed: Gaussians before the deformation.
+        residuals: Changes by the deformation.
+        semi_axes: Semi-axes after it, a column for each axis [m].
+    """
 
     placed: Placed
     residuals: Residuals
-    semi_axes: Float[Tensor, "places n 3 3"]  # a column for each axis [m]
+    semi_axes: Float[Tensor, "places n 3 3"]
+
+
+class Strengths(NamedTuple):
+    """Strengths of n Gaussians for b queries."""
+
+    signal: Float[Tensor, "b n c"]
+    opacities: Float[Tensor, "b n"]
+    attenuations: Float[Tensor, "b n"] | None
 
 
 @register("model", "gaigs")
 class GaussianSplatting(Model):
-    """Placement -> tokens -> residuals -> Gaussians as the query excites them -> splats -> map -> value.
+    """Placement, tokens, residuals, Gaussians as the query excites them, splats, map, value.
 
     If the pooling takes paths, there are no splats and no map.
 
     Args:
         scene: Receivers and task.
-        placement, tokenizer, deformation, projection, rasterizer, pooling: Registered components: each the name, the
-            configuration (a mapping with ``name`` and options), or the object itself. Pooling None is the label's own.
-            Projection and rasterizer are None if the pooling takes paths.
-        gaussians: Options of ``gaigs.splatting.gaussians.Gaussians`` [m]; None if the placement alone brings Gaussians.
+        placement, tokenizer, deformation, projection, rasterizer, pooling: Registered components:
+            each the name, the configuration (a mapping with ``name`` and options), or the object
+            itself. Pooling None is the label's own. Projection and rasterizer are None if the
+            pooling takes paths.
+        gaussians: Options of ``gaigs.splatting.gaussians.Gaussians`` [m]; None if the placement
+            alone brings Gaussians.
         trend: Model whose value the pooled map is added to, likewise; None for none.
 
     Raises:
-        ValueError: The pooling does not give the task's labels; the projection does not see all of the map; parts do
-            not go together; the trend needs its data or a training of its own.
+        ValueError: The pooling does not give the task's labels; the projection does not see all of
+            the map; parts do not go together; the trend needs its data or a training of its own.
 
     Source: GAI-GS, section "Framework"; the trend is ours (docs/methods.md).
 
@@ -59,7 +75,8 @@ class GaussianSplatting(Model):
         >>> from gaigs.splatting.tokenizer.euclidean import EuclideanTokenizer
         >>> links = gaigs.links("synthetic", transmitters=20, order=0)
         >>> tokenizer = EuclideanTokenizer(links.scene, width=32)
-        >>> model = GaussianSplatting(links.scene, tokenizer=tokenizer, rasterizer="torch", gaussians={"count": 50})
+        >>> parts = {"tokenizer": tokenizer, "rasterizer": "torch", "gaussians": {"count": 50}}
+        >>> model = GaussianSplatting(links.scene, **parts)
         >>> model.predict([[1.0, 2.0, 1.5]]).shape  # places, receivers, rows, columns
         torch.Size([1, 1, 90, 360])
     """
@@ -80,98 +97,115 @@ class GaussianSplatting(Model):
         trend: str | Mapping | Model | None = None,
     ):
         super().__init__(scene)
-        self.trend = None
-        if trend is not None:
-            self.trend = build_trend(trend, scene)
-            if (
-                isinstance(self.trend, LookUp)
-                or not self.trend.state_dict()
-                or [*self.trend.parameters()]
-            ):
-                raise ValueError(
-                    f"task.trend.name cannot be {name_of(self.trend)}; take mean, path_loss or friis"
-                )
-            self.register_buffer(
-                "level", torch.zeros(())
-            )  # of the untrained map, in the label's unit
-        self.pooling = registry("pooling").build(
-            self.own_pooling(scene) if pooling is None else pooling, scene=scene
-        )
+        # In this order: a part draws its parameters when it is built.
+        self.trend = None if trend is None else self._built_trend(trend)
+        pooling = self.own_pooling(scene) if pooling is None else pooling
+        self.pooling = registry("pooling").build(pooling, scene=scene)
         self.projection: Any = None
         self.rasterizer: Any = None
         zone = self.pooling.zone
         if self.takes_paths:
-            if projection is not None or rasterizer is not None:
-                raise ValueError(
-                    f"pooling {name_of(self.pooling)!r} takes paths, and no map is projected or rasterized\n"
-                    "leave out projection and rasterizer (~projection ~rasterizer, None in Python)"
-                )
-            amplitudes = torch.zeros(1, 0, dtype=torch.complex64)
-            paths = (
-                torch.zeros(1, 0, 3),
-                torch.zeros(1, 0, 3, 3),
-                amplitudes,
-                torch.zeros(1, 0),
-                torch.zeros(0),
-                None,
-            )
-            self._check_gives(ReceivedPaths(*paths, scene.receivers[0], torch.tensor([1e9])))
+            self._check_paths(projection, rasterizer)
         else:
-            if projection is None or rasterizer is None:
-                raise ValueError(
-                    f"pooling {name_of(self.pooling)!r} takes a map, which needs a projection and a rasterizer\n"
-                    "set projection=mercator rasterizer=fastest, or pooling=path_spectrum, path_rssi or path_csi"
-                )
-            grid = self.pooling.grid or scene.task.directions
-            if grid is None:
-                raise ValueError(
-                    f"labels of task {scene.task.name!r} have no directions; take the task's own pooling"
-                )
-            self._check_gives(torch.zeros(1, self.pooling.channels, *grid.shape))
-            self.projection = registry("projection").build(projection, pixel=grid.pitch)
-            self.rasterizer = registry("rasterizer").build(rasterizer)
-            self.projection.check_sees(grid)
+            grid = self._build_map(projection, rasterizer)
             if self.pooling.grid is None:
                 zone = grid.elevations.min().item(), grid.elevations.max().item()
         channels = self.pooling.channels
         self.placement = registry("placement").build(placement, scene=scene, channels=channels)
-        own = name_of(self.placement)
-        if self.placement.model not in (None, self.name):
-            raise ValueError(
-                f"placement {own!r} makes another predictor; set model={self.placement.model}"
-            )
-        if self.own_placement not in (None, own):
-            needed = f"placement={self.own_placement}"
-            raise ValueError(
-                f"model {self.name!r} takes {needed}, got {own}; take +experiment={self.name}"
-            )
-        self.gaussians = None
-        if gaussians is not None:
-            self.gaussians = call(
-                "gaussians", Gaussians, gaussians, scene=scene, zone=zone, channels=channels
-            )
-            if self.placement.has_own and self.gaussians.degree:
-                raise ValueError(
-                    f"placement {own!r} needs gaussians.degree=0, got {self.gaussians.degree}"
-                )
-        elif not self.placement.has_own:
-            raise ValueError(
-                f"placement {own!r} places free Gaussians alone; set gaussians=lattice"
-            )
+        self._check_placement()
+        self.gaussians = self._built_gaussians(gaussians, zone)
         component: Any = deformation
         if not is_built(deformation):
-            component = registry("deformation").get(
-                deformation if isinstance(deformation, str) else deformation["name"]
-            )
-        self.tokenizer, context = None, {"scene": scene, "channels": channels}
+            name = deformation if isinstance(deformation, str) else deformation["name"]
+            component = registry("deformation").get(name)
+        self.tokenizer = None
+        context: dict[str, Any] = {"scene": scene, "channels": channels}
         if component.reads_tokens:
-            parts = self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
-            context["tokenizer_widths"] = (
-                parts.scene_width,
-                parts.gaussian_width,
-                parts.transmitter_width,
-            )
+            built = self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
+            widths = built.scene_width, built.gaussian_width, built.transmitter_width
+            context["tokenizer_widths"] = widths
         self.deformation = registry("deformation").build(deformation, **context)
+
+    def _built_trend(self, trend: str | Mapping | Model) -> Model:
+        built = build_trend(trend, self.scene)
+        keeps_links = isinstance(built, LookUp) or not built.state_dict()
+        if keeps_links or [*built.parameters()]:
+            raise ValueError(
+                f"task.trend.name cannot be {name_of(built)}; take mean, path_loss or friis"
+            )
+        self.register_buffer("level", torch.zeros(()))  # of the untrained map, in the label's unit
+        return built
+
+    def _check_paths(self, projection: object, rasterizer: object) -> None:
+        """Raises a ``ValueError`` unless parts suit a pooling of paths."""
+        if projection is not None or rasterizer is not None:
+            raise ValueError(
+                f"pooling {name_of(self.pooling)!r} takes paths, and no map is projected or "
+                "rasterized\n"
+                "leave out projection and rasterizer (~projection ~rasterizer, None in Python)"
+            )
+        paths = ReceivedPaths(
+            means=torch.zeros(1, 0, 3),
+            semi_axes=torch.zeros(1, 0, 3, 3),
+            amplitudes=torch.zeros(1, 0, dtype=torch.complex64),
+            lengths=torch.zeros(1, 0),
+            coherences=torch.zeros(0),
+            bandwidth=None,
+            receiver=self.scene.receivers[0],
+            carriers=torch.tensor([1e9]),
+        )
+        self._check_gives(paths)
+
+    def _build_map(
+        self,
+        projection: str | Mapping | Projection | None,
+        rasterizer: str | Mapping | Rasterizer | None,
+    ) -> Directions:
+        """Builds projection and rasterizer, and gives the directions of the map."""
+        if projection is None or rasterizer is None:
+            raise ValueError(
+                f"pooling {name_of(self.pooling)!r} takes a map, which needs a projection and a "
+                "rasterizer\nset projection=mercator rasterizer=fastest, "
+                "or pooling=path_spectrum, path_rssi or path_csi"
+            )
+        task = self.scene.task
+        grid = self.pooling.grid or task.directions
+        if grid is None:
+            raise ValueError(
+                f"labels of task {task.name!r} have no directions; take the task's own pooling"
+            )
+        self._check_gives(torch.zeros(1, self.pooling.channels, *grid.shape))
+        self.projection = registry("projection").build(projection, pixel=grid.pitch)
+        self.rasterizer = registry("rasterizer").build(rasterizer)
+        self.projection.check_sees(grid)
+        return grid
+
+    def _check_placement(self) -> None:
+        """Raises a ``ValueError`` unless the placement makes a model of this name."""
+        name = name_of(self.placement)
+        if self.placement.model not in (None, self.name):
+            raise ValueError(
+                f"placement {name!r} makes another predictor; set model={self.placement.model}"
+            )
+        if self.own_placement not in (None, name):
+            raise ValueError(
+                f"model {self.name!r} takes placement={self.own_placement}, got {name}; "
+                f"take +experiment={self.name}"
+            )
+
+    def _built_gaussians(self, options: Mapping | None, zone: Any) -> Gaussians | None:
+        name = name_of(self.placement)
+        if options is None:
+            if not self.placement.has_own:
+                raise ValueError(
+                    f"placement {name!r} places free Gaussians alone; set gaussians=lattice"
+                )
+            return None
+        context = {"scene": self.scene, "zone": zone, "channels": self.pooling.channels}
+        built = call("gaussians", Gaussians, options, **context)
+        if self.placement.has_own and built.degree:
+            raise ValueError(f"placement {name!r} needs gaussians.degree=0, got {built.degree}")
+        return built
 
     @property
     def learning_rates(self) -> dict[str, float]:  # type: ignore[override]
@@ -195,7 +229,9 @@ class GaussianSplatting(Model):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits placement, pooling and trend; takes off the map's mean level, so that training starts from the trend."""
+        """Fits placement, pooling and trend; takes off the mean level of the map, so that training
+        starts from the trend.
+        """
         self.placement.fit(links)
         self.pooling.fit(links)
         if self.trend is None:
@@ -204,9 +240,11 @@ class GaussianSplatting(Model):
         if self.scene.task.dtype.is_complex:
             return  # waves have no level: their phases differ from link to link
         count = len(links.split.train)
-        # Evenly spread, though not at whole steps, which might meet the same receiver time and again.
-        some = links.split.train[torch.linspace(0, count - 1, min(64, count)).long()]
-        batch = Batch(links.query[some], links.task.directions).to(self.level.device)
+        # Evenly spread, though not at whole steps, which might meet the same receiver time and
+        # again.
+        rows = torch.linspace(0, count - 1, min(64, count)).long()
+        query = links.query[links.split.train[rows]]
+        batch = Batch(query, links.task.directions).to(self.level.device)
         self.level += (self(batch).value - self.trend(batch).value).mean()
 
     @property
@@ -214,38 +252,41 @@ class GaussianSplatting(Model):
         return self.trend is not None
 
     def forward(self, batch: Batch) -> Prediction:
-        own = next(self.parameters())
-        if torch.is_autocast_enabled(own.device.type) or torch.finfo(own.dtype).bits < 32:
+        parameter = next(self.parameters())
+        is_mixed = torch.is_autocast_enabled(parameter.device.type)
+        if is_mixed or torch.finfo(parameter.dtype).bits < 32:
             raise ValueError(
-                "angles and phases of Gaussians need float32; set trainer.precision to 32-true or 64-true"
+                "angles and phases of Gaussians need float32; "
+                "set trainer.precision to 32-true or 64-true"
             )
         query = batch.query
         # Receivers share what a place excites, unless a part looks at the receiver.
         parts = self.placement, self.tokenizer, self.deformation
-        places, which = query.unique(
-            with_receivers=any(getattr(part, "sees_receivers", False) for part in parts)
-        )
+        sees_receivers = any(getattr(part, "sees_receivers", False) for part in parts)
+        places, which = query.unique(with_receivers=sees_receivers)
         return self.respond(self.excite(places), which, batch)
 
     def respond(self, excited: Excited, which: Int[Tensor, " b"], batch: Batch) -> Prediction:
-        """Values of a batch whose rows excite the Gaussians as the rows ``which`` of ``excited``."""
+        """Values of a batch whose rows excite the Gaussians as the rows ``which`` of
+        ``excited``.
+        """
         query = batch.query
         links, values = [], []
         together = self.takes_paths and self.pooling.is_same_for_all
         group = torch.zeros_like(query.receivers) if together else query.receivers
         for receiver in group.unique().tolist() or [0]:  # no links have a label's shape too
-            links.append((group == receiver).nonzero()[:, 0])
-            own, rows = query[links[-1]], which[links[-1]]
+            index = (group == receiver).nonzero()[:, 0]
+            asked, rows = query[index], which[index]
             if self.takes_paths:
-                received = self.paths(excited, rows, receiver, own)
+                received = self.paths(excited, rows, receiver, asked)
             else:
                 calls = self._splats(excited, rows, receiver, batch.directions)
                 received = torch.cat([self.rasterizer(*arguments)[0] for arguments in calls])
-            value = self.pooling(received, own, batch.directions)
+            value = self.pooling(received, asked, batch.directions)
             if not self.takes_paths and self.pooling.grid is None and batch.directions is not None:
-                value = value.reshape(
-                    len(own), *batch.directions.shape
-                )  # a list of rays was rendered as one row
+                # A list of rays was rendered as one row.
+                value = value.reshape(len(asked), *batch.directions.shape)
+            links.append(index)
             values.append(value)
         value = self.on_trend(torch.cat(values)[torch.cat(links).argsort()], batch)
         penalties = {}
@@ -282,7 +323,9 @@ class GaussianSplatting(Model):
         return {} if self.rasterizer is None else {"rasterizer": self.rasterizer.used}
 
     def rendering(self, batch: Batch) -> Callable[[], object]:
-        """The rasterizer alone, or the sum over paths, for the links to the first link's receiver."""
+        """The rasterizer alone, or the sum over paths, for the links to the first link's
+        receiver.
+        """
         receiver = int(batch.query.receivers[0])
         query = batch.query[(batch.query.receivers == receiver).nonzero()[:, 0]]
         with torch.no_grad():
@@ -302,14 +345,15 @@ class GaussianSplatting(Model):
         """The Gaussians as each row of a query excites them."""
         placed = self.placement(self.gaussians, query)
         if placed.opacities is None:
-            own = self.gaussians
+            free = self.gaussians
             placed = placed._replace(
-                quats=own.unit_quats,
-                scales=own.scales[None],
-                opacities=own.opacities,
-                signal=_towards(own.bands, query.transmitters[:, None] - placed.means),
+                quats=free.unit_quats,
+                scales=free.scales[None],
+                opacities=free.opacities,
+                signal=_towards(free.bands, query.transmitters[:, None] - placed.means),
             )
-        # The network learns how a place responds to a transmitter. No gradient of it moves the Gaussians.
+        # The network learns how a place responds to a transmitter. No gradient of it moves the
+        # Gaussians.
         seen = Placed(*(None if part is None else part.detach() for part in placed))
         tokens = None if self.tokenizer is None else self.tokenizer(seen, seen.opacities, query)
         residuals = self.deformation(tokens, seen, query)
@@ -325,11 +369,11 @@ class GaussianSplatting(Model):
     ) -> ReceivedPaths:
         """The paths of some queries, each with its place ``which``, to one receiver."""
         placed = excited.placed
-        means, axes = (
-            part if len(part) == 1 else part[which] for part in (placed.means, excited.semi_axes)
-        )
+        means, axes = placed.means, excited.semi_axes
+        means = means if len(means) == 1 else means[which]  # (1 or b, n, 3)
+        axes = axes if len(axes) == 1 else axes[which]  # (1 or b, n, 3, 3)
         signal, opacities, _ = self._strengths(excited, which)
-        amplitudes = torch.complex(signal[..., 0], signal[..., 1]) * opacities
+        amplitudes = torch.complex(signal[..., 0], signal[..., 1]) * opacities  # (b, n)
         b, n = amplitudes.shape
         return ReceivedPaths(
             means.expand(b, -1, -1),
@@ -343,7 +387,9 @@ class GaussianSplatting(Model):
         )
 
     def carriers(self, query: Query) -> Float[Tensor, " b"]:
-        """The links' frequencies [Hz]; single antennas hear powers alike at any, so they need none."""
+        """The links' frequencies [Hz]; single antennas receive equal powers at any, so they need
+        none.
+        """
         is_known = (
             query.frequencies is not None
             or len(self.scene.frequencies)
@@ -360,27 +406,28 @@ class GaussianSplatting(Model):
         receiver: int,
         directions: Directions | None,
     ) -> list[tuple]:
-        """The rasterizer's arguments: Gaussians on the receiver's plane, for all queries at once unless they move."""
+        """The rasterizer's arguments: Gaussians on the receiver's plane, for all queries at once
+        unless they move.
+        """
         placed, axes = excited.placed, excited.semi_axes
         if self.pooling.grid is not None or directions is None:
             directions = self.pooling.grid or self.scene.task.directions
         plane = self.projection.plane(directions.to(placed.means.device).to(placed.means.dtype))
         means = placed.means
         if not len(means):  # no query: Gaussians that follow it may stand anywhere
-            means, axes = (
-                means.new_zeros(1, means.shape[1], 3),
-                means.new_ones(1, means.shape[1], 3, 3),
-            )
+            axes = means.new_ones(1, means.shape[1], 3, 3)
+            means = means.new_zeros(1, means.shape[1], 3)
+        pose = self.scene.receivers[receiver].pose
         calls = []
         for row in [which] if len(means) == 1 else which.split(1):
-            stands = means[0] if len(means) == 1 else means[row][0]
-            own_axes = axes if len(axes) == 1 else axes[row]
-            splats = self.projection.project(stands, own_axes, self.scene.receivers[receiver].pose)
+            centres = means[0] if len(means) == 1 else means[row][0]  # (n, 3)
+            axes_of_row = axes if len(axes) == 1 else axes[row]
+            splats = self.projection.project(centres, axes_of_row, pose)
             calls.append((splats, *self._strengths(excited, row), plane))
         return calls
 
-    def _strengths(self, excited: Excited, which: Int[Tensor, " b"]) -> tuple:
-        """Signal (b, n, c), opacities (b, n) and attenuations of some queries."""
+    def _strengths(self, excited: Excited, which: Int[Tensor, " b"]) -> Strengths:
+        """Strengths of the Gaussians for some queries."""
         placed, residuals = excited.placed, excited.residuals
         signal, opacities = placed.signal, placed.opacities
         if signal.ndim == 4:  # another for each query
@@ -391,36 +438,38 @@ class GaussianSplatting(Model):
             opacities = (opacities + residuals.delta_opacities[which]).clamp(0, 1)
         attenuations = None if residuals.attenuations is None else residuals.attenuations[which]
         signal = signal.squeeze(-1)
+        count = len(which)
         if placed.gains is None:
             signal = SH_DC * signal
         elif signal.shape[-1] == 1:
             signal = signal * magnitudes(placed.gains[which])[..., None]
-        else:
-            signal = torch.view_as_real(
-                torch.complex(*signal.expand(len(which), -1, -1).unbind(-1)) * placed.gains[which]
-            )
-        return signal.expand(len(which), -1, -1), opacities.expand(len(which), -1), attenuations
+        else:  # two channels are a complex number
+            numbers = torch.complex(*signal.expand(count, -1, -1).unbind(-1))  # (b, n)
+            signal = torch.view_as_real(numbers * placed.gains[which])
+        return Strengths(signal.expand(count, -1, -1), opacities.expand(count, -1), attenuations)
 
     def _check_gives(self, received: Tensor | ReceivedPaths) -> None:
         """Raises a ``ValueError`` unless the pooling gives labels of the task's shape."""
-        query = Query(
-            torch.zeros(1, 3), torch.zeros(1, dtype=torch.long), torch.tensor([1e9])
-        )  # any carrier
-        gives, task = tuple(self.pooling(received, query).shape[1:]), self.scene.task
-        if gives != task.shape:
-            own = f"labels of task {task.name!r}, {task.shape}"
+        any_carrier = torch.tensor([1e9])
+        query = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long), any_carrier)
+        shape, task = tuple(self.pooling(received, query).shape[1:]), self.scene.task
+        if shape != task.shape:
             raise ValueError(
-                f"pooling {name_of(self.pooling)!r} gives {gives}, not {own}; take the task's own pooling"
+                f"pooling {name_of(self.pooling)!r} gives {shape}, not labels of task "
+                f"{task.name!r}, {task.shape}; take the task's own pooling"
             )
 
 
 def _towards(
     bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]
 ) -> Float[Tensor, "*b n c 1"]:
-    """Signal of Gaussians towards transmitters at these offsets [m], before the factor of the constant harmonic."""
+    """Signal of Gaussians towards transmitters at these offsets [m], before the factor of the
+    constant harmonic.
+    """
     if bands.shape[-1] == 1:
         return bands
-    # On a centre there is no direction. Nearer than 0.05 m the harmonics fade: gradients stay moderate.
+    # On a centre there is no direction. Nearer than 0.05 m the harmonics fade: gradients stay
+    # moderate.
     seen = -offsets / offsets.norm(dim=-1, keepdim=True).clamp(min=0.05)
     harmonics = spherical_harmonics(seen, math.isqrt(bands.shape[-1]) - 1)
     return (bands * harmonics[:, :, None]).sum(-1, keepdim=True) / SH_DC

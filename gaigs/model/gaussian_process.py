@@ -4,16 +4,18 @@ positions.
 
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
 from gaigs.core.query import Batch, Query, evenly, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.core.stages import stage
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations
+from gaigs.kriging.gross_errors import without_gross_errors
 from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, kernel, kriging_weights
 from gaigs.kriging.links import (
     PART,
@@ -22,17 +24,23 @@ from gaigs.kriging.links import (
     distances,
     folds_of,
     known_links,
-    thinned,
-    without_gross_errors,
+    limit_known,
 )
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, build_trend
 from gaigs.registry import name_of, register
 
-NEIGHBOURS = 300
-"""Known links that enter each prediction of local kriging: with this kernel near links screen those
-behind them.
-"""
+
+class Solved(NamedTuple):
+    """What predictions of one receiver are made from; neither in local kriging.
+
+    Attributes:
+        solution: Residuals over the covariances of their links (k, m).
+        factor: Cholesky factor of the covariances (k, k).
+    """
+
+    solution: Tensor | None
+    factor: Tensor | None
 
 
 @register("model", "gaussian_process")
@@ -54,9 +62,9 @@ class GaussianProcess(LookUp):
     hyperparameters of its own. Of a receiver with more than ``LIMIT`` known links an even part is
     used.
 
-    A receiver with more than ``LIMIT`` known links is predicted from the ``NEIGHBOURS`` nearest to
-    each query (local kriging). Residuals of channels are limited to ``kriging.fit.LOUDEST`` times
-    the receiver's median channel.
+    A receiver with more than ``LIMIT`` known links is predicted from the 300 nearest to each query
+    (local kriging): with this kernel near links screen those behind them. Residuals of channels are
+    limited, see ``gaigs.kriging.fit.damping``.
 
     Args:
         trend: Configuration of the model whose residuals the process describes. None: ``friis`` for
@@ -71,19 +79,30 @@ class GaussianProcess(LookUp):
     """
 
     learnt = ("chosen",)
+    limit = LIMIT  # known links of a receiver beyond which kriging is local
+    neighbours = 300  # known links that enter each prediction of local kriging
 
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
         given = [{"name": name} for name in scene.task.trends] if trend is None else [trend]
         self.trends = tuple(build_trend(one, scene) for one in given)
-        if any([*built.parameters()] for built in self.trends):
+        if any(built.is_trained for built in self.trends):
             raise ValueError(
-                f"model.trend cannot be trained, got {trend['name']}; take mean, path_loss or friis"
+                f"model.trend cannot be trained, got {name_of(self.trends[0])}; "
+                "take mean, path_loss or friis"
             )
         self.chosen = 0
-        self.scalar = nn.ModuleList([ScalarProcess(scene)] if scene.task.is_scalar else [])
+        self.scalar = ScalarProcess(scene) if scene.task.is_scalar else None
         self.factors: Tensor | None = None
         self.process = Hyperparameters()
+        self.solved: list[Solved] = []
+        self.signals: list[float] = []  # deviation of each receiver's process
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        for key in [*state_dict]:  # the process was in a list in checkpoints of before
+            if key.startswith(f"{prefix}scalar.0."):
+                state_dict[key.replace("scalar.0.", "scalar.", 1)] = state_dict.pop(key)
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def get_extra_state(self) -> dict:
         trends = [dict(trend.state_dict()) for trend in self.trends]
@@ -92,9 +111,9 @@ class GaussianProcess(LookUp):
     def set_extra_state(self, state: dict) -> None:
         super().set_extra_state(state)
         self.process = Hyperparameters(*state["process"])
-        for trend, own in zip(self.trends, state["trends"], strict=True):
-            trend.load_state_dict(own)
-        if not self.scalar:
+        for trend, stored in zip(self.trends, state["trends"], strict=True):
+            trend.load_state_dict(stored)
+        if self.scalar is None:
             self._solve_known(chooses=False)
 
     def fit(self, links: Links) -> None:
@@ -106,15 +125,19 @@ class GaussianProcess(LookUp):
         kernel, noise and the choice of the trend."""
         self._fit(links, chooses=False)
 
+    def take_hyperparameters(self, other: Model) -> None:
+        if isinstance(other, GaussianProcess) and self.scalar is not None:
+            self.scalar.take(other.scalar)
+
     @torch.no_grad()
     def _fit(self, links: Links, chooses: bool) -> None:
-        if self.scalar:
+        if self.scalar is not None:
             links = without_gross_errors(links)
         self.links, self.known = links, known_links(links)
         for trend in self.trends if chooses else (self.trend,):
             trend.fit(links)
-        if self.scalar:
-            self._fit_scalar(thinned(links, LIMIT), chooses)
+        if self.scalar is not None:
+            self._fit_scalar(self.scalar, limit_known(links, self.limit), chooses)
         else:
             self._solve_known(chooses)
 
@@ -127,38 +150,41 @@ class GaussianProcess(LookUp):
             residuals = torch.cat([*self._residuals(index)])
             factors = damping(residuals, links.labels[index], links.query.receivers[index])
             self.factors = torch.ones(len(links)).index_copy(0, index, factors)
-        residuals = lambda index: torch.cat([thin_labels(part) for part in self._residuals(index)])
+
+        def thin_residuals(index: Int[Tensor, " k"]) -> Tensor:
+            return torch.cat([thin_labels(part) for part in self._residuals(index)])
+
         if chooses:
-            self.process, _ = fit_hyperparameters(self.scene, links, residuals)
+            self.process, _ = fit_hyperparameters(self.scene, links, thin_residuals)
         self.solved, self.signals = [], []
         for index in self.known:
             factor = self._factor(index)
             self.solved.append(self._solve(index, factor))
-            left = residuals(evenly(index, LIMIT) if factor is None else index)
-            # Without a factor, the mean square instead of the most likely variance.
-            wide = left.to(torch.promote_types(left.dtype, torch.float64))
-            root = (1 + self.process.nugget) ** 0.5
-            white = (
-                wide / root
-                if factor is None
-                else torch.linalg.solve_triangular(factor.to(wide), wide, upper=False)
-            )
+            residuals = thin_residuals(evenly(index, self.limit) if factor is None else index)
+            wide = residuals.to(torch.promote_types(residuals.dtype, torch.float64))
+            if factor is None:
+                # Without a factor, the mean square instead of the most likely variance.
+                white = wide / (1 + self.process.nugget) ** 0.5
+            else:
+                white = torch.linalg.solve_triangular(factor.to(wide), wide, upper=False)
             self.signals.append(white.abs().square().mean().sqrt().item())
 
-    def _fit_scalar(self, links: Links, chooses: bool) -> None:
+    def _fit_scalar(self, process: ScalarProcess, links: Links, chooses: bool) -> None:
         index = torch.cat(known_links(links))
-        query, process = links.query[index], self.scalar[0]
-        left = lambda trend: (links.labels[index] - trend(Batch(query)).value).double()
-        known, folds = (
-            (coordinates(self.scene, query, 1.0), query.receivers),
-            folds_of(links, index),
-        )
-        with stage("gaussian_process", len(self.trends) + 4 if chooses else 1):
+        query = links.query[index]
+        known = coordinates(self.scene, query, 1.0), query.receivers
+        folds = folds_of(links, index)
+
+        def residuals(trend: Model) -> Float[Tensor, " k"]:
+            return (links.labels[index] - trend(Batch(query)).value).double()
+
+        with stage("gaussian_process", process.fit_count(len(self.trends)) if chooses else 1):
             if chooses:
-                self.chosen = process.fit(*known, [left(trend) for trend in self.trends], folds)
+                candidates = [residuals(trend) for trend in self.trends]
+                self.chosen = process.fit(*known, candidates, folds)
             else:
-                process.refit(*known, left(self.trend), folds)
-        process.solve(*known, left(self.trend))
+                process.refit(*known, residuals(self.trend), folds)
+        process.solve(*known, residuals(self.trend))
 
     @property
     def trend(self) -> Model:
@@ -170,50 +196,48 @@ class GaussianProcess(LookUp):
         return self.trend.any_frequency
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
-        """The trend alone: its residuals at other frequencies do not correlate with the known ones."""
+        """The trend alone: residuals at other frequencies do not correlate with the known ones."""
         return self.trend.at_frequencies(frequencies)
 
     def facts(self) -> dict[str, object]:
         """``length_m``, ``nugget``, with several carriers ``frequency_scale_m``; of scalars the
         other choices.
         """
-        return (
-            {**self.scalar[0].facts(), "trend": name_of(self.trend)}
-            if self.scalar
-            else {**self.process.facts()}
-        )
+        if self.scalar is not None:
+            return {**self.scalar.facts(), "trend": name_of(self.trend)}
+        return {**self.process.facts()}
 
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query
         trend = self.trend(Batch(query, self.scene.task.directions)).value
-        if self.scalar:
-            levels = self.scalar[0](coordinates(self.scene, query, 1.0), query.receivers)
+        if self.scalar is not None:
+            levels = self.scalar(coordinates(self.scene, query, 1.0), query.receivers)
             return Prediction(trend + levels.to(trend), {})
         added = torch.zeros_like(trend)
         for receiver in query.receivers.unique().tolist():
-            own = query.receivers == receiver
-            added[own] = self._kriged(query[own], receiver)
+            is_asked = query.receivers == receiver
+            added[is_asked] = self._kriged(query[is_asked], receiver)
         return Prediction(at_directions(trend + added, batch, self.scene), {})
 
     def deviations(self, batch: Batch) -> Tensor:
         """Standard deviations of the labels, means over a label's numbers."""
         query = batch.query
-        if self.scalar:
-            return self.scalar[0].deviations(coordinates(self.scene, query, 1.0), query.receivers)
+        if self.scalar is not None:
+            places = coordinates(self.scene, query, 1.0)
+            return self.scalar.deviations(places, query.receivers)
         places = self._places(query)
-        found = torch.zeros_like(places[:, 0])
+        deviations = torch.zeros_like(places[:, 0])
         for receiver in query.receivers.unique().tolist():
-            own, known = (
-                query.receivers == receiver,
-                self._places(self.links.query[self.known[receiver]]),
-            )
-            found[own] = self.signals[receiver] * local_deviations(places[own], known, self.process)
-        return found
+            is_asked = query.receivers == receiver
+            known = self._places(self.links.query[self.known[receiver]])
+            local = local_deviations(places[is_asked], known, self.process)
+            deviations[is_asked] = self.signals[receiver] * local
+        return deviations
 
     def process_at(self, receiver: int) -> Process:
         """The process of one receiver."""
-        if self.scalar:
-            return self.scalar[0].at(receiver)
+        if self.scalar is not None:
+            return self.scalar.at(receiver)
         places = coordinates(self.scene, self.links.query[self.known[receiver]], 1.0)
         return self.process.at(places, self.signals[receiver] ** 2)
 
@@ -222,48 +246,45 @@ class GaussianProcess(LookUp):
 
     def _factor(self, index: Int[Tensor, " k"]) -> Tensor | None:
         """Cholesky factor of a receiver's covariances; None for local kriging."""
-        if len(index) > LIMIT:
+        if len(index) > self.limit:
             return None
         return cholesky_factor(
             self._places(self.links.query[index]), self.process.length, self.process.nugget
         )
 
-    def _solve(
-        self, index: Int[Tensor, " k"], factor: Tensor | None
-    ) -> tuple[Tensor | None, Tensor | None]:
-        """A receiver's residuals over their covariances or, if smaller, the covariances' factor;
-        None for neither.
-        """
+    def _solve(self, index: Int[Tensor, " k"], factor: Tensor | None) -> Solved:
+        """What predictions of a receiver are made from, the smaller of both."""
         if factor is None or math.prod(self.scene.task.shape) >= len(index):
-            return None, factor
+            return Solved(None, factor)
         residuals = torch.cat([*self._residuals(index)]).reshape(len(index), -1)
         wide = torch.promote_types(residuals.dtype, torch.float64)
-        return torch.cholesky_solve(residuals.to(wide), factor.to(wide)), None
+        return Solved(torch.cholesky_solve(residuals.to(wide), factor.to(wide)), None)
 
     def _residuals(self, index: Int[Tensor, " k"]) -> Iterator[Tensor]:
-        """Labels of some links, aligned to their trend, less this trend; ``PART`` links at a time."""
-        for some in index.split(PART):
-            trend = self.trend(Batch(self.links.query[some], self.scene.task.directions)).value
-            residuals = self.scene.task.align(self.links.labels[some], trend) - trend
+        """Labels of links, aligned to their trend, less this trend; ``PART`` links at a time."""
+        for part in index.split(PART):
+            trend = self.trend(Batch(self.links.query[part], self.scene.task.directions)).value
+            residuals = self.scene.task.align(self.links.labels[part], trend) - trend
             if self.factors is not None:
-                residuals = residuals * self.factors[some, None, None]
+                residuals = residuals * self.factors[part, None, None]
             yield residuals
 
     def _kriged(self, query: Query, receiver: int) -> Tensor:
         """Residuals (b, *shape) that the process predicts."""
-        index, (solution, factor) = self.known[receiver], self.solved[receiver]
+        index, task = self.known[receiver], self.scene.task
+        solution, factor = self.solved[receiver]
         asked, known = self._places(query), self._places(self.links.query[index])
         length, nugget, _ = self.process
         if solution is not None:
             values = kernel(asked, known, length).to(solution) @ solution
-            return values.reshape(len(query), *self.scene.task.shape).to(self.scene.task.dtype)
+            return values.reshape(len(query), *task.shape).to(task.dtype)
         if factor is not None:
             weights = torch.cholesky_solve(kernel(asked, known, length).T, factor).T
         else:
-            near = distances(asked, known).topk(NEIGHBOURS, largest=False).indices
-            own, _ = kriging_weights(asked, known[near], length, nugget)
+            near = distances(asked, known).topk(self.neighbours, largest=False).indices
+            local, _ = kriging_weights(asked, known[near], length, nugget)  # (b, neighbours)
             used, column = near.unique(return_inverse=True)
-            weights = own.new_zeros(len(query), len(used)).scatter(1, column, own)
+            weights = local.new_zeros(len(query), len(used)).scatter(1, column, local)
             index = index[used]
         parts = zip(weights.split(PART, 1), self._residuals(index), strict=True)
         return sum(torch.tensordot(part.to(residuals), residuals, 1) for part, residuals in parts)

@@ -55,8 +55,10 @@ class KNearestNeighbours(LookUp):
             raise ValueError(f"model.k must be at least 1 or null, got {k}")
         if power is not None and not 0 <= power < math.inf:
             raise ValueError(f"model.power must be 0 or more, and finite, got {power}")
-        usual = (None, 1.0) if scene.task.is_noisy else (3, 2.0)
-        self.k, self.power = k or usual[0], usual[1] if power is None else power
+        is_noisy = scene.task.is_noisy
+        self.k = k or (None if is_noisy else 3)
+        usual_power = 1.0 if is_noisy else 2.0
+        self.power = usual_power if power is None else power
         self.chosen = self.k or 3
         self.scale = math.nan
 
@@ -64,17 +66,12 @@ class KNearestNeighbours(LookUp):
         """Keeps the links, and chooses the scale of frequencies, and the number of neighbours if it
         is None.
         """
-        self.links, self.known, self.scale, self.chosen = (
-            links,
-            known_links(links),
-            math.nan,
-            self.k or 3,
-        )
+        self.links, self.known = links, known_links(links)
+        self.scale = math.nan
+        self.chosen = self.k or 3
         if self.scene.has_band:
-            low, high = scale_bounds(self.scene)
-            scales = torch.logspace(
-                math.log10(low), math.log10(high), 16, dtype=torch.float64
-            ).tolist()
+            low, high = (math.log10(bound) for bound in scale_bounds(self.scene))
+            scales = torch.logspace(low, high, 16, dtype=torch.float64).tolist()
             self.scale = min(scales, key=self._squared_error)
         if self.k is None:
             folds = [folds_of(links, index) for index in self.known]
@@ -89,17 +86,16 @@ class KNearestNeighbours(LookUp):
         query = batch.query
         labels = torch.empty(len(query), *self.scene.task.shape, dtype=self.scene.task.dtype)
         for receiver in query.receivers.unique():
-            own = query.receivers == receiver
-            apart = self._distances(query[own], self.known[receiver], self.scale)
-            labels[own] = self._look_up(apart, self.known[receiver])
+            is_asked = query.receivers == receiver
+            apart = self._distances(query[is_asked], self.known[receiver], self.scale)
+            labels[is_asked] = self._look_up(apart, self.known[receiver])
         return Prediction(at_directions(labels, batch, self.scene), {})
 
     def _distances(
         self, query: Query, index: Int[Tensor, " k"], scale: float
     ) -> Float[Tensor, "b k"]:
-        asked, known = (
-            coordinates(self.scene, part, scale) for part in (query, self.links.query[index])
-        )
+        asked = coordinates(self.scene, query, scale)
+        known = coordinates(self.scene, self.links.query[index], scale)
         return distances(asked, known)
 
     def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, " k"]) -> Tensor:
@@ -117,13 +113,10 @@ class KNearestNeighbours(LookUp):
         if not self.scene.task.shape:  # a radio map of many receivers asks for millions of numbers
             return weights[:, used].to(labels) @ labels
         rows = []
-        for own, first in zip(weights[:, used], apart[:, used].argmin(1).tolist(), strict=True):
-            near = own.nonzero()[:, 0]
-            rows.append(
-                torch.tensordot(
-                    own[near].to(labels), align(labels[near], labels[first : first + 1]), 1
-                )
-            )
+        for row, first in zip(weights[:, used], apart[:, used].argmin(1).tolist(), strict=True):
+            near = row.nonzero()[:, 0]
+            aligned = align(labels[near], labels[first : first + 1])  # to the nearest
+            rows.append(torch.tensordot(row[near].to(labels), aligned, 1))
         return torch.stack(rows)
 
     def _held_out(
@@ -139,27 +132,24 @@ class KNearestNeighbours(LookUp):
                 if folds is not None:
                     here |= folds[receiver][rows][:, None] == folds[receiver]
                 apart = self._distances(asked, index, self.scale).masked_fill(here, math.inf)
-                found = apart.isfinite().any(1)  # a place may be the only one
-                if found.any():
-                    values = self._look_up(apart[found], index)
-                    yield (
-                        self.scene.task.align(self.links.labels[index[rows[found]]], values),
-                        values,
-                    )
+                has_others = apart.isfinite().any(1)  # a place may be the only one
+                if has_others.any():
+                    values = self._look_up(apart[has_others], index)
+                    labels = self.links.labels[index[rows[has_others]]]
+                    yield self.scene.task.align(labels, values), values
 
     def _squared_error(self, scale: float) -> float:
         self.scale = scale
-        errors = [
-            (values - labels).abs().double().square().flatten()
-            for labels, values in self._held_out()
-        ]
+        errors = []
+        for labels, values in self._held_out():
+            errors.append((values - labels).abs().double().square().flatten())
         return torch.cat(errors).mean().item() if errors else 0.0
 
     def _rank(self, count: int, folds: Sequence[Int[Tensor, " _"]]) -> float:
         """Mean score of known links by some neighbours, an error or a negative similarity."""
-        self.chosen, task = count, self.scene.task
-        scores = [
-            task.scores(labels, values)[task.monitor] for labels, values in self._held_out(folds)
-        ]
+        self.chosen = count
+        task = self.scene.task
+        held = self._held_out(folds)
+        scores = [task.scores(labels, values)[task.monitor] for labels, values in held]
         mean = torch.cat(scores).mean().item() if scores else 0.0
         return -mean if task.higher_is_better else mean

@@ -3,40 +3,32 @@
 import logging
 import math
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor, nn
+from torch import Tensor
 
+from gaigs.calibration.held_out import Unseen, validation_halves
 from gaigs.core import stages
 from gaigs.core.query import Batch, evenly, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.data import Links
-from gaigs.kriging.field import Field
-from gaigs.kriging.fit import FEWEST, Hyperparameters, damping, fit_hyperparameters
+from gaigs.kriging.field import FieldPosterior
+from gaigs.kriging.fit import FEWEST
 from gaigs.kriging.kernel import LIMIT, Process
-from gaigs.kriging.links import (
-    PART,
-    coordinates,
-    folds_of,
-    scaled,
-    single_readings,
-    thinned,
-    without_gross_errors,
-)
-from gaigs.kriging.paths import Equations, PathField, PathProcess
-from gaigs.kriging.scalar import ScalarProcess
-from gaigs.model import LookUp, Model, Prediction, Wrapper, call_optional
+from gaigs.kriging.links import PART, limit_known, single_readings
+from gaigs.kriging.paths import PathPosterior
+from gaigs.kriging.posterior import Posterior
+from gaigs.kriging.scalar import ScalarPosterior
+from gaigs.model import LookUp, Model, Prediction, Wrapper
+from gaigs.model.answers import predicted
 from gaigs.registry import name_of, register, registry
 
 log = logging.getLogger(__name__)
-
-WEIGHTS = (1.0, 0.75, 0.5, 0.25, 0.0)
-"""Candidates of ``trend_weight`` and ``weight``; of equally good ones the first is taken."""
 
 
 @register("model", "kriging")
@@ -54,15 +46,11 @@ class Kriging(Wrapper):
     from the training links, score best: the likelihood alone would trust kriging too far where
     cubes of space are held out.
 
-    Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` as z, with hyperparameters
-    of each receiver. Their trend weight is the mean of the candidates, each as likely as it makes
-    the validation links, with all readings of a place as one: without such links a half. Their
-    weight is 1.
-
-    Of a trend whose paths have ``margins``, strengths are kriged path by path, and phases stay
-    those of the geometry. The process is always the same, and the weight 1 or 0. Where the
-    validation links say that kriged labels are better by more than chance, as of places closer than
-    half a wavelength, those are taken.
+    z is one of three posteriors: ``ScalarPosterior`` of labels of one real number, with
+    hyperparameters of each receiver; ``FieldPosterior`` of other labels; and ``PathPosterior`` of a
+    trend whose paths have ``margins``: strengths are kriged path by path. The first and the last
+    have a weight of 1, or 0. Where the validation links say that kriged labels are better than
+    kriged paths by more than chance, as of places closer than half a wavelength, labels are kriged.
 
     A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal
     components. Of a receiver with more than ``LIMIT`` known links an even part is used.
@@ -81,43 +69,47 @@ class Kriging(Wrapper):
 
     trend_weight: Tensor
     weight: Tensor
-    hyperparameters: Tensor
+    weights = (1.0, 0.75, 0.5, 0.25, 0.0)
+    """Candidates of ``trend_weight`` and ``weight``; of equally good ones the first is taken."""
 
     def __init__(self, scene: Scene, trend: dict | Model, fallback: dict | None = None):
         super().__init__(scene)
-        self.trend = (
-            trend if isinstance(trend, Model) else registry("model").build(trend, scene=scene)
-        )
+        is_built = isinstance(trend, Model)
+        self.trend: Model = trend if is_built else registry("model").build(trend, scene=scene)
         if not [*self.trend.parameters()]:
             raise ValueError(
                 f"kriging needs a trained model, got {name_of(self.trend)}; leave kriging out"
             )
         self.fallback_options = {"name": "mean"} if fallback is None else fallback
         self.fallback = registry("model").build(self.fallback_options, scene=scene)
-        if (
-            isinstance(self.fallback, LookUp)
-            or not self.fallback.state_dict()
-            or [*self.fallback.parameters()]
-        ):
+        keeps_links = isinstance(self.fallback, LookUp) or not self.fallback.state_dict()
+        if keeps_links or [*self.fallback.parameters()]:
             name = self.fallback_options["name"]
             raise ValueError(f"kriging_fallback cannot be {name}; take mean, path_loss or friis")
         self.chunk = self.trend.chunk
         self.register_buffer("trend_weight", torch.tensor(1.0, dtype=torch.float64))
         self.register_buffer("weight", torch.tensor(1.0, dtype=torch.float64))
-        self.register_buffer("hyperparameters", torch.full((3,), math.nan, dtype=torch.float64))
-        self.is_scalar = scene.task.is_scalar
-        if self.is_scalar:
-            self.process = ScalarProcess(scene)
-        self._make_fields(getattr(self.trend, "has_margins", False))
+        self._make_posterior(self.trend.has_margins)
 
-    def _make_fields(self, by_paths: bool) -> None:
-        self.by_paths = by_paths
-        if not self.is_scalar:
-            fields = (PathField() if by_paths else Field(self.scene) for _ in self.scene.receivers)
-            self.fields = nn.ModuleList(fields).to(self.weight.device)
+    def _make_posterior(self, by_paths: bool) -> None:
+        posterior: Posterior
+        if self.scene.task.is_scalar:
+            posterior = ScalarPosterior(self.scene)
+        elif by_paths:
+            posterior = PathPosterior(self.scene, self.trend.margins)
+        else:
+            posterior = FieldPosterior(self.scene)
+        self.posterior: Any = posterior.to(self.weight.device)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        self._make_fields(f"{prefix}fields.0.precisions" in state_dict)
+        # Parts of the posterior were parts of the model in checkpoints of before.
+        for key in [*state_dict]:
+            name = key.removeprefix(prefix)
+            if name.startswith(("process.", "fields.", "hyperparameters")):
+                state_dict[f"{prefix}posterior.{name}"] = state_dict.pop(key)
+        if self.scene.task.is_scalar:
+            state_dict.pop(f"{prefix}posterior.hyperparameters", None)
+        self._make_posterior(f"{prefix}posterior.fields.0.precisions" in state_dict)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def fit(self, links: Links) -> None:
@@ -125,87 +117,94 @@ class Kriging(Wrapper):
         self.krige(links)
 
     @torch.no_grad()
-    def krige(self, links: Links, is_final: bool = True, by_paths: bool | None = None) -> "Kriging":
+    def krige(
+        self,
+        links: Links,
+        is_final: bool = True,
+        by_paths: bool | None = None,
+        most: int = LIMIT,
+    ) -> "Kriging":
         """Fits, and gives the validation model: the same weights and hyperparameters on the
         training links alone.
 
-        If not ``is_final``, only the validation model is fitted, without a word. ``by_paths`` says
-        if strengths of paths are kriged, or whole labels; None: ``FEWEST`` validation links or more
-        choose.
+        Args:
+            links: Links with a split.
+            is_final: False if only the validation model is fitted, without a word.
+            by_paths: True if strengths of paths are kriged, False if labels are; None: ``FEWEST``
+                validation links or more choose.
+            most: Most known links of a receiver.
         """
-        if self.is_scalar:
-            links = without_gross_errors(links)
-        count, links = len(links.split.known), thinned(links, self._most(links))
+        links = self.posterior.cleaned(links)
+        count = len(links.split.known)
+        links = limit_known(links, self._most(links, most))
         if is_final and math.isfinite(stages.left()) and len(links.split.known) < count:
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
-        values, held = predicted(self.trend, links, links.split.known), links.split.validation
+        values = predicted(self.trend, links, links.split.known)
         self.fallback.fit(links)
-        has_paths = getattr(self.trend, "has_margins", False)
-        is_few = len(single_readings(links, held)) < FEWEST
-        if by_paths or (has_paths and by_paths is None and is_few):
+        if by_paths is None and self.trend.has_margins:
+            is_few = len(single_readings(links, links.split.validation)) < FEWEST
+            return self._krige_better(links, values, is_final, is_few)
+        if by_paths:
             return self._krige_paths(links, values, is_final)
-        if has_paths and by_paths is None:
-            models = (
-                self._krige_labels(links, values, False),
-                self._krige_paths(links, values, is_final),
-            )
-            scores = self._validation_scores(
-                links, (predicted(model, links, held) for model in models)
-            )
-            if not is_surely_better(*scores):
-                return models[1]
-            if is_final:
-                log.warning(
-                    "paths do not explain the channels: %s on validation links is %.3g, of kriged labels %.3g\n"
-                    "the prediction is that of kriged labels",
-                    links.task.monitor,
-                    *(score.mean() for score in scores[::-1]),
-                )
         return self._krige_labels(links, values, is_final)
 
-    def _most(self, links: Links) -> int:
-        """Most known links of a receiver: ``LIMIT``, or those whose three predictions take a third
-        of the time left.
+    def _krige_better(
+        self, links: Links, values: Tensor, is_final: bool, is_few: bool
+    ) -> "Kriging":
+        """``krige`` of paths, or of labels if the validation links are surely better by these."""
+        if is_few:
+            return self._krige_paths(links, values, is_final)
+        of_labels = self._krige_labels(links, values, False)
+        of_paths = self._krige_paths(links, values, is_final)
+        held = links.split.validation
+        scores = validation_scores(links, predicted(of_labels, links, held))
+        path_scores = validation_scores(links, predicted(of_paths, links, held))
+        if not is_surely_better(scores, path_scores):
+            return of_paths
+        if is_final:
+            log.warning(
+                "paths do not explain the channels: %s on validation links is %.3g, of kriged "
+                "labels %.3g\nthe prediction is that of kriged labels",
+                links.task.monitor,
+                path_scores.mean(),
+                scores.mean(),
+            )
+        return self._krige_labels(links, values, is_final)
+
+    def _most(self, links: Links, most: int) -> int:
+        """Most known links of a receiver: ``most``, or as many as three predictions of them take a
+        third of the time left.
 
         The trained model predicts the links once, and once more for each half of the validation
         links.
         """
         if math.isinf(stages.left()):
-            return LIMIT
-        some = evenly(links.split.known, 64)
-        predicted(self.trend, links, some[:1])  # the first prediction compiles and loads
+            return most
+        sample = evenly(links.split.known, 64)
+        predicted(self.trend, links, sample[:1])  # the first prediction compiles and loads
         began = time.monotonic()
-        predicted(self.trend, links, some)
-        each = max(time.monotonic() - began, 1e-9) / len(some)
-        return int(min(LIMIT, max(100, stages.left() / 9 / each / len(links.receivers))))
-
-    def _validation_scores(
-        self, links: Links, values: Iterable[Tensor]
-    ) -> list[Float[Tensor, " k"]]:
-        """Monitored scores of predictions of the validation links, higher ones better."""
-        task, labels = links.task, links.labels[links.split.validation]
-        sign = 1 if task.higher_is_better else -1
-        return [sign * task.scores(labels, part)[task.monitor].double() for part in values]
+        predicted(self.trend, links, sample)
+        each = max(time.monotonic() - began, 1e-9) / len(sample)
+        return int(min(most, max(100, stages.left() / 9 / each / len(links.receivers))))
 
     def _krige_labels(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
-        """``krige`` of whole labels; ``values`` are the trend's predictions of known links."""
-        self._make_fields(False)
-        held, trend = links.split.validation, values[len(links.split.train) :]
+        """``krige`` of labels; ``values`` are the trend's predictions of known links."""
+        self._make_posterior(False)
+        held = links.split.validation
         model = self._validation_model(links, values)
         is_unlearnt = False
         if len(held):
-            own, other = self._validation_scores(
-                links, (trend, predicted(model.fallback, links, held))
-            )
-            is_unlearnt = is_surely_better(other, own)
-        if is_unlearnt and not self.is_scalar:
+            trend = validation_scores(links, values[len(links.split.train) :])
+            fallback = validation_scores(links, predicted(model.fallback, links, held))
+            is_unlearnt = is_surely_better(fallback, trend)
+        if is_unlearnt and self.posterior.chooses_weight:
             # The likelihood may still mix it in: where the score is higher without it, it is left
             # out.
-            models = model, self._validation_model(links, values, (0.0,))
-            scores = self._validation_scores(links, (predicted(one, links, held) for one in models))
-            model = models[int(scores[1].mean() > scores[0].mean())]
-            for name in ("trend_weight", "hyperparameters", "weight"):
-                getattr(self, name).copy_(getattr(model, name))
+            without = self._validation_model(links, values, (0.0,))
+            score = validation_scores(links, predicted(model, links, held)).mean()
+            if validation_scores(links, predicted(without, links, held)).mean() > score:
+                model = without
+            self._copy_choices(model)
         if is_final:
             self._solve(links, values)
             if is_unlearnt:
@@ -213,37 +212,82 @@ class Kriging(Wrapper):
                 log.warning(
                     "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
                     "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
-                    *(links.task.monitor, own.mean().abs(), name, other.mean().abs(), name),
+                    *(links.task.monitor, trend.mean().abs(), name, fallback.mean().abs(), name),
                     100 * (1 - self.weight * (1 - self.trend_weight)),
                 )
             self._log()
         return model
 
     def _validation_model(
-        self, links: Links, values: Tensor, weights: Sequence[float] = WEIGHTS
+        self, links: Links, values: Tensor, weights: Sequence[float] = weights
     ) -> "Kriging":
         """Fits weights and hyperparameters, the trend weight one of ``weights``; a model of the
         training links.
         """
         split = links.split
-        self._fit_trend_weight(links, values, weights)
+        candidates = self._candidates(links, values, weights)
+        self.trend_weight.fill_(self.posterior.fit(links, candidates))
         training = replace(links, split=split.validating())
         model = Kriging(self.scene, self.trend, self.fallback_options)
-        model._make_fields(False)
-        model.trend_weight.copy_(self.trend_weight)
-        model.hyperparameters.copy_(self.hyperparameters)
-        if self.is_scalar:
-            model.process.load_state_dict(self.process.state_dict())
+        model._make_posterior(False)
+        model._copy_choices(self)
+        model.weight.fill_(1.0)
         model.fallback.fit(training)
         model._solve(training, values[: len(split.train)])
         model.to(self.weight.device)
-        if len(split.validation) and not self.is_scalar:
-            kriged, trend = predicted(model, links, split.validation), values[len(split.train) :]
-            blends = (blend(links.task, kriged, trend, weight) for weight in WEIGHTS)
-            means = [score.mean().item() for score in self._validation_scores(links, blends)]
-            self.weight.fill_(WEIGHTS[means.index(max(means))])
+        if len(split.validation) and self.posterior.chooses_weight:
+            # The likelihood alone would trust kriging too far where cubes of space are held out.
+            kriged = predicted(model, links, split.validation)
+            trend = values[len(split.train) :]
+            means = []
+            for weight in self.weights:
+                blended = blend(links.task, kriged, trend, weight)
+                means.append(validation_scores(links, blended).mean().item())
+            self.weight.fill_(self.weights[means.index(max(means))])
             model.weight.copy_(self.weight)
         return model
+
+    def _copy_choices(self, other: "Kriging") -> None:
+        """Takes weights and hyperparameters of another model."""
+        self.trend_weight.copy_(other.trend_weight)
+        self.weight.copy_(other.weight)
+        self.posterior.load_state_dict(other.posterior.state_dict())
+
+    def _candidates(
+        self, links: Links, values: Tensor, weights: Sequence[float]
+    ) -> dict[float, Tensor]:
+        """Residuals of the known links (k, m), ``thin_labels`` of them, by trend weight."""
+        index, task = links.split.known, links.task
+        # Labels that are never turned count number by number, and few numbers are enough.
+        is_turned = type(task).align is not Task.align
+        parts: dict[float, list[Tensor]] = {weight: [] for weight in weights}
+        for rows in torch.arange(len(index)).split(PART):
+            labels, trend = links.labels[index[rows]], values[rows]
+            fallback = predicted(self.fallback, links, index[rows])
+            if not is_turned:
+                labels, trend, fallback = map(thin_labels, (labels, trend, fallback))
+            for weight, residuals in parts.items():
+                mean = blend(task, trend, fallback, weight)
+                residuals.append(thin_labels(task.align(labels, mean) - mean))
+        return {weight: torch.cat(residuals) for weight, residuals in parts.items()}
+
+    def _solve(self, links: Links, values: Tensor) -> None:
+        """Kriges the residuals of the known links."""
+        index, weight, task = links.split.known, self.trend_weight.item(), links.task
+
+        def residuals(rows: Int[Tensor, " k"]) -> Tensor:
+            shape, dtype = self.scene.task.shape, self.scene.task.dtype
+            differences = torch.empty(len(rows), *shape, dtype=dtype)
+            for part in torch.arange(len(rows)).split(PART):
+                few = rows[part]
+                fallback = predicted(self.fallback, links, index[few])
+                mean = blend(task, values[few], fallback, weight)
+                labels = links.labels[index[few]]
+                differences[part] = (task.align(labels, mean) - mean).to(differences)
+            return differences
+
+        self.posterior.solve(links, residuals)
+        self.posterior.to(self.weight.device)
 
     def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` for a trend of paths.
@@ -251,234 +295,66 @@ class Kriging(Wrapper):
         The weight is 1 if ``FEWEST`` validation links or more have a mean score that rises by more
         than 1.5 standard errors, else 0.
         """
-        self._make_fields(True)
-        split, task, index = links.split, links.task, links.split.known
-        query, labels = links.query[index], links.labels[index]
-        aligned = task.align(labels, values)
-        residuals = aligned - values
-        trend: Any = self.trend
-        device = self.weight.device
-        equations, own = (
-            [],
-            [(query.receivers == receiver).nonzero()[:, 0] for receiver in range(len(self.fields))],
-        )
-        for rows in own:
-            margins = lambda part, rows=rows: trend.margins(query[rows[part]].to(device)).cpu()
-            equations.append(
-                Equations.of(query.transmitters[rows], margins, aligned[rows], residuals[rows])
-            )
-        validation_model = Kriging(self.scene, self.trend, self.fallback_options)
-        held = torch.arange(len(split.train), len(index))
-        plain, kriged, process = (
-            values[held],
-            values[held].clone(),
-            PathProcess.usual(self.scene.spacing),
-        )
-        for rows, field, known_ones in zip(own, validation_model.fields, equations, strict=True):
-            field.solve(known_ones[rows < len(split.train)], process)
-            for row in stages.track(rows[rows >= len(split.train)].tolist(), "kriging"):
-                strengths = field(query.transmitters[row : row + 1].double(), process)[0]
-                margins = trend.margins(query[row : row + 1].to(device)).cpu()[0]
-                kriged[row - len(split.train)] += torch.tensordot(strengths.to(kriged), margins, 1)
-        enough = len(single_readings(links, split.validation)) >= FEWEST
-        helps = enough and is_surely_better(
-            *self._validation_scores(links, (kriged, plain)), errors=1.5
-        )
-        for model in (self, validation_model) if is_final else (validation_model,):
-            model.trend_weight.fill_(1)
-            model.weight.fill_(helps)
-            model.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
-        for field, known_ones in zip(self.fields, equations, strict=True) if is_final else ():
-            field.solve(known_ones, process)
+        self._make_posterior(True)
+        split, index = links.split, links.split.known
+        query, device, count = links.query[index], self.weight.device, len(links.split.train)
+        aligned = links.task.align(links.labels[index], values)
+        equations = self.posterior.equations(query, aligned, aligned - values, device)
+        self.posterior.fit_process()
+        model = Kriging(self.scene, self.trend, self.fallback_options)
+        model._make_posterior(True)
+        model.posterior.load_state_dict(self.posterior.state_dict())
+        # Training links come first among the known ones, of a receiver too.
+        training = [
+            known[: int((query.receivers[:count] == receiver).sum())]
+            for receiver, known in enumerate(equations)
+        ]
+        model.posterior.solve_equations(training)
+        kriged = values[count:].clone()
+        # A link at a time: the margins of all of them may take gigabytes.
+        for row in stages.track(range(count, len(index)), "kriging"):
+            kriged[row - count] += model.posterior.mean_at(query[row : row + 1], device)
+        helps = False
+        if len(single_readings(links, split.validation)) >= FEWEST:
+            plain = validation_scores(links, values[count:])
+            helps = is_surely_better(validation_scores(links, kriged), plain, errors=1.5)
+        for one in (self, model) if is_final else (model,):
+            one.trend_weight.fill_(1)
+            one.weight.fill_(helps)
         if is_final:
+            self.posterior.solve_equations(equations)
             self._log()
-        self.fields.to(device)
-        return validation_model.to(device)
+        return model.to(device)
 
     @property
-    def scalar(self) -> list[ScalarProcess]:
-        """The process of labels of one real number, as ``GaussianProcess`` has it; none of others."""
-        return [self.process] if self.is_scalar else []
+    def by_paths(self) -> bool:
+        """True if strengths of paths are kriged, not labels."""
+        return self.posterior.by_paths
 
     def process_at(self, receiver: int) -> Process | None:
-        """The process of one receiver; None for kriged paths, whose strengths are processes."""
-        if self.is_scalar:
-            return self.process.at(receiver)
-        if self.by_paths:
-            return None
-        field, process = self.fields[receiver], self._hyperparameters
-        return process.at(scaled(field.places, 1 / process.scale), field.size(process).item() ** 2)
-
-    @property
-    def _hyperparameters(self) -> Any:
-        """The buffer ``hyperparameters`` by name, of kriged paths or labels."""
-        return (PathProcess if self.by_paths else Hyperparameters)(*self.hyperparameters.tolist())
-
-    def _log(self) -> None:
-        log.info(
-            "kriging: %s",
-            ", ".join(f"{name} {value:.3g}" for name, value in self.facts()["kriging"].items()),
-        )
+        return self.posterior.process_at(receiver)
 
     def deviations(self, batch: Batch) -> Tensor:
         """Standard deviations of the labels; of spectra means over their pixels.
 
         Those of kriged paths have no noise, and treat paths as if the elements resolved them all.
         """
-        query = batch.query
-        if self.is_scalar:
-            return self.process.deviations(coordinates(self.scene, query, 1.0), query.receivers)
-        process = self._hyperparameters
-        places = (
-            query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
-        )
-        found = places.new_zeros(len(query), *(self.scene.task.shape if self.by_paths else ()))
-        trend: Any = self.trend
-        for receiver in query.receivers.unique().tolist():
-            own, field = query.receivers == receiver, self.fields[receiver]
-            if self.by_paths:
-                variances = field.variances(places[own].double(), process)
-                squares = trend.margins(query[own]).abs().square()
-                found[own] = (variances.to(squares)[..., None, None] * squares).sum(1).to(found)
-            else:
-                found[own] = field.deviations(places[own], process).square()
-        return found.sqrt()
+        return self.posterior.deviations(batch)
 
-    def _fit_trend_weight(self, links: Links, values: Tensor, weights: Sequence[float]) -> None:
-        """Fits the trend weight, one of ``weights``, and the hyperparameters; ``values`` as for
-        ``_krige_labels``.
-        """
-        index = links.split.known
-        rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
-        residuals: dict[float, Any] = {trend_weight: [] for trend_weight in weights}
-        for part in torch.arange(len(index)).split(PART):
-            trio = (
-                links.labels[index[part]],
-                values[part],
-                predicted(self.fallback, links, index[part]),
-            )
-            # Labels that are never turned count number by number, and few numbers are enough.
-            labels, trend, fallback = (
-                map(thin_labels, trio) if type(links.task).align is Task.align else trio
-            )
-            for trend_weight, parts in residuals.items():
-                mean = blend(links.task, trend, fallback, trend_weight)
-                parts.append(thin_labels(links.task.align(labels, mean) - mean))
-
-        if self.is_scalar:
-            query = links.query[index]
-            left = [
-                torch.cat(residuals[trend_weight]).flatten().double() for trend_weight in WEIGHTS
-            ]
-            readings, folds = (
-                (coordinates(self.scene, query, 1.0), query.receivers),
-                folds_of(links, index),
-            )
-            # Training links' own residuals are too small, as the trend was trained on them:
-            # validation links decide.
-            held = (
-                torch.arange(len(links.split.train), len(index))
-                if len(links.split.validation)
-                else None
-            )
-
-            def refit(values: Tensor) -> float:
-                self.process.logarithms, self.process.choice = start
-                return self.process.refit(*readings, values, folds, held)
-
-            # Maximisations of the likelihood: 5 of the fit, 2 of each refit, or 1 without
-            # validation links.
-            with stages.stage("kriging", 6 if held is None else 5 + 2 * (len(left) + 1)):
-                self.process.cpu().fit(*readings, left[-1:], folds)
-                start = self.process.logarithms, self.process.choice
-                shares = torch.full((len(WEIGHTS),), 1 / len(WEIGHTS), dtype=torch.float64)
-                if held is not None:
-                    # Readings at one place err together: they count as one.
-                    each = len(held) / len(query.transmitters[held].unique(dim=0))
-                    costs = torch.tensor([refit(values) for values in left], dtype=torch.float64)
-                    shares = torch.softmax(
-                        -costs.clamp_min(-1e300) / each, 0
-                    )  # -inf if a trend explains all
-                refit(shares @ torch.stack(left))
-            self.trend_weight.fill_(shares @ torch.tensor(WEIGHTS, dtype=torch.float64))
-            return
-
-        def fitted(trend_weight: float, **options: int) -> tuple[Hyperparameters, float]:
-            left = torch.cat(residuals[trend_weight])
-            if left.is_complex():
-                left = (
-                    left
-                    * damping(left, thin_labels(links.labels[index]), links.query.receivers[index])[
-                        :, None
-                    ]
-                )
-            return fit_hyperparameters(self.scene, links, lambda some: left[rows[some]], **options)
-
-        found = {
-            trend_weight: fitted(trend_weight) for trend_weight in stages.track(weights, "kriging")
-        }
-        best = min(weights, key=lambda trend_weight: found[trend_weight][1])
-        # Residuals of a good trend correlate weakly with position: few links would overfit.
-        process, _ = fitted(best, most=1000) if best else found[best]
-        self.trend_weight.fill_(best)
-        self.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
-
-    def _solve(self, links: Links, values: Tensor) -> None:
-        """Kriges the residuals of the known links."""
-        index, trend_weight = links.split.known, self.trend_weight.item()
-        query, labels = links.query[index], links.labels[index]
-
-        def residuals(rows: Int[Tensor, " k"]) -> Tensor:
-            left = torch.empty(len(rows), *self.scene.task.shape, dtype=self.scene.task.dtype)
-            for part in torch.arange(len(rows)).split(PART):
-                some = rows[part]
-                mean = blend(
-                    links.task,
-                    values[some],
-                    predicted(self.fallback, links, index[some]),
-                    trend_weight,
-                )
-                left[part] = (links.task.align(labels[some], mean) - mean).to(left)
-            if left.is_complex():
-                left = left * damping(left, labels[rows], query.receivers[rows])[:, None, None]
-            return left
-
-        if self.is_scalar:
-            left = residuals(torch.arange(len(index))).double()
-            self.process.cpu().solve(coordinates(self.scene, query, 1.0), query.receivers, left)
-            self.process.to(self.weight.device)
-            return
-        process = self._hyperparameters
-        for receiver, field in enumerate(stages.track(self.fields, "kriging")):
-            rows = (query.receivers == receiver).nonzero()[:, 0]
-            field.solve(
-                coordinates(self.scene, query[rows], process.scale), residuals(rows), process
-            )
+    def _log(self) -> None:
+        facts = self.facts()["kriging"].items()
+        log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in facts))
 
     def forward(self, batch: Batch) -> Prediction:
-        query, trend_weight, weight = batch.query, self.trend_weight.item(), self.weight.item()
+        task, trend_weight, weight = self.scene.task, self.trend_weight.item(), self.weight.item()
         # A part without weight is not evaluated: that would cost its time, and a NaN of it would
         # count.
         trend = self.trend(batch).value if trend_weight > 0 or weight < 1 else None
         if weight == 0:
             return Prediction(trend, {})
-        task, fallback = self.scene.task, self.fallback(batch).value if trend_weight < 1 else None
+        fallback = self.fallback(batch).value if trend_weight < 1 else None
         value = blend(task, trend, fallback, trend_weight)
-        if self.is_scalar:
-            levels = self.process(coordinates(self.scene, query, 1.0), query.receivers).to(value)
-            return Prediction(blend(task, value + levels, trend, weight), {})
-        process = self._hyperparameters
-        places = (
-            query.transmitters if self.by_paths else coordinates(self.scene, query, process.scale)
-        )
-        for receiver in query.receivers.unique().tolist():
-            own = query.receivers == receiver
-            if self.by_paths:
-                strengths = self.fields[receiver](places[own].double(), process)
-                margins = self.trend.margins(query[own])
-                value[own] = value[own] + (strengths.to(value)[..., None, None] * margins).sum(1)
-            else:
-                value[own] = value[own] + self.fields[receiver](places[own], process.length, batch)
+        value = value + self.posterior.mean(batch, value)
         return Prediction(blend(task, value, trend, weight), {})
 
     @property
@@ -492,6 +368,28 @@ class Kriging(Wrapper):
         return self._alone.at_frequencies(frequencies)
 
     @property
+    def fold_count(self) -> int:
+        return 2
+
+    def unseen(self, links: Links) -> Iterator[Unseen]:
+        """Kriging of the training links with each half of the validation links, by whose other half
+        its weights and hyperparameters are chosen; one group alone chooses, too.
+        """
+        if not len(links.split.validation):
+            return
+        for chooses, asked in validation_halves(links):
+            if stages.is_up():
+                return
+            kriged = Kriging(links.scene, self.trend, self.fallback_options).to(self.device)
+            half = replace(links, split=links.split.choosing(chooses))
+            kriged = kriged.krige(half, is_final=False, by_paths=self.by_paths)
+            yield Unseen(kriged, single_readings(links, asked), links.split.train)
+
+    def take_hyperparameters(self, other: Model) -> None:
+        if isinstance(other, Kriging):
+            self.posterior.take_hyperparameters(other.posterior)
+
+    @property
     def _alone(self) -> Model:
         return self.trend if self.trend_weight > 0 else self.fallback
 
@@ -501,19 +399,15 @@ class Kriging(Wrapper):
 
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
-        facts: dict[str, Any] = {
-            "weight": self.weight.item(),
-            "trend_weight": self.trend_weight.item(),
-        }
-        if self.is_scalar:
-            facts |= {**self.process.facts(), "links": len(self.process.places)}
-            return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
-        facts |= self._hyperparameters.facts()
-        places = [len(field.places) for field in self.fields]
-        facts["links"] = sum(places)
-        if not self.by_paths:
-            facts["components"] = max(len(field.components) for field in self.fields)
-        return (call_optional(self.trend, "facts") or {}) | {"kriging": facts}
+        weights = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
+        return self.trend.facts() | {"kriging": weights | dict(self.posterior.facts())}
+
+
+def validation_scores(links: Links, values: Tensor) -> Float[Tensor, " k"]:
+    """Monitored scores of predictions of the validation links, higher ones better."""
+    task = links.task
+    scores = task.scores(links.labels[links.split.validation], values)[task.monitor].double()
+    return scores if task.higher_is_better else -scores
 
 
 def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -> Tensor:
@@ -532,16 +426,3 @@ def is_surely_better(
     """True if scores are higher by more than some standard errors; False of fewer than two."""
     gain = one - other
     return len(gain) > 1 and bool(gain.mean() > errors * gain.std() / math.sqrt(len(gain)))
-
-
-def predicted(
-    model: Model,
-    links: Links,
-    index: Int[Tensor, " k"],
-    frequencies: Float[Tensor, " s"] | None = None,
-) -> Tensor:
-    """Predictions of a model for some links, on the CPU; of channels at other subcarriers, if they
-    are given [Hz].
-    """
-    values = model.predict_batches(links.query[index], batch_size=64, frequencies=frequencies)
-    return torch.cat([part.cpu() for part in values])

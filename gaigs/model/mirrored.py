@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from gaigs.core.propagation import fit_gain
 from gaigs.core.query import Batch, Query
 from gaigs.core.scene import Scene, carriers, direct_gains, direct_waves
+from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting

@@ -7,7 +7,8 @@ from torch import Tensor
 from gaigs.core.query import Batch
 from gaigs.core.scene import Scene
 from gaigs.data import Links
-from gaigs.kriging.links import known_links, without_gross_errors
+from gaigs.kriging.gross_errors import without_gross_errors
+from gaigs.kriging.links import known_links
 from gaigs.model import Model, Prediction
 from gaigs.registry import register
 
@@ -33,9 +34,9 @@ class PathLoss(Model):
     def __init__(self, scene: Scene):
         super().__init__(scene)
         if not scene.task.is_scalar:
-            own = f"labels of task {scene.task.name!r}"
             raise ValueError(
-                f"model 'path_loss' predicts one real number a link, not {own}; take mean or knn"
+                "model 'path_loss' predicts one real number a link, not labels of task "
+                f"{scene.task.name!r}; take mean or knn"
             )
         self.register_buffer("levels", torch.full((len(scene.receivers),), torch.nan))  # T [dBm]
         self.register_buffer("exponents", torch.full((len(scene.receivers),), torch.nan))  # gamma
@@ -47,23 +48,19 @@ class PathLoss(Model):
         lines = []
         links = without_gross_errors(links)
         for index in known_links(links):
-            labels = links.labels[index].double()
-            decades = self._decades(
-                links.query.transmitters[index].double(), links.query.receivers[index]
-            )
+            query, labels = links.query[index], links.labels[index].double()
+            decades = self._decades(query.transmitters.double(), query.receivers)
             level, centre = labels.mean(), decades.mean()
-            labels, steps = labels - level, -10 * (decades - centre)
+            labels = labels - level
+            steps = -10 * (decades - centre)
             # Below a ratio of 1.01 one unit of the exponent changes the labels by less than 0.05
             # dB.
             is_spread = 10 ** (decades.max() - decades.min()) >= 1.01
             weight = steps.square().sum() * is_spread
             exponent = steps @ labels / weight if is_spread else weight
             errors = (labels - exponent * steps).square().sum()
-            lines.append(
-                torch.stack(
-                    (level, centre, exponent, weight, errors, len(index) - 1 - is_spread.to(weight))
-                )
-            )
+            freedom = len(index) - 1 - is_spread.to(weight)
+            lines.append(torch.stack((level, centre, exponent, weight, errors, freedom)))
         levels, centres, exponents, weights, errors, freedom = torch.stack(lines, 1)
         noise = errors.sum() / freedom.sum() if freedom.sum() else errors.new_tensor(torch.nan)
         exponents = shrunk(exponents, weights, noise)
@@ -79,12 +76,8 @@ class PathLoss(Model):
         self, transmitters: Float[Tensor, "b 3"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
         """log10 of the distances in [m]."""
-        return (
-            (transmitters - self.scene.positions(transmitters)[receivers])
-            .norm(dim=-1)
-            .clamp_min(0.1)
-            .log10()
-        )
+        positions = self.scene.positions(transmitters)[receivers]  # (b, 3)
+        return (transmitters - positions).norm(dim=-1).clamp_min(0.1).log10()
 
 
 def shrunk(
@@ -104,13 +97,12 @@ def shrunk(
     if noise.isnan():
         return torch.full_like(exponents, (weights @ exponents / total).item())
     noise = noise.clamp_min(1e-12)
+    # Scatter beyond chance (DerSimonian and Laird, 1986): Q - (r - 1) over the sum of weights less
+    # their squares over it.
     squares = weights @ (exponents - weights @ exponents / total).square()
     chance = ((weights > 0).sum() - 1) * noise
-    scatter = (
-        ((squares - chance) / (total - weights.square().sum() / total))
-        .nan_to_num(0, posinf=0)
-        .clamp_min(0)
-    )
+    scatter = (squares - chance) / (total - weights.square().sum() / total)
+    scatter = scatter.nan_to_num(0, posinf=0).clamp_min(0)
     precisions = weights / (scatter * weights + noise)  # of the exponents about the mean
     shares = scatter * precisions
     return shares * exponents + (1 - shares) * (precisions @ exponents / precisions.sum())

@@ -8,7 +8,7 @@ from gaigs.core.task.csi import Csi
 from gaigs.core.task.scalar import Scalar
 from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links
-from gaigs.model import Model, call_optional
+from gaigs.model import Model
 from gaigs.report import figures, style
 from gaigs.report.csi import CsiFigures
 from gaigs.report.curves import loss_curves, read_log
@@ -32,7 +32,7 @@ def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
 
     The model's ``primitives`` and ``learnt_room`` are drawn if it has them.
     """
-    learnt = call_optional(model, "learnt_room", links)
+    learnt = model.learnt_room(links)
     drawn = {"room": room(links, model.primitives, learnt)}
     if learnt is not None and learnt.paths:
         drawn["paths"] = paths(links, learnt)

@@ -16,9 +16,9 @@ from gaigs.core.stages import stage
 from gaigs.data import Links
 from gaigs.io.files import write_text
 from gaigs.kriging.links import check_known
-from gaigs.model import Model, call_optional, checkpoint
+from gaigs.model import Model, checkpoint
 from gaigs.processes import is_first, limited_threads, only_run
-from gaigs.registry import check_type, only_recorded, registry
+from gaigs.registry import check_type, name_of, only_recorded, registry
 from gaigs.report.table import metrics_table, verdict
 from gaigs.runs.folder import claim, is_configuration, store, stored_software, warn_of_changes
 
@@ -115,7 +115,7 @@ def load(path: str | Path, trust: bool = False) -> Model:
             "start it again, a finished one in another folder"
         )
     model: Any = checkpoint.load(folder / "best.ckpt", trust, stored_software(folder))
-    if config["kriging"] and not hasattr(model, "krige"):
+    if config["kriging"] and name_of(model) != "kriging":
         raise ValueError(
             f"the run in {folder} is not finished: it lacks its kriging\nstart it again, it goes on"
         )
@@ -204,10 +204,10 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         },
         "validation_score": validation[name][task.monitor].mean().item() if validation else None,
         "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
-    } | (call_optional(model, "facts") or {})
+    } | model.facts()
     if config["kriging"]:
         metrics["kriging"]["seconds"] = fitted.kriging_seconds
-    call_optional(model, "export", folder)
+    model.export(folder)
     if task.is_scalar:
         radio_map(model).save(folder / "radio_map.npz")
     from gaigs.report.run_figures import write_figures  # matplotlib is slow to import

@@ -25,11 +25,11 @@ from gaigs.data import Links
 from gaigs.data.compatibility import check_fit
 from gaigs.kriging.links import check_known
 from gaigs.model import Model, checkpoint
+from gaigs.model.answers import calibrated
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
 from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
 from gaigs.registry import call, configuration_of, digests, registry
-from gaigs.runs.evaluation import calibrated, is_trained
 from gaigs.runs.folder import ANOTHER, check_same_links, claim, fingerprint
 from gaigs.splatting.loss import Loss
 from gaigs.training.batches import Batches, InOrder
@@ -187,15 +187,15 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
     began, places = time.monotonic(), links.query[links.split.known].place_keys.unique()
     # Shares of the run's limit at which parts end: the search 0.3, the training 0.5, kriging and
     # intervals 0.8.
-    with stages.stage(until=0.3 if is_trained(model) else 0.8):
+    with stages.stage(until=0.3 if model.is_trained else 0.8):
         model.fit(links)
         if stages.is_up():
             stages.leave_out(f"the time for the fit of {name} was up")
-    if is_trained(model) and model.known_places is not None:  # a training before this one
+    if model.is_trained and model.known_places is not None:  # a training before this one
         places = torch.cat((places, model.known_places)).unique()
     model.known_places = places
     searched, start = time.monotonic() - began, count_gaussians(model)
-    if not is_trained(model):
+    if not model.is_trained:
         with stages.stage(until=0.8):
             model.calibration = calibrated(model, links)
         if is_first() and model.state_dict():

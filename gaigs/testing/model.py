@@ -11,7 +11,7 @@ from gaigs.core.geometry import Directions, ExtrapolationWarning, Grid
 from gaigs.core.query import Batch, Query
 from gaigs.core.scene import Scene
 from gaigs.data import Links
-from gaigs.model import Model, Prediction, call_optional
+from gaigs.model import Model, Prediction
 from gaigs.registry import registry
 from gaigs.splatting.gaussians import Gaussians
 from gaigs.testing import checks
@@ -157,9 +157,9 @@ def _check_evaluation(model: Model, batch: Batch, mixed: Batch) -> None:
 
 def _check_report(model: Model, batch: Batch) -> None:
     """Attributes and optional methods that a run reads."""
-    facts = call_optional(model, "facts")
+    facts = model.facts()
     require(
-        facts is None or isinstance(facts, dict),
+        isinstance(facts, dict),
         f"facts must be a dictionary, got {type(facts).__name__}",
     )
     try:
@@ -177,7 +177,7 @@ def _check_report(model: Model, batch: Batch) -> None:
         primitives is None or isinstance(primitives, Gaussians),
         "primitives must be Gaussians or None",
     )
-    rendering = call_optional(model, "rendering", batch)
+    rendering = model.rendering(batch)
     if callable(rendering):
         rendering()
 

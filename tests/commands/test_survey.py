@@ -11,13 +11,14 @@ from scipy.spatial.distance import cdist
 import gaigs
 from gaigs.commands.survey import MEAN, POINTS, heard, posterior, with_trend, without
 from gaigs.core.geometry import Frame, even_places
-from gaigs.kriging import scalar
 from gaigs.kriging.kernel import Process
+from gaigs.kriging.scalar import ScalarProcess
+from gaigs.kriging.scalar_fit import ScalarOptions
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(scalar, "NEAREST", 8)
+    monkeypatch.setattr(ScalarProcess, "options", ScalarOptions(neighbours=8))
 
 
 def fitted(links):

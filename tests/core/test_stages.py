@@ -14,7 +14,9 @@ from rich.console import Console
 import gaigs
 from gaigs import runs
 from gaigs.core import stages
-from gaigs.kriging import scalar
+from gaigs.kriging import scalar_fit
+from gaigs.kriging.scalar import ScalarProcess
+from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging
 from gaigs.testing import example_links
@@ -110,8 +112,8 @@ def test_what_cannot_be_shortened_is_announced(clock, caplog):
 
 
 def test_a_fit_of_a_process_ends_with_its_stage(clock, monkeypatch):
-    links, calls, one = example_links("rssi"), [], scalar.conditional
-    monkeypatch.setattr(scalar, "conditional", lambda *parts: calls.append(0) or one(*parts))
+    links, calls, one = example_links("rssi"), [], scalar_fit.conditional
+    monkeypatch.setattr(scalar_fit, "conditional", lambda *parts: calls.append(0) or one(*parts))
     counts = []
     for limit in (math.inf, 1e9, 10.0):
         calls.clear()
@@ -121,7 +123,7 @@ def test_a_fit_of_a_process_ends_with_its_stage(clock, monkeypatch):
             model = GaussianProcess(links.scene)
             model.fit(links)
         counts.append(len(calls))
-        assert model.scalar[0].weights.isfinite().all()
+        assert model.scalar.weights.isfinite().all()
     assert counts[0] == counts[1]
     assert counts[2] < counts[0] / 3
 
@@ -150,12 +152,12 @@ SMALL = (
 def unlimited(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unlimited")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scalar, "ITERATIONS", 2)
+        patch.setattr(ScalarProcess, "options", ScalarOptions(iterations=2))
         return folder, runs.run(gaigs.compose(*SMALL), folder)
 
 
 def test_a_limit_that_is_far_changes_nothing(unlimited, clock, monkeypatch, tmp_path):
-    monkeypatch.setattr(scalar, "ITERATIONS", 2)
+    monkeypatch.setattr(ScalarProcess, "options", ScalarOptions(iterations=2))
     folder, before = unlimited
     metrics = runs.run(gaigs.compose(*SMALL, "max_time=00:01:00:00"), tmp_path)
     assert metrics["left_out"] == []

@@ -11,7 +11,6 @@ from gaigs.data import divide
 from gaigs.data.gateways import estimate_place
 from gaigs.data.readings import marks_of
 from gaigs.data.rssi_wide import read
-from gaigs.runs.evaluation import unseen
 
 PLACES = np.array([[x, y] for x in range(8) for y in range(5)]) + 0.25
 GATEWAYS = {"00:cd:1a": (0.0, 0.0, 2.5), "00:cd:1b": (7.0, 4.0, 2.5), "00:cd:1c": (2.0, 4.5, 2.0)}
@@ -159,7 +158,7 @@ def test_test_links_do_not_move_a_gateway(survey, tmp_path):
 def test_links_that_calibrate_do_not_move_a_gateway(survey):
     links = divide(survey(table()), {"name": "random"})
     model = gaigs.train("path_loss", links)
-    for fold, _, known in unseen(model, links):
+    for fold, _, known in model.unseen(links):
         own = known[links.query.receivers[known] == 0]
         place, _ = estimate_place(links.query.transmitters[own], links.labels[own])
         assert torch.equal(fold.scene.receivers[0].pose.position, place)

@@ -14,21 +14,15 @@ from scipy.spatial.distance import cdist
 from gaigs.core.query import Query
 from gaigs.core.task.csi import Csi
 from gaigs.data import Split
-from gaigs.kriging import fit
-from gaigs.kriging.fit import NUGGETS, HeldOut, hold_out, negative_log_likelihood
+from gaigs.kriging.fit import HeldOut, hold_out, negative_log_likelihood
 from gaigs.kriging.kernel import kriging_weights
-from gaigs.model import Model, gaussian_process
+from gaigs.model import Model
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.registry import registry
 from gaigs.testing import example_links
 
 TASKS = pytest.mark.parametrize("task", ["spectrum", "csi", "one channel"])
 BOX = torch.tensor([6.0, 4.0, 2.0])
-
-
-@pytest.fixture(autouse=True)
-def few_neighbours(monkeypatch):
-    monkeypatch.setattr(fit, "AROUND", 16)
 
 
 def make(task="rssi", count=60, carriers=()):
@@ -113,8 +107,8 @@ def test_the_variance_is_the_conditional_one():
 @TASKS
 def test_many_links_are_predicted_from_the_nearest(task, monkeypatch):
     links = make(task)
-    monkeypatch.setattr(gaussian_process, "LIMIT", 20)
-    monkeypatch.setattr(gaussian_process, "NEIGHBOURS", 7)
+    monkeypatch.setattr(GaussianProcess, "limit", 20)
+    monkeypatch.setattr(GaussianProcess, "neighbours", 7)
     model, asked = fitted(links), BOX * torch.rand(5, 3)
     found, expected = model.predict(asked, 1), kriged(model, links, 1, asked, nearest=7)
     assert found.dtype == links.task.dtype
@@ -144,7 +138,7 @@ def test_places_measured_twice_do_not_break_the_matrices(task):
     positions = links.query.transmitters
     positions[4:40] = positions[:4].repeat(9, 1)
     model = fitted(links)
-    model.process = model.process._replace(nugget=NUGGETS[0])
+    model.process = model.process._replace(nugget=1e-4)
     model.solved = [model._solve(index, model._factor(index)) for index in model.known]
     found, expected = model.predict(positions[:2], 0), kriged(model, links, 0, positions[:2])
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
@@ -207,6 +201,17 @@ def test_a_receiver_with_hardly_a_link_is_predicted(first, count):
     labels = links.labels[known]
     assert found.isfinite().all()
     assert (found - labels.mean()).abs().max() <= (labels - found.mean()).abs().max() + 1e-6
+
+
+def test_a_state_whose_process_is_in_a_list_loads():
+    links = make("rssi")
+    model = fitted(links)
+    state = {
+        name.replace("scalar.", "scalar.0."): part for name, part in model.state_dict().items()
+    }
+    fresh = GaussianProcess(links.scene)
+    fresh.load_state_dict(state)
+    assert torch.equal(fresh.predict(links.query), model.predict(links.query))
 
 
 # --- faults ---

@@ -7,8 +7,9 @@ import torch
 
 import gaigs
 from gaigs.core.query import Batch
-from gaigs.kriging import scalar
-from gaigs.kriging.links import without_gross_errors
+from gaigs.kriging.gross_errors import without_gross_errors
+from gaigs.kriging.scalar import ScalarProcess
+from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.path_loss import PathLoss
 
@@ -44,7 +45,7 @@ def test_clean_levels_all_count():
 @pytest.mark.parametrize("model", [PathLoss, GaussianProcess])
 @pytest.mark.parametrize("size", [70.0, -100.0])
 def test_one_wrong_level_does_not_move_a_fit(model, size, monkeypatch):
-    monkeypatch.setattr(scalar, "ITERATIONS", 5)
+    monkeypatch.setattr(ScalarProcess, "options", ScalarOptions(iterations=5))
 
     def error(links):
         one = model(links.scene)

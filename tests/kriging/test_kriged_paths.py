@@ -15,7 +15,6 @@ from gaigs.data import Split
 from gaigs.kriging.paths import Equations, PathField, PathProcess, conjugate_gradients
 from gaigs.model.kriging import Kriging
 from gaigs.model.mirrored import MirroredSplatting
-from gaigs.runs.evaluation import unseen
 from gaigs.testing import example_links
 
 PROCESS = PathProcess(2.0, 0.1, 0.4)
@@ -166,9 +165,9 @@ def test_variance_grows_away_from_known_places():
     variance = model.deviations(links.batch(torch.arange(5))).square()
     assert variance.shape == (5, *links.task.shape)
     assert (variance > 0).all()
-    process = PathProcess(*model.hyperparameters.tolist())
+    process = model.posterior.process
     places = links.query.transmitters[:5].double()
-    near, far = (model.fields[0].variances(at, process) for at in (places, places + 20))
+    near, far = (model.posterior.fields[0].variances(at, process) for at in (places, places + 20))
     assert (near < far).all()
     torch.testing.assert_close(far, torch.full_like(far, process.deviation**2), rtol=1e-2, atol=0)
     trend.double()
@@ -210,4 +209,4 @@ def test_halves_of_the_validation_links_keep_what_all_of_them_chose(by_paths, mo
     model.krige(links, by_paths=by_paths)
     # Each half would choose the other.
     monkeypatch.setattr("gaigs.model.kriging.is_surely_better", lambda *_, **__: by_paths)
-    assert [one.by_paths for one, *_ in unseen(model, links)] == [by_paths] * 2
+    assert [one.by_paths for one, *_ in model.unseen(links)] == [by_paths] * 2

@@ -10,7 +10,8 @@ import torch
 import gaigs
 from gaigs import runs
 from gaigs.data import load
-from gaigs.kriging import fit, scalar
+from gaigs.kriging.scalar import ScalarProcess
+from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model import checkpoint
 from gaigs.runs import evaluation
 from gaigs.training.descent import Descent
@@ -27,9 +28,7 @@ SMALL = (
 def quick():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(runs, "radio_map", Mock())
-        patch.setattr(fit, "AROUND", 8)
-        patch.setattr(scalar, "NEAREST", 8)
-        patch.setattr(scalar, "ITERATIONS", 2)
+        patch.setattr(ScalarProcess, "options", ScalarOptions(neighbours=8, iterations=2))
         yield
 
 

@@ -12,12 +12,14 @@ from torch import nn
 from gaigs.commands.survey import posterior
 from gaigs.core.query import Batch, Query
 from gaigs.data import Split
-from gaigs.kriging import field, fit, scalar
-from gaigs.kriging.field import principal_components
+from gaigs.kriging import field, fit
+from gaigs.kriging.field import FieldPosterior, principal_components
 from gaigs.kriging.fit import Hyperparameters
-from gaigs.kriging.links import at_directions, coordinates, thinned
-from gaigs.kriging.scalar import Choice, ScalarProcess
-from gaigs.model import Model, Prediction, call_optional, kriging
+from gaigs.kriging.likelihood import Choice
+from gaigs.kriging.links import at_directions, coordinates, limit_known
+from gaigs.kriging.scalar import ScalarProcess
+from gaigs.kriging.scalar_fit import ScalarOptions
+from gaigs.model import Model, Prediction, kriging
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging
 from gaigs.registry import registry
@@ -47,8 +49,7 @@ class Trained(Model):
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
     monkeypatch.setitem(registry("model")._registered, "trained", Trained)
-    monkeypatch.setattr(fit, "AROUND", 8)
-    monkeypatch.setattr(scalar, "NEAREST", 8)
+    monkeypatch.setattr(ScalarProcess, "options", ScalarOptions(neighbours=8))
 
 
 def make(task="rssi", count=100, carriers=(), smooth=0.0, trained=0.0, noise=0.0):
@@ -110,7 +111,7 @@ def half(monkeypatch):
         return 0.0  # as likely as any other
 
     costs = []
-    monkeypatch.setattr(kriging, "fit_hyperparameters", fixed)
+    monkeypatch.setattr(field, "fit_hyperparameters", fixed)
     monkeypatch.setattr(kriging, "is_surely_better", lambda *_, **__: False)
     monkeypatch.setattr(ScalarProcess, "fit", fixed_scalar)
     monkeypatch.setattr(ScalarProcess, "refit", fixed_scalar)
@@ -171,7 +172,7 @@ def test_predictions_are_the_formula(task, carriers, half, monkeypatch):
     frequencies = torch.tensor([1e9, 1.3e9, 2e9, 4e9]) if carriers else None
     query = Query(BOX * torch.rand(4, 3), torch.ones(4, dtype=torch.long), frequencies)
     coarse, _ = kriged(links)
-    monkeypatch.setattr(field, "LEFT", 0.0)
+    monkeypatch.setattr(FieldPosterior, "share", 0.0)
     model, validation_model = kriged(links)
     expected = formula(model, links, query, own(links, links.split.known, 1))
     np.testing.assert_allclose(
@@ -201,10 +202,22 @@ def test_predictions_are_the_formula(task, carriers, half, monkeypatch):
     torch.testing.assert_close(model.predict(query), parts)
 
 
+@TASKS
+def test_a_state_with_the_names_of_before_loads(task, half):
+    links = make(task, smooth=1.0)
+    model, _ = kriged(links)
+    state = {name.removeprefix("posterior."): part for name, part in model.state_dict().items()}
+    if task == "rssi":
+        state["hyperparameters"] = torch.full((3,), np.nan)
+    fresh = Kriging(links.scene, Trained(links.scene))
+    fresh.load_state_dict(state)
+    assert torch.equal(fresh.predict(links.query), model.predict(links.query))
+
+
 def test_facts_of_trend_and_kriging_are_reported(half):
     links = make("spectrum", smooth=1.0)
     model, _ = kriged(links)
-    components = max(len(field.components) for field in model.fields)
+    components = max(len(field.components) for field in model.posterior.fields)
     facts = {
         "weight": 1.0,
         "trend_weight": 0.5,
@@ -215,18 +228,18 @@ def test_facts_of_trend_and_kriging_are_reported(half):
     }
     assert model.facts() == {"kriging": facts}
     assert model.primitives is None
-    assert call_optional(model, "rendering", links.batch(links.split.test)) is None
+    assert model.rendering(links.batch(links.split.test)) is None
 
 
-def test_many_links_are_thinned_evenly(half, monkeypatch):
-    monkeypatch.setattr(kriging, "LIMIT", 20)
+def test_many_links_are_thinned_evenly(half):
     links = make("rssi", smooth=1.0)
-    few = thinned(links, 20)
+    few = limit_known(links, 20)
     assert [len(few.known(receiver)) for receiver in (0, 1)] == [20, 20]
     for part, whole in zip(few.split.parts().values(), links.split.parts().values(), strict=True):
         assert {*part.tolist()} <= {*whole.tolist()}
     assert torch.equal(few.split.test, links.split.test)
-    model, _ = kriged(links)
+    model = Kriging(links.scene, Trained(links.scene))
+    model.krige(links, most=20)
     query = links.query[own(links, links.split.test, 0)]
     expected = formula(model, links, query, few.known(0))
     np.testing.assert_allclose(model.predict(query), expected, rtol=0, atol=1e-4)
@@ -246,7 +259,7 @@ def test_without_validation_links_kriging_counts_fully(half):
 
 @TASKS
 def test_a_trend_without_information_leaves_the_plain_process(task, monkeypatch):
-    monkeypatch.setattr(field, "LEFT", 0.0)
+    monkeypatch.setattr(FieldPosterior, "share", 0.0)
     links = make(
         task, 400 if task == "rssi" else 100, smooth=1.0, noise=0.1
     )  # one number says little
@@ -264,7 +277,9 @@ def test_a_trend_without_information_leaves_the_plain_process(task, monkeypatch)
         0.1 if task == "rssi" else 0
     )  # of RSSI a mean over what is likely
     if task != "rssi":
-        assert model.hyperparameters.tolist() == pytest.approx([*plain.process], nan_ok=True)
+        assert model.posterior.hyperparameters.tolist() == pytest.approx(
+            [*plain.process], nan_ok=True
+        )
     query = links.query[links.split.test]
     error = 0.1 if task == "rssi" else 0.02
     torch.testing.assert_close(model.predict(query), plain.predict(query), rtol=0, atol=error)
@@ -300,7 +315,7 @@ def test_a_trend_that_was_not_learnt_is_left_out_where_scores_are_higher_without
         fit.fit_hyperparameters(*parts, **options)[0],
         next(numbers),
     )  # first the trend
-    monkeypatch.setattr(kriging, "fit_hyperparameters", likely)
+    monkeypatch.setattr(field, "fit_hyperparameters", likely)
     model = Kriging(links.scene, Trained(links.scene))
     model.fit(links)
     assert model.trend_weight == 0
@@ -343,8 +358,7 @@ def test_where_kriging_does_harm_its_weight_is_zero(half):
 
 @pytest.mark.parametrize("carriers", [(), (2.4e9, 5e9)])
 @pytest.mark.parametrize("kind", [GaussianProcess, Kriging])
-def test_surveys_see_the_process_of_the_predictions(kind, carriers, monkeypatch):
-    monkeypatch.setattr(fit, "AROUND", 100)
+def test_surveys_see_the_process_of_the_predictions(kind, carriers):
     links = make("spectrum", carriers=carriers, smooth=1.0)
     model = (
         GaussianProcess(links.scene)
@@ -367,15 +381,13 @@ def test_surveys_see_the_process_of_the_predictions(kind, carriers, monkeypatch)
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.complex64])
 @pytest.mark.parametrize("exact", [True, False])
-def test_components_are_the_fewest_that_leave_little_out(dtype, exact, monkeypatch):
-    monkeypatch.setattr(field, "LEFT", 0.02)
-    monkeypatch.setattr(field, "EXACT", 512 if exact else 10)
+def test_components_are_the_fewest_that_leave_little_out(dtype, exact):
+    options = {"share": 0.02, "most": 100, "exact": 512 if exact else 10}
     generator = torch.Generator().manual_seed(0)
     draw = lambda *shape: torch.randn(*shape, dtype=dtype, generator=generator)
     residuals = draw(150, 60) @ (2.0 ** -torch.arange(60))[:, None].to(dtype).mul(draw(60, 200))
-    monkeypatch.setattr(field, "MOST", 100)
     state = torch.random.get_rng_state()
-    components = principal_components(residuals)
+    components = principal_components(residuals, **options)
     assert torch.equal(torch.random.get_rng_state(), state)
     assert components.abs().amax(1) == pytest.approx(1)
     values = np.linalg.svd(residuals.numpy(), compute_uv=False).astype(float)
@@ -386,9 +398,7 @@ def test_components_are_the_fewest_that_leave_little_out(dtype, exact, monkeypat
     assert np.linalg.norm(over) ** 2 / np.linalg.norm(residuals) ** 2 == pytest.approx(
         left(len(components)), rel=0.02
     )
-    monkeypatch.setattr(field, "MOST", 3)
-    monkeypatch.setattr(field, "LEFT", 0.0)
-    assert len(principal_components(residuals)) == 3
+    assert len(principal_components(residuals, **options | {"share": 0.0, "most": 3})) == 3
 
 
 def test_components_of_millions_of_numbers_leave_as_little_out():
@@ -398,7 +408,10 @@ def test_components_of_millions_of_numbers_leave_as_little_out():
     residuals = draw(500, 150) * torch.logspace(0, -2.5, 150) @ draw(150, 32400)
     basis, _ = torch.linalg.qr(principal_components(residuals).T)
     over = residuals - residuals @ basis @ basis.T
-    assert over.double().square().sum() < 1.01 * field.LEFT * residuals.double().square().sum()
+    assert (
+        over.double().square().sum()
+        < 1.01 * FieldPosterior.share * residuals.double().square().sum()
+    )
 
 
 def test_residuals_of_zero_are_kriged_to_zero():

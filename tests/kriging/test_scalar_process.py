@@ -15,9 +15,11 @@ from scipy.spatial.distance import cdist
 import gaigs
 from gaigs.core.query import Query
 from gaigs.data import Split
-from gaigs.kriging import scalar
+from gaigs.kriging.likelihood import Choice, conditional, covariances, log_density
 from gaigs.kriging.links import coordinates, folds_of
-from gaigs.kriging.scalar import Choice, ScalarProcess, conditional, covariances, log_density
+from gaigs.kriging.neighbours import Readings
+from gaigs.kriging.scalar import ScalarProcess
+from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.testing import example_links
 
@@ -30,7 +32,7 @@ MATERN = {
 
 @pytest.fixture(autouse=True)
 def few_neighbours(monkeypatch):
-    monkeypatch.setattr(scalar, "NEAREST", 16)
+    monkeypatch.setattr(ScalarProcess, "options", ScalarOptions(neighbours=16))
 
 
 def drawn(
@@ -78,6 +80,14 @@ def known(links):
     return coordinates(links.scene, query, 1.0), query.receivers, links.labels[index].double()
 
 
+def first(readings, count):
+    """The readings around the first ones, each without itself."""
+    rows = torch.arange(count)
+    places, receivers = readings.places[rows], readings.receivers[rows]
+    every = torch.arange(len(readings.places))
+    return readings.around(places, receivers, readings.nearest(places, receivers, rows, every))
+
+
 @pytest.mark.parametrize("degrees", [math.inf, 4.0])
 @pytest.mark.parametrize(("variance", "noise"), [(4.0, 0.5), (0.2, 3.0), (1.0, 1.0)])
 def test_the_density_is_that_of_a_normal_variable_plus_noise(degrees, variance, noise):
@@ -95,7 +105,7 @@ def test_the_density_is_that_of_a_normal_variable_plus_noise(degrees, variance, 
 
 @pytest.mark.parametrize("smoothness", [0.5, 1.5])
 @pytest.mark.parametrize("carriers", [(), (1e9, 1.7e9, 2.9e9)])
-def test_means_and_deviations_are_the_formula(smoothness, carriers, monkeypatch):
+def test_means_and_deviations_are_the_formula(smoothness, carriers):
     links = drawn(count=60, carriers=carriers)
     places, receivers, values = known(links)
     process = ScalarProcess(links.scene)
@@ -117,11 +127,9 @@ def test_means_and_deviations_are_the_formula(smoothness, carriers, monkeypatch)
     # Student's t of four degrees of freedom has twice its squared scale as variance.
     expected = np.sqrt(9 - np.einsum("ij,jk,ik->i", towards, solve, towards) + 2 * 4)
     np.testing.assert_allclose(process.deviations(asked, query.receivers), expected, rtol=1e-6)
-    with monkeypatch.context() as few:
-        few.setattr(scalar, "MANY", 0)
-        np.testing.assert_allclose(
-            process.deviations(asked, query.receivers), expected, rtol=0.03
-        )  # of 42 readings 16
+    process.options = ScalarOptions(neighbours=16, many=0)  # of 42 readings 16
+    np.testing.assert_allclose(process.deviations(asked, query.receivers), expected, rtol=0.03)
+    process.options = ScalarProcess.options
     fresh = ScalarProcess(links.scene)
     fresh.load_state_dict(process.state_dict())
     assert torch.equal(fresh(asked, query.receivers), process(asked, query.receivers))
@@ -133,18 +141,13 @@ def test_means_and_deviations_are_the_formula(smoothness, carriers, monkeypatch)
 def test_the_gradient_is_finite_where_places_coincide():
     links = drawn(count=40, carriers=(1e9, 2e9))
     links.query.transmitters[1::2] = links.query.transmitters[::2]
-    process = ScalarProcess(links.scene)
-    process.places, process.receivers, values = known(links)
-    rows = torch.arange(10)
-    nearest = process._nearest(
-        process.places[rows], process.receivers[rows], rows, torch.arange(len(values))
-    )
-    around = process._around(process.places[rows], process.receivers[rows], nearest)
+    *readings, values = known(links)
+    around = first(Readings(links.scene, *readings, 16), 10)
     logarithms = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
     scale = torch.ones((), dtype=torch.float64, requires_grad=True)
     between = covariances(around, logarithms.exp(), Choice(0.5, math.inf, scale))
     parts = conditional(
-        between, values[around.rows], torch.ones_like(around.found, dtype=torch.float64)
+        between, values[around.rows], torch.ones_like(around.exists, dtype=torch.float64)
     )
     sum(part.sum() for part in parts).backward()
     assert logarithms.grad.isfinite().all()
@@ -153,13 +156,8 @@ def test_the_gradient_is_finite_where_places_coincide():
 
 def test_gradients_are_those_of_finite_differences():
     links = drawn(count=40)
-    process = ScalarProcess(links.scene)
-    process.places, process.receivers, values = known(links)
-    rows = torch.arange(3)
-    nearest = process._nearest(
-        process.places[rows], process.receivers[rows], rows, torch.arange(len(values))
-    )
-    around = process._around(process.places[rows], process.receivers[rows], nearest)
+    *readings, values = known(links)
+    around = first(Readings(links.scene, *readings, 16), 3)
 
     def both(logarithms, noises):
         return conditional(
@@ -167,21 +165,21 @@ def test_gradients_are_those_of_finite_differences():
         )
 
     point = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
-    noises = torch.ones_like(around.found, dtype=torch.float64, requires_grad=True)
+    noises = torch.ones_like(around.exists, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(both, (point, noises))
 
 
 def test_readings_of_the_own_fold_do_not_predict():
     links = drawn(count=60)
     links.query.transmitters[20:40] = links.query.transmitters[:20]
-    process = ScalarProcess(links.scene)
-    process.places, process.receivers, _ = known(links)
+    places, receivers, _ = known(links)
     folds = folds_of(links, links.split.train)
-    rows, found = process._nearest(process.places, process.receivers, folds, folds)
-    assert found.any(1).all()
-    assert (folds[rows] != folds[:, None])[found].all()
-    same = (process.places[rows] == process.places[:, None]).all(-1)
-    assert not (same & found).any(), "readings at one place are one fold"
+    readings = Readings(links.scene, places, receivers, 16)
+    rows, exists = readings.nearest(places, receivers, folds, folds)
+    assert exists.any(1).all()
+    assert (folds[rows] != folds[:, None])[exists].all()
+    same = (places[rows] == places[:, None]).all(-1)
+    assert not (same & exists).any(), "readings at one place are one fold"
 
 
 # --- choices ---
@@ -196,7 +194,7 @@ def test_kernel_tails_and_hyperparameters_are_those_of_the_draw(smoothness, degr
     facts = model.facts()
     assert facts["smoothness"] == smoothness
     assert facts["degrees_of_freedom"] == (0 if math.isinf(degrees) else 4)
-    length, signal, noise = model.scalar[0].logarithms.exp().unbind(1)
+    length, signal, noise = model.scalar.logarithms.exp().unbind(1)
     # Within a box of few lengths, length and variance are hardly known apart, but well as this
     # power of both.
     slope = lambda length, signal: signal**2 / length ** (2 * smoothness)
@@ -207,7 +205,7 @@ def test_kernel_tails_and_hyperparameters_are_those_of_the_draw(smoothness, degr
 
 
 def test_each_receiver_has_a_length_of_its_own():
-    process = fitted(drawn((0.7, 4.0), noise=0.3, count=500), trend={"name": "mean"}).scalar[0]
+    process = fitted(drawn((0.7, 4.0), noise=0.3, count=500), trend={"name": "mean"}).scalar
     short, long = process.logarithms[:, 0].exp()
     assert long > 1.5 * short
 
@@ -215,7 +213,7 @@ def test_each_receiver_has_a_length_of_its_own():
 def test_each_receiver_has_a_noise_of_its_own():
     links = drawn(signal=1.0, noise=0.5, count=60)
     links.labels[60:] += 8 * torch.randn(60, generator=torch.Generator().manual_seed(0))
-    process = fitted(links).scalar[0]
+    process = fitted(links).scalar
     quiet, noisy = process.deviations(process.places[:1].expand(2, -1), torch.arange(2))
     assert quiet < 2
     assert noisy > 5
@@ -243,8 +241,7 @@ def test_a_few_readings_that_are_far_out_hardly_count():
     errors = [(model.predict(query) - labels).abs().mean() for model in (plain, robust)]
     assert errors[1] < 1.3 * errors[0]
     factors = (
-        robust.scalar[0].variances
-        / (2 * robust.scalar[0].logarithms[robust.scalar[0].receivers, 2]).exp()
+        robust.scalar.variances / (2 * robust.scalar.logarithms[robust.scalar.receivers, 2]).exp()
     )
     is_spoilt = torch.isin(torch.cat(robust.known), rows)
     assert factors[is_spoilt].min() > 10 * factors[~is_spoilt].median()
@@ -254,7 +251,7 @@ def test_intervals_of_the_process_hold_their_share():
     links = drawn((1.0, 2.0), 0.5, 5.0, 1.0, 4.0, 800)
     model, test = fitted(links), links.split.test
     query = links.query[test]
-    deviations = model.scalar[0].deviations(coordinates(links.scene, query, 1.0), query.receivers)
+    deviations = model.scalar.deviations(coordinates(links.scene, query, 1.0), query.receivers)
     within = (
         ((model.predict(query) - links.labels[test]).abs() <= 1.645 * deviations).double().mean()
     )
@@ -304,7 +301,7 @@ def test_levels_beside_a_dense_track_stay_those_of_a_receiver():
     links = gaigs.links(
         task="rssi", transmitters=places, receivers=[[9.0, 5.0, 2.0]], labels=levels, test=0.0
     )
-    process = fitted(links).scalar[0]
+    process = fitted(links).scalar
     size = process.values.square().mean().sqrt()
     assert process.logarithms[0, 1].exp() < 2.5 * size
     away = torch.tensor([[2.0, 9.0, 0.0]]).double()

@@ -21,7 +21,7 @@ from gaigs.core.task.csi import Csi
 from gaigs.core.task.rssi import Rssi
 from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Split
-from gaigs.kriging.links import without_gross_errors
+from gaigs.kriging.gross_errors import without_gross_errors
 from gaigs.registry import registry
 from gaigs.runs import evaluation
 

@@ -5,7 +5,8 @@ import pytest
 import torch
 
 import gaigs
-from gaigs.kriging import scalar
+from gaigs.kriging.scalar import ScalarProcess
+from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model import checkpoint
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.gaigs import GaussianSplatting
@@ -77,8 +78,8 @@ def test_channels_deviate_by_the_size_of_their_complex_difference():
 
 
 def test_kriging_has_the_ensemble_as_its_trend(tmp_path, monkeypatch):
-    monkeypatch.setattr(scalar, "NEAREST", 4)
-    monkeypatch.setattr(scalar, "ITERATIONS", 2)
+    options = ScalarOptions(neighbours=4, iterations=2)
+    monkeypatch.setattr(ScalarProcess, "options", options)
     links = gaigs.links("synthetic_rssi", transmitters=20, order=0)
     model = gaigs.train("gaigs", links, ensemble=2, kriging=True, folder=tmp_path, **FEW)
     assert isinstance(gaigs.load(tmp_path / "best.ckpt").trend, Ensemble)

@@ -237,3 +237,15 @@ def test_places_measured_twice_do_not_predict_themselves():
     for model, part in zip(models, (links, double), strict=True):
         model.fit(part)
     assert models[0].scale == pytest.approx(models[1].scale)
+
+
+def test_what_a_run_asks_for_is_empty_by_default(links):
+    model = Mean(links.scene)
+    model.fit(links)
+    batch = links.batch(links.split.test[:1])
+    assert model.facts() == {}
+    assert model.learnt_paths(batch.query) == []
+    answers = model.rendering(batch), model.learnt_room(links), model.process_at(0)
+    assert answers == (None, None, None)
+    assert model.deviations(batch) is None
+    assert not model.has_margins

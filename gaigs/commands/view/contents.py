@@ -18,7 +18,7 @@ from gaigs.core.query import Query, evenly
 from gaigs.core.task.scalar import with_unit
 from gaigs.data import Links
 from gaigs.data.compatibility import check_fit
-from gaigs.model import Model, call_optional
+from gaigs.model import Model
 from gaigs.report.csi import decibels, impulse_response
 from gaigs.splatting.gaussians import SH_DC
 
@@ -107,7 +107,7 @@ class Contents:
             )
             facts |= {"edges": plain(self.links.edges), "places": plain(known)}
         with self.lock:
-            gaussians, learnt = self.model.primitives, call_optional(self.model, "learnt_room")
+            gaussians, learnt = self.model.primitives, self.model.learnt_room()
         if gaussians is not None:
             with torch.no_grad():
                 strengths = gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)
@@ -171,7 +171,7 @@ class Contents:
             [place], receiver, self.frequency, self._names, self.scene.frequencies
         )
         with self.lock:
-            paths = call_optional(self.model, "learnt_paths", query) or []
+            paths = self.model.learnt_paths(query)
         answer["paths"] = [
             {"points": plain(path.points), "power": plain(path.power_db)} for path in paths
         ]

@@ -10,13 +10,17 @@ from scipy import stats
 from scipy.integrate import quad
 
 import gaigs
-from gaigs.calibration import Calibration, Estimate, interval_scores, nearest, summarise_intervals
+from gaigs.calibration import Calibration, Estimate
+from gaigs.calibration.conformal import nearest
+from gaigs.calibration.scores import interval_scores, summarise_intervals
 from gaigs.core.antenna import Array, Receiver
 from gaigs.core.geometry import Pose, Rays
 from gaigs.core.query import Query
 from gaigs.core.task.csi import Csi
 from gaigs.data import Split
-from gaigs.kriging import scalar
+from gaigs.kriging.scalar import ScalarProcess
+from gaigs.kriging.scalar_fit import ScalarOptions
+from gaigs.model import answers
 from gaigs.model.kriging import Kriging
 from gaigs.report.intervals import intervals
 from gaigs.runs import evaluation
@@ -353,16 +357,18 @@ def test_look_ups_are_calibrated_by_all_known_links(validation):
 @pytest.mark.parametrize("data", ["synthetic_rssi", "synthetic_csi"])
 def test_folds_state_deviations_with_the_hyperparameters_of_all_links(monkeypatch, data):
     links = gaigs.links(data, transmitters=30, order=0)
-    model, spreads, stating = gaigs.train("gaussian_process", links), evaluation.spreads, []
+    model, spreads, stating = gaigs.train("gaussian_process", links), answers.spreads, []
     monkeypatch.setattr(
-        evaluation, "spreads", lambda one, *rest: stating.append(one) or spreads(one, *rest)
+        answers, "spreads", lambda one, *rest: stating.append(one) or spreads(one, *rest)
     )
-    evaluation.calibrated(model, links)
+    answers.calibrated(model, links)
     assert len(stating) == 5
     for one in stating:
-        assert one.process == model.process or one.scalar
-        for process, whole in zip(one.scalar, model.scalar, strict=True):
-            torch.testing.assert_close(process.logarithms, whole.logarithms, rtol=0, atol=0)
+        if one.scalar is None:
+            assert one.process == model.process
+        else:
+            whole = model.scalar.logarithms
+            torch.testing.assert_close(one.scalar.logarithms, whole, rtol=0, atol=0)
 
 
 @pytest.mark.usefixtures("quick")
@@ -370,16 +376,17 @@ def test_halves_state_deviations_with_the_hyperparameters_of_all_links(monkeypat
     links = gaigs.links("synthetic_rssi", transmitters=60, order=0, validation=0.3)
     model, spreads, stating = (
         Kriging(links.scene, barely_trained(links)).krige(links),
-        evaluation.spreads,
+        answers.spreads,
         [],
     )
     monkeypatch.setattr(
-        evaluation, "spreads", lambda one, *rest: stating.append(one) or spreads(one, *rest)
+        answers, "spreads", lambda one, *rest: stating.append(one) or spreads(one, *rest)
     )
-    evaluation.calibrated(model, links)
+    answers.calibrated(model, links)
     assert len(stating) == 2
     for one in stating:
-        torch.testing.assert_close(one.process.logarithms, model.process.logarithms, rtol=0, atol=0)
+        found, whole = (each.posterior.process.logarithms for each in (one, model))
+        torch.testing.assert_close(found, whole, rtol=0, atol=0)
 
 
 @pytest.mark.parametrize(("level", "need"), [(0.9, 9), (0.8, 4), (0.5, 1), (0.99, 99)])
@@ -415,8 +422,8 @@ def test_intervals_that_the_links_cannot_give_are_refused():
 
 @pytest.fixture
 def quick(monkeypatch):
-    monkeypatch.setattr(scalar, "NEAREST", 4)
-    monkeypatch.setattr(scalar, "ITERATIONS", 2)
+    options = ScalarOptions(neighbours=4, iterations=2)
+    monkeypatch.setattr(ScalarProcess, "options", options)
 
 
 def barely_trained(links):
@@ -436,13 +443,13 @@ def test_the_links_that_calibrate_kriging_did_not_choose_its_weights(monkeypatch
     links = gaigs.links("synthetic_rssi", transmitters=60, order=0, validation=0.3)
     trend = barely_trained(links)
     chosen, predicted = [], []
-    krige, predict = Kriging.krige, evaluation.predicted
+    krige, predict = Kriging.krige, answers.predicted
     monkeypatch.setattr(
         Kriging, "krige", lambda *a, **k: chosen.append(a[1].split.validation) or krige(*a, **k)
     )
-    monkeypatch.setattr(evaluation, "predicted", lambda *a: predicted.append(a[2]) or predict(*a))
+    monkeypatch.setattr(answers, "predicted", lambda *a: predicted.append(a[2]) or predict(*a))
     kriged = Kriging(links.scene, trend)
-    calibration = evaluation.calibrated(kriged.krige(links), links)
+    calibration = answers.calibrated(kriged.krige(links), links)
     assert torch.equal(chosen[0], links.split.validation)
     assert len(chosen) == 3
     assert calibration.counts.sum() == len(links.split.validation)
@@ -500,9 +507,9 @@ def test_kriging_does_not_know_a_single_group_of_validation_links():
     links = replace(links, split=links.split.only(links.split.train).choosing(alone))
     kriged = Kriging(links.scene, barely_trained(links))
     kriged.krige(links)
-    ((model, part, known),) = evaluation.unseen(kriged, links)
+    ((model, part, known),) = kriged.unseen(links)
     assert torch.equal(part, alone)
-    assert len(model.process.values) == len(known) == len(links.split.train)
+    assert len(model.posterior.process.values) == len(known) == len(links.split.train)
 
 
 def test_elements_that_an_array_lacks_have_no_intervals_and_count_in_none(tmp_path):

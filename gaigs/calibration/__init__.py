@@ -1,0 +1,7 @@
+"""Intervals of predictions, by conformal prediction on links that the predicting model has not
+seen.
+"""
+
+from gaigs.calibration.conformal import Calibration, Estimate, fewest
+
+__all__ = ["Calibration", "Estimate", "fewest"]

@@ -1,0 +1,381 @@
+"""Conformal intervals: quantiles of the errors at links that the predicting model has not seen."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Inexact, Int
+from torch import Tensor
+
+from gaigs.core.query import Query, evenly, thin_labels
+from gaigs.core.task import Task
+from gaigs.io import FAR
+from gaigs.kriging.links import distances
+
+
+class Estimate(NamedTuple):
+    """A prediction with its uncertainty, from ``model.predict(x, interval=0.9)``; tensors shaped as
+    the value.
+
+    Attributes:
+        value: The prediction of ``predict`` without an interval.
+        std: Standard deviation of the label about it, in the label's unit; of channels that of the
+            complex error. NaN, as what follows, at elements that an array lacks.
+        lower, upper: Ends of the interval, which holds the label with the asked probability; None
+            for channels.
+        radius: Of channels, that of a disc about the value which holds the channel with this
+            probability, in the label's unit; else None.
+        snr_db: Of channels, the expected signal-to-noise ratio of each link's prediction [dB],
+            without the axes of elements and subcarriers; else None.
+
+    Example:
+        >>> model = gaigs.train("knn", gaigs.links("synthetic_rssi", transmitters=100))
+        >>> found = model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]], interval=0.9)
+        >>> found.upper.shape, bool((found.lower < found.value).all())  # places, receivers
+        (torch.Size([2, 4]), True)
+    """
+
+    value: Tensor
+    std: Tensor
+    lower: Tensor | None
+    upper: Tensor | None
+    radius: Tensor | None = None
+    snr_db: Tensor | None = None
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """Quantiles of the absolute errors at links not seen over a model's own deviation, in groups.
+
+    Links are in one group per receiver where each has at least 100 of them; of a model that
+    states no deviation also by the distance to the nearest known place of their receiver, if errors
+    rise with it. Pixels of a spectrum are in eight groups by their predicted amplitude too, or
+    in fewer with pixels of more links each. A group of n links has an interval of level p by the
+    quantile p (n + 1) / n of its errors: it then holds a new link's label with probability p, if
+    links are exchangeable. Of labels of several numbers, n is the number of single ones whose share
+    within an interval of level 0.9 would scatter as much, so they are held with a probability
+    of about p.
+
+    Attributes:
+        edges: Of the distances (r or 1, g - 1) [m].
+        amplitudes: Edges of the predicted amplitudes (bins - 1,).
+        counts: Links of each group (groups,).
+        quantiles: Of the errors, for intervals of levels 0 to 1 (groups, bins, steps + 1).
+        sizes: Root mean square of the errors (groups, bins).
+        places, receivers: Of the known links, for the distance; empty with one group of distances.
+        lowest: Least possible label.
+
+    Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; by groups of
+    links: Dunn, Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical
+    models, 2022.
+    """
+
+    edges: Float[Tensor, "r e"]
+    amplitudes: Float[Tensor, " a"]
+    counts: Int[Tensor, " g"]
+    quantiles: Float[Tensor, "g b q"]
+    sizes: Float[Tensor, "g b"]
+    places: Float[Tensor, "k 3"]
+    receivers: Int[Tensor, " k"]
+    lowest: Float[Tensor, ""]
+
+    @classmethod
+    def of(
+        cls,
+        task: Task,
+        labels: Inexact[Tensor, " n *shape"],
+        values: Inexact[Tensor, " n *shape"],
+        deviations: Float[Tensor, " n ..."],
+        query: Query,
+        near: Float[Tensor, " n"] | None,
+        known: Query,
+        steps: int = 200,
+    ) -> "Calibration":
+        """From links that were predicted by models that do not know them.
+
+        Args:
+            task: Task of the labels.
+            labels, values: Labels of the links and their predictions.
+            deviations: Deviations that the model states.
+            query: The links.
+            near: Distance of each link to the nearest place that its predicting model knows [m];
+                None if the model states deviations, which need no groups of distances.
+            known: Links that the calibrated model knows.
+            steps: Levels of the stored quantiles of errors; one in between has the next higher.
+        """
+        labels, values, deviations = thinned(task, labels, values, deviations)
+        scale = _shaped(deviations, values)  # (n, m)
+        errors = (labels - values).abs() / scale  # (n, m)
+        exists = ~scale.isnan()
+        groups = group_links(query, known, near, errors)
+        bins = bin_numbers(values)
+        levels = torch.linspace(0, 1, steps + 1, dtype=torch.float64)
+        shape = len(groups.counts), len(bins.amplitudes) + 1
+        quantiles = errors.new_zeros(*shape, steps + 1, dtype=torch.float64)
+        sizes = errors.new_zeros(shape, dtype=torch.float64)
+        for group in range(shape[0]):
+            for number in range(shape[1]):
+                # A bin without pixels in a group, as of receivers in different surroundings, has
+                # the errors of all groups.
+                in_bin = bins.numbers == number
+                inside = in_bin & (groups.numbers == group)[:, None] & exists
+                inside = inside if inside.any() else in_bin & exists
+                inside = inside if inside.any() else exists
+                ordered = errors[inside].double().sort().values
+                sizes[group, number] = ordered.square().mean().sqrt()
+                quantiles[group, number] = link_quantiles(ordered, errors, inside, levels)
+        if not groups.edges.shape[1]:
+            known = known[:0]
+        lowest = torch.tensor(task.lowest, dtype=torch.float64)
+        return cls(
+            groups.edges,
+            bins.amplitudes,
+            groups.counts,
+            quantiles,
+            sizes,
+            known.transmitters,
+            known.receivers,
+            lowest,
+        )
+
+    def estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
+        """The interval of some predictions; raises a ``ValueError`` where it needs more links."""
+        groups = self._groups_of(query)
+        self._check_counts(groups, level)
+        cells = groups.reshape(-1, *[1] * (value.ndim - 1))
+        amplitudes = self.amplitudes.to(value.real)
+        if len(amplitudes):
+            cells = cells * (len(amplitudes) + 1) + torch.bucketize(value.contiguous(), amplitudes)
+        scale = _shaped(deviations, value)
+        rank = math.ceil(level * self.steps - 1e-9)
+        half = scale * self.quantiles[..., rank].flatten().to(scale).take(cells)
+        std = scale * self.sizes.flatten().to(scale).take(cells)
+        if not value.is_complex():
+            lower = (value - half).clamp_min(self.lowest.item())
+            # Some models predict less than the least label.
+            return Estimate(value, std, torch.minimum(lower, value), value + half)
+        absent = std.isnan()
+        power = value.masked_fill(absent, 0).abs().square().flatten(1).sum(1)  # (b,)
+        error = std.masked_fill(absent, 0).abs().square().flatten(1).sum(1)  # (b,)
+        return Estimate(value, std, None, None, half, 10 * (power / error).log10())
+
+    def _groups_of(self, query: Query) -> Int[Tensor, " b"]:
+        """Group of each link, by receiver and distance."""
+        receivers = query.receivers
+        rows = receivers if len(self.edges) > 1 else torch.zeros_like(receivers)
+        groups = rows * (self.edges.shape[1] + 1)
+        if self.edges.shape[1]:
+            places = self.places.to(query.transmitters)
+            near = nearest(query, places, self.receivers.to(receivers))
+            groups = groups + torch.searchsorted(self.edges.to(near)[rows], near[:, None])[:, 0]
+        return groups
+
+    def _check_counts(self, groups: Int[Tensor, " b"], level: float) -> None:
+        """Raises the error of ``estimate``."""
+        counts = self.counts.to(groups)[groups]
+        need = fewest(level)
+        if len(counts) and (few := int(counts.min())) < need:
+            raise ValueError(
+                f"an interval of {100 * level:g} % needs {need} links to calibrate it, "
+                f"the model has {few}\n"
+                "ask for a narrower interval, or give more links: to a look-up known ones, "
+                "else by split.validation"
+            )
+
+    @property
+    def steps(self) -> int:
+        """Number of the levels of the stored quantiles, without 0."""
+        return self.quantiles.shape[-1] - 1
+
+    @property
+    def mean_error(self) -> float:
+        """Mean absolute error over the model's own deviation; of labels of one number, of which few
+        calibrate, a little too large."""
+        return torch.trapezoid(self.quantiles, dx=1 / self.steps).mean().item()
+
+    def gives(self, level: float) -> bool:
+        """True if every group has enough links for intervals of a level."""
+        return fewest(level) <= int(self.counts.min())
+
+    def state(self) -> dict[str, Tensor]:
+        """Plain tensors for a checkpoint; ``Calibration(**state)`` makes it anew."""
+        return {name: getattr(self, name).cpu() for name in self.__dataclass_fields__}
+
+
+class Groups(NamedTuple):
+    """Links in groups by receiver and distance.
+
+    Attributes:
+        edges: Distances between the groups of a receiver, or of all receivers (r or 1, g - 1) [m].
+        numbers: Group of each link (n,).
+        counts: Links of each group (groups,).
+    """
+
+    edges: Float[Tensor, "r e"]
+    numbers: Int[Tensor, " n"]
+    counts: Int[Tensor, " g"]
+
+
+def group_links(
+    query: Query,
+    known: Query,
+    near: Float[Tensor, " n"] | None,
+    errors: Float[Tensor, "n m"],
+    enough: int = 100,
+    most: int = 4,
+) -> Groups:
+    """Groups of links, see ``Calibration``.
+
+    Args:
+        query, known, near: As for ``Calibration.of``.
+        errors: Errors of the links over their deviations.
+        enough: Links that a group needs for intervals of its own.
+        most: Most groups of distances.
+    """
+    receivers = query.receivers
+    count = int(torch.cat((receivers, known.receivers)).max()) + 1
+    links = receivers.bincount(minlength=count)  # (r,)
+    has_rows = links.min() >= enough and count > 1
+    rows = receivers if has_rows else torch.zeros_like(receivers)
+    apart = torch.zeros(len(rows), dtype=torch.float64)
+    groups = 1
+    if near is not None:
+        apart = near.clamp_max(FAR)
+        groups = max(1, min(most, int(rows.bincount().min()) // enough))
+    while True:  # equal distances may leave a group with few links
+        levels = torch.arange(1, groups, dtype=torch.float64) / groups
+        edges = torch.stack(
+            [apart[rows == row].quantile(levels) for row in range(int(rows.max()) + 1)]
+        )  # (r, groups - 1)
+        numbers = rows * groups + torch.searchsorted(edges[rows], apart[:, None])[:, 0]  # (n,)
+        counts = numbers.bincount(minlength=len(edges) * groups)
+        if groups == 1:
+            return Groups(edges, numbers, counts)
+        squares = torch.stack(
+            [errors[numbers == group].square().nanmean() for group in range(len(counts))]
+        )
+        # Distance tells errors apart only if these rise with it.
+        rises = (squares.view(-1, groups).diff() > 0).all()
+        if counts.min() >= enough // 2 and rises:
+            return Groups(edges, numbers, counts)
+        groups -= 1
+
+
+class Bins(NamedTuple):
+    """Numbers of labels in bins by the predicted amplitude.
+
+    Attributes:
+        amplitudes: Edges of the bins (bins - 1,).
+        numbers: Bin of each number of each link (n, m).
+    """
+
+    amplitudes: Float[Tensor, " a"]
+    numbers: Int[Tensor, "n m"]
+
+
+def bin_numbers(values: Inexact[Tensor, "n m"], most: int = 8) -> Bins:
+    """Bins of predictions: where the amplitude is high, errors are larger.
+
+    Labels of one number and channels have one bin. So do others if single links fill a bin, whose
+    errors would then be theirs alone.
+    """
+    numbers = (values.abs() if values.is_complex() else values).double()
+    sample = numbers.flatten()[evenly(torch.arange(numbers.numel()), 10**6)]
+    count = most if numbers.shape[1] > 1 and not values.is_complex() else 1
+    while True:
+        amplitudes = sample.quantile(torch.arange(1, count, dtype=torch.float64) / count)
+        bins = torch.bucketize(numbers, amplitudes)
+        links = torch.stack([(bins == number).any(1).sum() for number in range(count)])
+        if count == 1 or links.min() >= fewest(0.9):
+            return Bins(amplitudes, bins)
+        count //= 2
+
+
+def link_quantiles(
+    ordered: Float[Tensor, " k"],
+    errors: Float[Tensor, "n m"],
+    inside: Bool[Tensor, "n m"],
+    levels: Float[Tensor, " q"],
+    level: float = 0.9,
+) -> Float[Tensor, " q"]:
+    """Quantiles of errors for intervals of new links, from sorted numbers ``inside`` of a group.
+
+    Shares of links scatter at ``level``, which stands for all levels.
+    """
+    held = (errors <= quantile(ordered, levels.new_tensor(level))) & inside
+    count = effective_count(held.sum(1), inside.sum(1))
+    # Quantile p (n + 1) / n: the new link is one of n + 1 exchangeable ones.
+    return quantile(ordered, levels * (1 + 1 / count))
+
+
+def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float[Tensor, "*q"]:
+    """The least of n sorted numbers that are not below a share of them."""
+    ranks = (levels * len(numbers) - 1e-9).ceil().long()
+    return numbers[(ranks - 1).clamp(0, len(numbers) - 1)]
+
+
+def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float:
+    """Number of single numbers whose share within an interval would scatter as much as the share of
+    links with ``counts`` numbers, of which ``held`` are within.
+
+    Numbers of a link err together, though less than one number with itself.
+    """
+    total = counts.sum().double()
+    weights = counts / total
+    parts = held / total
+    share = parts.sum().item()
+    links = 1 / weights.square().sum().item()
+    scatter = (parts - share * weights).square().sum().item()
+    # A share of n independent numbers has the variance p (1 - p) / n.
+    return max(links, share * (1 - share) * (1 - 1 / links) / max(scatter, 1e-12))
+
+
+def fewest(level: float) -> int:
+    """Fewest links that give an interval of a level; 0.9 / (1 - 0.9) is above 9 by rounding."""
+    return math.ceil(level / (1 - level) - 1e-9)
+
+
+def nearest(
+    query: Query, places: Float[Tensor, "k 3"], receivers: Int[Tensor, " k"]
+) -> Float[Tensor, " b"]:
+    """Distance of each link to its receiver's nearest known place [m]; infinite without one."""
+    near = torch.full((len(query),), math.inf, dtype=torch.float64, device=places.device)
+    for receiver in query.receivers.unique().tolist():
+        asked = (query.receivers == receiver).nonzero()[:, 0]
+        known = places[receivers == receiver].double()  # (k, 3)
+        for part in asked.split(1024) if len(known) else ():
+            near[part] = distances(query.transmitters[part].double(), known).amin(1)
+    return near
+
+
+def _shaped(deviations: Tensor, values: Tensor) -> Tensor:
+    """Deviations of links, or of all their numbers, in the shape of the values; above 0."""
+    axes = [1] * (values.ndim - deviations.ndim)
+    shaped = deviations.reshape(*deviations.shape, *axes).to(values.real)
+    return shaped.clamp_min(torch.finfo(shaped.dtype).tiny).expand(values.shape)
+
+
+class Thinned(NamedTuple):
+    """Links whose labels have few numbers."""
+
+    labels: Inexact[Tensor, "n m"]
+    values: Inexact[Tensor, "n m"]
+    deviations: Float[Tensor, " n ..."]
+
+
+def thinned(
+    task: Task,
+    labels: Inexact[Tensor, " n *shape"],
+    values: Inexact[Tensor, " n *shape"],
+    deviations: Float[Tensor, " n ..."],
+) -> Thinned:
+    """Aligned labels, predictions and, unless there is one for each link, deviations by
+    ``thin_labels``.
+    """
+    if deviations.ndim > 1:
+        deviations = thin_labels(deviations)
+    # An alignment takes several times the memory of the labels.
+    pairs = zip(labels.split(64), values.split(64), strict=True)
+    aligned = [thin_labels(task.align(*pair)) for pair in pairs]
+    return Thinned(torch.cat(aligned), thin_labels(values), deviations)

@@ -1,0 +1,123 @@
+"""Links that calibrate a model: those that it, or a model like it, has not seen."""
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Inexact, Int
+from torch import Tensor
+
+from gaigs.calibration.conformal import Calibration, nearest
+from gaigs.core import stages
+from gaigs.core.query import evenly
+from gaigs.data import Links, with_places
+from gaigs.kriging.links import folds_of, single_readings
+
+LOOK_UP_FOLDS = 5
+"""Folds of the known links that calibrate a look-up."""
+
+
+class Unseen(NamedTuple):
+    """A model, links that it has not seen, and the links that it knows."""
+
+    model: Any
+    asked: Int[Tensor, " k"]
+    known: Int[Tensor, " j"]
+
+
+class Fold(NamedTuple):
+    """Links without a fold of the known ones, and links of the fold that are asked for."""
+
+    rest: Links
+    asked: Int[Tensor, " k"]
+
+
+class Answers(NamedTuple):
+    """Predictions of some links.
+
+    Attributes:
+        values: Predictions (k, *shape).
+        deviations: Standard deviations of the labels (k,) or (k, *shape).
+        are_stated: True if the model knows its deviations; False if they are a default.
+    """
+
+    values: Inexact[Tensor, " k *shape"]
+    deviations: Float[Tensor, " k ..."]
+    are_stated: bool
+
+
+def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -> Iterator[Fold]:
+    """Folds of the known links, of which at most so many are asked for; ends when time is up."""
+    index, receivers = links.split.known, links.query.receivers
+    folds = folds_of(links, index) % count
+    asked = evenly(single_readings(links, index), most)
+    for fold in range(count):
+        if stages.is_up():
+            return
+        is_known = folds != fold
+        # A receiver that has links in this fold alone keeps them.
+        is_known |= torch.isin(receivers[index], receivers[index[is_known]], invert=True)
+        part = index[~is_known & torch.isin(index, asked)]
+        if not len(part):
+            continue
+        rest = replace(links, split=links.split.only(index[is_known]))
+        if links.uncertainties is not None and links.uncertainties.any():
+            is_estimated = links.uncertainties > 0
+            unknown = torch.where(is_estimated, math.inf, 0.0)
+            rest = with_places(replace(rest, uncertainties=unknown))
+        yield Fold(rest, part)
+
+
+def validation_halves(links: Links) -> list[tuple[Int[Tensor, " k"], Int[Tensor, " j"]]]:
+    """Each half of the validation links with the other; one group alone with itself."""
+    validation = links.split.validation
+    halves = folds_of(links, validation) % 2
+    first, second = validation[halves == 0], validation[halves == 1]
+    if not len(first) or not len(second):
+        return [(validation, validation)]
+    return [(first, second), (second, first)]
+
+
+def calibrate(
+    links: Links,
+    name: str,
+    count: int,
+    unseen: Iterable[Unseen],
+    answer: Callable[[Any, Int[Tensor, " k"]], Answers],
+) -> Calibration | None:
+    """The calibration of a model by errors at links that it has not seen; None without such links.
+
+    Args:
+        links: Links with the split of the model.
+        name: Name of the model, for the log.
+        count: Most models of ``unseen``.
+        unseen: Models like the model, with links that they have not seen.
+        answer: Function from a model and indices of links to its answers.
+    """
+    asked, answers, near = [], [], []
+    for one in stages.track(unseen, "intervals", count):
+        if count > 1 and stages.is_up():  # it was fitted in haste
+            break
+        asked.append(one.asked)
+        answers.append(answer(one.model, one.asked))
+        known = links.query[one.known]
+        near.append(nearest(links.query[one.asked], known.transmitters, known.receivers))
+    if stages.is_up() and len(asked) < count:
+        stages.leave_out(f"{len(asked)} of {count} folds calibrate {name}")
+    if not asked:
+        return None
+    index = torch.cat(asked)
+    values = torch.cat([part.values for part in answers])
+    deviations = torch.cat([part.deviations for part in answers])
+    are_stated = all(part.are_stated for part in answers)
+    return Calibration.of(
+        links.task,
+        links.labels[index],
+        values,
+        deviations,
+        links.query[index],
+        None if are_stated else torch.cat(near),
+        links.query[links.split.known],
+    )

@@ -1,0 +1,141 @@
+"""Scores of intervals: how often they hold, and how wide they are."""
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Inexact
+from torch import Tensor
+
+from gaigs.calibration.conformal import Calibration, Estimate, Thinned
+from gaigs.core.query import Query, evenly
+
+
+def holds(estimate: Estimate, labels: Inexact[Tensor, " k *shape"]) -> Bool[Tensor, " k *shape"]:
+    """True for each number of aligned labels that is within its interval."""
+    if estimate.radius is not None:
+        return (labels - estimate.value).abs() <= estimate.radius
+    return (estimate.lower <= labels) & (labels <= estimate.upper)  # type: ignore[operator]
+
+
+def interval_scores(
+    labels: Inexact[Tensor, " k *shape"], half: Estimate, most: Estimate
+) -> dict[str, Float[Tensor, " k"]]:
+    """Scores of each link's intervals of 50 % and 90 %: shares of its aligned numbers inside,
+    width, CRPS and -log p.
+
+    The last two are scores of a normal distribution with the estimate's ``std``, of channels for
+    real and imaginary part. CRPS has the label's unit.
+
+    Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation, 2007.
+    """
+    std = most.std
+    errors = labels - most.value
+    if errors.is_complex():
+        errors = torch.view_as_real(errors)  # (k, *shape, 2)
+        std = (std / math.sqrt(2))[..., None].expand(*std.shape, 2)
+    # A deviation of 0, where the model is exact, has the least that float32 tells from it.
+    std = std.double().clamp_min(torch.finfo(torch.float32).tiny)
+    z = errors.double() / std
+    density = torch.exp(-z.square() / 2) / math.sqrt(2 * math.pi)
+    crps = std * (z * torch.erf(z / math.sqrt(2)) + 2 * density - 1 / math.sqrt(math.pi))
+    nll = z.square() / 2 + std.log() + math.log(2 * math.pi) / 2
+    if most.radius is not None:
+        width = 2 * most.radius
+    else:
+        width = most.upper - most.lower  # type: ignore[operator]
+    parts = {
+        "coverage_50": holds(half, labels),
+        "coverage_90": holds(most, labels),
+        "width_90": width,
+        "crps": crps,
+        "nll": nll,
+    }
+    is_absent = most.std.isnan()
+    means = {}
+    for name, part in parts.items():
+        numbers = part.double().reshape(*most.value.shape, -1).mean(-1)  # (k, *shape)
+        numbers = numbers.masked_fill(is_absent, math.nan)
+        means[name] = numbers[..., None].flatten(1).nanmean(1)  # (k,)
+    return means
+
+
+def scores_of_links(
+    calibration: Calibration, links: Thinned, query: Query, size: int = 64
+) -> dict[str, Float[Tensor, " k"]]:
+    """``interval_scores`` of predictions, with ``calibration_links`` and the number of each link's
+    place; ``size`` links at a time, as estimates take ten times the memory of labels.
+    """
+    parts = []
+    for rows in torch.arange(len(query)).split(size):
+        arguments = links.values[rows], links.deviations[rows], query[rows]
+        half = calibration.estimate(*arguments, 0.5)
+        most = calibration.estimate(*arguments, 0.9)
+        parts.append(interval_scores(links.labels[rows], half, most))
+    scores = {}
+    for name in parts[0]:
+        scores[name] = torch.cat([part[name] for part in parts])
+    scores["calibration_links"] = torch.full((len(query),), float(calibration.counts.sum()))
+    scores["places"] = query.place_keys.unique(return_inverse=True)[1].double()
+    return scores
+
+
+def shares_within(
+    calibration: Calibration, links: Thinned, query: Query, most: int = 300
+) -> np.ndarray:
+    """Shares of labels within intervals of the levels 0.05 to 0.95 (19,), of ``most`` links; NaN
+    where an interval needs more links.
+    """
+    rows = evenly(torch.arange(len(query)), most)
+    arguments = links.values[rows], links.deviations[rows], query[rows]
+    shares = []
+    for level in np.arange(1, 20) / 20:
+        if not calibration.gives(level):
+            shares.append(math.nan)
+            continue
+        estimate = calibration.estimate(*arguments, level)
+        exists = ~estimate.std.isnan()
+        shares.append(holds(estimate, links.labels[rows])[exists].double().mean().item())
+    return np.array(shares)
+
+
+def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
+    """Means over links, and the standard errors of both coverages, ``coverage_50_error`` and
+    ``coverage_90_error``.
+
+    ``places`` has the number of each link's place, from 0.
+    """
+    numbers = {}
+    for name, score in scores.items():
+        if name == "places":
+            continue
+        numbers[name] = score.mean().item()
+        if name.startswith("coverage"):
+            calibrating = scores["calibration_links"].mean().item()
+            level = int(name[-2:]) / 100
+            places = scores["places"].long()
+            numbers[f"{name}_error"] = coverage_error(score, level, places, calibrating)
+    return numbers
+
+
+def coverage_error(
+    score: Float[Tensor, " k"], level: float, places: Tensor, calibration_links: float
+) -> float:
+    """Standard error of the mean share of links within intervals; NaN with one place.
+
+    It counts the test's links and the ``calibration_links``, both placed alike. Errors of one place
+    depend on each other, errors of different places count as independent. If all links have one
+    share, places scatter as the level says.
+
+    Source: Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015.
+    """
+    count = len(score)
+    sums = places.bincount(score - score.mean())  # (places,)
+    if len(sums) <= 1:
+        return math.nan
+    links = 1 / count + 1 / calibration_links
+    # Variance of a link's share that places of independent errors have.
+    spread = sums.square().sum().item() / count * len(sums) / max(len(sums) - 1, 1)
+    if score.min() == score.max():
+        spread = level * (1 - level) * count / len(sums)
+    return math.sqrt(spread * links)

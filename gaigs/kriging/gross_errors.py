@@ -1,0 +1,92 @@
+"""Levels that no room explains."""
+
+import math
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gaigs.data import Links, Split
+from gaigs.kriging.links import distances
+
+
+def without_gross_errors(links: Links, size: float = 6.0) -> Links:
+    """Links of one number each without known levels that no room explains: one of them moves a
+    whole fit.
+
+    Levels fall with the logarithm of the distance to their receiver. A level is left out if its
+    error by this law is more than ``size`` standard deviations, and as far from those of the five
+    nearest levels of its receiver: what neighbours share is a part of the room. So is what more
+    than one in twenty have. The line has Cauchy's weights, so few levels do not move it. The
+    deviation is 1.48 times the median error, the larger one of the receiver and of all receivers, 1
+    dB or more. Fewer than 20 known links keep all.
+
+    Source: Maronna, Martin and Yohai, Robust Statistics, 2006, sections 4.4 and 5.2.
+    """
+    index = links.split.known
+    if len(index) < 20:
+        return links
+    query, labels = links.query[index], links.labels[index].double()
+    positions = links.scene.positions(links.labels)[query.receivers]
+    lengths = (query.transmitters - positions).norm(dim=1).clamp_min(0.1)
+    errors = torch.zeros_like(labels)
+    receivers = query.receivers.unique()
+    for receiver in receivers:
+        rows = query.receivers == receiver
+        errors[rows] = errors_of_law(lengths[rows].double().log10(), labels[rows])
+    common = robust_deviation(errors)
+    is_kept = torch.ones_like(index, dtype=torch.bool)
+    for receiver in receivers:
+        rows = (query.receivers == receiver).nonzero()[:, 0]
+        most = size * torch.maximum(common, robust_deviation(errors[rows]))
+        is_kept[rows] = ~are_alone(query.transmitters[rows], errors[rows], most)
+    parts = links.split.parts()
+    train, validation = (
+        parts[name][torch.isin(parts[name], index[is_kept])] for name in ("train", "validation")
+    )
+    split = Split(links.split.name, train, validation, parts["test"], links.split.groups)
+    return replace(links, split=split)
+
+
+def are_alone(
+    places: Float[Tensor, "k 3"],
+    errors: Float[Tensor, " k"],
+    most: Float[Tensor, ""],
+    neighbours: int = 5,
+) -> Bool[Tensor, " k"]:
+    """True for errors above ``most`` that are as far from those of the nearest places; all False if
+    more than one in twenty are.
+    """
+    is_alone = torch.zeros_like(errors, dtype=torch.bool)
+    far = (errors.abs() > most).nonzero()[:, 0]
+    if len(errors) <= neighbours or not len(far):
+        return is_alone
+    apart = distances(places[far], places)  # (f, k)
+    itself = far[:, None] == torch.arange(len(errors))
+    near = apart.masked_fill(itself, math.inf).topk(neighbours, largest=False).indices
+    differs = (errors[far, None] - errors[near]).abs().amin(1) > most
+    is_few = differs.sum() <= max(1, len(errors) // 20)
+    is_alone[far] = differs & is_few
+    return is_alone
+
+
+def errors_of_law(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
+    """Levels less those of a line over the logarithm of the distance, by least squares with
+    Cauchy's weights.
+    """
+    weights = torch.ones_like(levels)
+    for _ in range(20):
+        shares = weights / weights.sum()
+        steps = decades - shares @ decades
+        errors = levels - shares @ levels
+        slope = shares @ (steps * errors) / (shares @ steps.square()).clamp_min(1e-6)
+        errors = errors - slope * steps
+        # Cauchy's weight at twice the deviation is a half.
+        weights = 1 / (1 + (errors / (2 * robust_deviation(errors))).square())
+    return errors
+
+
+def robust_deviation(errors: Float[Tensor, " k"]) -> Float[Tensor, ""]:
+    """Standard deviation of normal errors by their median size, at least 1 in the label's unit."""
+    return (1.4826 * errors.abs().median()).clamp_min(1.0)

@@ -1,0 +1,152 @@
+"""Known readings around places: the nearest ones, which screen those behind them."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gaigs.core.query import evenly
+from gaigs.core.scene import Scene
+from gaigs.kriging.links import distances, scale_bounds, scaled
+
+
+class Nearest(NamedTuple):
+    """Rows of known readings near each of m places.
+
+    Attributes:
+        rows: Rows of the readings (m, j).
+        exists: False beyond a receiver's readings (m, j).
+    """
+
+    rows: Int[Tensor, "m j"]
+    exists: Bool[Tensor, "m j"]
+
+
+class Around(NamedTuple):
+    """The nearest readings of the same receiver around each of m asked places; the place itself
+    comes last.
+
+    Attributes:
+        rows: Rows of the readings (m, j).
+        exists: False for rows beyond a receiver's readings (m, j).
+        receivers: Receivers of the asked places (m,).
+        apart: Distances of places [m] (m, j + 1, j + 1), 1e15 for rows that do not exist: nothing
+            correlates.
+        bands: Squared distances of carriers, see ``coordinates`` of scale 1 (m, j + 1, j + 1); None
+            without a band.
+    """
+
+    rows: Int[Tensor, "m j"]
+    exists: Bool[Tensor, "m j"]
+    receivers: Int[Tensor, " m"]
+    apart: Float[Tensor, "m i i"]
+    bands: Float[Tensor, "m i i"] | None
+
+
+class HeldOutReadings(NamedTuple):
+    """Rows of held-out readings (m,), and the readings of other folds around them."""
+
+    rows: Int[Tensor, " m"]
+    around: Around
+
+
+class Readings(NamedTuple):
+    """Known readings, of which ``count`` are around a place.
+
+    Attributes:
+        scene: Receivers and carriers.
+        places: Places (k, d), see ``coordinates`` of scale 1.
+        receivers: Receivers (k,).
+        count: Number of readings around a place.
+    """
+
+    scene: Scene
+    places: Float[Tensor, "k d"]
+    receivers: Int[Tensor, " k"]
+    count: int
+
+    def nearest(
+        self,
+        places: Float[Tensor, "m d"],
+        receivers: Int[Tensor, " m"],
+        own: Int[Tensor, " m"] | None = None,
+        folds: Int[Tensor, " k"] | None = None,
+        reach: bool = False,
+        size: int = 2048,
+    ) -> Nearest:
+        """The nearest known readings, see ``Around``.
+
+        Args:
+            places, receivers: What is asked.
+            own: Folds of the places, whose readings are left out; None: no folds.
+            folds: Folds of the known readings.
+            reach: True if half of the readings lie farther and farther away: near ones alone say
+                little on lengths.
+            size: Places whose neighbours are held in memory at a time.
+
+        Source: Stein, Chi and Welty, Approximating likelihoods for large spatial data sets, 2004.
+        """
+        rows = receivers.new_zeros(len(places), self.count)
+        exists = torch.zeros_like(rows, dtype=torch.bool)
+        # Among carriers the nearest readings are those of a middle scale, so that they stay the
+        # same during a fit.
+        scale = math.nan
+        if self.scene.has_band:
+            scale = math.sqrt(math.prod(scale_bounds(self.scene)))
+        for receiver in receivers.unique().tolist():
+            known = (self.receivers == receiver).nonzero()[:, 0]
+            known_places = scaled(self.places[known], scale)
+            count = min(self.count, len(known))
+            for asked in (receivers == receiver).nonzero()[:, 0].split(size):
+                apart = distances(scaled(places[asked], scale), known_places)
+                if own is not None and folds is not None:
+                    is_own = own[asked, None] == folds[known]
+                    apart = apart.masked_fill(is_own, math.inf)
+                farthest = int(apart.isfinite().sum(1).min())
+                if reach and farthest > self.count:
+                    ranks = self._far_ranks(farthest)
+                    rows[asked] = known[apart.argsort(1)[:, ranks]]
+                    exists[asked] = True
+                    continue
+                near = apart.topk(count, largest=False)
+                rows[asked, :count] = known[near.indices]
+                exists[asked, :count] = near.values.isfinite()
+        return Nearest(rows, exists)
+
+    def _far_ranks(self, farthest: int) -> Int[Tensor, " j"]:
+        """Ranks by distance: the nearest half, and a geometric series up to the farthest."""
+        half = self.count // 2
+        far = torch.from_numpy(np.geomspace(half, farthest - 1, half)).round().long()
+        return torch.cat((torch.arange(half), far))
+
+    def around(
+        self, places: Float[Tensor, "m d"], receivers: Int[Tensor, " m"], nearest: Nearest
+    ) -> Around:
+        """Distances among each place and the readings near it."""
+        points = torch.cat((self.places[nearest.rows], places[:, None]), 1)  # (m, j + 1, d)
+        exists = torch.nn.functional.pad(nearest.exists, (0, 1), value=True)
+        pairs = exists[:, :, None] & exists[:, None]
+        apart = distances(points[..., :3], points[..., :3]).where(pairs, 1e15)
+        bands = None
+        if self.scene.has_band:
+            bands = (points[..., 3:] - points[..., 3:].mT).square()
+        return Around(nearest.rows, nearest.exists, receivers, apart, bands)
+
+    def held_out(
+        self, rows: Int[Tensor, " h"], folds: Int[Tensor, " k"], most: int
+    ) -> HeldOutReadings:
+        """About ``most`` of the rows that may be held out, and the readings of other folds around
+        each.
+
+        Receivers have 16 each or more, unless that makes four times as many.
+        """
+        receivers = self.receivers[rows].unique()
+        each = max(1, most // len(receivers), min(16, 4 * most // len(receivers)))
+        parts = [rows[self.receivers[rows] == receiver] for receiver in receivers]
+        asked = torch.cat([evenly(part, each) for part in parts])
+        places, of_asked = self.places[asked], self.receivers[asked]
+        nearest = self.nearest(places, of_asked, folds[asked], folds, reach=True)
+        return HeldOutReadings(asked, self.around(places, of_asked, nearest))

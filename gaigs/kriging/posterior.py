@@ -1,0 +1,64 @@
+"""What kriging asks a posterior of residuals for."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from jaxtyping import Int
+from torch import Tensor, nn
+
+from gaigs.core.query import Batch
+from gaigs.data import Links
+from gaigs.kriging.kernel import Process
+
+
+class Posterior(nn.Module):
+    """Residuals of a trend as Gaussian processes over places, given known links.
+
+    ``fit`` finds hyperparameters, ``solve`` takes known residuals, ``mean`` and ``deviations``
+    predict. The state dict has all that predictions need.
+
+    Attributes:
+        chooses_weight: True if validation links choose the weight of kriging, else 1.
+        by_paths: True if strengths of paths are kriged, not labels.
+    """
+
+    chooses_weight = False
+    by_paths = False
+
+    def cleaned(self, links: Links) -> Links:
+        """The links without those that would move the whole fit; by default all."""
+        return links
+
+    def fit(self, links: Links, candidates: Mapping[float, Tensor]) -> float:
+        """Finds hyperparameters, and gives the trend weight.
+
+        Args:
+            links: Links with a split.
+            candidates: Residuals of the known links (k, m), ``thin_labels`` of them, by trend
+                weight.
+        """
+        raise NotImplementedError
+
+    def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
+        """Takes the known links; ``residuals`` gives those of some of their rows (j, *shape)."""
+        raise NotImplementedError
+
+    @abstractmethod
+    def mean(self, batch: Batch, like: Tensor) -> Tensor:
+        """Mean of the residuals, shaped as the values ``like`` of the batch."""
+
+    @abstractmethod
+    def deviations(self, batch: Batch) -> Tensor:
+        """Standard deviations of the labels (b,), means over their numbers, or (b, *shape)."""
+
+    @abstractmethod
+    def facts(self) -> Mapping[str, float]:
+        """Hyperparameters and sizes for ``metrics.json``."""
+
+    def process_at(self, receiver: int) -> Process | None:
+        """The process of one receiver's labels; None if processes are not of labels."""
+        return None
+
+    def take_hyperparameters(self, other: Any) -> None:
+        """Takes what ``deviations`` depend on from another posterior, by default nothing."""

@@ -1,0 +1,216 @@
+"""Hyperparameters of processes of one number, by the likelihood of held-out readings."""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.optimize import minimize
+from torch import Tensor
+
+from gaigs.core import stages
+from gaigs.core.scene import Scene
+from gaigs.kriging.likelihood import (
+    Choice,
+    conditional,
+    covariances,
+    expected_factors,
+    log_density,
+)
+from gaigs.kriging.links import scale_bounds
+from gaigs.kriging.neighbours import HeldOutReadings
+
+
+@dataclass(frozen=True)
+class ScalarOptions:
+    """Options of a process of one number.
+
+    Attributes:
+        neighbours: Readings around a held-out one while a process is fitted, and around a place
+            whose variance is asked of many.
+        many: Readings of a receiver that all enter a variance; of more the nearest, which then take
+            less time.
+        scatter: Scatter between receivers of the logarithms of length, signal and noise: the prior
+            of each receiver's.
+        degrees: Degrees of freedom of Student's t: of the scatter, and of the noise where it is not
+            normal.
+        rounds: Repetitions of expectation and maximisation for the variances of single readings.
+        iterations: Most iterations of a maximisation.
+        size: Places whose covariances are held in memory at a time.
+        edges: Longest correlation length, in longest edges of the box of places: beyond it the
+            kernel is a line in the box.
+        widest: Largest deviation of the signal over the residuals' root mean square. Readings
+            millimetres apart show its ratio to a power of the length alone: beside them a larger
+            one would give levels that no receiver hears.
+        largest: Largest deviation of the noise over the residuals' root mean square, and the
+            inverse of the least one of both: the noise keeps matrices regular where a place is
+            measured twice.
+    """
+
+    neighbours: int = 32
+    many: int = 300
+    scatter: tuple[float, float, float] = (0.25, 0.15, 0.15)
+    degrees: float = 4.0
+    rounds: int = 3
+    iterations: int = 50
+    size: int = 2048
+    edges: float = 8.0
+    widest: float = 2.0
+    largest: float = 50.0
+
+
+class ScalarFit(NamedTuple):
+    """Hyperparameters with the least cost.
+
+    Attributes:
+        cost: Negative log likelihood of the held-out readings, with the prior.
+        logarithms: Logarithms of length, signal and noise at each receiver (r, 3).
+        choice: Kernel, noise and scale of carriers.
+    """
+
+    cost: float
+    logarithms: Float[Tensor, "r 3"]
+    choice: Choice
+
+
+class HeldOutCost:
+    """Negative log posterior of hyperparameters, given held-out readings.
+
+    A point has the logarithms of length, signal and noise of all receivers, of the scale of
+    carriers where there are several, and with ``has_deviations`` each receiver's deviations from
+    the first three, in units of their scatter.
+
+    Args:
+        scene: Receivers and carriers.
+        values: Known readings, residuals of a trend (k,).
+        held: Held-out readings, and those around them.
+        choice: Kernel and noise, which stay.
+        has_deviations: True if receivers have hyperparameters of their own.
+        prior: Logarithms about which those of all receivers scatter; None: no prior.
+        options: Options of the process.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        values: Float[Tensor, " k"],
+        held: HeldOutReadings,
+        choice: Choice,
+        has_deviations: bool,
+        prior: Float[Tensor, " 3"] | None,
+        options: ScalarOptions,
+    ):
+        self.options, self.choice, self.prior = options, choice, prior
+        self.has_deviations = has_deviations
+        self.count = len(scene.receivers)
+        self.around = held.around
+        self.asked = values[held.rows]
+        self.readings = values[held.around.rows].where(held.around.exists, 0)
+        self.factors = torch.ones_like(self.readings)
+        self.spread = torch.tensor(options.scatter, dtype=torch.float64)
+        self.size = values.square().mean().sqrt().item()
+        self.bounds = self._bounds(scene)
+
+    def _bounds(self, scene: Scene) -> np.ndarray:
+        options, size = self.options, self.size or 1.0
+        edge = (scene.upper - scene.lower).max().item()
+        lengths = scene.spacing, options.edges * edge
+        signals = size * np.array([1 / options.largest, options.widest])
+        noises = size * np.array([1 / options.largest, options.largest])
+        scales = [scale_bounds(scene)] if scene.has_band else []
+        bounds = np.log([lengths, signals, noises, *scales])
+        self.shared = len(bounds)
+        if self.has_deviations:
+            bounds = np.concatenate((bounds, np.tile([-20.0, 20.0], (3 * self.count, 1))))
+        return bounds
+
+    def unpacked(self, point: Tensor) -> tuple[Float[Tensor, "r 3"], Choice]:
+        """Logarithms of each receiver's hyperparameters, and the choice, of a point."""
+        logarithms = point[:3].expand(self.count, 3)
+        if self.has_deviations:
+            deviations = point[self.shared :].reshape(self.count, 3)
+            logarithms = logarithms + self.spread * deviations
+        has_scale = self.shared > 3
+        choice = self.choice._replace(scale=point[3].exp()) if has_scale else self.choice
+        return logarithms, choice
+
+    def __call__(self, point: np.ndarray) -> tuple[float, np.ndarray]:
+        """The cost at a point, and its gradient."""
+        degrees = self.options.degrees
+        with torch.enable_grad():
+            leaf = torch.tensor(point, requires_grad=True)
+            logarithms, choice = self.unpacked(leaf)
+            noises = (2 * logarithms[self.around.receivers, 2]).exp()  # (m,)
+            between = covariances(self.around, logarithms.exp(), choice)
+            means, variances = conditional(between, self.readings, noises[:, None] * self.factors)
+            total = -log_density(self.asked - means, variances, noises, choice.degrees).sum()
+            # Student's t: one receiver may be far noisier than the others.
+            squares = leaf[self.shared :].square() / degrees
+            total = total + ((degrees + 1) / 2 * squares.log1p()).sum()
+            if self.prior is not None:
+                steps = (leaf[:3] - self.prior) / self.spread
+                total = total + steps.square().sum() / 2
+            (gradient,) = torch.autograd.grad(total, leaf)
+        return total.item(), gradient.numpy()
+
+    def start(self, logarithms: Float[Tensor, "r 3"] | None) -> np.ndarray:
+        """The point to start from: of earlier hyperparameters, or the best of a coarse grid."""
+        if logarithms is not None:
+            scale = np.log([self.choice.scale][: self.shared - 3])
+            point = np.concatenate((logarithms.mean(0).numpy(), scale))
+        else:
+            middle = self.bounds[3 : self.shared].mean(1)
+            points = []
+            for length in self.bounds[0] @ [[5, 3, 1], [1, 3, 5]] / 6:
+                for share in (0.5, 0.8):  # of the signal in the residuals
+                    signal = np.log(self.size * share)
+                    noise = np.log(self.size * (1 - share * share) ** 0.5)
+                    points.append([length, signal, noise, *middle])
+            point = np.array(min(points, key=lambda one: self(np.array(one))[0]))
+        return np.concatenate((point, np.zeros(len(self.bounds) - self.shared)))
+
+    def expect(self, point: np.ndarray) -> None:
+        """Takes the expected variances of the noise of single readings: one that disagrees with all
+        around it counts little."""
+        logarithms, choice = self.unpacked(torch.from_numpy(point))
+        between = covariances(self.around, logarithms.exp(), choice)[:, :-1, :-1]
+        noises = (2 * logarithms[self.around.receivers, 2]).exp()
+        self.factors = expected_factors(
+            between, self.readings, noises, choice.degrees, self.options.rounds
+        )
+
+    def fit_at(self, cost: float, point: np.ndarray) -> ScalarFit:
+        """The hyperparameters of a point."""
+        logarithms, choice = self.unpacked(torch.from_numpy(point))
+        return ScalarFit(cost, logarithms, choice._replace(scale=float(choice.scale)))
+
+
+def maximise(cost: HeldOutCost, start: Float[Tensor, "r 3"] | None = None) -> ScalarFit:
+    """The hyperparameters with the least cost, from ``start`` or a coarse grid.
+
+    Noise with Student's t takes a second maximisation, with expected variances of single readings.
+    """
+    if not cost.size:  # the trend explains all: any hyperparameters do
+        return cost.fit_at(-math.inf, cost.bounds.mean(1))
+    point = cost.start(start)
+    least = math.inf
+    for repeat in range(1 if math.isinf(cost.choice.degrees) else 2):
+        if repeat:
+            cost.expect(point)
+        if stages.is_up():  # the start has to do
+            least = cost(point)[0]
+            continue
+        result = minimize(
+            cost,
+            point,
+            jac=True,
+            method="L-BFGS-B",
+            bounds=cost.bounds,
+            options={"maxiter": cost.options.iterations, "ftol": 1e-8},
+            callback=stages.end_in_time,
+        )
+        point, least = result.x, float(result.fun)
+    stages.advance()
+    return cost.fit_at(least, point)

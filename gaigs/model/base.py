@@ -1,0 +1,499 @@
+"""The contract of kind ``model``."""
+
+import copy
+import itertools
+import math
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, overload
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor, nn
+
+from gaigs.calibration import Calibration, Estimate
+from gaigs.calibration.held_out import LOOK_UP_FOLDS, Unseen, held_out_folds
+from gaigs.core.antenna import lacking
+from gaigs.core.geometry import Directions, ExtrapolationWarning
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene
+from gaigs.core.stages import track
+from gaigs.data import Links
+from gaigs.kriging.kernel import Process
+from gaigs.kriging.links import single_readings
+from gaigs.model import checkpoint
+from gaigs.model.requests import (
+    Request,
+    as_known_subcarriers,
+    lacks_elements,
+    usual_batch_size,
+)
+from gaigs.registry import check_type
+from gaigs.registry.torch_modes import usual_modes
+from gaigs.splatting.gaussians import Gaussians
+
+
+class Prediction(NamedTuple):
+    """A model's answer to a batch.
+
+    Attributes:
+        value: (b, *shape) of the task, or of the batch's directions.
+        penalties: Scalars added to the loss, by name; means over the batch's places.
+    """
+
+    value: Tensor
+    penalties: Mapping[str, Tensor] = {}
+
+
+class Model(nn.Module):
+    """The contract of kind ``model``: ``forward`` takes a ``Batch`` and gives a ``Prediction``.
+
+    The state dict has all that ``predict`` needs. A model with parameters is trained. One without
+    is a look-up: it learns in ``fit`` only, see ``LookUp``.
+
+    Args:
+        scene: Receivers and task.
+
+    Attributes:
+        trained_by: Name of the component of kind ``training`` that trains it.
+        learning_rates: Default learning rate of each parameter group; ``training.learning_rates``
+            overrides it.
+        penalty_weights: Default weight of each penalty; ``training.penalties`` overrides it.
+        chunk: Largest number of pairs of a link and a direction evaluated at a time; None: whole
+            labels. Training sees as many as ``training.thinning`` leaves.
+        revisions: Fractions of the training after which ``revise`` is called.
+        predicts_untrained: True if values before the training are worth a score.
+        any_frequency: True if channels are a function of frequency, read from
+            ``scene.task.frequencies``.
+        configuration: Options that a registered model was made with; ``save`` stores them.
+        calibration: What intervals are made of; None if no validation links have measured the
+            model's errors.
+        known_places: Keys of the training and validation places, ``Query.place_keys``; None if
+            these are unknown.
+        links: Links that a look-up keeps.
+
+    Example:
+        >>> class Nearest(gaigs.Model):
+        ...     \"\"\"The label of the nearest training place.\"\"\"
+        ...
+        ...     def fit(self, links):
+        ...         train = links.split.train
+        ...         self.places, self.values = links.query[train].transmitters, links.labels[train]
+        ...
+        ...     def forward(self, batch):
+        ...         near = torch.cdist(batch.query.transmitters, self.places).argmin(1)
+        ...         return gaigs.model.Prediction(self.values[near], {})
+        >>> links = gaigs.links("synthetic", transmitters=20, order=0)
+        >>> model = Nearest(links.scene)
+        >>> model.fit(links)
+        >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]).shape  # places first
+        torch.Size([2, 1, 90, 360])
+    """
+
+    trained_by = "descent"
+    learning_rates: Mapping[str, float] = {"network": 1.6e-2}
+    penalty_weights: Mapping[str, float] = {}
+    chunk: int | None = None
+    revisions: tuple[float, ...] = ()
+    predicts_untrained: bool = False
+    any_frequency: bool = False
+    primitives: Gaussians | None = None
+    calibration: Calibration | None = None
+    known_places: Tensor | None = None
+    links: Links | Batch | None = None
+
+    def __init__(self, scene: Scene):
+        super().__init__()
+        self.scene = scene
+
+    @property
+    def device(self) -> torch.device:
+        """The device of the model's tensors; the CPU for a look-up without."""
+        tensors = itertools.chain(self.parameters(), self.buffers())
+        return next((tensor.device for tensor in tensors), torch.device("cpu"))
+
+    @property
+    def is_trained(self) -> bool:
+        """True if a model has parameters to train, beside those that ``fit`` sets."""
+        return any(parameter.requires_grad for parameter in self.parameters())
+
+    def fit(self, links: Links) -> None:
+        """Learns from the training links without gradients; by default nothing.
+
+        Raises:
+            ValueError: A receiver has no training or validation links.
+        """
+
+    def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """Parameters by the names in ``learning_rates``."""
+        return {"network": list(self.parameters())}
+
+    def save(self, path: str | Path) -> None:
+        """Writes the model into one file, which ``gaigs.load`` reads anywhere, without the data.
+
+        Raises:
+            ValueError: The model has no state, such as a look-up before its fit; or a part has no
+                registered name.
+            OSError: The file cannot be written; an earlier file stays as it was.
+
+        Example:
+            >>> links = gaigs.links("synthetic_rssi", transmitters=50)
+            >>> gaigs.train("path_loss", links).save("room.ckpt")
+            >>> gaigs.load("room.ckpt").predict([[1.0, 2.0, 1.5]], receiver="west").shape
+            torch.Size([1])
+        """
+        checkpoint.save(self, path)
+
+    def calibrate(self, state: Mapping[str, Tensor] | None) -> None:
+        """Takes the state of a calibration from a checkpoint; None if it has none."""
+        self.calibration = None if state is None else Calibration(**state)
+
+    @torch.no_grad()
+    def evaluate(self, batch: Batch) -> Tensor:
+        """Values (b, *shape) of a batch in all its directions, ``chunk`` pairs of a link and a
+        direction at a time.
+        """
+        if self.chunk is None or batch.directions is None:
+            return self(batch).value
+        rays = batch.directions.flatten()
+        (count,) = rays.shape
+        values = []
+        for query in batch.query.parts(max(1, self.chunk // count)):
+            parts = (rays[start : start + self.chunk] for start in range(0, count, self.chunk))
+            asked = [replace(batch, query=query, directions=part, labels=None) for part in parts]
+            value = torch.cat([self(part).value for part in asked], 1)
+            values.append(value.unflatten(1, batch.directions.shape))
+        return torch.cat(values)
+
+    @overload
+    def predict(
+        self, transmitters: object, *options: Any, interval: None = None, **named: Any
+    ) -> Tensor: ...
+    @overload
+    def predict(
+        self, transmitters: object, *options: Any, interval: float, **named: Any
+    ) -> Estimate: ...
+    def predict(  # type: ignore[misc]
+        self,
+        transmitters: object,
+        receiver: object = None,
+        frequency: object = None,
+        batch_size: int | None = None,
+        directions: Directions | None = None,
+        frequencies: object = None,
+        interval: float | None = None,
+    ) -> Tensor | Estimate | dict:
+        """Values for transmitters anywhere: a query, or a point, a list of points, or a grid.
+
+        Args:
+            transmitters: Positions (..., 3), world frame [m], anything that becomes a float tensor;
+                or a whole query.
+            receiver: Name or index of the receiver, or of that of each position; None: all
+                receivers.
+            frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the
+                training links' only carrier.
+            batch_size: Links computed at a time, of all receivers at least those of one position;
+                None: as many as have 2^17 numbers together.
+            directions: Directions to predict; None: the label's own, if it has directions.
+            frequencies: Subcarriers of channels to predict (s,) [Hz], also ones that no label had;
+                None: the label's own. A model without ``any_frequency``, such as ``knn``, gives the
+                values of its nearest subcarriers.
+            interval: Probability with which an interval holds the label, between 0 and 1, e.g. 0.9;
+                None: values alone.
+
+        Returns:
+            Values (..., receivers, *shape), of the axes of the positions, of all receivers in the
+            order of ``model.scene.receivers``, of a single one too, and of the task's shape. With
+            ``receiver`` (..., *shape); of a query (b, *shape). They are scaled as the training
+            labels (``model.scene.task.normalisation``), on the model's device. With an interval an
+            ``Estimate``: the value, its standard deviation, and the interval's ends. Where arrays
+            have different numbers of elements, channels of all receivers are a dictionary by name;
+            channels of a named receiver have the elements of its array.
+
+        Warns:
+            ExtrapolationWarning: A position is farther from the training transmitters' box than the
+                diagonal of this box and the receivers, or a frequency is outside the training
+                links' band, or subcarriers are farther from the band of the labels than it is wide,
+                or the values are those of other subcarriers. Not for a query.
+
+        Raises:
+            ValueError: The batch size is less than 1, or a position, receiver, frequency or
+                direction is impossible; or the labels have no subcarriers; or the model had too few
+                validation links for the interval.
+
+        Example:
+            >>> model = gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0))
+            >>> model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]).shape
+            torch.Size([2, 1, 90, 360])
+            >>> few = gaigs.Grid.degrees(elevations=range(10, 90, 10), azimuths=range(0, 360, 10))
+            >>> model.predict([1.0, 2.0, 1.5], receiver=0, directions=few).shape
+            torch.Size([8, 36])
+            >>> links = gaigs.links("synthetic_csi", transmitters=20, order=0)
+            >>> channels = gaigs.train("friis", links)
+            >>> channels.predict([1.0, 2.0, 1.5], frequencies=[6.8e9, 6.9e9]).shape
+            torch.Size([1, 16, 2])
+            >>> links = gaigs.links("synthetic_rssi", transmitters=100)
+            >>> levels = gaigs.train("gaussian_process", links)
+            >>> low, high = levels.predict([1.0, 2.0, 1.5], interval=0.9)[2:4]  # [dBm]
+            >>> low.shape, bool((low < high).all())
+            (torch.Size([4]), True)
+        """
+        check_type("interval", interval, float | None)
+        if interval is not None:
+            self._check_interval(interval, frequencies)
+        request = self._request(transmitters, receiver, frequency, directions, frequencies)
+        if interval is None:
+            values = torch.cat([*self._values(request, batch_size)])
+            return request.arranged(values, self.scene)
+        batches = self._estimates(request, batch_size, float(interval))
+        fields = []
+        for parts in zip(*batches, strict=True):
+            joined = None if parts[0] is None else torch.cat(parts)
+            fields.append(None if joined is None else request.arranged(joined, self.scene))
+        if not isinstance(fields[0], dict):
+            return Estimate(*fields)
+        estimates = {}
+        for name in fields[0]:
+            estimates[name] = Estimate(*(part and part[name] for part in fields))
+        return estimates
+
+    def predict_batches(
+        self,
+        transmitters: object,
+        receiver: object = None,
+        frequency: object = None,
+        batch_size: int | None = None,
+        directions: Directions | None = None,
+        frequencies: object = None,
+    ) -> Iterator[Any]:
+        """The values of ``predict`` for a list of positions, a batch at a time, each computed when
+        it is asked for.
+
+        A batch is (b, receivers, *shape), with a receiver (b, *shape). Arguments, warnings and
+        errors are those of ``predict``, and come at once. The positions of a grid are in the order
+        of ``reshape(-1, 3)``; the last batch may be smaller.
+        """
+        request = self._request(transmitters, receiver, frequency, directions, frequencies)
+        values = self._values(request, batch_size)
+        receivers = request.axes[-1:] if request.receiver is None else ()
+        count = math.prod(receivers)
+        return (
+            request.arranged(part, self.scene, (len(part) // count, *receivers)) for part in values
+        )
+
+    def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Model":
+        """A copy of a model with ``any_frequency`` whose labels have other subcarriers [Hz]."""
+        scene = replace(self.scene, task=self.scene.task.at_frequencies(frequencies))
+        other = copy.deepcopy(self)
+        for part in other.modules():
+            if hasattr(part, "scene"):
+                part.scene = scene
+        return other
+
+    def _check_interval(self, interval: float, frequencies: object) -> None:
+        if not 0 < interval < 1:
+            raise ValueError(
+                f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}"
+            )
+        if self.calibration is None:
+            raise ValueError(
+                "the model has no intervals: no held-out links have measured its errors\n"
+                "train it with split.validation above 0, on two places, runs or blocks or more, "
+                "without data.band_train"
+            )
+        subcarriers = as_known_subcarriers(frequencies, self.scene, self.any_frequency)
+        if subcarriers.warning or subcarriers.exchanged is not None:
+            raise ValueError(
+                "intervals are those of the labels' own subcarriers; leave frequencies out"
+            )
+
+    def _request(
+        self,
+        transmitters: object,
+        receiver: object,
+        frequency: object,
+        directions: Directions | None,
+        frequencies: object,
+    ) -> Request:
+        """The checked arguments of ``predict``, whose warnings name the line that called it."""
+        subcarriers = as_known_subcarriers(frequencies, self.scene, self.any_frequency)
+        request = Request.of(self.scene, transmitters, receiver, frequency, directions, subcarriers)
+        for message in request.warnings:
+            warnings.warn(message, ExtrapolationWarning, stacklevel=3)
+        return request
+
+    def _values(self, request: Request, batch_size: int | None) -> Iterator[Tensor]:
+        """Values of the links (b, *shape), a batch at a time."""
+        exchanged, columns, _ = request.subcarriers
+        model = self if exchanged is None else self.at_frequencies(exchanged)
+        values = map(model._answer, model._batches(request, batch_size))
+        return values if columns is None else (part[..., columns] for part in values)
+
+    def _estimates(
+        self, request: Request, batch_size: int | None, interval: float
+    ) -> Iterator[Estimate]:
+        """Estimates of the links, a batch at a time."""
+        columns = request.subcarriers.columns
+
+        def chosen(part: Tensor | None) -> Tensor | None:
+            has_columns = part is not None and part.ndim > 2 and columns is not None
+            return part[..., columns] if has_columns else part  # type: ignore[index]
+
+        for batch in self._batches(request, batch_size):
+            estimate = self._estimate(batch, interval)
+            yield Estimate(*map(chosen, estimate))  # type: ignore[arg-type]
+
+    def _batches(self, request: Request, batch_size: int | None) -> Iterator[Batch]:
+        """The links of a request, a batch at a time; all receivers of a position together."""
+        check_type("batch_size", batch_size, int | None)
+        if batch_size is None:
+            batch_size = usual_batch_size(self.scene.task.shape)
+        if batch_size < 1:
+            raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
+        size = max(1, batch_size // request.each) * request.each
+        query = request.query.to(self.device)
+        directions = request.directions
+        if directions is not None:
+            directions = directions.to(self.device)
+        count = math.ceil(len(query) / size)
+        parts = track(query.parts(size), "predictions", count, is_fixed=True)
+        return (Batch(part, directions) for part in parts)
+
+    @usual_modes()
+    @torch.no_grad()
+    def _answer(self, batch: Batch) -> Tensor:
+        """Values of a batch in evaluation mode; the mode stays as it was."""
+        training = self.training
+        self.eval()
+        try:
+            return self.evaluate(batch)
+        finally:
+            self.train(training)
+
+    @usual_modes()
+    def _estimate(self, batch: Batch, interval: float) -> Estimate:
+        value = self._answer(batch)
+        assert self.calibration is not None
+        return self.calibration.estimate(value, self.spread(batch, value), batch.query, interval)
+
+    @torch.no_grad()
+    def spread(self, batch: Batch, value: Tensor) -> Tensor:
+        """Standard deviation of the labels as the model knows it, (b,) or of each number; a
+        calibration scales it.
+
+        Without ``deviations`` it is 1, of channels the root mean square of each link's value. It is
+        NaN at elements that a receiver's array lacks, which have no error.
+        """
+        deviations = self.deviations(batch)
+        if deviations is None and value.is_complex():
+            deviations = value.abs().square().flatten(1).mean(1).sqrt()  # (b,)
+        if deviations is None:
+            deviations = torch.ones(len(value), device=value.device)
+        if not lacks_elements(self.scene):
+            return deviations
+        receivers = batch.query.receivers
+        absent = lacking(self.scene.receivers, receivers, value.shape[1])[..., None]  # (b, e, 1)
+        if deviations.ndim == 1:  # over all numbers, of which those that are absent are 0
+            present = 1 - absent.to(deviations).mean((1, 2))  # (b,)
+            deviations = (deviations / present.sqrt())[:, None, None]
+        return deviations.expand(value.shape).masked_fill(absent, math.nan)
+
+    # --- what a run asks a model for, beside values ---
+
+    def facts(self) -> dict[str, Any]:
+        """Entries of ``metrics.json`` beside the model's sizes; plain values by name."""
+        return {}
+
+    def rendering(self, batch: Batch) -> Callable[[], object] | None:
+        """The rendering alone of a batch, to be timed; None for a model that renders nothing."""
+        return None
+
+    def learnt_room(self, links: Links | None = None) -> Any:
+        """The room learnt from the links, a ``gaigs.planes.learnt_room.LearntRoom`` for figures;
+        without links from the state alone. None for a model that learns no room."""
+        return None
+
+    def learnt_paths(self, query: Query) -> list:
+        """The strongest paths of some links together, each a
+        ``gaigs.planes.learnt_room.LearntPath``."""
+        return []
+
+    def export(self, folder: Path) -> None:
+        """Writes files for other programs into a run's folder; by default none."""
+
+    def revise(
+        self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]
+    ) -> str:
+        """Changes the model between two training steps, such as by a search.
+
+        Parameters keep their shapes, and the state dict has every decision.
+
+        Args:
+            number: Index into ``revisions``.
+            train: Some training links, thinned as in a step.
+            validation: Some validation links.
+            loss: Loss of the model on a batch.
+
+        Returns:
+            A sentence for the log.
+        """
+        return "nothing is revised"
+
+    # --- what a model knows of its errors ---
+
+    def deviations(self, batch: Batch) -> Tensor | None:
+        """Standard deviations of the labels (b,), root mean squares over all their numbers, or of
+        each number (b, *shape); but for a common factor. None if the model does not know them."""
+        return None
+
+    def process_at(self, receiver: int) -> Process | None:
+        """The Gaussian process of a receiver's labels, which plans surveys; None without one."""
+        return None
+
+    @property
+    def has_margins(self) -> bool:
+        """True if ``margins`` gives the paths of channels."""
+        return False
+
+    def margins(self, query: Query) -> Complex[Tensor, "b n e s"]:
+        """Channels by which each path of links to one receiver may deviate, for kriging."""
+        raise ValueError("the model has no paths of channels; ask has_margins first")
+
+    def refit(self, links: Links) -> None:
+        """Fits to some of the links of an earlier fit, whose choices may stay: it may be faster."""
+        self.fit(links)
+
+    def take_hyperparameters(self, other: "Model") -> None:
+        """Takes from a model of the same kind what its ``deviations`` depend on; by default
+        nothing."""
+
+    @property
+    def fold_count(self) -> int:
+        """Most models that ``unseen`` gives."""
+        return 1 if self.is_trained else LOOK_UP_FOLDS
+
+    def unseen(self, links: Links) -> Iterator[Unseen]:
+        """Models like this one with links that they have not seen, each when it is asked for.
+
+        A look-up is fitted anew without each fold of the known links; so are estimated places of
+        receivers. A trained model has the validation links; the step of its training stays the one
+        chosen on all of them. Of repeated readings one calibrates, see ``single_readings``. The
+        time limit of a run leaves later folds out.
+        """
+        if not self.is_trained:
+            for fold in held_out_folds(links):
+                yield Unseen(self._refitted(fold.rest), fold.asked, fold.rest.split.train)
+        elif len(links.split.validation):
+            asked = single_readings(links, links.split.validation)
+            yield Unseen(self, asked, links.split.train)
+
+    def _refitted(self, links: Links) -> "Model":
+        """A copy that is fitted to some of the links of an earlier fit."""
+        scene = replace(self.scene, receivers=links.receivers)  # whose places may be estimated
+        # Known links are large, and stay as they are.
+        memo: dict[int, Any] = {id(self.links): self.links, id(self.scene): scene}
+        copied = copy.deepcopy(self, memo)
+        copied.refit(links)
+        return copied

@@ -1,0 +1,60 @@
+"""Base of models that keep the links that they know."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from gaigs.core.query import Batch, Query
+from gaigs.data import Links
+from gaigs.kriging.links import PART
+from gaigs.model.base import Model
+from gaigs.registry import name_of
+
+
+class LookUp(Model):
+    """Base of a model that keeps its known links: they are its state, with the attributes of the
+    names ``learnt``.
+
+    It answers on the processor.
+
+    Attributes:
+        links: Links, or a batch of the known ones; None before the fit.
+        known: Numbers of each receiver's known links.
+        learnt: Names of attributes with plain values that ``fit`` sets.
+    """
+
+    links: Links | Batch | None = None
+    known: Sequence[Tensor] = ()
+    learnt: tuple[str, ...] = ()
+
+    def _apply(self, *_: Any) -> "LookUp":
+        return self
+
+    def get_extra_state(self) -> dict:
+        """Known links and ``learnt``; labels in bytes if all are 255ths from 0 to 1, as of 8-bit
+        images.
+        """
+        if self.links is None:
+            raise ValueError(f"model {name_of(self)!r} has no links to save; fit it first")
+        index = torch.cat([*self.known])
+        labels = []
+        for part in index.split(PART):
+            values = self.links.labels[part]
+            levels = (255 * values.real).round().clamp(0, 255).to(torch.uint8)
+            is_exact = (levels / 255 == values).all()
+            labels.append(levels if is_exact else values)
+        learnt = {name: getattr(self, name) for name in self.learnt}
+        return {"query": vars(self.links.query[index]), "labels": labels, **learnt}
+
+    def set_extra_state(self, state: dict) -> None:
+        """Takes the state of a fitted look-up."""
+        labels = [part / 255 if part.dtype == torch.uint8 else part for part in state["labels"]]
+        self.links = Batch(Query(**state["query"]), None, torch.cat(labels))
+        receivers = self.links.query.receivers
+        self.known = [
+            (receivers == number).nonzero()[:, 0] for number in range(len(self.scene.receivers))
+        ]
+        for name in self.learnt:
+            setattr(self, name, state[name])

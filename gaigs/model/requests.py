@@ -1,0 +1,168 @@
+"""Arguments of ``Model.predict``: checked, with the axes of the answer and the warnings."""
+
+import math
+from typing import Any, NamedTuple
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Directions
+from gaigs.core.query import ROUNDING, Query, as_directions, as_receivers, as_subcarriers
+from gaigs.core.scene import Scene
+
+
+class Subcarriers(NamedTuple):
+    """Subcarriers that a prediction is asked at.
+
+    Attributes:
+        exchanged: Frequencies [Hz] that the model computes in place of the labels' own; None: the
+            labels' own.
+        columns: The labels' own subcarriers that are taken (s,); None: all.
+        warning: Sentence on the values, empty if there is nothing to say.
+    """
+
+    exchanged: Float[Tensor, " s"] | None = None
+    columns: Int[Tensor, " s"] | None = None
+    warning: str = ""
+
+
+class Request(NamedTuple):
+    """Links to predict, and how their values are arranged.
+
+    Attributes:
+        query: Links, the receivers of a position one after the other.
+        axes: Axes of the links in the answer, see ``Query.from_positions``.
+        receiver: Receivers as they were asked for; None: all.
+        each: Number of links of a position.
+        directions: Directions to predict; None: the label's own.
+        subcarriers: Subcarriers to predict.
+        warnings: Sentences on positions, carriers and subcarriers far from the training links.
+    """
+
+    query: Query
+    axes: tuple[int, ...]
+    receiver: object
+    each: int
+    directions: Directions | None
+    subcarriers: Subcarriers
+    warnings: list[str]
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        transmitters: object,
+        receiver: object,
+        frequency: object,
+        directions: Directions | None,
+        subcarriers: Subcarriers,
+    ) -> "Request":
+        """Checks the arguments of ``Model.predict``, which has the errors."""
+        directions = as_directions(directions, scene.task.directions, scene.task.name)
+        names = [one.name for one in scene.receivers]
+        query, axes = Query.from_positions(
+            transmitters, receiver, frequency, names, scene.frequencies
+        )
+        if isinstance(transmitters, Query):
+            return cls(query, axes, transmitters.receivers, 1, directions, subcarriers, [])
+        each = axes[-1] if receiver is None else 1
+        warnings = [subcarriers.warning] if subcarriers.warning else []
+        warnings += extrapolations(query[::each], scene)
+        return cls(query, axes, receiver, each, directions, subcarriers, warnings)
+
+    def arranged(self, values: Tensor, scene: Scene, axes: tuple[int, ...] | None = None) -> Any:
+        """Values of links (b, ...) with the axes of the answer, or with other ones.
+
+        Where arrays have different numbers of elements, a dictionary by receiver or, of one
+        receiver, the elements of its array.
+        """
+        axes = self.axes if axes is None else axes
+        receivers = scene.receivers
+        values = values.reshape((*axes, *values.shape[1:]))
+        if not lacks_elements(scene):
+            return values
+        is_channel = values.ndim > len(axes)
+
+        def of_array(part: Tensor, receiver: Receiver) -> Tensor:
+            return part[..., : len(receiver.array), :] if is_channel else part
+
+        if self.receiver is None:
+            parts = values.unbind(len(axes) - 1)
+            pairs = zip(receivers, parts, strict=True)
+            return {receiver.name: of_array(part, receiver) for receiver, part in pairs}
+        number = as_receivers(self.receiver, [receiver.name for receiver in receivers])
+        return values if number.ndim else of_array(values, receivers[int(number)])
+
+
+def lacks_elements(scene: Scene) -> bool:
+    """True for channels if an array has fewer elements than another one."""
+    if not scene.task.is_channel:
+        return False
+    return min(len(receiver.array) for receiver in scene.receivers) < scene.task.elements
+
+
+def as_known_subcarriers(frequencies: object, scene: Scene, any_frequency: bool) -> Subcarriers:
+    """Subcarriers of ``Model.predict``, for a model that computes them anywhere or does not.
+
+    Raises:
+        ValueError: The labels have no subcarriers, or a frequency is impossible.
+    """
+    if frequencies is None:
+        return Subcarriers()
+    if not scene.task.is_channel:
+        raise ValueError(
+            f"labels of task {scene.task.name!r} have no subcarriers; leave frequencies out"
+        )
+    asked = as_subcarriers(frequencies)
+    apart, columns = (scene.task.frequencies - asked[:, None]).abs().min(1)
+    if (apart <= 1e-9 * asked).all():  # float64 computes them no better
+        return Subcarriers(columns=columns)
+    if not any_frequency:
+        warning = (
+            "values are those of the nearest subcarriers with labels, "
+            f"up to {apart.max():.7g} Hz away"
+        )
+        return Subcarriers(columns=columns, warning=warning)
+    low, high = scene.task.frequencies.aminmax()
+    beyond = max(low - asked.min(), asked.max() - high).item()
+    warning = ""
+    if beyond > high - low:
+        warning = (
+            f"subcarriers are up to {beyond:.4g} Hz beyond those with labels, which span "
+            f"{high - low:.4g} Hz: phases may be off"
+        )
+    return Subcarriers(exchanged=asked, warning=warning)
+
+
+def usual_batch_size(shape: tuple[int, ...], numbers: int = 2**17, most: int = 1024) -> int:
+    """Links that have so many numbers of labels together; 16 links at least."""
+    return min(most, max(16, numbers // math.prod(shape)))
+
+
+def extrapolations(query: Query, scene: Scene) -> list[str]:
+    """Sentences on positions farther from the training transmitters' box than the scene's extent,
+    and on carriers outside the training links' band."""
+    messages = []
+    points = query.transmitters
+    nearest = points.clamp(scene.lower.to(points), scene.upper.to(points))  # (b, 3), in the box
+    distances = (points - nearest).norm(dim=-1)  # (b,)
+    if count := int((distances > scene.extent).sum()):
+        messages.append(
+            f"{count} of {len(points)} positions are up to {distances.amax():.3g} m outside the "
+            "box of the training transmitters, which with the receivers is "
+            f"{scene.extent:.3g} m across: nothing was measured near there"
+        )
+    if query.frequencies is None or not scene.has_band:
+        return messages
+    asked = query.frequencies.double()
+    low, high = scene.frequencies.double()[[0, -1]].tolist()
+    outside = asked[(asked < low * (1 - ROUNDING)) | (asked > high * (1 + ROUNDING))]
+    if len(outside):
+        ends = f"{outside.amin():.7g}", f"{outside.amax():.7g}"
+        span = " to ".join(dict.fromkeys(ends))
+        messages.append(
+            f"{len(outside)} of {len(asked)} positions are asked at {span} Hz, outside the "
+            f"training links' band of {low:.7g} to {high:.7g} Hz: nothing was measured there"
+        )
+    return messages

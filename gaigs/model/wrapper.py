@@ -1,0 +1,48 @@
+"""Models that are made of other models."""
+
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene
+from gaigs.data import Links
+from gaigs.model.base import Model
+from gaigs.registry import registry
+from gaigs.splatting.gaussians import Gaussians
+
+
+class Wrapper(Model):
+    """Base of a model around an ``underlying`` one, which has the room, the Gaussians, the
+    rendering and the files.
+    """
+
+    @property
+    @abstractmethod
+    def underlying(self) -> Model:
+        """The model within, such as the trend of kriging."""
+
+    @property
+    def primitives(self) -> Gaussians | None:  # type: ignore[override]
+        return self.underlying.primitives
+
+    def rendering(self, batch: Batch) -> Callable[[], object] | None:
+        return self.underlying.rendering(batch)
+
+    def learnt_room(self, links: Links | None = None) -> Any:
+        return self.underlying.learnt_room(links)
+
+    def learnt_paths(self, query: Query) -> list:
+        return self.underlying.learnt_paths(query)
+
+    def export(self, folder: Path) -> None:
+        self.underlying.export(folder)
+
+
+def build_trend(trend: str | Mapping | Model, scene: Scene) -> Model:
+    """The model that is a trend; errors name the option ``model.trend``."""
+    try:
+        return registry("model").build(trend, scene=scene)
+    except ValueError as error:
+        raise ValueError(f"model.trend: {error}") from error
