@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from gaigs.commands.locate.location import Location
     from gaigs.commands.locate.posterior import locate
     from gaigs.commands.locate.prediction_map import fingerprints
-    from gaigs.commands.survey import SurveyPlan, survey
+    from gaigs.commands.survey.plan import SurveyPlan, survey
     from gaigs.commands.view import View, view
     from gaigs.configuration import compose
     from gaigs.core.antenna import Array, Receiver
@@ -57,8 +57,8 @@ PLACES = {
     "Location": "commands.locate.location",
     "fingerprints": "commands.locate.prediction_map",
     "Fingerprints": "commands.locate.fingerprints",
-    "survey": "commands.survey",
-    "SurveyPlan": "commands.survey",
+    "survey": "commands.survey.plan",
+    "SurveyPlan": "commands.survey.plan",
     "view": "commands.view",
     "View": "commands.view",
     "compose": "configuration",
