@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -150,9 +149,9 @@ def measure(
     )
     # SSIM of 4e8 numbers takes half a minute of one core.
     most = min(most, max(30, int(400_000_000 / math.prod((*shape, *links.task.shape)))))
-    drawn = draw(empty, places, order, groups, most, block, random)
-    scores = {cell: compare(links, *ends.T) for cell, ends in drawn.ends.items()}
-    return replace(empty, pairs=drawn.counts.reshape(shape), scores=scores)
+    counts, drawn = draw(empty, places, order, groups, most, block, random)
+    scores = {cell: compare(links, *ends.T) for cell, ends in drawn.items()}
+    return replace(empty, pairs=counts.reshape(shape), scores=scores)
 
 
 def distance_edges(links: Links, places: Float[ndarray, "n 3"]) -> Float[ndarray, " rows"]:
@@ -182,18 +181,6 @@ def groups_of(links: Links) -> list[Int[ndarray, " k"]]:
     order = which.argsort(stable=True).numpy()
     groups = np.split(order, which.bincount().cumsum(0)[:-1].numpy())
     return [group for group in groups if len(group) > 1]
-
-
-class Drawn(NamedTuple):
-    """Random pairs of links.
-
-    Attributes:
-        counts: Number of pairs of each cell, drawn or not.
-        ends: Earlier and later link of the drawn pairs (k, 2), by cell.
-    """
-
-    counts: Int[ndarray, " cells"]
-    ends: dict[int, Int[ndarray, "k 2"]]
 
 
 class Reservoir:
@@ -235,8 +222,11 @@ def draw(
     most: int,
     block: int,
     random: np.random.Generator,
-) -> Drawn:
-    """Counts the pairs of each cell, and draws at most so many of them; see ``measure``."""
+) -> tuple[Int[ndarray, " cells"], dict[int, Int[ndarray, "k 2"]]]:
+    """Number of pairs of each cell, and at most so many of them, earlier and later link.
+
+    Arguments are those of ``measure``.
+    """
     size = agreement.pairs.size
     counts = np.zeros(size + 1, int)  # the last cell holds links that are not a pair
     reservoir = Reservoir(size, most)
@@ -255,7 +245,7 @@ def draw(
             counts += np.bincount(cells, minlength=size + 1)
             reservoir.add(cells, random.random(len(cells)), rows, group)
     ends = {cell: np.sort(pairs, 1) for cell, pairs in reservoir.ends.items() if len(pairs)}
-    return Drawn(counts[:size], ends)
+    return counts[:size], ends
 
 
 def compare(links: Links, earlier: ndarray, later: ndarray) -> dict[str, Tensor]:

@@ -72,12 +72,9 @@ class PlaceDensity:
         width: float,
         folds: Int[Tensor, " g"] | None = None,
     ) -> Float[Tensor, " g"]:
-        """Logarithm of the density at places [m].
+        """Logarithm of the density at places, for normal densities of a width [m].
 
-        Args:
-            asked: Places.
-            width: Standard deviation of the normal densities [m].
-            folds: Folds of the places, whose known places do not count; None: all count.
+        Known places of a place's own fold do not count, if there are ``folds``.
         """
         axes = self.has_extent
         squares = distances(asked[:, axes], self.places[:, axes]).square_()  # (g, k)
@@ -86,6 +83,7 @@ class PlaceDensity:
             squares = squares.masked_fill(is_other, math.inf)
         if folds is not None:
             squares = squares.masked_fill(folds[:, None] == self.folds, math.inf)
+        # log sum over k of (1 - e) / k N(asked; place, width), and e / volume
         share = math.log(1 - self.elsewhere) - math.log(len(self.places))
         peak = share - int(axes.sum()) * math.log(width * math.sqrt(2 * math.pi))
         near = torch.logsumexp(squares / (-2 * width**2), 1) + peak  # (g,)
@@ -97,7 +95,7 @@ class PlaceDensity:
 
         Args:
             spacing: Median distance from a known place to the next [m].
-            most: Largest number of places whose density is computed.
+            most: Largest number of places whose density counts.
             tried: Number of widths, from a quarter of the spacing to the diagonal of the box.
         """
         some = evenly(torch.arange(len(self.places)), most)
@@ -119,15 +117,7 @@ def near_candidates(
     links: Links,
     known: Int[Tensor, " k"],
 ) -> Candidates:
-    """A grid with a quarter of the places, and random places about those of known links.
-
-    Args:
-        box: Corners of the grid [m].
-        points: Number of places.
-        floors: Heights of separate floors [m], on which the places lie.
-        links: Links with a split.
-        known: The known ones.
-    """
+    """A grid with a quarter of the places, and random places about those of known links."""
     places, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)
     folds = torch.zeros(len(places), dtype=torch.long)
     folds = folds.index_copy(0, which, folds_of(links, known))

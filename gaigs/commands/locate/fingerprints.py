@@ -100,6 +100,7 @@ class Fingerprints:
                     is_received = torch.ones(len(order), dtype=torch.bool)
                     candidates, logarithms = track(candidates, logarithms[order], step, is_received)
                     truth = truth[order]
+                # Candidates are a sample of the prior: their density is not their probability.
                 heights = logarithms - candidates.prior + candidates.density  # (n, g)
                 nearest = candidates.nearest(truth)[:, None]
                 parts.append(heights.amax(1) - heights.gather(1, nearest)[:, 0])

@@ -16,11 +16,7 @@ from gaigs.core.query import ROUNDING, evenly
 def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor, "m k"]:
     """Axes along which errors of a label's numbers are independent.
 
-    They are scaled to a mean square of 1 a label.
-
-    Args:
-        errors: Errors of labels; of more than ``most`` an even part counts.
-        most: Largest number of labels.
+    They are scaled to a mean square of 1 a label. Of more than ``most`` errors an even part counts.
 
     Source: Ledoit and Wolf, A well-conditioned estimator for large-dimensional covariance matrices,
     2004.
@@ -59,13 +55,10 @@ class Mismatch(NamedTuple):
 def mismatch(
     prints: Fingerprints, asked: Float[Tensor, "n r k"], unknown_power: bool = False
 ) -> Mismatch:
-    """Differences of values from the predictions of a map.
+    """Differences of values, along the axes of a map, from its predictions.
 
-    Args:
-        prints: The map.
-        asked: Values along its axes, NaN where a receiver has received nothing.
-        unknown_power: True for the least squares over all offsets of a value's levels, or all
-            factors of a prediction's spectra or channels.
+    With ``unknown_power`` squares are the least over all offsets of a value's levels, or all
+    factors of a prediction's spectra or channels.
     """
     is_received = ~asked[..., 0].isnan()  # (n, r)
     if prints.task.shape:

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,10 +17,7 @@ def walk(places: Float[Tensor, "n 3"], step: float, most: int = 10) -> Int[Tenso
     It stays for as many values as moves of ``step`` along each axis take to the next place: errors
     of values that are received near each other have much in common.
 
-    Args:
-        places: Places [m].
-        step: Standard deviation of a move along each axis [m].
-        most: Largest number of values at each place.
+    At most ``most`` values are at each place; ``step`` is in metres.
     """
     apart = distances(places, places)
     is_free = torch.ones(len(places), dtype=torch.bool)
@@ -37,35 +33,22 @@ def walk(places: Float[Tensor, "n 3"], step: float, most: int = 10) -> Int[Tenso
     return torch.tensor(order).repeat_interleave(min(max(1, stays), most))
 
 
-class Track(NamedTuple):
-    """Posterior of a track.
-
-    Attributes:
-        candidates: Its j candidates.
-        logarithms: Logarithm of each candidate's probability, for each value (n, j).
-    """
-
-    candidates: Candidates
-    logarithms: Float[Tensor, "n j"]
-
-
 def track(
     candidates: Candidates,
     logarithms: Float[Tensor, "n g"],
     step: float,
     is_received: Bool[Tensor, " n"],
     spread: int = 75,
-) -> Track:
-    """The posterior of a track at an even part of the candidates.
+) -> tuple[Candidates, Float[Tensor, "n j"]]:
+    """An even part of the candidates, and the logarithms of a track's posterior there.
 
     Args:
         candidates: Candidates of single values.
-        logarithms: Posteriors of single values.
-        step: Standard deviation of a move along each axis [m].
-        is_received: True for values that a receiver has received.
-        spread: Number of candidates over which the posterior of a single value still spreads:
-            those that ``smoothed`` links then hold it, and reach as far as the regions of tracks,
-            far beyond the likeliest candidates.
+        logarithms: Logarithms of their posteriors.
+        step, is_received: As for ``smoothed``.
+        spread: Number of candidates over which the posterior of a single value still spreads. The
+            candidates that ``smoothed`` links then hold it: regions of tracks reach far beyond the
+            likeliest ones.
     """
     # The inverse of the sum of squares counts candidates of equal probability.
     posteriors = torch.softmax(logarithms[is_received], 1)
@@ -76,16 +59,14 @@ def track(
     single = logarithms[:, even]  # (n, j)
     single = (single - single.amax(1, keepdim=True)).float()
     places = (part.places - part.places.mean(0)).float()
-    return Track(part, smoothed(single, places, step, is_received).to(logarithms))
+    return part, smoothed(single, places, step, is_received).to(logarithms)
 
 
 class Moves:
     """Moves of a transmitter between candidates of consecutive values.
 
     Args:
-        places: Candidate places [m].
-        step: Standard deviation of a move along each axis [m].
-        jump: Density of a move to any place over that of a move to the same one.
+        places, step, jump: As for ``smoothed``.
     """
 
     def __init__(self, places: Float[Tensor, "g 3"], step: float, jump: float):
@@ -138,8 +119,8 @@ def smoothed(
 
     Source: Rabiner, A tutorial on hidden Markov models, 1989, the forward-backward algorithm.
     """
-    apart = distances(straight_lines(logarithms, places, is_received), places)
-    preference = torch.where(is_received[:, None], logarithms, -apart)  # (n, g)
+    apart = distances(straight_lines(logarithms, places, is_received), places)  # (n, g)
+    preference = torch.where(is_received[:, None], logarithms, -apart)
     indices = preference.topk(min(most, len(places)), dim=1).indices  # (n, k)
     single = logarithms.gather(1, indices)  # (n, k)
 
@@ -149,7 +130,7 @@ def smoothed(
     moves = Moves(places, math.hypot(step, spacing.item()), jump)
 
     # forward: given the values until each one; backward: given those after it.
-    forward = [single[0]]
+    forward = [single[0]]  # n of (k,)
     for value, pair in zip(single[1:], itertools.pairwise(indices), strict=True):
         forward.append(value + moves.take(forward[-1], *pair))
     backward = [torch.zeros_like(single[0])]

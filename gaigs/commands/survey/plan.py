@@ -176,8 +176,7 @@ def survey(
     chosen, errors = Selection(processes, asked, places, factor).choose(count)
     box = asked[places.evaluated]
     if region is None and candidates is not None:
-        even = even_places(model.scene.lower, model.scene.upper, GRID, model.scene.floors)
-        box = coordinates_of(model, even, frequency).to(processes[0].places)
+        box = coordinates_of(model, training_grid(model), frequency).to(processes[0].places)
     measured = measured_places(processes, box, factor)
     return SurveyPlan(
         places.candidates[chosen],
@@ -189,11 +188,6 @@ def survey(
         model.scene.frame,
         measured.error,
     )
-
-
-GRID = 1000
-"""Approximate number of places of a grid over a region: of candidates, and of places over which the
-error is stated."""
 
 
 class SurveyPlaces(NamedTuple):
@@ -222,15 +216,6 @@ class SurveyPlaces(NamedTuple):
 def survey_places(model: Model | None, region: object, candidates: object) -> SurveyPlaces:
     """Places of the arguments of ``survey``."""
     none = torch.zeros(0, 3)
-    floors: Sequence[float] | Tensor = ()
-    if region is None and candidates is None:
-        if model is None:
-            raise ValueError(
-                "a survey without a model takes a region or candidates, got neither\n"
-                "give one (survey.region=...), or a trained model (folder=runs/...)"
-            )
-        region = torch.stack((model.scene.lower, model.scene.upper))
-        floors = model.scene.floors
     even = none
     if region is not None:
         box = as_positions("region", region).reshape(-1, 3)
@@ -240,10 +225,32 @@ def survey_places(model: Model | None, region: object, candidates: object) -> Su
                 "region must be two corners [[x, y, z], [x, y, z]] [m], "
                 f"got {len(box)} points{advice}"
             )
-        even = even_places(box[0], box[1], GRID, floors)
+        even = grid(box[0], box[1])
+    elif candidates is None:
+        if model is None:
+            raise ValueError(
+                "a survey without a model takes a region or candidates, got neither\n"
+                "give one (survey.region=...), or a trained model (folder=runs/...)"
+            )
+        even = training_grid(model)
     if candidates is None:
         return SurveyPlaces(even, none)
     return SurveyPlaces(as_positions("candidates", candidates).reshape(-1, 3), even)
+
+
+def grid(
+    lower: Float[Tensor, "3"],
+    upper: Float[Tensor, "3"],
+    floors: Sequence[float] | Tensor = (),
+    count: int = 1000,
+) -> Float[Tensor, "g 3"]:
+    """Even places in a box, as candidates or for the mean error over it."""
+    return even_places(lower, upper, count, floors)
+
+
+def training_grid(model: Model) -> Float[Tensor, "g 3"]:
+    """Even places in the box of the training transmitters, or on their floors."""
+    return grid(model.scene.lower, model.scene.upper, model.scene.floors)
 
 
 def check_memory(candidates: int, receivers: int, limit: float = 2e9) -> None:
@@ -282,18 +289,6 @@ def error_factor(model: Model) -> float:
     return mean_absolute(calibration.sizes.square().mean().sqrt().item())
 
 
-class Chosen(NamedTuple):
-    """Chosen candidates.
-
-    Attributes:
-        numbers: Numbers of the candidates, in their order.
-        errors: Expected mean error before and after each.
-    """
-
-    numbers: list[int]
-    errors: Float[Tensor, " n1"]
-
-
 class Selection:
     """Covariances of all receivers at places, given the readings and the chosen candidates.
 
@@ -318,8 +313,8 @@ class Selection:
         self.factor = factor
         self.is_free = torch.ones(len(places.candidates), dtype=torch.bool)
 
-    def choose(self, count: int) -> Chosen:
-        """Chooses so many candidates, or all."""
+    def choose(self, count: int) -> tuple[list[int], Float[Tensor, " n1"]]:
+        """Numbers of so many candidates, or all; and the errors before and after each."""
         numbers = []
         errors = [self.error()]
         for _ in track(range(min(count, len(self.is_free))), "places to measure"):
@@ -328,7 +323,7 @@ class Selection:
             self.measure(number)
             numbers.append(number)
             errors.append(self.error())
-        return Chosen(numbers, torch.tensor(errors))
+        return numbers, torch.tensor(errors)
 
     def error(self) -> float:
         """Expected mean error of a new reading."""
