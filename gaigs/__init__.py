@@ -23,8 +23,11 @@ if TYPE_CHECKING:
     from gaigs.commands import run
     from gaigs.commands.describe import Description, describe
     from gaigs.commands.export import export
-    from gaigs.commands.locate import Fingerprints, Location, fingerprints, locate
-    from gaigs.commands.survey import SurveyPlan, survey
+    from gaigs.commands.locate.fingerprints import Fingerprints
+    from gaigs.commands.locate.location import Location
+    from gaigs.commands.locate.posterior import locate
+    from gaigs.commands.locate.prediction_map import fingerprints
+    from gaigs.commands.survey.plan import SurveyPlan, survey
     from gaigs.commands.view import View, view
     from gaigs.configuration import compose
     from gaigs.core.antenna import Array, Receiver
@@ -48,12 +51,12 @@ PLACES = {
     "describe": "commands.describe",
     "Description": "commands.describe",
     "export": "commands.export",
-    "locate": "commands.locate",
-    "Location": "commands.locate",
-    "fingerprints": "commands.locate",
-    "Fingerprints": "commands.locate",
-    "survey": "commands.survey",
-    "SurveyPlan": "commands.survey",
+    "locate": "commands.locate.posterior",
+    "Location": "commands.locate.location",
+    "fingerprints": "commands.locate.prediction_map",
+    "Fingerprints": "commands.locate.fingerprints",
+    "survey": "commands.survey.plan",
+    "SurveyPlan": "commands.survey.plan",
     "view": "commands.view",
     "View": "commands.view",
     "compose": "configuration",

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -19,11 +20,6 @@ from gaigs.data.checks import Finding, check
 from gaigs.io.files import write_text
 from gaigs.registry import check_instance
 from gaigs.report import style
-
-LINKS, RECEIVERS = 2000, 12
-"""Most links whose spectra or channels are read, evenly spread, and most receivers that the text
-lists.
-"""
 
 
 @dataclass(frozen=True)
@@ -50,16 +46,15 @@ class Description:
         return tuple(map(str, self.findings))
 
     def __str__(self) -> str:
-        found = ["nothing suspicious"]
+        verdict = ["nothing suspicious"]
         if self.findings:
-            found = ["suspicious:", *(f"  {sentence}" for sentence in self.suspicious)]
-        return "\n".join((*self.read, *found))
+            verdict = ["suspicious:", *(f"  {sentence}" for sentence in self.suspicious)]
+        return "\n".join((*self.read, *verdict))
 
 
 @torch.no_grad()
 def describe(links: Links) -> Description:
-    """A first look at links of any task: extent, levels and receivers, and what is suspicious in
-    them.
+    """A first look at links of any task: extent, levels, receivers, and what is suspicious.
 
     Args:
         links: With or without a split.
@@ -69,80 +64,106 @@ def describe(links: Links) -> Description:
         ()
     """
     check_instance("links", links, Links)
-    places, index = links.query.transmitters, _read(links)
-    sites, values = places.unique(dim=0), levels(links, index)
-    axes = zip("xyz", sites.amin(0).tolist(), sites.amax(0).tolist(), strict=True)
-    quantity, unit = quantity_of(links)
-    low, middle, high = np.quantile(
-        values.numpy(), (0.0, 0.5, 1.0)
-    ).tolist()  # torch takes no more than 2**24
-    count = len(links.receivers)
-    read = [
-        f"{links.task.name}: {len(links)} links of {len(sites)} places at {count} receiver{'s' * (count != 1)}",
-        "places [m]: " + ", ".join(f"{axis} {a:.2f} to {b:.2f}" for axis, a, b in axes),
-        f"{with_unit(quantity, unit)}: {low:.3g} to {high:.3g}, median {middle:.3g}"
-        + f" of {len(index)} links" * (len(index) < len(links)),
-    ]
-    if links.split is not None:
-        read.append(
-            f"split {links.split.name}: "
-            + ", ".join(f"{len(p)} {n}" for n, p in links.split.parts().items())
-        )
-    if repeated := len(links) - len(links.query.unique(with_receivers=True)[0]):
-        read.append(f"{repeated} links repeat place and receiver of another")
+    levels = Levels.of(links)
     findings = tuple(check(links))
     remarks = links.remarks
     for finding in findings:  # a split has them among its remarks
         remarks = remarks.replace(str(finding), "")
-    read += filter(None, remarks.split("; "))
-    if count > 1:
-        read.append(f"{'receiver':20} {'links':>6} {'median':>7}  position [m]")
-        numbers = links.query.receivers.bincount(minlength=count)
-        for k in numbers.argsort(descending=True)[:RECEIVERS].tolist():
-            own, receiver = values[links.query.receivers[index] == k], links.receivers[k]
-            median = f"{own.median().item():7.3g}" if len(own) else "       "
-            place = ", ".join(f"{x:.2f}" for x in receiver.pose.position.tolist())
-            certain = 0.0 if links.uncertainties is None else links.uncertainties[k].item()
-            about = f" +- {certain:.2g}, estimated" if certain else ""
-            read.append(f"{receiver.name[:20]:20} {numbers[k]:6} {median}  {place}{about}")
-        if count > RECEIVERS:
-            read.append(f"... and {count - RECEIVERS} more receivers with fewer links")
+    read = [
+        *extent_lines(links, levels),
+        *filter(None, remarks.split("; ")),
+        *receiver_lines(links, levels),
+    ]
     return Description(tuple(read), findings)
 
 
-def _read(links: Links) -> Int[Tensor, " k"]:
-    """The links whose labels are read: all of one number each, otherwise at most ``LINKS``."""
-    index = torch.arange(len(links))
-    return evenly(index, LINKS) if links.task.shape else index
+@dataclass(frozen=True)
+class Levels:
+    """One number of each of some links: its label, the label's mean, or a channel's mean power.
+
+    Attributes:
+        index: The links.
+        values: Their numbers.
+        title: Name and unit of a number.
+    """
+
+    index: Int[Tensor, " k"]
+    values: Float[Tensor, " k"]
+    title: str
+
+    @classmethod
+    def of(cls, links: Links, most: int = 2000) -> "Levels":
+        """Numbers of all links; of at most so many, evenly spread, if labels have many numbers."""
+        task = links.task
+        index = torch.arange(len(links))
+        if task.shape:
+            index = evenly(index, most)
+        title = with_unit(f"mean {task.quantity}" if task.shape else task.quantity, task.unit)
+        if task.dtype.is_complex:
+            title = "mean power [dB]"
+        parts = [mean_levels(links, part) for part in index.split(256)]
+        return cls(index, torch.cat(parts), title)
 
 
-def quantity_of(links: Links) -> tuple[str, str]:
-    """Name and unit of ``levels``."""
-    task = links.task
-    if task.dtype.is_complex:
-        return "mean power", "dB"
-    return (f"mean {task.quantity}" if task.shape else task.quantity), task.unit
+def mean_levels(links: Links, index: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
+    """The means of some labels; for channels the mean power [dB]."""
+    labels = links.labels[index].reshape(len(index), -1)
+    if not labels.is_complex():
+        return labels.double().mean(1)
+    power = labels.abs().double().square().mean(1)
+    if links.task.is_channel:  # over the elements that arrays have
+        absent = lacking(links.receivers, links.query.receivers[index], links.task.elements)
+        power = power / (1 - absent.double().mean(1))
+    return 10 * power.clamp_min(1e-300).log10()
 
 
-def levels(links: Links, index: Tensor) -> Float[Tensor, " k"]:
-    """One number of each of some labels: itself, its mean, or the mean power of a channel [dB]."""
-    found = []
-    for part in index.split(256):
-        flat = links.labels[part].reshape(len(part), -1)
-        is_wave = flat.is_complex()
-        mean = (flat.abs().double().square() if is_wave else flat.double()).mean(1)
-        if links.task.is_channel:  # over the elements that arrays have
-            absent = lacking(links.receivers, links.query.receivers[part], links.task.elements)
-            mean = mean / (1 - absent.double().mean(1))
-        found.append(10 * mean.clamp_min(1e-300).log10() if is_wave else mean)
-    return torch.cat(found)
+def extent_lines(links: Links, levels: Levels) -> list[str]:
+    """Numbers of links and places, ranges of places and levels, parts of the split, repetitions."""
+    sites = links.query.transmitters.unique(dim=0)
+    axes = zip("xyz", sites.amin(0).tolist(), sites.amax(0).tolist(), strict=True)
+    ranges = ", ".join(f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in axes)
+    # Quantiles of torch take no more than 2**24 numbers.
+    low, median, high = np.quantile(levels.values.numpy(), (0.0, 0.5, 1.0)).tolist()
+    count = len(links.receivers)
+    receivers = f"{count} receiver{'s' * (count != 1)}"
+    part = f" of {len(levels.index)} links" * (len(levels.index) < len(links))
+    lines = [
+        f"{links.task.name}: {len(links)} links of {len(sites)} places at {receivers}",
+        f"places [m]: {ranges}",
+        f"{levels.title}: {low:.3g} to {high:.3g}, median {median:.3g}{part}",
+    ]
+    if links.split is not None:
+        counts = ", ".join(f"{len(part)} {name}" for name, part in links.split.parts().items())
+        lines.append(f"split {links.split.name}: {counts}")
+    distinct, _ = links.query.unique(with_receivers=True)
+    if repeated := len(links) - len(distinct):
+        lines.append(f"{repeated} links repeat place and receiver of another")
+    return lines
+
+
+def receiver_lines(links: Links, levels: Levels, most: int = 12) -> list[str]:
+    """A table of the receivers with the most links, at most so many; empty for one receiver."""
+    count = len(links.receivers)
+    if count == 1:
+        return []
+    lines = [f"{'receiver':20} {'links':>6} {'median':>7}  position [m]"]
+    numbers = links.query.receivers.bincount(minlength=count)
+    for k in numbers.argsort(descending=True)[:most].tolist():
+        receiver = links.receivers[k]
+        values = levels.values[links.query.receivers[levels.index] == k]
+        median = f"{values.median().item():7.3g}" if len(values) else " " * 7
+        place = ", ".join(f"{x:.2f}" for x in receiver.pose.position.tolist())
+        deviation = 0.0 if links.uncertainties is None else links.uncertainties[k].item()
+        about = f" +- {deviation:.2g}, estimated" if deviation else ""
+        lines.append(f"{receiver.name[:20]:20} {numbers[k]:6} {median}  {place}{about}")
+    if count > most:
+        lines.append(f"... and {count - most} more receivers with fewer links")
+    return lines
 
 
 def run(config: dict, folder: Path) -> None:
-    """Describes the data of a configuration; prints the text, and writes ``describe.txt`` and
-    ``describe.png``.
-    """
-    links = load(config["data"], config["split"])
+    """Describes the data of a configuration; writes ``describe.txt`` and ``describe.png``."""
+    links = load(config["data"], config["split"], is_checked=False)
     text = str(describe(links))
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "describe.txt", text + "\n")
@@ -151,52 +172,58 @@ def run(config: dict, folder: Path) -> None:
 
 
 def figure(links: Links) -> Figure:
-    """Places and receivers from above, and a histogram of levels.
-
-    Colours are the number of receivers that hear a place, or the level at the first one if all
-    numbers are equal.
-    """
-    index = _read(links)
-    values, (quantity, unit) = levels(links, index), quantity_of(links)
-    heard = torch.cat((links.query.transmitters, links.query.receivers[:, None].float()), 1).unique(
-        dim=0
-    )
-    places, counts = heard[:, :3].unique(dim=0, return_counts=True)
-    colours, label = counts, "receivers that hear the place"
-    if counts.min() == counts.max():
-        first = links.query.receivers[index] == 0
-        places, colours, label = (
-            links.query.transmitters[index[first]],
-            values[first],
-            with_unit(quantity, unit),
-        )
-        label += f" at {links.receivers[0].name}" if len(links.receivers) > 1 else ""
+    """Places and receivers from above, and a histogram of levels."""
+    levels = Levels.of(links)
     with rc_context(style.STYLE):
         drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
-        left, right = drawn.subplots(1, 2)
-        dots = left.scatter(*places[:, :2].T.numpy(), 8, colours.numpy(), cmap="viridis", zorder=2)
-        drawn.colorbar(dots, ax=left, label=label)
-        stands = torch.stack([receiver.pose.position for receiver in links.receivers])
-        words = (
-            "receivers"
-            if links.uncertainties is None or not links.uncertainties.any()
-            else "receivers, estimated"
-        )
-        left.plot(
-            *stands[:, :2].T.numpy(),
-            "^",
-            color=style.ORANGE,
-            markeredgecolor="white",
-            markersize=6,
-            label=words,
-        )
-        left.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+        above, histogram = drawn.subplots(1, 2)
+        draw_places(above, links, levels)
         drawn.legend(loc="outside lower left")
-        low, high = math.floor(values.min().item()), values.max().item()
-        step = math.ceil((high - low) / 40) if links.task.is_noisy else 0
-        edges = np.arange(low - 0.5, high + step, step) if step else 40  # levels are whole numbers
-        right.hist(values.numpy(), edges, color=style.BLUE)
-        right.set(xlabel=with_unit(quantity, unit), ylabel="links")
-        right.grid(axis="y")
-        right.set_axisbelow(True)
+        draw_histogram(histogram, levels, links.task.is_noisy)
     return drawn
+
+
+def draw_places(axis: Axes, links: Links, levels: Levels) -> None:
+    """Draws places and receivers from above.
+
+    Colours are the number of receivers that receive a place, or the level at the first one if all
+    numbers are equal.
+    """
+    query = links.query
+    pairs = torch.cat((query.transmitters, query.receivers[:, None].float()), 1).unique(dim=0)
+    places, colours = pairs[:, :3].unique(dim=0, return_counts=True)
+    label = "receivers that hear the place"
+    if colours.min() == colours.max():
+        is_first = query.receivers[levels.index] == 0
+        places = query.transmitters[levels.index[is_first]]
+        colours = levels.values[is_first]
+        label = levels.title
+        label += f" at {links.receivers[0].name}" if len(links.receivers) > 1 else ""
+    x, y = places[:, :2].T.numpy()
+    dots = axis.scatter(x, y, 8, colours.numpy(), cmap="viridis", zorder=2)
+    axis.figure.colorbar(dots, ax=axis, label=label)
+    stands = torch.stack([receiver.pose.position for receiver in links.receivers])
+    is_estimated = links.uncertainties is not None and links.uncertainties.any()
+    axis.plot(
+        *stands[:, :2].T.numpy(),
+        "^",
+        color=style.ORANGE,
+        markeredgecolor="white",
+        markersize=6,
+        label="receivers, estimated" if is_estimated else "receivers",
+    )
+    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+
+
+def draw_histogram(axis: Axes, levels: Levels, is_noisy: bool, bins: int = 40) -> None:
+    """Draws the numbers of links of each level; bins of noisy levels hold whole numbers."""
+    edges: int | np.ndarray = bins
+    low = math.floor(levels.values.min().item())
+    high = levels.values.max().item()
+    step = math.ceil((high - low) / bins) if is_noisy else 0
+    if step:
+        edges = np.arange(low - 0.5, high + step, step)
+    axis.hist(levels.values.numpy(), edges, color=style.BLUE)
+    axis.set(xlabel=levels.title, ylabel="links")
+    axis.grid(axis="y")
+    axis.set_axisbelow(True)

@@ -205,10 +205,10 @@ def floors_of(places: Float[Tensor, "n 3"]) -> Float[Tensor, " k"]:
     return torch.stack([floor.median() for floor in sorted(floors, key=len, reverse=True)])
 
 
-def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
+def load(data: Mapping, split: Mapping, task: str | None = None, is_checked: bool = True) -> Links:
     """A data set with its split, by the configurations of both.
 
-    ``task`` names the expected task; None for any.
+    ``task`` names the expected task; None for any. ``is_checked`` is as for ``divide``.
 
     Raises:
         FileNotFoundError: The data are missing.
@@ -221,11 +221,13 @@ def load(data: Mapping, split: Mapping, task: str | None = None) -> Links:
             f"configuration is for {task!r}; add task={links.task.name}"
         )
     origin = {"data": dict(data), "split": dict(split)}
-    return replace(divide(links, split), origin=origin)
+    return replace(divide(links, split, is_checked), origin=origin)
 
 
-def divide(links: Links, split: Mapping) -> Links:
+def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
     """Links with their split, by its configuration; remarks name doubts, such as random phases.
+
+    With ``is_checked`` remarks name what ``data.checks`` finds, too.
 
     In links with ``uncertainties``, receivers without a training link are left out, and receivers
     without a place get an estimate of it from the training links.
@@ -254,7 +256,7 @@ def divide(links: Links, split: Mapping) -> Links:
     if phase != "known":
         unknown = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}[phase]
         remarks.append(f"{unknown} of each link unknown, and removed in every score")
-    for finding in check(links):
+    for finding in check(links) if is_checked else ():
         log.warning("%s", finding)
         remarks.append(str(finding))
     return replace(links, remarks="; ".join(filter(None, remarks)))

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.distance import cdist
 from torch import nn
 
-from gaigs.commands.survey import posterior
+from gaigs.commands.survey.processes import posterior
 from gaigs.core.query import Batch, Query
 from gaigs.data import Split
 from gaigs.kriging import field, fit

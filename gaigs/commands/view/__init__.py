@@ -24,21 +24,6 @@ from gaigs.model.kriging import Kriging
 from gaigs.registry import call, check_instance, name_of
 from gaigs.runs import configuration_of, links_of, load
 
-PLACES = 96
-"""About as many places of a transmitter are in a file, fewer with many receivers."""
-
-FEWEST = 12
-"""Places in a file with any number of receivers."""
-
-MAPS = 24
-"""Most slices of radio maps in a file."""
-
-STEP = 3
-"""Every so many rows and columns of a spectrum are in a file."""
-
-COLOURS = "viridis", "plasma_r", "YlOrRd", "Blues"
-"""Matplotlib's scales of amplitudes and maps, of paths, of errors, and of Gaussians."""
-
 
 @dataclass(frozen=True)
 class View:
@@ -57,12 +42,13 @@ class View:
 
     @cached_property
     def facts(self) -> list[dict]:
-        """What does not depend on the transmitter, one a model."""
+        """Facts that do not depend on the transmitter, for each model."""
         return [each.facts() for each in self.contents]
 
     def save(self, path: str | Path) -> None:
-        """Writes one HTML file with all predictions of some places, which any browser opens without
-        a server.
+        """Writes one HTML file with all predictions of some places.
+
+        Any browser opens it without a server.
 
         Raises:
             OSError: The file cannot be written.
@@ -74,7 +60,7 @@ class View:
         is dragged.
 
         Args:
-            port: Of http://127.0.0.1; 0 for any free one.
+            port: Port of http://127.0.0.1; 0 for any free one.
 
         Raises:
             OSError: The port cannot be opened.
@@ -86,50 +72,51 @@ class View:
                 f"port {port} cannot be opened ({error.strerror}); take another, or 0 for any"
             ) from None
         with serving:
-            print(
-                f"open http://127.0.0.1:{serving.server_port} in a browser; Ctrl-C ends", flush=True
-            )
+            address = f"http://127.0.0.1:{serving.server_port}"
+            print(f"open {address} in a browser; Ctrl-C ends", flush=True)
             serving.serve_forever()
 
     def page(self, stored: dict | None = None) -> str:
         """The HTML page; without stored predictions it asks the server that sent it."""
-        colours = {
-            name: [colormaps[name](i, bytes=True)[:3] for i in range(256)] for name in COLOURS
-        }
+        # Amplitudes and maps, paths, errors, and Gaussians.
+        colours = {}
+        for name in ("viridis", "plasma_r", "YlOrRd", "Blues"):
+            colours[name] = [colormaps[name](i, bytes=True)[:3] for i in range(256)]
         content = {"runs": self.facts, "stored": stored, "colours": colours}
-        packed = gzip.compress(
-            json.dumps(content, default=int, separators=(",", ":")).encode(), mtime=0
-        )
-        read = lambda name: files("gaigs.commands.view").joinpath(name).read_text(encoding="utf-8")
-        parts = {
-            "style": read("page.css"),
-            "drawing": read("drawing.js"),
-            "script": read("page.js"),
-        }
-        parts["content"] = base64.b64encode(packed).decode()
-        text = read("page.html")
-        for name, part in parts.items():
-            text = text.replace(f"@{name}@", part)
-        return text
+        text = json.dumps(content, default=int, separators=(",", ":"))
+        packed = gzip.compress(text.encode(), mtime=0)
+        folder = files("gaigs.commands.view")
+        page = folder.joinpath("page.html").read_text(encoding="utf-8")
+        parts = {"style": "page.css", "drawing": "drawing.js", "script": "page.js"}
+        for mark, name in parts.items():
+            page = page.replace(f"@{mark}@", folder.joinpath(name).read_text(encoding="utf-8"))
+        return page.replace("@content@", base64.b64encode(packed).decode())
 
-    def stored(self) -> dict:
-        """Predictions for transmitters at even places in the box of the training transmitters, for
-        all receivers.
+    def stored(self, places: int = 96, fewest: int = 12, maps: int = 24, step: int = 3) -> dict:
+        """Predictions at even places in the box of the training transmitters, for all receivers.
+
+        Args:
+            places: About as many places of a transmitter with one receiver, fewer with more.
+            fewest: About as many places with any number of receivers.
+            maps: Largest number of slices of radio maps.
+            step: Rows and columns from one stored pixel of a spectrum to the next.
         """
         scene = self.contents[0].scene
         count = len(scene.receivers)
-        places = even_places(scene.lower, scene.upper, max(FEWEST, PLACES // count))
-        heights = places[:, 2].unique()
-        heights = heights[evenly(torch.arange(len(heights)), max(1, MAPS // count))].tolist()
+        grid = even_places(scene.lower, scene.upper, max(fewest, places // count))
+        heights = grid[:, 2].unique()
+        heights = heights[evenly(torch.arange(len(heights)), max(1, maps // count))].tolist()
         runs = []
-        for one in self.contents:
-            answers = [
-                [one.answer(place, k, STEP) for k in range(count)] for place in places.tolist()
-            ]
-            maps = [[one.slice(z, k) for k in range(count)] for z in heights] if one.has_map else []
-            links = [one.comparison(k, STEP) for k in range(len(one.tests))]
-            runs.append({"answers": answers, "maps": maps, "links": links})
-        return {"places": places.tolist(), "heights": heights, "runs": runs}
+        for contents in self.contents:
+            answers = []
+            for place in grid.tolist():
+                answers.append([contents.answer(place, k, step) for k in range(count)])
+            slices = []
+            for height in heights if contents.has_map else ():
+                slices.append([contents.slice(height, k) for k in range(count)])
+            links = [contents.comparison(k, step) for k in range(len(contents.tests))]
+            runs.append({"answers": answers, "maps": slices, "links": links})
+        return {"places": grid.tolist(), "heights": heights, "runs": runs}
 
     def _repr_html_(self) -> str:
         page = html.escape(self.page(self.stored()))
@@ -153,29 +140,32 @@ def view(model: Model, links: Links | None = None, other: Model | None = None) -
         >>> model = gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0))
         >>> gaigs.view(model).save("spectra.html")
     """
-    for name, one in (("model", model), ("other", other)):
-        if one is not None:
-            check_instance(name, one, Model)
+    check_instance("model", model, Model)
+    models = [model]
+    if other is not None:
+        check_instance("other", other, Model)
+        models.append(other)
     if links is not None:
         check_instance("links", links, Links)
-    shown = [one for one in (model, other) if one is not None]
-    names = [name_of(one.trend if isinstance(one, Kriging) else one) for one in shown]
-    return View(
-        side_by_side([Contents(one, links, name) for one, name in zip(shown, names, strict=True)])
-    )
+    contents = []
+    for one in models:
+        name = name_of(one.trend if isinstance(one, Kriging) else one)
+        contents.append(Contents(one, links, name))
+    return View(side_by_side(contents))
 
 
 def side_by_side(contents: list[Contents]) -> list[Contents]:
-    """The contents; a ``ValueError`` if they are not of the same receivers."""
-    own = contents[0].scene
-    for each in contents[1:]:
-        names = [[one.name for one in scene.receivers] for scene in (own, each.scene)]
-        if names[0] != names[1] or not torch.allclose(
-            own.positions(own.lower), each.scene.positions(own.lower)
-        ):
+    """The contents; raises a ``ValueError`` if their receivers differ."""
+    scene = contents[0].scene
+    places = scene.positions(scene.lower)
+    names = [receiver.name for receiver in scene.receivers]
+    for other in contents[1:]:
+        other_names = [receiver.name for receiver in other.scene.receivers]
+        if names != other_names or not torch.allclose(places, other.scene.positions(scene.lower)):
             raise ValueError(
-                f"two models side by side must have the same receivers, got {', '.join(names[0][:5])} and "
-                f"{', '.join(names[1][:5])}, or other positions; view them one by one"
+                "two models side by side must have the same receivers, got "
+                f"{', '.join(names[:5])} and {', '.join(other_names[:5])}, or other positions; "
+                "view them one by one"
             )
     return contents
 
@@ -202,11 +192,8 @@ def show(
     folder: str, trust: bool, other: str | None = None, out: str | None = None, port: int = 8080
 ) -> None:
     """One run, or two side by side: in a file ``out``, or without one by a server."""
-    shown = View(
-        side_by_side(
-            [contents_of(source, trust) for source in (folder, other) if source is not None]
-        )
-    )
+    sources = [folder] if other is None else [folder, other]
+    shown = View(side_by_side([contents_of(source, trust) for source in sources]))
     if out is None:
         shown.serve(port)
         return

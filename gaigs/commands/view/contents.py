@@ -5,7 +5,7 @@ import math
 import threading
 import warnings
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -13,26 +13,31 @@ from jaxtyping import Float
 from numpy import ndarray
 from torch import Tensor
 
+from gaigs.core.antenna import Receiver
 from gaigs.core.geometry import ExtrapolationWarning
 from gaigs.core.query import Query, evenly
+from gaigs.core.task import Task
 from gaigs.core.task.scalar import with_unit
 from gaigs.data import Links
 from gaigs.data.compatibility import check_fit
 from gaigs.model import Model
+from gaigs.planes.learnt_room import LearntPlane, Matter
 from gaigs.report.csi import decibels, impulse_response
-from gaigs.splatting.gaussians import SH_DC
+from gaigs.splatting.gaussians import SH_DC, Gaussians
 
-COMPARED = 100
-"""Most test links that are shown with their errors."""
 
-STRONGEST = 3000
-"""Most Gaussians that are shown."""
+class Shown(NamedTuple):
+    """Predictions on the CPU.
 
-POINTS = 48
-"""Points along the longer side of a slice of the radio map; places that are predicted at a time."""
+    Attributes:
+        value: Values.
+        std: Their deviations; None if the model states none.
+        snr_db: Expected signal-to-noise ratio of channels [dB]; None if the model states none.
+    """
 
-LEAST = 1e-12
-"""Amplitude that counts as 0: levels end at -240 dB."""
+    value: Tensor
+    std: Tensor | None
+    snr_db: Tensor | None
 
 
 class Contents:
@@ -42,27 +47,39 @@ class Contents:
         model: A trained, fitted or loaded model.
         links: Its data; None: no true walls and no test links are shown.
         title: Name above the picture.
+        points: Points along the longer side of a slice of the radio map, and places that are
+            predicted at a time.
+        compared: Largest number of test links that are shown with their errors.
 
     Raises:
         ValueError: The links have other receivers or another task than the model.
     """
 
-    def __init__(self, model: Model, links: Links | None = None, title: str = ""):
+    def __init__(
+        self,
+        model: Model,
+        links: Links | None = None,
+        title: str = "",
+        points: int = 48,
+        compared: int = 100,
+    ):
         if links is not None:
             check_fit(links, model.scene)
-        self.model, self.links, self.title, self.scene = model, links, title, model.scene
+        self.model = model
+        self.links = links
+        self.title = title
+        self.points = points
+        self.scene = model.scene
         self.task: Any = model.scene.task
-        kinds = {"spectrum": self.task.directions is not None, "level": self.task.is_scalar}
-        kinds["channel"] = self.task.is_channel
-        self.kind = next((kind for kind, fits in kinds.items() if fits), None)
+        self.kind = kind_of(self.task)
         self.frequency = self.scene.middle_frequency
-        self.interval = (
-            0.5 if model.calibration is not None and model.calibration.gives(0.5) else None
-        )
+        self.interval = None
+        if model.calibration is not None and model.calibration.gives(0.5):
+            self.interval = 0.5
         self.lock = threading.Lock()  # models hold what they compute for a moment
         self.tests = torch.zeros(0, dtype=torch.long)
         if links is not None and links.held_out is None:
-            self.tests = evenly(links.split.test, COMPARED)
+            self.tests = evenly(links.split.test, compared)
 
     @property
     def has_map(self) -> bool:
@@ -77,10 +94,19 @@ class Contents:
             return self.links.labels[self.tests], torch.cat([part.cpu() for part in batches])
 
     def facts(self) -> dict:
-        """All that does not depend on the transmitter: axes and units, room, Gaussians, receivers,
-        errors of links.
+        """Axes and units, room, Gaussians, receivers, and errors of links.
+
+        They do not depend on the transmitter.
         """
         quantity = with_unit(self.task.quantity, self.task.unit)
+        with self.lock:
+            gaussians = self.model.primitives
+            room = self.model.learnt_room()
+        splats: dict[str, dict] = {}
+        if gaussians is not None:
+            splats["gaussians"] = gaussian_splats(gaussians)
+        if room is not None and room.matter is not None:
+            splats["obstacles"] = obstacle_splats(room.matter)
         facts: dict[str, Any] = {
             "title": self.title,
             "task": self.task.name,
@@ -90,72 +116,52 @@ class Contents:
             "map": {"level": quantity, "channel": "power [dB]"}.get(self.kind or ""),
             "box": plain(torch.stack((self.scene.lower, self.scene.upper))),
             "height": self.scene.height,
-            "receivers": [
-                {"name": one.name, "place": plain(one.pose.position), "axes": plain(one.pose.rotation.mT)}
-                for one in self.scene.receivers
-            ],
-            "edges": [], "places": [], "planes": [], "splats": {}, "tests": None,
-        }  # fmt: skip
+            "receivers": [receiver_facts(receiver) for receiver in self.scene.receivers],
+            "edges": [],
+            "places": [],
+            "planes": [] if room is None else [plane_facts(plane) for plane in room.planes],
+            "splats": splats,
+            "tests": self.test_facts() if len(self.tests) else None,
+        }
         if self.kind == "spectrum":
-            grid = self.task.directions
-            facts |= {
-                name: plain(getattr(grid, name).rad2deg()) for name in ("elevations", "azimuths")
-            }
+            facts["elevations"] = plain(self.task.directions.elevations.rad2deg())
+            facts["azimuths"] = plain(self.task.directions.azimuths.rad2deg())
         if self.links is not None:
-            known = self.links.query.transmitters[evenly(self.links.split.train, 1000)].unique(
-                dim=0
-            )
-            facts |= {"edges": plain(self.links.edges), "places": plain(known)}
-        with self.lock:
-            gaussians, learnt = self.model.primitives, self.model.learnt_room()
-        if gaussians is not None:
-            with torch.no_grad():
-                strengths = gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)
-                strongest = strengths.topk(min(STRONGEST, len(strengths))).indices
-                parts = gaussians.means, gaussians.covariances, gaussians.opacities, strengths
-                facts["splats"]["gaussians"] = splats(
-                    *(part[strongest].cpu().numpy() for part in parts)
-                )
-                facts["splats"]["gaussians"]["total"] = len(strengths)
-        if learnt is not None:
-            facts["planes"] = [
-                {"number": one.number, "share": plain(one.share), "corners": plain(one.corners)}
-                for one in learnt.planes
-            ]
-            if learnt.matter is not None:
-                centres, widths, densities = learnt.matter
-                losses = (
-                    densities * math.sqrt(2 * math.pi) * np.exp(np.log(widths).mean(1))
-                )  # through the middle [dB]
-                covariances = widths[:, :, None] ** 2 * np.eye(3)
-                facts["splats"]["obstacles"] = splats(
-                    centres, covariances, 1 - 10 ** (-losses / 10), losses
-                )
-        if len(self.tests):
-            query, (labels, values) = self.links.query[self.tests], self.compared
-            scores = self.task.scores(labels, values)[self.task.monitor]
-            facts["tests"] = {
-                "places": plain(query.transmitters),
-                "receivers": query.receivers.tolist(),
-                "scores": plain(scores),
-                "title": with_unit("error", self.task.error_unit)
-                if self.kind == "level"
-                else self.task.pair_score,
-                "rises": bool(self.task.higher_is_better),
-            }
+            known = self.links.query.transmitters[evenly(self.links.split.train, 1000)]
+            facts["edges"] = plain(self.links.edges)
+            facts["places"] = plain(known.unique(dim=0))
         return facts
+
+    def test_facts(self) -> dict:
+        """Places and scores of the shown test links."""
+        query = self.links.query[self.tests]
+        labels, values = self.compared
+        scores = self.task.scores(labels, values)[self.task.monitor]
+        title = self.task.pair_score
+        if self.kind == "level":
+            title = with_unit("error", self.task.error_unit)
+        return {
+            "places": plain(query.transmitters),
+            "receivers": query.receivers.tolist(),
+            "scores": plain(scores),
+            "title": title,
+            "rises": bool(self.task.higher_is_better),
+        }
 
     @torch.no_grad()
     def answer(self, place: list[float], receiver: int, step: int = 1) -> dict:
         """Prediction, its deviation, and paths, of a transmitter at a place [m].
 
         Args:
-            step: Every so many rows and columns of a spectrum.
+            place: Position [m].
+            receiver: Number of the receiver; levels are those of all receivers.
+            step: Rows and columns from one shown pixel of a spectrum to the next.
         """
+        asked = None if self.kind == "level" else receiver
+        shown = self._estimate(torch.tensor([place]), asked)
+        value = shown.value
+        std = shown.std
         answer: dict[str, Any] = {}
-        value, std, snr = self._estimate(
-            torch.tensor([place]), None if self.kind == "level" else receiver
-        )
         if self.kind == "level":
             answer["levels"] = plain(value[0])
             answer["stds"] = None if std is None else plain(std[0])
@@ -166,9 +172,11 @@ class Contents:
             answer["curves"] = {"predicted": self._curve(value[0], int(loudest(value[0])))}
             answer["level"] = plain(level(value)[0])
             answer["std"] = None if std is None else plain(level(std)[0])
+            snr = shown.snr_db
             answer["snr"] = None if snr is None else plain(snr[0].clamp_max(140))
+        names = [one.name for one in self.scene.receivers]
         query, _ = Query.from_positions(
-            [place], receiver, self.frequency, self._names, self.scene.frequencies
+            [place], receiver, self.frequency, names, self.scene.frequencies
         )
         with self.lock:
             paths = self.model.learnt_paths(query)
@@ -180,90 +188,128 @@ class Contents:
     def slice(self, height: float, receiver: int) -> dict:
         """The radio map over the training transmitters and receivers at a height [m]."""
         lower, upper = (corner[:2].double().numpy() for corner in self.scene.box)
-        pitch = float((upper - lower).max()) / POINTS
-        counts = np.maximum(np.ceil((upper - lower) / pitch).astype(int), 1)
-        x, y = (
-            low + pitch * (np.arange(count) + 0.5) for low, count in zip(lower, counts, strict=True)
-        )
-        places = np.stack((*np.meshgrid(x, y), np.full((len(y), len(x)), height)), -1).astype(
-            np.float32
-        )
+        pitch = float((upper - lower).max()) / self.points
+        columns, rows = np.maximum(np.ceil((upper - lower) / pitch).astype(int), 1)
+        x = lower[0] + pitch * (np.arange(columns) + 0.5)
+        y = lower[1] + pitch * (np.arange(rows) + 0.5)
+        heights = np.full((rows, columns), height)
+        places = np.stack((*np.meshgrid(x, y), heights), -1).astype(np.float32)
+        points = torch.from_numpy(places.reshape(-1, 3))  # (rows columns, 3)
         # In parts, so that a drag need not wait for the whole map.
-        parts = torch.from_numpy(places.reshape(-1, 3)).split(POINTS)
-        found = torch.cat([self._estimate(part, receiver)[0] for part in parts])
-        values = level(found) if found.is_complex() else found
+        parts = [self._estimate(part, receiver).value for part in points.split(self.points)]
+        values = torch.cat(parts)
+        if values.is_complex():
+            values = level(values)
         return {"x": plain(x), "y": plain(y), "height": plain(height), "values": plain(values)}
 
     def comparison(self, number: int, step: int = 1) -> dict:
-        """Label and prediction of a shown test link; ``step`` as of ``answer``."""
-        label, value = (part[number : number + 1] for part in self.compared)
-        label = self.task.align(label, value)[0]
-        value = value[0]
+        """Label and prediction of a shown test link; ``step`` as for ``answer``."""
+        labels, values = self.compared
+        value = values[number]
+        label = self.task.align(labels[number : number + 1], values[number : number + 1])[0]
         if self.kind == "level":
             return {"label": plain(label), "prediction": plain(value)}
         if self.kind == "spectrum":
             return {"label": grey(label, step), "prediction": grey(value, step)}
         if self.kind == "channel":
             element = int(loudest(label))
-            return {
-                "curves": {
-                    "predicted": self._curve(value, element),
-                    "measured": self._curve(label, element),
-                }
-            }
+            predicted = self._curve(value, element)
+            return {"curves": {"predicted": predicted, "measured": self._curve(label, element)}}
         return {}
 
-    @property
-    def _names(self) -> list[str]:
-        return [receiver.name for receiver in self.scene.receivers]
-
-    def _estimate(
-        self, points: Float[Tensor, "b 3"], receiver: Any
-    ) -> tuple[Tensor, Tensor | None, Tensor | None]:
-        """Values, deviations and expected SNR [dB], on the CPU; None if the model has none."""
+    def _estimate(self, points: Float[Tensor, "b 3"], receiver: int | None) -> Shown:
+        """Predictions at places [m] for a receiver; None for all."""
+        options = {
+            "frequency": self.frequency,
+            "batch_size": self.points,
+            "interval": self.interval,
+        }
         with warnings.catch_warnings():
-            warnings.simplefilter(
-                "ignore", ExtrapolationWarning
-            )  # a transmitter may be dragged anywhere
-            options = {"frequency": self.frequency, "batch_size": POINTS, "interval": self.interval}
+            # A transmitter may be dragged anywhere.
+            warnings.simplefilter("ignore", ExtrapolationWarning)
             with self.lock:
-                found: Any = self.model.predict(points, receiver, **options)
-        parts = (found.value, found.std, found.snr_db) if self.interval else (found, None, None)
-        return tuple(None if part is None else part.cpu() for part in parts)  # type: ignore[return-value]
+                predicted: Any = self.model.predict(points, receiver, **options)
+        if self.interval is None:
+            return Shown(predicted.cpu(), None, None)
+        parts = (predicted.value, predicted.std, predicted.snr_db)
+        return Shown(*(None if part is None else part.cpu() for part in parts))
 
     def _curve(self, channel: Tensor, element: int) -> dict:
         """Magnitude [dB] over delay [ns] at an element; of one subcarrier over the elements."""
         if channel.shape[1] == 1:
-            x, responses = np.arange(1, len(channel) + 1), channel[:, 0].numpy()
-            names = "element", "|h| [dB]"
+            x = np.arange(1, len(channel) + 1)
+            responses = channel[:, 0].numpy()
+            xlabel = "element"
+            ylabel = "|h| [dB]"
         else:
-            delays, responses = impulse_response(
-                channel[element].numpy(), self.task.frequencies.numpy()
-            )
-            x, names = (
-                1e9 * delays,
-                ("delay [ns]", f"|impulse response| [dB], element {element + 1}"),
-            )
-        return {
-            "x": plain(x),
-            "y": plain(np.maximum(decibels(responses), 20 * math.log10(LEAST))),
-            "xlabel": names[0],
-            "ylabel": names[1],
-        }
+            response = channel[element].numpy()
+            delays, responses = impulse_response(response, self.task.frequencies.numpy())
+            x = 1e9 * delays
+            xlabel = "delay [ns]"
+            ylabel = f"|impulse response| [dB], element {element + 1}"
+        levels = np.maximum(decibels(responses), -240.0)  # JSON has no infinity
+        return {"x": plain(x), "y": plain(levels), "xlabel": xlabel, "ylabel": ylabel}
+
+
+def kind_of(task: Task) -> str | None:
+    """The drawing of a label: spectrum, level or channel; None for other labels."""
+    if task.directions is not None:
+        return "spectrum"
+    if task.is_scalar:
+        return "level"
+    return "channel" if task.is_channel else None
+
+
+def receiver_facts(receiver: Receiver) -> dict:
+    """Name, place and axes of a receiver."""
+    pose = receiver.pose
+    return {
+        "name": receiver.name,
+        "place": plain(pose.position),
+        "axes": plain(pose.rotation.mT),
+    }
+
+
+def plane_facts(plane: LearntPlane) -> dict:
+    """Number, share of the received power, and corners of a learnt plane."""
+    return {
+        "number": plane.number,
+        "share": plain(plane.share),
+        "corners": plain(plane.corners),
+    }
+
+
+def gaussian_splats(gaussians: Gaussians, most: int = 3000) -> dict:
+    """The strongest Gaussians, at most so many, and the number of all."""
+    with torch.no_grad():
+        strengths = gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)
+        strongest = strengths.topk(min(most, len(strengths))).indices
+        parts = gaussians.means, gaussians.covariances, gaussians.opacities, strengths
+        arrays = [part[strongest].cpu().numpy() for part in parts]
+    return splats(*arrays) | {"total": len(strengths)}
+
+
+def obstacle_splats(matter: Matter) -> dict:
+    """Obstacles, as opaque as a path through their middle loses."""
+    centres, widths, densities = matter
+    losses = densities * math.sqrt(2 * math.pi) * np.exp(np.log(widths).mean(1))  # [dB]
+    covariances = widths[:, :, None] ** 2 * np.eye(3)
+    return splats(centres, covariances, 1 - 10 ** (-losses / 10), losses)
 
 
 def plain(values: Any) -> Any:
     """Numbers for JSON: four significant digits, at least three decimals below 10,000."""
-    array = np.asarray(
-        values.detach().cpu() if isinstance(values, Tensor) else values, dtype=np.float64
-    )
+    if isinstance(values, Tensor):
+        values = values.detach().cpu()
+    array = np.asarray(values, dtype=np.float64)
     largest = float(np.abs(array).max(initial=1e-30))
     return np.round(array, max(3, 3 - math.floor(math.log10(largest)))).tolist()
 
 
 def grey(image: Float[Tensor, "rows columns"], step: int = 1) -> dict:
-    """An image as bytes, 255 for an amplitude of 1, by their changes from pixel to pixel, which
-    pack well.
+    """An image as bytes, 255 for an amplitude of 1.
+
+    They are stored by their changes from pixel to pixel, which pack well.
     """
     levels = (255 * image[::step, ::step].clamp(0, 1)).round().to(torch.uint8).numpy()
     changes = np.diff(levels.ravel(), prepend=np.uint8(0))
@@ -283,7 +329,8 @@ def splats(
     """Gaussians by the upper triangles of their covariances [m²]."""
     rows, columns = np.triu_indices(3)
     parts = {"means": means, "covariances": covariances[:, rows, columns], "opacities": opacities}
-    return {name: plain(part) for name, part in parts.items()} | {"strengths": plain(strengths)}
+    parts["strengths"] = strengths
+    return {name: plain(part) for name, part in parts.items()}
 
 
 def loudest(channel: Tensor) -> Tensor:
@@ -292,5 +339,6 @@ def loudest(channel: Tensor) -> Tensor:
 
 
 def level(channels: Tensor) -> Tensor:
-    """Mean power of channels (b, elements, subcarriers) [dB]."""
-    return 10 * channels.abs().square().flatten(1).mean(1).clamp_min(LEAST**2).log10()
+    """Mean power of channels (b, elements, subcarriers) [dB], -240 dB and more."""
+    power = channels.abs().square().flatten(1).mean(1)  # (b,)
+    return 10 * power.clamp_min(1e-12**2).log10()

@@ -14,23 +14,22 @@ log = logging.getLogger(__name__)
 
 
 def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServer:
-    """A server of the page at ``/`` and of answers at ``/answer``, ``/slice`` and ``/comparison``;
-    not started.
+    """A server, not started, of the page at ``/`` and of answers.
 
-    It answers to names of this machine alone: a page of a foreign name that is made to lead here
-    reads nothing.
+    The answers are at ``/answer``, ``/slice`` and ``/comparison``. It answers to names of this
+    machine alone: a page of a foreign name that is made to lead here reads nothing.
     """
 
     def respond(path: str, asked: dict[str, Any]) -> str:
-        own = contents[int(asked["run"])]
+        run = contents[int(asked["run"])]
         match path:
             case "/answer":
                 place = [float(x) for x in asked["place"].split(",")]
-                return json.dumps(own.answer(place, int(asked["receiver"])))
+                return json.dumps(run.answer(place, int(asked["receiver"])))
             case "/slice":
-                return json.dumps(own.slice(float(asked["height"]), int(asked["receiver"])))
+                return json.dumps(run.slice(float(asked["height"]), int(asked["receiver"])))
             case "/comparison":
-                return json.dumps(own.comparison(int(asked["number"])))
+                return json.dumps(run.comparison(int(asked["number"])))
         raise ValueError(f"no answer at {path}")
 
     class Handler(BaseHTTPRequestHandler):
@@ -38,22 +37,22 @@ def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServe
 
         def do_GET(self) -> None:
             url = urlsplit(self.path)
-            kind, status = "application/json", HTTPStatus.OK
-            if not re.fullmatch(
-                r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?", self.headers.get("Host", "").lower()
-            ):
-                kind, status = "text/plain; charset=utf-8", HTTPStatus.FORBIDDEN
+            kind = "application/json"
+            status = HTTPStatus.OK
+            host = self.headers.get("Host", "").lower()
+            if not re.fullmatch(r"(localhost|127\.0\.0\.1|\[::1\])(:\d+)?", host):
+                kind = "text/plain; charset=utf-8"
+                status = HTTPStatus.FORBIDDEN
                 text = "this server answers to the names localhost and 127.0.0.1 alone\n"
             elif url.path == "/":
-                kind, text = "text/html; charset=utf-8", page
+                kind = "text/html; charset=utf-8"
+                text = page
             else:
                 try:
                     text = respond(url.path, dict(parse_qsl(url.query)))
                 except Exception as error:  # the page shows it, and the server goes on
-                    status, text = (
-                        HTTPStatus.BAD_REQUEST,
-                        json.dumps({"error": str(error) or repr(error)}),
-                    )
+                    status = HTTPStatus.BAD_REQUEST
+                    text = json.dumps({"error": str(error) or repr(error)})
             data = text.encode()
             self.send_response(status)
             self.send_header("Content-Type", kind)

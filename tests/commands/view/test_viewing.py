@@ -26,13 +26,6 @@ ROOT = Path(__file__).parents[3]
 EXAMPLE = ROOT / "examples/room.ckpt"
 
 
-@pytest.fixture(autouse=True)
-def few_places(monkeypatch):
-    monkeypatch.setattr("gaigs.commands.view.PLACES", 8)
-    monkeypatch.setattr("gaigs.commands.view.FEWEST", 4)
-    monkeypatch.setattr("gaigs.commands.view.contents.POINTS", 6)
-
-
 @pytest.fixture(scope="module")
 def links():
     return {task: example_links(task) for task in ("spectrum", "rssi", "csi")}
@@ -126,7 +119,7 @@ def test_a_channels_impulse_response_peaks_at_the_direct_path(links):
 @pytest.mark.parametrize("task", ["spectrum", "rssi", "csi"])
 def test_a_file_has_all_answers(task, links):
     view = gaigs.view(gaigs.train("mean", links[task]), links[task])
-    found = content(view.page(view.stored()))
+    found = content(view.page(view.stored(places=8, fewest=4)))
     (facts,), stored = found["runs"], found["stored"]
     (run,) = stored["runs"]
     receivers = len(facts["receivers"])

@@ -2,8 +2,8 @@
 
 import math
 
+from gaigs.commands.agreement.page import Cell, figure, write
 from gaigs.core.task.rssi import Rssi
-from gaigs.report.agreement import Cell, figure, write
 
 CELLS = [
     Cell((0.0, 0.0), (0, 3), 1, 1, (5.0, 5.0, 5.0)),

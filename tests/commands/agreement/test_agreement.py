@@ -9,8 +9,9 @@ import pytest
 import torch
 
 import gaigs
-from gaigs.commands import agreement
-from gaigs.commands.agreement import measure, on_split, run, visits
+from gaigs.commands.agreement import run
+from gaigs.commands.agreement.expectation import on_split
+from gaigs.commands.agreement.pairs import measure, visits
 from gaigs.core.query import Query
 from gaigs.core.task.rssi import Rssi
 from gaigs.data import Split
@@ -119,7 +120,7 @@ def test_pairs_are_those_of_one_receiver_and_carrier_each_once(counted):
         assert found.pairs.ravel().tolist() == true.tolist()
     else:
         assert found.share < 1
-        assert "drawn at random, with all others" in agreement._remarks(found)[1]
+        assert "drawn at random, with all others" in found.remarks()[1]
         assert (found.pairs.ravel() <= true).all()
         assert found.pairs.sum() > found.share * true.sum()
     for (
@@ -148,7 +149,7 @@ def test_of_many_pairs_random_ones_are_compared():
         min(30, count) for count in found.pairs.ravel() if count
     ]
     assert scores[0] == scores[1] != scores[2]
-    (remark,) = agreement._remarks(found)
+    (remark,) = found.remarks()
     assert "which counts as that of measurement" in remark
 
 
@@ -158,7 +159,7 @@ def test_files_in_no_order_are_noted():
     links = replace(links, query=links.query[shuffled], labels=links.labels[shuffled])
     found = measure(links, seeded())
     assert not found.has_order
-    assert "columns tell nothing of time" in agreement._remarks(found)[0]
+    assert "columns tell nothing of time" in found.remarks()[0]
     cells = by_bounds(found)
     medians = [
         cells[(0.5, 1.0), column].quantiles[1] for column in ((0, 3), (4, 30), (31, math.inf))

@@ -9,11 +9,15 @@ import torch
 from scipy.spatial.distance import cdist
 
 import gaigs
-from gaigs.commands.survey import MEAN, POINTS, heard, posterior, with_trend, without
+from gaigs.commands.survey.measured import measured_places
+from gaigs.commands.survey.plan import mean_absolute
+from gaigs.commands.survey.processes import posterior, reception_chances, with_trend
 from gaigs.core.geometry import Frame, even_places
 from gaigs.kriging.kernel import Process
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.kriging.scalar_fit import ScalarOptions
+
+MEAN = mean_absolute(1.0)
 
 
 @pytest.fixture(autouse=True)
@@ -35,6 +39,11 @@ def process(seed=0, known=12, noise=0.3):
     return Process(covariances, places, torch.full((known,), noise, dtype=torch.float64), noise)
 
 
+def asked_places(count=60):
+    rng = torch.Generator().manual_seed(0)
+    return 4 * torch.rand(count, 3, dtype=torch.float64, generator=rng)
+
+
 def variances(process, rows, asked):
     """Variances at places given some of the known readings, in numpy."""
     places, cover = process.places[rows], lambda a, b: process.covariances(a, b).numpy()
@@ -45,15 +54,15 @@ def variances(process, rows, asked):
 
 
 def test_covariances_are_those_given_the_readings():
-    own, asked = process(), torch.rand(5, 3, dtype=torch.float64) * 4
+    own, asked = process(), asked_places(5)
     np.testing.assert_allclose(
         posterior(own, asked).diagonal(), variances(own, range(12), asked), atol=1e-9
     )
 
 
 def test_losses_are_those_of_leaving_a_place_out():
-    own, asked = process(noise=1.0), torch.rand(60, 3, dtype=torch.float64) * 4
-    known, _, losses, superfluous = without([own], asked, MEAN)
+    own, asked = process(noise=1.0), asked_places()
+    known, _, losses, superfluous = measured_places([own], asked, MEAN)
     error = lambda rows: MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
     every = error(range(12))
     for place, loss in zip(known, losses, strict=True):
@@ -70,7 +79,7 @@ def test_each_place_lowers_the_mean_variance_most():
     candidates = torch.rand(12, 3, generator=torch.Generator().manual_seed(0)) * 3
     box = candidates.amin(0), candidates.amax(0)
     plan = gaigs.survey(model, region=torch.stack(box), count=2, candidates=candidates)
-    centres, asked = links.scene.positions(candidates.double()), even_places(*box, POINTS).double()
+    centres, asked = links.scene.positions(candidates.double()), even_places(*box, 1000).double()
     processes = [with_trend(model.process_at(receiver), centres[receiver]) for receiver in range(4)]
     known = []
     for place in plan.places:
@@ -99,7 +108,7 @@ def test_a_receiver_counts_where_it_is_likely_to_be_heard():
         replace(own, places=part.double(), noises=torch.full((len(part),), 0.3))
         for own, part in ((both, torch.cat((near, far))), (first, near))
     )
-    hearing = heard([both, first], torch.cat((near[:5], far[:5])).double())
+    hearing = reception_chances([both, first], torch.cat((near[:5], far[:5])).double())
     assert (hearing[0] == 1).all()
     assert (hearing[1, :5] > 0.9).all()
     assert (hearing[1, 5:] < 0.1).all()
@@ -122,7 +131,7 @@ def test_plans_count_a_receiver_where_it_is_heard():
     region = torch.stack((places.amin(0), places.amax(0)))
     plan = gaigs.survey(model, region=region, count=6)
     assert (plan.places[:, 0] < 6).sum() >= 4
-    asked, stands = even_places(*region, POINTS).double(), model.scene.positions(places.double())
+    asked, stands = even_places(*region, 1000).double(), model.scene.positions(places.double())
     processes = [with_trend(model.process_at(k), stands[k]) for k in range(2)]
     deviations = [(posterior(own, asked).diagonal() + own.noise).sqrt() for own in processes]
     left, right = asked[:, 0] < 4, asked[:, 0] > 6
@@ -205,7 +214,7 @@ def test_plans_are_written_and_wrong_ones_are_refused(tmp_path):
         gaigs.survey(model, frequency=2.4)
     with pytest.raises(ValueError, match="two corners"):
         gaigs.survey(model, region=[[0.0, 0.0, 0.0]])
-    with pytest.raises(ValueError, match="a survey takes a process over places"):
+    with pytest.raises(ValueError, match="model 'mean' has no Gaussian process over places"):
         gaigs.survey(gaigs.train("mean", links))
 
 
@@ -250,10 +259,10 @@ def test_the_command_plans_before_anything_is_measured(tmp_path, capsys):
 
 
 def test_losses_are_those_of_leaving_all_readings_of_a_place_out():
-    own, asked = process(noise=1.0), torch.rand(60, 3, dtype=torch.float64) * 4
+    own, asked = process(noise=1.0), asked_places()
     often = torch.tensor([0] * 8 + [1] * 3 + list(range(2, 12)))
     own = replace(own, places=own.places[often], noises=own.noises[often])
-    known, _, losses, _ = without([own], asked, MEAN)
+    known, _, losses, _ = measured_places([own], asked, MEAN)
     error = lambda rows: MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
     for place, loss in zip(known, losses, strict=True):
         rows = [

@@ -32,6 +32,11 @@ class Cell(NamedTuple):
     compared: int
     quantiles: tuple[float, float, float]
 
+    def text(self, score: str) -> str:
+        """The cell in a table."""
+        low, median, high = (_number(value, score) for value in self.quantiles)
+        return f"{median} ({low} to {high}), {self.pairs:,}"
+
 
 def write(
     folder: Path,
@@ -41,45 +46,48 @@ def write(
     split: str,
     remarks: Sequence[str],
 ) -> str:
-    """Writes ``agreement.md`` and ``agreement.png``, and returns the page; ``rows`` are metrics by
-    predictor.
+    """Writes ``agreement.md`` and ``agreement.png``, and returns the page.
+
+    Args:
+        folder: Gets the files.
+        task: Task of the labels.
+        cells: Cells with pairs.
+        rows: Metrics by predictor.
+        split: Name of the split.
+        remarks: Sentences below the tables.
     """
-    score, titles = task.pair_score, {name: metric.title for name, metric in task.metrics().items()}
-    at = {(cell.distance, cell.separation): cell for cell in cells}
-    distances, columns = (
-        dict.fromkeys(cell.distance for cell in cells),
-        sorted({cell.separation for cell in cells}),
-    )
-
-    def text(cell: Cell | None) -> str:
-        if cell is None:
-            return ""
-        low, median, high = (_number(value, score) for value in cell.quantiles)
-        return f"{median} ({low} to {high}), {cell.pairs:,}"
-
-    lines = [["distance [m]", *map(_separation, columns)]]
-    lines += [
-        [_distance(row), *(text(at.get((row, column))) for column in columns)] for row in distances
+    score = task.pair_score
+    parts = [
+        f"Median {score} of two labels, 10th to 90th percentile, and number of pairs, "
+        "by the distance of their places and by how many measurements apart they are:\n\n"
+        f"{markdown(table_of_cells(cells, score))}"
     ]
-    about = f"Median {score} of two labels, 10th to 90th percentile, and number of pairs"
-    by = "by the distance of their places and by how many measurements apart they are"
-    parts = [f"{about}, {by}:\n\n{markdown(lines)}"]
     if rows:
-        lines = [
-            [name, *(_number(row[key], title) for key, title in titles.items())]
-            for name, row in rows.items()
-        ]
-        lines = [["predicted by", *titles.values()], *lines]
+        titles = {name: metric.title for name, metric in task.metrics().items()}
+        lines = [["predicted by", *titles.values()]]
+        for name, row in rows.items():
+            lines.append([name, *(_number(row[key], title) for key, title in titles.items())])
         parts.append(f"What that lets expect on split {split}:\n\n{markdown(lines)}")
     compared = [cell.compared for cell in cells if cell.compared < cell.pairs]
-    drawn = (
-        [f"of a cell with more, {max(compared):,} random pairs are compared"] if compared else []
-    )
-    parts.append("".join(f"- {remark}\n" for remark in [*remarks, *drawn]))
+    if compared:
+        drawn = f"of a cell with more, {max(compared):,} random pairs are compared"
+        remarks = [*remarks, drawn]
+    parts.append("".join(f"- {remark}\n" for remark in remarks))
     page = "\n".join(parts)
     write_text(folder / "agreement.md", page)
     save(figure(score, cells), folder / "agreement.png")
     return page
+
+
+def table_of_cells(cells: Sequence[Cell], score: str) -> list[list[str]]:
+    """Lines of a table: distances down, separations across."""
+    texts = {(cell.distance, cell.separation): cell.text(score) for cell in cells}
+    columns = sorted({cell.separation for cell in cells})
+    lines = [["distance [m]", *map(_separation, columns)]]
+    for distance in dict.fromkeys(cell.distance for cell in cells):
+        row = [texts.get((distance, column), "") for column in columns]
+        lines.append([_distance(distance), *row])
+    return lines
 
 
 def figure(score: str, cells: Sequence[Cell]) -> Figure:
@@ -90,26 +98,25 @@ def figure(score: str, cells: Sequence[Cell]) -> Figure:
         figure = Figure(figsize=(COLUMN, 2.9), layout="constrained")
         ax = figure.subplots()
         for number, column in enumerate(columns):
-            own = [cell for cell in cells if cell.separation == column]
-            shift = 0.14 * (number - (len(columns) - 1) / 2)
-            x = [distances.index(cell.distance) + shift for cell in own]
-            low, median, high = np.array([cell.quantiles for cell in own]).T
-            (colour, dash), marker = LINES[number % len(LINES)], "os^Dv"[number % 5]
-            look = {
-                "color": colour,
-                "linestyle": dash,
-                "marker": marker,
-                "markersize": 3.5,
-                "elinewidth": 0.6,
-            }
-            ax.errorbar(x, median, [median - low, high - median], label=_separation(column), **look)
+            members = [cell for cell in cells if cell.separation == column]
+            shift = 0.14 * (number - (len(columns) - 1) / 2)  # lines beside each other
+            x = [distances.index(cell.distance) + shift for cell in members]
+            low, median, high = np.array([cell.quantiles for cell in members]).T
+            colour, dash = LINES[number % len(LINES)]
+            ax.errorbar(
+                x,
+                median,
+                [median - low, high - median],
+                label=_separation(column),
+                color=colour,
+                linestyle=dash,
+                marker="os^Dv"[number % 5],
+                markersize=3.5,
+                elinewidth=0.6,
+            )
         ax.set(xlabel="distance of the places [m]", ylabel=f"{score} of two labels")
-        ax.set_xticks(
-            range(len(distances)),
-            [_distance(distance) for distance in distances],
-            rotation=40,
-            ha="right",
-        )
+        labels = [_distance(distance) for distance in distances]
+        ax.set_xticks(range(len(distances)), labels, rotation=40, ha="right")
         ax.grid(axis="y")
         figure.legend(loc="outside upper center", ncols=2, title="measurements apart")
     return figure

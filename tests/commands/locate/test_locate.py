@@ -9,20 +9,14 @@ import torch
 from scipy.optimize import minimize
 
 import gaigs
-from gaigs.commands import locate as locating
-from gaigs.commands.locate import (
-    Candidates,
-    Fingerprints,
-    geometric_median,
-    independent,
-    log_likelihood,
-    neighbours,
-    posterior,
-    received,
-    smoothed,
-    squares,
-    walk,
-)
+from gaigs.commands.locate import posterior as posteriors
+from gaigs.commands.locate import prediction_map
+from gaigs.commands.locate.candidates import Candidates
+from gaigs.commands.locate.fingerprints import Fingerprints, transmissions
+from gaigs.commands.locate.likelihood import Mismatch, independent, log_likelihood, mismatch
+from gaigs.commands.locate.neighbours import neighbours
+from gaigs.commands.locate.posterior import geometric_median, posterior
+from gaigs.commands.locate.tracks import smoothed, walk
 from gaigs.core.geometry import ExtrapolationWarning
 from gaigs.core.task.csi import Csi
 
@@ -137,7 +131,7 @@ def test_unknown_power_takes_the_offset_with_the_least_error():
         [[-40.0, -60.0, -50.0], [-50.0, -52.0, -70.0]], [[2.0, 3.0, 1.0], [4.0, 3.0, 2.0]]
     )
     asked = torch.tensor([[[-47.0], [-66.0], [-58.0]]])
-    total, _, count, _ = squares(prints, asked, unknown_power=True)
+    total, _, count, _ = mismatch(prints, asked, unknown_power=True)
     for place in range(2):
         errors, deviations = asked[0, :, 0] - prints.values[place, :, 0], prints.deviations[place]
         best = min(
@@ -160,7 +154,7 @@ def test_spectra_of_unknown_power_may_have_any_factor():
     )
     same = gaigs.locate(prints, label, unknown_power=True)
     asked = torch.rand(1, 1, prints.values.shape[2])
-    total, *_ = squares(prints, asked, unknown_power=True)
+    total, *_ = mismatch(prints, asked, unknown_power=True)
     factors = torch.linspace(0, 3, 301)[:, None] * asked.norm() / prints.values[:, 0].norm(dim=1)
     left = (asked - factors[..., None] * prints.values[:, 0]).square().sum(2).amin(
         0
@@ -193,7 +187,7 @@ def test_a_track_has_the_posterior_of_all_its_paths():
 
 def test_a_track_goes_on_where_no_receiver_hears(rssi):
     links, _, prints = rssi
-    values, places = received(links, links.split.train)
+    values, places = transmissions(links, links.split.train)
     ends = values[[places[:, 0].argmin(), places[:, 0].argmax()], :, 0].repeat_interleave(3, 0)
     found = gaigs.locate(
         prints, torch.cat((ends[:3], torch.full((7, 4), math.nan), ends[3:])), step=0.5
@@ -207,7 +201,10 @@ def test_transmitters_are_nearer_than_their_neighbours_and_in_their_regions():
     links = gaigs.links("synthetic_csi", transmitters=120, order=0)
     prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=2000)
     known = torch.cat((links.split.train, links.split.validation))
-    (asked, truth), (prior, places) = received(links, links.split.test), received(links, known)
+    (asked, truth), (prior, places) = (
+        transmissions(links, links.split.test),
+        transmissions(links, known),
+    )
     found = posterior(prints, asked, False, None, 0.9)
     guess = neighbours(asked, prior, places, torch.arange(len(places)))
     own, other = ((part - truth).norm(dim=1).mean() for part in (found.mean, guess))
@@ -219,9 +216,9 @@ def test_transmitters_are_nearer_than_their_neighbours_and_in_their_regions():
 
 def test_values_are_located_in_parts(rssi, monkeypatch):
     prints, sizes = rssi[2], []
-    own = locating.squares
+    own = posteriors.mismatch
     monkeypatch.setattr(
-        locating, "squares", lambda *parts: sizes.append(len(parts[1])) or own(*parts)
+        posteriors, "mismatch", lambda *parts: sizes.append(len(parts[1])) or own(*parts)
     )
     values = torch.randn(150, 4, generator=torch.Generator().manual_seed(0)) * 10 - 60
     found, last = gaigs.locate(prints, values), gaigs.locate(prints, values[-1])
@@ -242,7 +239,7 @@ def test_walks_go_to_the_nearest_place_and_stay_while_steps_would_take_them_ther
 def test_regions_of_tracks_hold_more_than_the_posterior_says(rssi):
     links, model, _ = rssi
     prints = gaigs.fingerprints(model, links, points=500)
-    asked, truth = received(links, links.split.test)
+    asked, truth = transmissions(links, links.split.test)
     order = walk(truth, 0.5)
     own, plain = (
         posterior(one, asked[order], False, 0.5, 0.9) for one in (prints, replace(prints, held=()))
@@ -266,13 +263,11 @@ def test_prior_follows_the_known_places_and_a_region_replaces_it(rssi):
     assert not gaigs.locate(even, [-50.0, -60.0, -55.0, -70.0]).calibrated
 
 
-@pytest.mark.parametrize(
-    ("data", "degrees"), [("synthetic_rssi", 4.0), ("synthetic", min(locating.DEGREES))]
-)
+@pytest.mark.parametrize(("data", "degrees"), [("synthetic_rssi", 4.0), ("synthetic", 0.25)])
 def test_few_fingerprints_do_not_rule_outliers_out(data, degrees):
     links = gaigs.links(data, transmitters=16, order=0)
     prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=200)
-    assert 0 < sum(len(one.truth) for one in prints.held) < locating.FEW
+    assert 0 < prints.held_out_count < 20
     assert prints.degrees == degrees  # the least energy score of the levels would be at 30
 
 
@@ -280,9 +275,9 @@ def test_held_out_fingerprints_are_located_among_the_other_places(monkeypatch):
     # A density that knew them would put each region about its own place.
     links = gaigs.links("synthetic_rssi", transmitters=60, order=0)
     asked = []
-    own = locating.candidates
+    own = prediction_map.near_candidates
     monkeypatch.setattr(
-        locating, "candidates", lambda *parts: asked.append(parts[-1]) or own(*parts)
+        prediction_map, "near_candidates", lambda *parts: asked.append(parts[-1]) or own(*parts)
     )
     prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=300)
     every, *others = (set(known.tolist()) for known in asked)
@@ -378,9 +373,8 @@ def test_median_place_has_the_least_expected_distance():
 
 
 def test_likelihood_of_a_perfect_value_is_finite():
-    found = log_likelihood(
-        torch.zeros(1, 2), torch.zeros(1, 2), torch.ones(1), torch.zeros(1, 2), 0.25, 16.0
-    )
+    perfect = Mismatch(torch.zeros(1, 2), torch.zeros(1, 2), torch.ones(1), torch.zeros(1, 2))
+    found = log_likelihood(perfect, 0.25, 16.0)
     assert found.isfinite().all()
 
 

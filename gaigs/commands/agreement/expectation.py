@@ -1,0 +1,129 @@
+"""Scores to expect on a split, from the agreement of labels."""
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gaigs.commands.agreement.pairs import Agreement, groups_of, joined_scores, visits
+from gaigs.data import Links
+from gaigs.runs import evaluation
+
+
+def on_split(
+    agreement: Agreement,
+    links: Links,
+    random: np.random.Generator,
+    baselines: list[Mapping],
+    looked_up: int = 30_000_000,
+) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """Expected metrics on the split's test links and those of the baselines, by row; and remarks.
+
+    Each test link is looked up in the cell of its nearest known link of the same receiver and
+    carrier, and stands for the pairs compared there. The rows are empty if no test link can be
+    looked up. Baselines are fitted if labels have at most ``looked_up`` numbers.
+    """
+    rows: dict[str, dict[str, float]] = {}
+    remarks = []
+    nearest = nearest_known(links)
+    if nearest.missing:
+        remarks.append(
+            f"{nearest.missing:,} test links have no known link of their receiver and carrier, "
+            "and are left out"
+        )
+    cells = agreement.cell(nearest.distances, nearest.separations)
+    cells = cells[np.isin(cells, [*agreement.scores])]  # a part of the links may have no such pair
+    if len(cells):
+        low, median, high = np.quantile(nearest.distances, (0.1, 0.5, 0.9))
+        remarks.append(
+            "from a test link to the nearest known one of its receiver and carrier it is "
+            f"{median:.3g} m (median; 10th to 90th percentile {low:.3g} to {high:.3g} m), "
+            f"and in the order {np.median(nearest.separations):,.0f} (median)"
+        )
+        scores = drawn_scores(agreement, cells, links.task.compared_by, random)
+        rows["one label as near"] = links.task.summarise(scores)
+        remarks.append(
+            "one label as near: random pairs of the cell that a test link and its nearest known "
+            "one are in"
+        )
+        averaged = links.task.averaged(scores)
+        if averaged is not None:
+            rows["mean of many as near"] = links.task.summarise(averaged)
+            remarks.append("mean of many as near: the same with half of the squared difference")
+    count = sum(map(len, links.split.parts().values()))
+    if baselines and count * math.prod(links.task.shape) > looked_up:
+        remarks.append(
+            "the baselines are left out, as labels are large and many; "
+            "command=train model=mean has them"
+        )
+    elif baselines:
+        rows |= baseline_rows(links, baselines)
+    return rows, remarks
+
+
+class Nearest(NamedTuple):
+    """The nearest known link of each test link.
+
+    Attributes:
+        distances: To the nearest known link of the same receiver and carrier [m].
+        separations: To the same link, in measurements.
+        missing: Number of test links without one.
+    """
+
+    distances: Float[ndarray, " k"]
+    separations: ndarray
+    missing: int
+
+
+def nearest_known(links: Links) -> Nearest:
+    """The nearest known link of each test link of the same receiver and carrier."""
+    places = links.query.transmitters.double().numpy()
+    order = visits(links)
+    test = links.split.test.numpy()
+    known = links.split.known.numpy()
+    distances = [np.zeros(0)]
+    separations = [np.zeros(0)]
+    for group in groups_of(links):
+        asked = np.intersect1d(group, test)
+        there = np.intersect1d(group, known)
+        if len(asked) and len(there):
+            distance, nearest = cKDTree(places[there]).query(places[asked])
+            distances.append(distance)
+            separations.append(np.abs(order[asked] - order[there[nearest]]))
+    all_distances = np.concatenate(distances)
+    missing = len(test) - len(all_distances)
+    return Nearest(all_distances, np.concatenate(separations), missing)
+
+
+def drawn_scores(
+    agreement: Agreement,
+    cells: ndarray,
+    score: str,
+    random: np.random.Generator,
+    fewest: int = 20_000,
+) -> dict[str, Tensor]:
+    """Scores of random pairs of random cells, at least so many."""
+    numbers, counts = np.unique(random.choice(cells, max(fewest, len(cells))), return_counts=True)
+    parts = []
+    for cell, count in zip(numbers, counts, strict=True):
+        scores = agreement.scores[int(cell)]
+        which = torch.from_numpy(random.integers(len(scores[score]), size=count))
+        parts.append({name: values[which] for name, values in scores.items()})
+    return joined_scores(parts)
+
+
+def baseline_rows(links: Links, baselines: list[Mapping]) -> dict[str, dict[str, float]]:
+    """Metrics of the baselines on the test links."""
+    test = links.split.test
+    labels = torch.cat([links.labels[part] for part in test.split(evaluation.BATCH)])
+    rows = {}
+    for name, look_up in evaluation.build_baselines(baselines, "", links.scene).items():
+        values = evaluation.predicted(evaluation.fitted(look_up, links), links, test)
+        rows[f"`{name}`"] = links.task.summarise(links.task.scores(labels, values))
+    return rows

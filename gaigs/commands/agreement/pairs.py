@@ -1,0 +1,266 @@
+"""Pairs of labels of one receiver and carrier, counted and compared in cells."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy import ndarray
+from scipy.spatial.distance import cdist
+from torch import Tensor
+
+from gaigs.commands.agreement.page import Cell
+from gaigs.data import Links, median_spacing
+from gaigs.report.style import round_step
+from gaigs.runs import evaluation
+from gaigs.split import rows_of
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Scores of pairs of labels, in cells of distance (rows) and separation (columns).
+
+    Attributes:
+        distances: Upper edges of the rows [m]; the first row holds pairs at one place, and its edge
+            is next to 0.
+        separations: Last separations of the columns but the last, ascending; in measurements.
+        pairs: Number of pairs in each cell.
+        share: Share of the pairs that were counted.
+        scores: Scores of the compared pairs by cell (row times columns plus column) and by the
+            score's name.
+        step: Median distance from a measurement to the next [m].
+        apart: Median distance of two random measurements [m].
+    """
+
+    distances: ndarray
+    separations: ndarray
+    pairs: Int[ndarray, "rows columns"]
+    share: float
+    scores: dict[int, dict[str, Tensor]]
+    step: float
+    apart: float
+
+    @property
+    def has_order(self) -> bool:
+        """True if consecutive places are close together, so that separations measure time."""
+        return self.step < self.apart / 2
+
+    def cell(self, distance: ndarray, separation: ndarray) -> ndarray:
+        """The cell of each pair, from its distance [m] and its separation."""
+        row = np.searchsorted(self.distances, distance, side="right")
+        column = np.searchsorted(self.separations, separation)
+        return row * (len(self.separations) + 1) + column
+
+    def cells(self, score: str) -> list[Cell]:
+        """Cells with pairs, by rows, as tables and figures show them."""
+        lows = [0.0, 0.0, *self.distances[1:]]
+        highs = [0.0, *self.distances[1:]]
+        firsts = [0, *(self.separations + 1).tolist()]
+        lasts = [*self.separations.tolist(), math.inf]
+        cells = []
+        for number, scores in sorted(self.scores.items()):
+            row, column = divmod(number, len(lasts))
+            cell = Cell(
+                distance=(float(lows[row]), float(highs[row])),
+                separation=(firsts[column], lasts[column]),
+                pairs=int(self.pairs[row, column]),
+                compared=len(scores[score]),
+                quantiles=tuple(np.quantile(scores[score].numpy(), (0.1, 0.5, 0.9)).tolist()),
+            )
+            cells.append(cell)
+        return cells
+
+    def remarks(self) -> list[str]:
+        """Sentences on the columns and the counted pairs."""
+        order = "in the order of the files, which counts as that of measurement"
+        if not self.has_order:
+            order = (
+                "in the order of the files, in which no place is near the one before: "
+                "columns tell nothing of time"
+            )
+        remarks = [
+            f"columns: how many measurements apart, {order}; consecutive ones are "
+            f"{self.step:.2g} m apart (median), any two {self.apart:.2g} m"
+        ]
+        if self.share < 1:
+            remarks.append(
+                f"pairs are those of {self.share:.2g} of the links, drawn at random, "
+                "with all others"
+            )
+        return remarks
+
+
+def measure(
+    links: Links,
+    random: np.random.Generator,
+    counted: int = 50_000_000,
+    block: int = 1_000_000,
+    most: int = 2_000,
+) -> Agreement:
+    """Counts the pairs of labels of one receiver and carrier by cell, and compares random ones.
+
+    The later label of a pair is scored with the earlier as its prediction.
+
+    Args:
+        links: All links in the order of the files, which counts as that of measurement.
+        random: Draws the pairs.
+        counted: Largest number of computed distances; of more pairs, those of random links with all
+            others count.
+        block: Number of distances in memory at a time.
+        most: Largest number of pairs of a cell whose labels are compared; at least 30 of large
+            labels.
+
+    Raises:
+        ValueError: No two links share receiver and carrier, or all transmitters stand at one point.
+    """
+    places = links.query.transmitters.double().numpy()
+    groups = groups_of(links)
+    if not groups:
+        raise ValueError(
+            f"no two of {len(links)} links have the same receiver and carrier; add measurements"
+        )
+    if not np.ptp(places, 0).any():
+        point = ", ".join(f"{value:g}" for value in places[0])
+        raise ValueError(
+            f"all {len(links)} links have their transmitter at {point} m; check the positions"
+        )
+    order = visits(links)
+    edges = distance_edges(links, places)
+    # Nine tenths of all measurements are further apart than the last limit.
+    limits = 3 * 10 ** np.arange(18)
+    limits = limits[limits <= (int(order.max()) + 1) / 10]
+
+    _, first = np.unique(order, return_index=True)
+    way = places[first]  # the place of each measurement
+    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    apart = np.linalg.norm(way - way[random.permutation(len(way))], axis=1)
+
+    shape = len(edges), len(limits) + 1
+    empty = Agreement(
+        distances=edges,
+        separations=limits,
+        pairs=np.zeros(shape, int),
+        share=min(1.0, counted / sum(len(group) ** 2 for group in groups)),
+        scores={},
+        step=float(np.median(steps)) if len(steps) else 0.0,
+        apart=float(np.median(apart)),
+    )
+    # SSIM of 4e8 numbers takes half a minute of one core.
+    most = min(most, max(30, int(400_000_000 / math.prod((*shape, *links.task.shape)))))
+    counts, drawn = draw(empty, places, order, groups, most, block, random)
+    scores = {cell: compare(links, *ends.T) for cell, ends in drawn.items()}
+    return replace(empty, pairs=counts.reshape(shape), scores=scores)
+
+
+def distance_edges(links: Links, places: Float[ndarray, "n 3"]) -> Float[ndarray, " rows"]:
+    """Upper edges of the rows of distances [m], from the spacing of places to their extent."""
+    extent = float(np.linalg.norm(np.ptp(places, 0)))
+    spacing = median_spacing(links.query.transmitters.unique(dim=0))
+    edges = [np.nextafter(0, 1), round_step(spacing, 1)]
+    while edges[-1] < 1.01 * extent:  # rounding takes no distance beyond
+        edges.append(round_step(1.5 * edges[-1], 1))
+    return np.array(edges)
+
+
+def visits(links: Links) -> Int[ndarray, " n"]:
+    """Number of each link's measurement.
+
+    It is one more at each change of the row, so a place measured again counts anew.
+    """
+    return np.concatenate(([0], (rows_of(links).diff() != 0).numpy().cumsum()))
+
+
+def groups_of(links: Links) -> list[Int[ndarray, " k"]]:
+    """Links of one receiver and carrier, ascending, where there are two or more."""
+    keys = [links.query.receivers.double()]
+    if links.query.frequencies is not None:
+        keys.append(links.query.frequencies.double())
+    _, which = torch.stack(keys, 1).unique(dim=0, return_inverse=True)
+    order = which.argsort(stable=True).numpy()
+    groups = np.split(order, which.bincount().cumsum(0)[:-1].numpy())
+    return [group for group in groups if len(group) > 1]
+
+
+class Reservoir:
+    """The pairs of each cell with the smallest random keys.
+
+    Args:
+        cells: Number of cells. Pairs of a further cell are never kept.
+        most: Largest number of pairs of a cell.
+    """
+
+    def __init__(self, cells: int, most: int):
+        self.most = most
+        self.bounds = np.ones(cells + 1)  # keys from here on are too large
+        self.bounds[cells] = 0
+        self.keys = {cell: np.zeros(0) for cell in range(cells)}
+        self.ends = {cell: np.zeros((0, 2), int) for cell in range(cells)}
+
+    def add(self, cells: ndarray, keys: ndarray, rows: ndarray, columns: ndarray) -> None:
+        """Offers the pairs of all rows with all columns, by rows, with their cells and keys."""
+        small = np.flatnonzero(keys < self.bounds[cells])
+        for cell in np.unique(cells[small]):
+            here = small[cells[small] == cell]
+            row, column = np.divmod(here, len(columns))
+            ends = np.stack((rows[row], columns[column]), 1)
+            all_keys = np.concatenate((self.keys[cell], keys[here]))
+            all_ends = np.concatenate((self.ends[cell], ends))
+            best = np.argsort(all_keys)[: self.most]
+            self.keys[cell] = all_keys[best]
+            self.ends[cell] = all_ends[best]
+            if len(best) == self.most:
+                self.bounds[cell] = all_keys[best[-1]]
+
+
+def draw(
+    agreement: Agreement,
+    places: Float[ndarray, "n 3"],
+    order: Int[ndarray, " n"],
+    groups: Sequence[ndarray],
+    most: int,
+    block: int,
+    random: np.random.Generator,
+) -> tuple[Int[ndarray, " cells"], dict[int, Int[ndarray, "k 2"]]]:
+    """Number of pairs of each cell, and at most so many of them, earlier and later link.
+
+    Arguments are those of ``measure``.
+    """
+    size = agreement.pairs.size
+    counts = np.zeros(size + 1, int)  # the last cell holds links that are not a pair
+    reservoir = Reservoir(size, most)
+    for group in groups:
+        number = math.ceil(agreement.share * len(group))
+        chosen = np.sort(random.choice(len(group), number, replace=False))
+        numbers = np.arange(len(group))
+        is_chosen = np.isin(numbers, chosen)
+        for part in np.array_split(chosen, math.ceil(number * len(group) / block)):
+            rows = group[part]
+            separation = np.abs(order[rows, None] - order[group])
+            cells = agreement.cell(cdist(places[rows], places[group]), separation)
+            # Two chosen links meet twice, and each link meets itself.
+            cells[is_chosen & (numbers <= part[:, None])] = size
+            cells = cells.ravel()
+            counts += np.bincount(cells, minlength=size + 1)
+            reservoir.add(cells, random.random(len(cells)), rows, group)
+    ends = {cell: np.sort(pairs, 1) for cell, pairs in reservoir.ends.items() if len(pairs)}
+    return counts[:size], ends
+
+
+def compare(links: Links, earlier: ndarray, later: ndarray) -> dict[str, Tensor]:
+    """Scores of labels with others as their predictions."""
+    labels = torch.from_numpy(later).split(evaluation.BATCH)
+    others = torch.from_numpy(earlier).split(evaluation.BATCH)
+    parts = []
+    for label, other in zip(labels, others, strict=True):
+        parts.append(links.task.scores(links.labels[label], links.labels[other]))
+    return joined_scores(parts)
+
+
+def joined_scores(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Scores of several parts, one after another."""
+    scores = {}
+    for name in parts[0]:
+        scores[name] = torch.cat([part[name] for part in parts])
+    return scores

@@ -1,0 +1,140 @@
+"""Candidate places of a transmitter, with their prior probability."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gaigs.core.geometry import even_places
+from gaigs.core.query import evenly
+from gaigs.data import Links
+from gaigs.kriging.links import distances, folds_of
+
+
+class Candidates(NamedTuple):
+    """Candidate places, before anything is received.
+
+    Attributes:
+        places: (g, 3) [m].
+        prior: Logarithm of each candidate's probability (g,).
+        density: Logarithm of the prior density there, but for a constant (g,).
+    """
+
+    places: Float[Tensor, "g 3"]
+    prior: Float[Tensor, " g"]
+    density: Float[Tensor, " g"]
+
+    def nearest(self, places: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
+        """Number of the candidate nearest to each place."""
+        return distances(places.double(), self.places.double()).argmin(1)
+
+
+def even_candidates(
+    box: Float[Tensor, "2 3"], points: int, floors: Sequence[float] | Float[Tensor, " f"] = ()
+) -> Candidates:
+    """A grid of equally likely places in the box, or on separate floors."""
+    places = even_places(box[0], box[1], points, floors)
+    prior = torch.full((len(places),), -math.log(len(places)))
+    return Candidates(places, prior, torch.zeros(len(places)))
+
+
+@dataclass(frozen=True)
+class PlaceDensity:
+    """Prior density of transmitters: normal ones about known places, and an even one in their box.
+
+    Attributes:
+        places: Known places (k, 3) [m].
+        folds: Fold of each of them (k,).
+        edges: Edges of the box [m]; 0 across separate floors.
+        floors: Heights of separate floors [m]; empty for one floor.
+        elsewhere: Prior probability that a transmitter is not near a known place but anywhere in
+            the box.
+    """
+
+    places: Float[Tensor, "k 3"]
+    folds: Int[Tensor, " k"]
+    edges: Float[Tensor, "3"]
+    floors: Float[Tensor, " f"]
+    elsewhere: float = 0.1
+
+    @property
+    def has_extent(self) -> Bool[Tensor, "3"]:
+        """True for axes along which places differ."""
+        return self.edges > 1e-3 * self.edges.max()
+
+    def logarithm(
+        self,
+        asked: Float[Tensor, "g 3"],
+        width: float,
+        folds: Int[Tensor, " g"] | None = None,
+    ) -> Float[Tensor, " g"]:
+        """Logarithm of the density at places, for normal densities of a width [m].
+
+        Known places of a place's own fold do not count, if there are ``folds``.
+        """
+        axes = self.has_extent
+        squares = distances(asked[:, axes], self.places[:, axes]).square_()  # (g, k)
+        if len(self.floors):
+            is_other = self._floor(asked)[:, None] != self._floor(self.places)
+            squares = squares.masked_fill(is_other, math.inf)
+        if folds is not None:
+            squares = squares.masked_fill(folds[:, None] == self.folds, math.inf)
+        # log sum over k of (1 - e) / k N(asked; place, width), and e / volume
+        share = math.log(1 - self.elsewhere) - math.log(len(self.places))
+        peak = share - int(axes.sum()) * math.log(width * math.sqrt(2 * math.pi))
+        near = torch.logsumexp(squares / (-2 * width**2), 1) + peak  # (g,)
+        volume = self.edges[axes].prod() * max(1, len(self.floors))
+        return torch.logaddexp(near, (self.elsewhere / volume).log())
+
+    def likeliest_width(self, spacing: float, most: int = 1000, tried: int = 24) -> float:
+        """The width under which known places are most likely by those of other folds [m].
+
+        Args:
+            spacing: Median distance from a known place to the next [m].
+            most: Largest number of places whose density counts.
+            tried: Number of widths, from a quarter of the spacing to the diagonal of the box.
+        """
+        some = evenly(torch.arange(len(self.places)), most)
+        ends = math.log10(spacing / 4), math.log10(self.edges.norm())
+
+        def mean_logarithm(width: float) -> float:
+            return self.logarithm(self.places[some], width, self.folds[some]).mean().item()
+
+        return max(torch.logspace(*ends, tried).tolist(), key=mean_logarithm)
+
+    def _floor(self, places: Float[Tensor, "g 3"]) -> Int[Tensor, " g"]:
+        return (places[:, 2:] - self.floors).abs().argmin(1)
+
+
+def near_candidates(
+    box: Float[Tensor, "2 3"],
+    points: int,
+    floors: Float[Tensor, " f"],
+    links: Links,
+    known: Int[Tensor, " k"],
+) -> Candidates:
+    """A grid with a quarter of the places, and random places about those of known links."""
+    places, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)
+    folds = torch.zeros(len(places), dtype=torch.long)
+    folds = folds.index_copy(0, which, folds_of(links, known))
+    edges = (box[1] - box[0]).double()
+    edges[2] *= not len(floors)
+    density = PlaceDensity(places, folds, edges, floors)
+    width = density.likeliest_width(links.scene.spacing)
+
+    even = even_places(box[0], box[1], max(1, points // 4), floors)
+    count = points - points // 4
+    steps = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
+    steps = width * density.has_extent * steps
+    around = places[torch.arange(count) * len(places) // count] + steps
+    chosen = torch.cat((even, around.float()))  # (g, 3)
+
+    # Candidates drawn from a part of the prior share this part's probability evenly.
+    shares = torch.tensor([density.elsewhere / len(even), (1 - density.elsewhere) / count]).log()
+    prior = shares.repeat_interleave(torch.tensor([len(even), count]))
+    logarithms = [density.logarithm(part.double(), width) for part in chosen.split(1024)]
+    return Candidates(chosen, prior, torch.cat(logarithms).float())

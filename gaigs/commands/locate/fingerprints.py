@@ -1,0 +1,151 @@
+"""Fingerprints: the values of all receivers by which places are compared."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gaigs.commands.locate.candidates import Candidates
+from gaigs.commands.locate.tracks import track, walk
+from gaigs.core.geometry import Frame
+from gaigs.core.query import ROUNDING
+from gaigs.core.task import Task
+from gaigs.data import Links
+from gaigs.split import rows_of
+
+
+class LocatedFold(NamedTuple):
+    """Held-out fingerprints of a fold, located in the map of a model that does not know them.
+
+    Attributes:
+        candidates: Candidates of this map.
+        likelihoods: Logarithms there, with known and with unknown power (2, n, g); the likelihood
+            is chosen without these fingerprints.
+        truth: Places of the fingerprints (n, 3) [m].
+    """
+
+    candidates: Candidates
+    likelihoods: Float[Tensor, "2 n g"]
+    truth: Float[Tensor, "n 3"]
+
+
+@dataclass(frozen=True, repr=False)
+class Fingerprints:
+    """Values that a model predicts at candidate places, from ``fingerprints``.
+
+    ``locate`` looks a value up in them.
+
+    Attributes:
+        task: Task of the values.
+        frequency: Carrier [Hz]; None if unknown.
+        receivers: Names of the receivers.
+        candidates: Where the values are predicted, g places.
+        axes: Axes of a label's numbers along which errors are independent and of the same size
+            (m, k).
+        values: Predictions at the candidates along these axes (g, r, k).
+        deviations: Standard deviations of labels of one number (g, r); else 1.
+        hearing: Probability that each receiver receives a transmitter there (g, r); without links a
+            half.
+        degrees, temper: Arguments of ``log_likelihood``.
+        held: Held-out fingerprints of each fold, which calibrate regions; empty without links.
+        frame: Place of x and y on a map; None if unknown.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=500)
+        >>> len(prints.candidates.places) == len(prints.values), prints.degrees in (0.25, 1, 4, 30)
+        (True, True)
+    """
+
+    task: Task
+    frequency: float | None
+    receivers: Sequence[str]
+    candidates: Candidates
+    axes: Float[Tensor, "m k"]
+    values: Float[Tensor, "g r k"]
+    deviations: Float[Tensor, "g r"]
+    hearing: Float[Tensor, "g r"]
+    degrees: float = 4.0
+    temper: float = 1.0
+    held: tuple[LocatedFold, ...] = ()
+    frame: Frame | None = None
+    _drops: dict = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __repr__(self) -> str:
+        places, receivers, _ = self.values.shape
+        size = f"{places} candidates, {receivers} receivers"
+        return f"<fingerprints of task {self.task.name!r}: {size}>"
+
+    @property
+    def held_out_count(self) -> int:
+        """Number of held-out fingerprints."""
+        return sum(len(fold.truth) for fold in self.held)
+
+    def drops(self, unknown_power: bool = False, step: float | None = None) -> Float[Tensor, " h"]:
+        """Logarithms of the best candidate's density over the density at the true place, ascending.
+
+        One for each held-out fingerprint. Options are those of ``locate``; with ``step``
+        fingerprints are values of a ``walk``.
+        """
+        if (unknown_power, step) not in self._drops:
+            parts = [torch.zeros(0, dtype=torch.float64)]
+            for candidates, likelihoods, truth in self.held:
+                logarithms = likelihoods[int(unknown_power)] + candidates.prior.double()
+                if step is not None:
+                    order = walk(truth, step)
+                    is_received = torch.ones(len(order), dtype=torch.bool)
+                    candidates, logarithms = track(candidates, logarithms[order], step, is_received)
+                    truth = truth[order]
+                # Candidates are a sample of the prior: their density is not their probability.
+                heights = logarithms - candidates.prior + candidates.density  # (n, g)
+                nearest = candidates.nearest(truth)[:, None]
+                parts.append(heights.amax(1) - heights.gather(1, nearest)[:, 0])
+            self._drops[unknown_power, step] = torch.cat(parts).sort().values
+        return self._drops[unknown_power, step]
+
+
+class Transmissions(NamedTuple):
+    """Fingerprints of transmissions, and where these were sent.
+
+    Attributes:
+        values: Labels as ``Task.fingerprint`` gives them, NaN where a receiver has none (n, r, m).
+        places: (n, 3) [m].
+    """
+
+    values: Float[Tensor, "n r m"]
+    places: Float[Tensor, "n 3"]
+
+
+def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor, " k"]:
+    """Links of some parts of the split at a carrier [Hz]."""
+    index = torch.cat([getattr(links.split, part) for part in parts])
+    if frequency is None or links.query.frequencies is None:
+        return index
+    return index[(links.query.frequencies[index] / frequency - 1).abs() < ROUNDING]
+
+
+def transmissions(links: Links, index: Int[Tensor, " k"]) -> Transmissions:
+    """Transmissions of some links, with the labels of these."""
+    rows, which = rows_of(links)[index].unique(return_inverse=True)
+    labels = torch.cat([links.task.fingerprint(links.labels[part]) for part in index.split(256)])
+    values = labels.new_full((len(rows), len(links.receivers), labels.shape[1]), math.nan)
+    values[which, links.query.receivers[index]] = labels
+    places = torch.zeros(len(rows), 3)
+    places[which] = links.query.transmitters[index]
+    return Transmissions(values, places)
+
+
+def receptions(
+    links: Links, index: Int[Tensor, " k"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n r"]]:
+    """Places of the transmissions of some links, and 1 for each receiver that has one, else 0."""
+    rows, which = rows_of(links)[index].unique(return_inverse=True)
+    places = torch.zeros(len(rows), 3)
+    places[which] = links.query.transmitters[index]
+    is_received = torch.zeros(len(rows), len(links.receivers))
+    is_received[which, links.query.receivers[index]] = 1
+    return places, is_received

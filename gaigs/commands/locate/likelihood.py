@@ -1,0 +1,216 @@
+"""The likelihood of places, and its choice by held-out fingerprints."""
+
+import itertools
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gaigs.commands.locate.fingerprints import Fingerprints, LocatedFold
+from gaigs.core.query import ROUNDING, evenly
+
+
+def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor, "m k"]:
+    """Axes along which errors of a label's numbers are independent.
+
+    They are scaled to a mean square of 1 a label. Of more than ``most`` errors an even part counts.
+
+    Source: Ledoit and Wolf, A well-conditioned estimator for large-dimensional covariance matrices,
+    2004.
+    """
+    errors = errors[evenly(torch.arange(len(errors)), most)].double()
+    if not errors.any():
+        return torch.eye(errors.shape[1])
+    sizes, vectors = torch.linalg.eigh(errors.mT @ errors / len(errors))
+    # Shrink the covariance towards a multiple of the identity, by its own scatter (section 3).
+    scatter = (errors.square().sum(1).square().mean() - sizes.square().sum()) / len(errors)
+    spread = (sizes - sizes.mean()).square().sum()
+    share = (scatter / spread).nan_to_num(1.0).clamp(0, 1)  # 0 / 0 if all are equal
+    sizes = (1 - share) * sizes.clamp_min(0) + share * sizes.mean()
+    # Numbers that never err get no infinite weight.
+    axes = vectors / sizes.clamp_min(1e-6 * sizes.max()).sqrt()
+    return (axes / (errors @ axes).square().sum(1).mean().sqrt()).float()
+
+
+class Mismatch(NamedTuple):
+    """Differences of n values from the predictions at g candidates.
+
+    Attributes:
+        squares: Sum of squared errors over squared deviations (n, g).
+        log_deviations: Sum of the logarithms of the deviations (n, g).
+        counts: Number of receivers that tell of the place (n,).
+        reception: Logarithm of the probability that these receivers receive the value and no other
+            does (n, g); 0 for unknown power.
+    """
+
+    squares: Float[Tensor, "n g"]
+    log_deviations: Float[Tensor, "n g"]
+    counts: Float[Tensor, " n"]
+    reception: Float[Tensor, "n g"]
+
+
+def mismatch(
+    prints: Fingerprints, asked: Float[Tensor, "n r k"], unknown_power: bool = False
+) -> Mismatch:
+    """Differences of values, along the axes of a map, from its predictions.
+
+    With ``unknown_power`` squares are the least over all offsets of a value's levels, or all
+    factors of a prediction's spectra or channels.
+    """
+    is_received = ~asked[..., 0].isnan()  # (n, r)
+    if prints.task.shape:
+        squares = _array_squares(prints, asked, is_received, unknown_power)
+        log_deviations = torch.zeros_like(squares)
+    else:
+        squares, log_deviations = _level_squares(prints, asked, is_received, unknown_power)
+    counts = is_received.float().sum(1)
+    reception = torch.zeros_like(squares)
+    if not unknown_power:
+        likely = is_received.float() @ prints.hearing.log().mT
+        unlikely = (~is_received).float() @ (-prints.hearing).log1p().mT
+        # In a track, a value that no receiver has received may not have been sent.
+        reception = (likely + unlikely) * (counts > 0)[:, None]
+    elif not prints.task.shape:
+        counts = counts - 1  # one number less tells of the place
+    return Mismatch(squares.clamp_min(0), log_deviations, counts, reception)
+
+
+def _level_squares(
+    prints: Fingerprints,
+    asked: Float[Tensor, "n r 1"],
+    is_received: Bool[Tensor, "n r"],
+    unknown_power: bool,
+) -> tuple[Float[Tensor, "n g"], Float[Tensor, "n g"]]:
+    """``squares`` and ``log_deviations`` of labels of one number."""
+    total = torch.zeros(len(asked), len(prints.values))
+    log_deviations = torch.zeros_like(total)
+    errors_sum = torch.zeros_like(total)
+    weights_sum = torch.zeros_like(total)
+    for receiver in range(asked.shape[1]):
+        rows = is_received[:, receiver]
+        values = prints.values[:, receiver]
+        smallest = ROUNDING * values.abs().max()  # for labels without any error
+        deviations = prints.deviations[:, receiver].clamp_min(smallest)
+        errors = (asked[rows, receiver] - values[:, 0]) / deviations  # (k, g)
+        total[rows] += errors.square()
+        errors_sum[rows] += errors / deviations
+        weights_sum[rows] += deviations.square().reciprocal()
+        log_deviations[rows] += deviations.log()
+    if unknown_power:
+        # min over c of sum ((e - c) / s)² = sum (e / s)² - (sum e / s²)² / sum 1 / s²
+        tiny = torch.finfo(torch.float32).tiny
+        total = total - errors_sum.square() / weights_sum.clamp_min(tiny)
+    return total, log_deviations
+
+
+def _array_squares(
+    prints: Fingerprints,
+    asked: Float[Tensor, "n r k"],
+    is_received: Bool[Tensor, "n r"],
+    unknown_power: bool,
+) -> Float[Tensor, "n g"]:
+    """``squares`` of labels of several numbers."""
+    products = torch.zeros(len(asked), len(prints.values))
+    predicted_powers = torch.zeros_like(products)
+    powers = torch.zeros(len(asked), 1)
+    for receiver in range(asked.shape[1]):
+        rows = is_received[:, receiver]
+        values = prints.values[:, receiver]
+        products[rows] += asked[rows, receiver] @ values.mT
+        predicted_powers[rows] += values.square().sum(1)
+        powers[rows] += asked[rows, receiver].square().sum(1, keepdim=True)
+    if not unknown_power:
+        return predicted_powers - 2 * products + powers
+    # The part of the value that no factor of the prediction gives: 1 - (x y)² / (x² y²).
+    tiny = torch.finfo(torch.float32).tiny
+    cosines = products.clamp_min(0).square() / (predicted_powers * powers).clamp_min(tiny)
+    return predicted_powers.mean(1, keepdim=True) * (1 - cosines)
+
+
+def log_likelihood(difference: Mismatch, degrees: float, temper: float) -> Float[Tensor, "n g"]:
+    """Student's t of all receivers together, to a power, and the chance of their reception.
+
+    Args:
+        difference: Values and predictions compared.
+        degrees: Degrees of freedom. The fewer, the less one unlike place or receiver counts.
+        temper: The power. It stands for what the errors of receivers have in common, and for what
+            the axes miss.
+    """
+    exponent = (degrees + difference.counts[:, None]) / 2
+    together = exponent * torch.log1p(difference.squares / degrees) + difference.log_deviations
+    return (difference.reception - temper * together).double()
+
+
+class Trial(NamedTuple):
+    """Held-out fingerprints, compared with the map of a model that does not know them.
+
+    Attributes:
+        prints: The map.
+        differences: With known and with unknown power.
+        truth: Places of the fingerprints (n, 3) [m].
+    """
+
+    prints: Fingerprints
+    differences: Sequence[Mismatch]
+    truth: Float[Tensor, "n 3"]
+
+    def score(self, degrees: float, temper: float, draws: int = 128) -> float:
+        """Sum of the energy scores of the posteriors by a likelihood [m].
+
+        Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation,
+        2007, section 4.3.
+        """
+        places, prior, _ = self.prints.candidates
+        logarithms = log_likelihood(self.differences[0], degrees, temper) + prior
+        probabilities = torch.softmax(logarithms, 1)
+        rng = torch.Generator().manual_seed(0)
+        drawn = places[torch.multinomial(probabilities, draws, True, generator=rng)]  # (n, d, 3)
+        # E |X - x| - E |X - X'| / 2
+        apart = (drawn[:, ::2] - drawn[:, 1::2]).norm(dim=2).mean(1)
+        errors = (drawn - self.truth[:, None]).norm(dim=2).mean(1)
+        return (errors - apart / 2).sum().item()
+
+
+def fitted(
+    prints: Fingerprints,
+    trials: Sequence[Trial],
+    degrees: Sequence[float] = (0.25, 1.0, 4.0, 30.0),
+    half_octaves: Iterable[int] = range(-8, 17),
+    fewest: int = 20,
+) -> Fingerprints:
+    """A map with the likelihood of the least energy score of held-out fingerprints.
+
+    The likelihood of each fold is chosen by the other folds.
+
+    Args:
+        prints: The map.
+        trials: Held-out fingerprints of each fold.
+        degrees: Degrees of freedom to choose from, the heaviest tails first.
+        half_octaves: Exponents to choose from, in powers of the root of 2.
+        fewest: Number of fingerprints below which the degrees are not chosen: so few hardly show
+            whether one of twenty is an outlier. Levels then keep the likelihood of ``prints``, and
+            other labels take the heaviest tails.
+    """
+    tempers = [2.0 ** (power / 2) for power in half_octaves]
+    if sum(len(trial.truth) for trial in trials) >= fewest:
+        choices = [*itertools.product(degrees, tempers)]
+    elif prints.task.shape:
+        choices = [*itertools.product(degrees[:1], tempers)]
+    else:
+        choices = [(prints.degrees, prints.temper)]
+    rows = []
+    for trial in trials:
+        rows.append([trial.score(*choice) for choice in choices])
+    scores = torch.tensor(rows)  # (folds, choices)
+    total = scores.sum(0)
+    held = []
+    for trial, score in zip(trials, scores, strict=True):
+        others = total - score if len(trials) > 1 else score
+        choice = choices[int(others.argmin())]
+        parts = [log_likelihood(part, *choice).float() for part in trial.differences]
+        held.append(LocatedFold(trial.prints.candidates, torch.stack(parts), trial.truth))
+    best_degrees, best_temper = choices[int(total.argmin())]
+    return replace(prints, degrees=best_degrees, temper=best_temper, held=tuple(held))

@@ -1,0 +1,211 @@
+"""The posterior over candidate places, and the places and regions that it gives."""
+
+import math
+import warnings
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.calibration import fewest
+from gaigs.commands.locate.candidates import Candidates
+from gaigs.commands.locate.fingerprints import Fingerprints
+from gaigs.commands.locate.likelihood import log_likelihood, mismatch
+from gaigs.commands.locate.location import Location, joined
+from gaigs.commands.locate.prediction_map import fingerprints
+from gaigs.commands.locate.tracks import track
+from gaigs.commands.locate.values import as_fingerprints
+from gaigs.core.geometry import ExtrapolationWarning
+from gaigs.data import Links
+from gaigs.kriging.links import distances
+from gaigs.model import Model
+from gaigs.registry import check_type
+
+
+@torch.no_grad()
+def locate(
+    model: Model | Fingerprints,
+    value: object,
+    links: Links | None = None,
+    region: object = None,
+    unknown_power: bool = False,
+    step: float | None = None,
+    level: float = 0.9,
+) -> Location:
+    """Places where transmitters may be, by the values that receivers measure of them.
+
+    Args:
+        model: A model with intervals; or its ``fingerprints``, which then take a few milliseconds a
+            value.
+        value: A label of each receiver (r, *shape), or of each transmission and receiver (n, r,
+            *shape), scaled as the training labels; with one receiver also (*shape) or (n, *shape);
+            or a mapping of the receivers' names to their labels, (*shape) or (n, *shape). NaN, of
+            channels also zeros, where a receiver has not heard it, as if a mapping lacks it; of a
+            track, a value may be unheard by all.
+        links, region: As for ``fingerprints``.
+        unknown_power: True if all labels of a transmission share an unknown offset [dB], or factor
+            of amplitudes. Channels are always compared without their power and phase.
+        step: Standard deviation of the move from one value to the next along each axis, if values
+            are a track [m].
+        level: Probability with which the region holds the transmitter, by held-out fingerprints (9
+            or more for 0.9), with ``step`` by walks among them, once for each step. With fewer and
+            without links the posterior counts, whose regions are often too small.
+
+    Raises:
+        ValueError: A value has another shape than the labels, or was heard by no receiver and is no
+            part of a track; or an option is impossible.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> prints = gaigs.fingerprints(gaigs.train("gaussian_process", links), links, points=500)
+        >>> walk = [[-50.0, -48.0, -55.0, -61.0], [-51.0, -47.0, -56.0, -60.0]]  # [dBm]
+        >>> found = gaigs.locate(prints, walk, step=0.5)
+        >>> found.mean.shape, found.region.shape == (2, len(found.places))
+        (torch.Size([2, 3]), True)
+
+    Source: Haeberlen et al., Practical robust localization over large-scale 802.11 wireless
+    networks, 2004, for the posterior over places; Rabiner, A tutorial on hidden Markov models,
+    1989, for tracks.
+    """
+    if isinstance(model, Fingerprints):
+        if links is not None or region is not None:
+            raise ValueError("fingerprints have their links and region; leave links and region out")
+        prints = model
+    else:
+        prints = fingerprints(model, links, region)
+    asked = as_fingerprints(value, prints, step is not None)
+    if not prints.task.shape and not unknown_power:
+        excess = excess_of(asked, prints)
+        if excess is not None:
+            unit = prints.task.error_unit
+            warnings.warn(
+                f"readings are up to {excess:.3g} {unit} beyond all predicted ones; "
+                "check their unit, and leave out what was not heard",
+                ExtrapolationWarning,
+                stacklevel=3,  # as for a radio map
+            )
+    return posterior(prints, asked, unknown_power, step, level)
+
+
+def excess_of(
+    asked: Float[Tensor, "n r 1"], prints: Fingerprints, deviations: float = 5.0
+) -> float | None:
+    """How far readings are beyond all predictions; None if that is plausible.
+
+    Args:
+        asked: Readings.
+        prints: Predictions.
+        deviations: Largest plausible number of standard deviations; half the range of the
+            predictions is plausible, too.
+    """
+    lowest, highest = prints.values.aminmax()
+    excess = torch.maximum(asked - highest, lowest - asked).nan_to_num(0).max()
+    allowed = max(deviations * prints.deviations.max(), (highest - lowest) / 2)
+    return excess.item() if excess > allowed else None
+
+
+def posterior(
+    prints: Fingerprints,
+    asked: Float[Tensor, "n r m"],
+    unknown_power: bool,
+    step: float | None,
+    level: float,
+) -> Location:
+    """``locate`` for the fingerprints of values."""
+    check_type("level", level, float)
+    check_type("step", step, float | None)
+    if not 0 < level < 1:
+        raise ValueError(f"level must be a probability between 0 and 1 such as 0.9, got {level!r}")
+    if step is not None and not 0 < step < math.inf:
+        raise ValueError(f"step must be above 0 m, got {step!r}")
+    step = step if len(asked) > 1 else None  # one value is no track
+    drop = drop_of(prints, unknown_power, step, level)
+    is_calibrated = prints.held_out_count >= fewest(level)
+    parts = []
+    # In parts: a value takes 60 bytes a candidate, and its posterior 9. A track is one part.
+    for part in asked.split(64 if step is None else len(asked)):
+        difference = mismatch(prints, part @ prints.axes, unknown_power)
+        candidates = prints.candidates
+        logarithms = log_likelihood(difference, prints.degrees, prints.temper) + candidates.prior
+        if step is not None:
+            is_received = ~part.isnan().all((1, 2))
+            candidates, logarithms = track(candidates, logarithms, step, is_received)
+        parts.append(located(candidates, logarithms, level, drop, is_calibrated))
+    return replace(joined(parts), frame=prints.frame)
+
+
+def drop_of(
+    prints: Fingerprints, unknown_power: bool, step: float | None, level: float
+) -> Float[Tensor, ""] | None:
+    """Largest drop below the highest density within a region of a level; None if nothing is held
+    out.
+    """
+    drops = prints.drops(unknown_power, step)
+    count = prints.held_out_count
+    if not count:
+        return None
+    # Split conformal prediction: the quantile level (n + 1) / n of n held-out values.
+    rank = math.ceil(level * (count + 1) / count * len(drops))
+    return drops[min(rank, len(drops)) - 1]
+
+
+def located(
+    candidates: Candidates,
+    logarithms: Float[Tensor, "n g"],
+    level: float,
+    drop: Float[Tensor, ""] | None,
+    is_calibrated: bool,
+) -> Location:
+    """Places and regions of some values, from the logarithms of their posteriors."""
+    places = candidates.places
+    probabilities = torch.softmax(logarithms, 1)
+    heights = logarithms - candidates.prior + candidates.density  # (n, g)
+    order = heights.argsort(1, descending=True)
+    # The highest densities that hold the level together.
+    ordered = probabilities.gather(1, order)
+    is_inside = ordered.cumsum(1) - ordered < level
+    region = torch.zeros_like(order, dtype=torch.bool).scatter(1, order, is_inside)
+    if drop is not None:
+        near = heights >= heights.gather(1, order[:, :1]) - drop
+        region = near if is_calibrated else near | region
+    medians = [geometric_median(places, part) for part in probabilities.split(64)]
+    return Location(
+        places,
+        probabilities,
+        mean=(probabilities @ places.double()).float(),
+        median=torch.cat(medians),
+        likeliest=places[order[:, 0]],
+        region=region,
+        sizes=(region * candidates.prior.softmax(0)).sum(1),
+        calibrated=is_calibrated,
+    )
+
+
+def geometric_median(
+    places: Float[Tensor, "g 3"],
+    probabilities: Float[Tensor, "n g"],
+    tolerance: float = 1e-3,
+    steps: int = 100,
+) -> Float[Tensor, "n 3"]:
+    """Places with the least mean distance from the candidates, for each row of probabilities.
+
+    Args:
+        places: Candidates [m].
+        probabilities: Weights of the candidates.
+        tolerance: Largest last change of a coordinate, and least distance that counts: a candidate
+            may be the place itself [m].
+        steps: Largest number of steps.
+
+    Source: Weiszfeld, Sur le point pour lequel la somme des distances de n points donnés est
+    minimum, 1937.
+    """
+    places = places.double()
+    median = probabilities @ places
+    for _ in range(steps):
+        weights = probabilities / distances(median, places).clamp_min(tolerance)
+        previous = median
+        median = weights @ places / weights.sum(1, keepdim=True)
+        if (median - previous).abs().max() < tolerance:
+            break
+    return median.float()

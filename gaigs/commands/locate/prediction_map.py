@@ -1,0 +1,301 @@
+"""The map of a model's predictions, in which ``locate`` looks values up."""
+
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gaigs.commands.locate.candidates import even_candidates, near_candidates
+from gaigs.commands.locate.fingerprints import (
+    Fingerprints,
+    at_carrier,
+    receptions,
+    transmissions,
+)
+from gaigs.commands.locate.likelihood import Trial, fitted, independent, mismatch
+from gaigs.core import stages
+from gaigs.core.geometry import ExtrapolationWarning, even_places
+from gaigs.core.query import as_positions, evenly
+from gaigs.data import Links
+from gaigs.data.compatibility import check_fit
+from gaigs.kriging.links import reception_probability
+from gaigs.model import Model
+from gaigs.registry import check_instance, check_type
+from gaigs.split import rows_of
+
+
+@torch.no_grad()
+def fingerprints(
+    model: Model,
+    links: Links | None = None,
+    region: object = None,
+    frequency: float | None = None,
+    points: int | None = None,
+) -> Fingerprints:
+    """The map of predictions in which ``locate`` looks values up; make it once for many of them.
+
+    Args:
+        model: Trained, fitted or loaded, with intervals.
+        links: Links that the model was trained on. Transmitters are then likely where the known
+            ones are dense, and held-out ones set the width of the likelihood and the size of
+            regions. None: they are anywhere alike, and the errors of a label's numbers are
+            independent, which makes regions too small.
+        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m] in which transmitters are
+            anywhere alike; None: the box of the training transmitters.
+        frequency: Carrier of known links, with a region any [Hz]; None: that of the training links,
+            of several the middle one.
+        points: Number of candidate places; None: 20,000, fewer where the model takes more than a
+            minute for them.
+
+    Raises:
+        ValueError: The model has no intervals, or an option is impossible.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> prints = gaigs.fingerprints(gaigs.train("gaussian_process", links), links, points=500)
+        >>> gaigs.locate(prints, [-50.0, -48.0, float("nan"), -61.0]).mean.shape
+        torch.Size([1, 3])
+    """
+    check_instance("model", model, Model)
+    check_type("points", points, int | None)
+    if links is not None:
+        check_instance("links", links, Links)
+        check_fit(links, model.scene)
+    if points is not None and points < 2:
+        raise ValueError(f"points must be at least 2 candidates, got {points}")
+    box = box_of(model, region)
+    frequency = model.scene.middle_frequency if frequency is None else frequency
+    points = affordable_points(model, box, frequency) if points is None else points
+    if links is None:
+        maker = MapMaker(box, region is not None, points, frequency)
+        prints = maker.make(model, torch.zeros(0, dtype=torch.long))
+        return along(prints, [])
+    known = at_carrier(links, frequency, "train", "validation")
+    if region is None and not len(known):
+        carriers = ", ".join(f"{carrier:.7g}" for carrier in model.scene.frequencies.tolist())
+        raise ValueError(
+            f"frequency must be that of known links, {carriers} Hz, got {frequency:.7g}; "
+            "or give a region"
+        )
+    maker = MapMaker(box, region is not None, points, frequency, links)
+    prints = maker.make(model, known)
+    folds = held_out_folds(maker, model, known)
+    trials = trials_of(folds)
+    prints = along(prints, [fold.errors for fold in folds])
+    return fitted(prints, trials) if trials else prints
+
+
+def box_of(model: Model, region: object) -> Float[Tensor, "2 3"]:
+    """Corners of a region [m], or of the box of the training transmitters."""
+    if region is None:
+        return torch.stack((model.scene.lower, model.scene.upper))
+    box = as_positions("region", region).reshape(-1, 3)
+    if len(box) != 2:
+        raise ValueError(
+            f"region must be two corners [[x, y, z], [x, y, z]] [m], got {len(box)} points"
+        )
+    return box
+
+
+def affordable_points(
+    model: Model,
+    box: Float[Tensor, "2 3"],
+    frequency: float | None,
+    most: int = 20_000,
+    fewest: int = 1000,
+    seconds: float = 60.0,
+) -> int:
+    """Number of candidate places that a model predicts within some seconds."""
+    places = even_places(box[0], box[1], 512)
+    predicted(model, places[:2], frequency)  # the first prediction compiles and loads
+    start = time.perf_counter()
+    predicted(model, places, frequency)
+    taken = time.perf_counter() - start
+    return min(most, max(fewest, int(seconds * len(places) / taken)))
+
+
+class Predicted(NamedTuple):
+    """Predictions of a model at places, for all receivers.
+
+    Attributes:
+        values: As ``Task.fingerprint`` gives them (g, r, m).
+        deviations: Standard deviations of labels of one number (g, r); else 1.
+    """
+
+    values: Float[Tensor, "g r m"]
+    deviations: Float[Tensor, "g r"]
+
+
+def predicted(model: Model, places: Float[Tensor, "g 3"], frequency: float | None) -> Predicted:
+    """Predictions of a model at places [m] and a carrier [Hz]."""
+    task = model.scene.task
+    count = len(model.scene.receivers)
+    size = 8192
+    if task.shape:  # a look-up reads its labels once a batch
+        size = 64 if model.is_trained else 512
+    options: dict[str, Any] = {"frequency": frequency, "batch_size": size}
+    values = []
+    deviations = []
+    # Candidates may lie outside the box of the training transmitters.
+    with warnings.catch_warnings(action="ignore", category=ExtrapolationWarning):
+        for part in stages.track(places.split(max(1, size // count)), "fingerprints"):
+            transmitters = part[:, None].expand(-1, count, 3)
+            receivers = torch.arange(count).expand(len(part), -1)
+            if task.shape:
+                value = model.predict(transmitters, receivers, **options).cpu().flatten(0, 1)
+                deviations.append(torch.ones(len(part), count))
+            else:
+                estimate = model.predict(transmitters, receivers, interval=0.5, **options)
+                value = estimate.value.cpu().flatten()
+                deviations.append(estimate.std.cpu())
+            values.append(task.fingerprint(value).unflatten(0, (len(part), count)))
+    return Predicted(torch.cat(values), torch.cat(deviations))
+
+
+@dataclass(frozen=True)
+class MapMaker:
+    """Makes maps of models that know all or some of the same links.
+
+    Attributes:
+        box: Corners of the box of the candidates [m].
+        is_region: True if transmitters are anywhere in the box alike.
+        points: Number of candidates.
+        frequency: Carrier [Hz]; None if unknown.
+        links: Links with a split; None if there are none.
+    """
+
+    box: Float[Tensor, "2 3"]
+    is_region: bool
+    points: int
+    frequency: float | None
+    links: Links | None = None
+
+    def make(self, model: Model, known: Int[Tensor, " k"]) -> Fingerprints:
+        """The map of a model that knows some links, along the numbers of a label."""
+        scene = model.scene
+        if self.is_region:
+            candidates = even_candidates(self.box, self.points)
+        elif self.links is None:
+            candidates = even_candidates(self.box, self.points, scene.floors)
+        else:
+            candidates = near_candidates(self.box, self.points, scene.floors, self.links, known)
+        values, deviations = predicted(model, candidates.places, self.frequency)
+        hearing = torch.full(values.shape[:2], 0.5)
+        if len(known) and self.has_whole_transmissions():
+            parts = receptions(self.links, known)
+            hearing = reception_probability(candidates.places, *parts, prior=0.5)
+        return Fingerprints(
+            scene.task,
+            self.frequency,
+            [receiver.name for receiver in scene.receivers],
+            candidates,
+            torch.eye(values.shape[2]),
+            values,
+            deviations,
+            hearing,
+            frame=scene.frame,
+        )
+
+    def has_whole_transmissions(self) -> bool:
+        """True if no transmission of a known link has a link in the test.
+
+        A receiver without a link of a transmission has then not received it.
+        """
+        rows = rows_of(self.links)
+        known = rows[at_carrier(self.links, self.frequency, "train", "validation")]
+        tested = rows[at_carrier(self.links, self.frequency, "test")]
+        return not torch.isin(known, tested).any()
+
+    def contains(self, places: Float[Tensor, "n 3"]) -> Tensor:
+        """True for places in the box (n,)."""
+        return ((places >= self.box.amin(0)) & (places <= self.box.amax(0))).all(1)
+
+
+class Fold(NamedTuple):
+    """Held-out fingerprints of one fold.
+
+    Attributes:
+        prints: Map of a model that does not know them.
+        values: Their values (n, r, m).
+        truth: Their places (n, 3) [m].
+        errors: Values less predictions at known places, of these and others (k, r, m).
+    """
+
+    prints: Fingerprints
+    values: Float[Tensor, "n r m"]
+    truth: Float[Tensor, "n 3"]
+    errors: Float[Tensor, "k r m"]
+
+    def half(self, number: int) -> "Fold":
+        """Every second fingerprint."""
+        return Fold(self.prints, *(part[number::2] for part in self[1:]))
+
+
+def held_out_folds(
+    maker: MapMaker,
+    model: Model,
+    known: Int[Tensor, " k"],
+    most: int = 500,
+    located: int = 200,
+    enough: int = 300,
+) -> list[Fold]:
+    """Folds of known links with the maps of models that do not know them.
+
+    Args:
+        maker: Makes the maps.
+        model: The model that knows all.
+        known: Known links at the carrier of the map.
+        most: Largest number of fingerprints of a fold whose errors give the axes.
+        located: Largest number of them that are located.
+        enough: Number of located fingerprints after which no fold is added.
+    """
+    links = maker.links
+    folds: list[Fold] = []
+    for one, part, others in stages.track(model.unseen(links), "folds", model.fold_count):
+        one.calibration = model.calibration
+        # Known links of a transmission that has a link in the part are held out with it.
+        rows = rows_of(links)
+        values, truth = transmissions(links, known[torch.isin(rows[known], rows[part])])
+        chosen = evenly(torch.arange(len(truth)), most)
+        others = others[torch.isin(others, known)]
+        if len(chosen) and (len(others) or maker.is_region):
+            errors = values[chosen] - predicted(one, truth[chosen], maker.frequency).values
+            if maker.is_region:  # a value from elsewhere is not like those that will be asked
+                chosen = chosen[maker.contains(truth[chosen])]
+            folds.append(Fold(maker.make(one, others), values[chosen], truth[chosen], errors))
+        if sum(min(len(fold.truth), located) for fold in folds) >= enough:
+            break
+    if len(folds) == 1 and len(folds[0].values) > 1:
+        return [folds[0].half(0), folds[0].half(1)]
+    return folds
+
+
+def trials_of(folds: Sequence[Fold], most: int = 200) -> list[Trial]:
+    """Held-out fingerprints compared with the maps of their folds, at most so many of each."""
+    trials = []
+    for number, fold in enumerate(folds):
+        # Along the axes of their own errors, fingerprints would be too near their predictions.
+        others = [other.errors for other in (*folds[:number], *folds[number + 1 :])]
+        prints = along(fold.prints, others)
+        chosen = evenly(torch.arange(len(fold.truth)), most)
+        if len(chosen):
+            asked = fold.values[chosen] @ prints.axes
+            differences = [mismatch(prints, asked, unknown) for unknown in (False, True)]
+            trials.append(Trial(prints, differences, fold.truth[chosen]))
+    return trials
+
+
+def along(prints: Fingerprints, errors: Sequence[Float[Tensor, "_ r m"]]) -> Fingerprints:
+    """A map along the axes of some errors; without any along those of its own differences."""
+    if not prints.task.shape:
+        return replace(prints, axes=torch.eye(1))
+    if not errors:
+        errors = [prints.values - prints.values.mean(0)]
+    values = torch.cat([*errors]).flatten(0, 1)  # (n r, m)
+    axes = independent(values[~values.isnan().any(1)])
+    return replace(prints, axes=axes, values=prints.values @ axes)

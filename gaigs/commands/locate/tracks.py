@@ -1,0 +1,157 @@
+"""Tracks: the places of several values, where a transmitter moves little from one to the next."""
+
+import itertools
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gaigs.commands.locate.candidates import Candidates
+from gaigs.kriging.links import distances
+
+
+def walk(places: Float[Tensor, "n 3"], step: float, most: int = 10) -> Int[Tensor, " k"]:
+    """A walk through places, always to the nearest one that is not yet on it.
+
+    It stays for as many values as moves of ``step`` along each axis take to the next place: errors
+    of values that are received near each other have much in common.
+
+    At most ``most`` values are at each place; ``step`` is in metres.
+    """
+    apart = distances(places, places)
+    is_free = torch.ones(len(places), dtype=torch.bool)
+    is_free[0] = False
+    order = [0]
+    moves = []
+    while is_free.any():
+        move, following = apart[order[-1]].masked_fill(~is_free, math.inf).min(0)
+        is_free[following] = False
+        order.append(int(following))
+        moves.append(move)
+    stays = round(float(torch.stack(moves).median()) / (step * math.sqrt(3))) if moves else 1
+    return torch.tensor(order).repeat_interleave(min(max(1, stays), most))
+
+
+def track(
+    candidates: Candidates,
+    logarithms: Float[Tensor, "n g"],
+    step: float,
+    is_received: Bool[Tensor, " n"],
+    spread: int = 75,
+) -> tuple[Candidates, Float[Tensor, "n j"]]:
+    """An even part of the candidates, and the logarithms of a track's posterior there.
+
+    Args:
+        candidates: Candidates of single values.
+        logarithms: Logarithms of their posteriors.
+        step, is_received: As for ``smoothed``.
+        spread: Number of candidates over which the posterior of a single value still spreads. The
+            candidates that ``smoothed`` links then hold it: regions of tracks reach far beyond the
+            likeliest ones.
+    """
+    # The inverse of the sum of squares counts candidates of equal probability.
+    posteriors = torch.softmax(logarithms[is_received], 1)
+    count = posteriors.square().sum(1).reciprocal().median()
+    even = torch.arange(0, len(candidates.places), max(1, int(count / spread)))
+    part = Candidates(*(column[even] for column in candidates))
+    # Single precision halves the time; across a room it moves the mean by less than a micrometre.
+    single = logarithms[:, even]  # (n, j)
+    single = (single - single.amax(1, keepdim=True)).float()
+    places = (part.places - part.places.mean(0)).float()
+    return part, smoothed(single, places, step, is_received).to(logarithms)
+
+
+class Moves:
+    """Moves of a transmitter between candidates of consecutive values.
+
+    Args:
+        places, step, jump: As for ``smoothed``.
+    """
+
+    def __init__(self, places: Float[Tensor, "g 3"], step: float, jump: float):
+        self.places = places
+        self.step = step
+        self.jump = jump
+        self._last: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def take(
+        self,
+        logarithm: Float[Tensor, " k"],
+        start: Int[Tensor, " k"],
+        end: Int[Tensor, " k"],
+    ) -> Float[Tensor, " k"]:
+        """Logarithms of probabilities at the candidates ``end``, from those at ``start``."""
+        # The logarithm is of a number above 0, as each move may be a jump.
+        return (self._densities(start, end) @ (logarithm - logarithm.max()).exp()).log()
+
+    def _densities(self, start: Int[Tensor, " k"], end: Int[Tensor, " k"]) -> Float[Tensor, "k k"]:
+        if self._last is not None:  # a walk may stay
+            first, second, densities = self._last
+            if torch.equal(first, start) and torch.equal(second, end):
+                return densities
+        squares = (distances(self.places[end], self.places[start]) / self.step).square_()
+        exponents = squares.div_(-2)
+        # Less than exp(-30) is nothing beside the jump, and slow to compute.
+        densities = exponents.clamp_min_(-30).exp_().add_(self.jump)
+        self._last = start, end, densities
+        return densities
+
+
+def smoothed(
+    logarithms: Float[Tensor, "n g"],
+    places: Float[Tensor, "g 3"],
+    step: float,
+    is_received: Bool[Tensor, " n"],
+    most: int = 1500,
+    jump: float = 1e-4,
+) -> Float[Tensor, "n g"]:
+    """Posterior of each place of a track given all values, from those given each value alone.
+
+    Args:
+        logarithms: Posteriors given each value alone.
+        places: Candidate places [m].
+        step: Standard deviation of a move along each axis [m].
+        is_received: True for values that a receiver has received. The track is near
+            ``straight_lines`` where it is False.
+        most: Largest number of candidates of each value that are linked to those before and after.
+        jump: Density of a move to any place over that of a move to the same one: a track may jump.
+
+    Source: Rabiner, A tutorial on hidden Markov models, 1989, the forward-backward algorithm.
+    """
+    apart = distances(straight_lines(logarithms, places, is_received), places)  # (n, g)
+    preference = torch.where(is_received[:, None], logarithms, -apart)
+    indices = preference.topk(min(most, len(places)), dim=1).indices  # (n, k)
+    single = logarithms.gather(1, indices)  # (n, k)
+
+    # Moves are at least as wide as the candidates are apart.
+    first = places[indices[0]]
+    spacing = distances(first, first).fill_diagonal_(math.inf).amin(1).median()
+    moves = Moves(places, math.hypot(step, spacing.item()), jump)
+
+    # forward: given the values until each one; backward: given those after it.
+    forward = [single[0]]  # n of (k,)
+    for value, pair in zip(single[1:], itertools.pairwise(indices), strict=True):
+        forward.append(value + moves.take(forward[-1], *pair))
+    backward = [torch.zeros_like(single[0])]
+    reversed_pairs = itertools.pairwise(indices.flip(0))
+    for value, pair in zip(single.flip(0), reversed_pairs, strict=False):
+        backward.append(moves.take(value + backward[-1], *pair))
+    posterior = torch.stack(forward) + torch.stack(backward[::-1])
+    return torch.full_like(logarithms, -math.inf).scatter(1, indices, posterior)
+
+
+def straight_lines(
+    logarithms: Float[Tensor, "n g"],
+    places: Float[Tensor, "g 3"],
+    is_received: Bool[Tensor, " n"],
+) -> Float[Tensor, "n 3"]:
+    """Places on straight lines between the likeliest ones of the received values around."""
+    received = is_received.nonzero()[:, 0]
+    numbers = torch.arange(len(is_received))
+    after = torch.searchsorted(received, numbers).clamp_max(len(received) - 1)
+    before = (torch.searchsorted(received, numbers, right=True) - 1).clamp_min(0)
+    likeliest = places[logarithms[received].argmax(1)]
+    gaps = (received[after] - received[before]).clamp_min(1)
+    shares = ((numbers - received[before]) / gaps).clamp(0, 1)[:, None]
+    return torch.lerp(likeliest[before], likeliest[after], shares.to(places))

@@ -1,0 +1,78 @@
+"""Survey planning: where to measure next, and which measured places could have been left out."""
+
+from pathlib import Path
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from gaigs.commands.survey.plan import SurveyPlan, survey
+from gaigs.io.tables import read_points
+from gaigs.registry import call
+from gaigs.report import style
+from gaigs.runs import load
+
+
+def run(config: dict, folder: Path) -> None:
+    """Plans a survey, by the model of a finished run if there is one.
+
+    Writes ``survey.csv`` and ``survey.png`` into a folder.
+    """
+    model = None if config["folder"] is None else load(config["folder"], config["trust"])
+    options = dict(config["survey"])
+    if isinstance(options["candidates"], str):
+        options["candidates"] = read_points(
+            Path(options["candidates"]), "xyz", "x,y,z [m] of one candidate a line"
+        )
+    plan = call("survey", survey, options, model=model)
+    folder.mkdir(parents=True, exist_ok=True)
+    plan.save(folder / "survey.csv")
+    style.save(figure(plan), folder / "survey.png")
+    print(plan)
+    if plan.frame is not None:
+        print(f"easting and northing are those of EPSG:{plan.frame.epsg}")
+    print(f"results: {folder}")
+
+
+def figure(plan: SurveyPlan) -> Figure:
+    """Places from above and, with a model, the expected error after each new one."""
+    with rc_context(style.STYLE):
+        drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
+        count = 1 if plan.errors is None else 2
+        axes = drawn.subplots(1, count, squeeze=False)[0]
+        draw_places(axes[0], plan)
+        drawn.legend(loc="outside lower left", ncols=3)
+        if plan.errors is not None:
+            draw_errors(axes[1], plan)
+    return drawn
+
+
+def draw_places(axis: Axes, plan: SurveyPlan) -> None:
+    """Draws measured places, and places to measure with their numbers, from above."""
+    if len(plan.known):
+        x, y = plan.known[~plan.superfluous, :2].T.numpy()
+        axis.plot(x, y, "o", markersize=3, label="measured", color=style.GREY)
+        x, y = plan.known[plan.superfluous, :2].T.numpy()
+        label = "measured, could be left out"
+        axis.plot(x, y, "o", markersize=3, label=label, color="none", markeredgecolor=style.GREY)
+    x, y = plan.places[:, :2].T.numpy()
+    label = "to measure, in this order"
+    axis.plot(x, y, "o", markersize=8, label=label, color=style.ORANGE, clip_on=False)
+    numbers: dict[tuple[float, ...], list[str]] = {}
+    for number, place in enumerate(plan.places.tolist(), 1):
+        numbers.setdefault(tuple(place[:2]), []).append(str(number))
+    for point, lines in numbers.items():  # one above the other, for places at several heights
+        size = 5 / len(lines) ** 0.5
+        text = "\n".join(lines)
+        axis.annotate(text, point, ha="center", va="center", color="white", size=size)
+    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+
+
+def draw_errors(axis: Axes, plan: SurveyPlan) -> None:
+    """Draws the expected error after each new place."""
+    label = f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
+    axis.plot(plan.errors.numpy(), color=style.BLUE)
+    axis.set(xlabel="new places", ylabel=label, ylim=(0, 1.05 * plan.errors.max().item()))
+    axis.locator_params(axis="x", integer=True)
+    axis.grid()
+    axis.set_axisbelow(True)

@@ -1,0 +1,129 @@
+"""Measured places: what each of them is worth, and which could have been left out."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gaigs.commands.survey.processes import mean_of_received, reception_chances
+from gaigs.core.query import evenly
+from gaigs.core.stages import track
+from gaigs.kriging.kernel import Process
+from gaigs.kriging.links import distances
+
+
+class Measured(NamedTuple):
+    """Measured places and their worth.
+
+    Attributes:
+        places: (k, 3) [m].
+        error: Mean error with all of them.
+        losses: Its rise without each of them (k,).
+        superfluous: Places that together raise it by little (k,).
+    """
+
+    places: Float[Tensor, "k 3"]
+    error: float
+    losses: Float[Tensor, " k"]
+    superfluous: Bool[Tensor, " k"]
+
+
+class Readings(NamedTuple):
+    """Readings of one receiver, and its process at the asked places.
+
+    Attributes:
+        process: The process.
+        rows: Numbers of the readings (n,).
+        places: Number of each reading's measured place (n,).
+        variances: Variances of the process at the asked places without any reading (g,).
+        chances: Probability that the receiver receives the asked places (g,).
+    """
+
+    process: Process
+    rows: Int[Tensor, " n"]
+    places: Int[Tensor, " n"]
+    variances: Float[Tensor, " g"]
+    chances: Float[Tensor, " g"]
+
+    def deviations(self, whitened: Float[Tensor, "n g"]) -> Float[Tensor, " g"]:
+        """Standard deviations of new readings, from ``Process.whitened`` of the known ones."""
+        variances = (self.variances - whitened.square().sum(0)).clamp_min(0)
+        return (variances + self.process.noise).sqrt()
+
+    def rises(self, asked: Float[Tensor, "g d"]) -> Iterator[tuple[int, Float[Tensor, ""]]]:
+        """Numbers of the measured places, and the rise of the summed deviations without each."""
+        whitened, factor = self.process.whitened(asked, self.rows)
+        deviations = self.deviations(whitened)
+        weights = torch.linalg.solve_triangular(factor.mT, whitened, upper=True)  # (n, g)
+        inverse = torch.cholesky_inverse(factor)  # (n, n)
+        for number in self.places.unique().tolist():  # all readings of a place go together
+            there = (self.places == number).nonzero()[:, 0]
+            gone = weights[there]
+            # Variances rise by w' (inverse of these rows)^-1 w; roots by half of it over
+            # themselves.
+            block = inverse[there[:, None], there]
+            rises = (gone * torch.linalg.solve(block, gone)).sum(0)  # (g,)
+            yield number, self.chances @ (rises / (2 * deviations))
+
+
+def measured_places(
+    processes: Sequence[Process],
+    asked: Float[Tensor, "g d"],
+    factor: float,
+    most: int = 1500,
+    tolerated: float = 1.05,
+) -> Measured:
+    """The measured places, and what they are worth for the mean error at other places.
+
+    Args:
+        processes: Processes of the receivers.
+        asked: Places over which the error is the mean.
+        factor: Mean absolute error of a label over its standard deviation.
+        most: Largest number of readings of a receiver that count, an even part of more.
+        tolerated: Largest factor on the mean error without the superfluous places.
+    """
+    rows = []
+    places = []
+    for process in processes:
+        index = evenly(torch.arange(len(process.places)), most).to(asked.device)
+        rows.append(index)
+        places.append(process.places[index, :3])
+    known = torch.cat(places).unique(dim=0)
+    chances = reception_chances(processes, asked)
+    readings = []
+    for process, index, measured, chance in zip(processes, rows, places, chances, strict=True):
+        which = distances(measured, known).argmin(1)
+        parts = [process.covariances(part, part).diagonal() for part in asked.split(16)]
+        readings.append(Readings(process, index, which, torch.cat(parts), chance))
+
+    def error(is_kept: Bool[Tensor, " k"]) -> float:
+        deviations = []
+        for one in readings:
+            whitened, _ = one.process.whitened(asked, one.rows[is_kept[one.places]])
+            deviations.append(one.deviations(whitened))
+        return mean_of_received(torch.stack(deviations), chances)
+
+    losses = known.new_zeros(len(known))
+    for one in track(readings, "places to leave out"):
+        for number, rise in one.rises(asked):
+            losses[number] += rise / chances.sum()
+
+    # Bisection: the places of the least losses that may be left out together.
+    is_kept = torch.ones(len(known), dtype=torch.bool, device=known.device)
+    before = error(is_kept)
+    order = losses.argsort()
+    possible = 0
+    impossible = len(known) - 1
+    while impossible - possible > max(1, len(known) // 32):
+        middle = (possible + impossible) // 2
+        is_kept.fill_(True)
+        is_kept[order[:middle]] = False
+        if error(is_kept) <= tolerated * before:
+            possible = middle
+        else:
+            impossible = middle
+    superfluous = torch.zeros(len(known), dtype=torch.bool)
+    superfluous[order[:possible].cpu()] = True
+    return Measured(known.float().cpu(), factor * before, factor * losses.cpu(), superfluous)

@@ -1,0 +1,352 @@
+"""The next places to measure, chosen one by one for the least mean variance."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gaigs.commands.survey.measured import measured_places
+from gaigs.commands.survey.processes import (
+    default_process,
+    mean_of_received,
+    posterior,
+    processes_of,
+    reception_chances,
+    with_trend,
+)
+from gaigs.core.geometry import Frame, even_places
+from gaigs.core.query import Query, as_positions
+from gaigs.core.stages import track
+from gaigs.io.tables import write_csv
+from gaigs.kriging.kernel import Process
+from gaigs.kriging.links import coordinates
+from gaigs.model import Model
+from gaigs.registry import check_type
+
+
+@dataclass(frozen=True, repr=False)
+class SurveyPlan:
+    """The next places to measure, and the mean error that is expected after each.
+
+    Attributes:
+        places: Places to measure, the most useful first (n, 3) [m].
+        errors: Expected mean absolute error of a label over the region and all receivers, before
+            and after each place, in the label's unit (n + 1,); None without a model.
+        known: Places that were measured (k, 3) [m].
+        losses: Rise of ``known_error`` if one of them had been left out (k,).
+        superfluous: Known places that together raise ``known_error`` by at most 5 % if left out
+            (k,).
+        unit: Unit of the errors.
+        frame: Place of x and y on a map; None if unknown.
+        known_error: Expected mean error over the region, or else the box of the training
+            transmitters, now.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> print(gaigs.survey(gaigs.train("gaussian_process", links), count=3))
+        3 more places bring the expected mean error from ...
+    """
+
+    places: Float[Tensor, "n 3"]
+    errors: Float[Tensor, " n1"] | None
+    known: Float[Tensor, "k 3"]
+    losses: Float[Tensor, " k"]
+    superfluous: Bool[Tensor, " k"]
+    unit: str = ""
+    frame: Frame | None = None
+    known_error: float = math.nan
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
+
+    def __str__(self) -> str:
+        count = len(self.places)
+        if self.errors is None:
+            return (
+                f"{count} places to measure first; without a trained model their error is unknown"
+            )
+        first, last = (f"{error:.3g}" for error in (self.errors[0], self.errors[-1]))
+        change = f"from {first} to {last} {self.unit}".rstrip()
+        few = int(self.superfluous.sum())
+        return (
+            f"{count} more places bring the expected mean error {change}; "
+            f"{few} of {len(self.known)} measured places could have been left out for 5 % more"
+        )
+
+    def save(self, path: str | Path) -> None:
+        """Writes a CSV table: places to measure, each with the error after it, then measured ones
+        to leave out.
+
+        With a ``frame`` it has easting and northing too. Without a model errors are empty.
+        """
+        on_map = [] if self.frame is None else ["easting", "northing"]
+        rows = [["use", "x", "y", "z", *on_map, "mean_error"]]
+        errors = [""] * len(self.places)
+        if self.errors is not None:
+            errors = [f"{error:.6g}" for error in self.errors[1:].tolist()]
+        for place, error in zip(self.places.tolist(), errors, strict=True):
+            rows.append(self._row("measure", place, error))
+        losses = self.losses[self.superfluous].tolist()
+        for place, loss in zip(self.known[self.superfluous].tolist(), losses, strict=True):
+            rows.append(self._row("leave out", place, f"{self.known_error + loss:.6g}"))
+        write_csv(Path(path), rows)
+
+    def _row(self, use: str, place: Sequence[float], error: str) -> list[str]:
+        numbers = [*place]
+        if self.frame is not None:
+            numbers += [self.frame.x + place[0], self.frame.y + place[1]]
+        return [use, *(f"{number:.3f}" for number in numbers), error]
+
+
+@torch.no_grad()
+def survey(
+    model: Model | None = None,
+    region: object = None,
+    count: int = 20,
+    candidates: object = None,
+    frequency: float | None = None,
+) -> SurveyPlan:
+    """The next places to measure: each lowers the mean variance over a region most, at all
+    receivers together.
+
+    A receiver counts at a place as much as it is likely to hear it, by the measured places around.
+    Labels do not enter beyond the fitted process, so a plan is made before anything is measured.
+    The largest variance would be a poor guide: it is in the corners. The first places of a longer
+    plan are those of a shorter one.
+
+    Args:
+        model: ``gaussian_process``, or a trained model with kriging; None: nothing is measured yet,
+            and a default process takes its place.
+        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the error is stated;
+            None: the candidates or, without these, the box of the training transmitters, of several
+            floors these.
+        count: Number of places; at most as many as there are candidates.
+        candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
+        frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
+            Without a model it has no effect.
+
+    Raises:
+        ValueError: The model has no process over places, the count is less than 1, a place is
+            impossible, or there is neither model nor region nor candidates.
+
+    Example:
+        >>> first = gaigs.survey(region=[[0, 0, 1], [6, 4, 1]], count=15)  # nothing is measured yet
+        >>> first.places.shape, first.errors
+        (torch.Size([15, 3]), None)
+        >>> model = gaigs.train("gaussian_process", gaigs.links("synthetic_rssi", transmitters=60))
+        >>> plan = gaigs.survey(model, count=5)
+        >>> plan.places.shape, bool(plan.errors[-1] < plan.errors[0])
+        (torch.Size([5, 3]), True)
+        >>> plan.save("survey.csv")
+
+    Source: Krause, Singh and Guestrin, Near-optimal sensor placements in Gaussian processes, 2008;
+    the criterion is the A-optimal one of Cohn, Neural network exploration using optimal experiment
+    design, 1996.
+    """
+    if not isinstance(model, Model | None):
+        raise TypeError(
+            f"model must be a trained model, got {model!r}\n"
+            "load one with gaigs.load(...), or give region=..."
+        )
+    check_type("count", count, int)
+    if count < 1:
+        raise ValueError(f"count must be at least 1 place, got {count}")
+    places = survey_places(model, region, candidates)
+    processes = [] if model is None else processes_of(model)
+    check_memory(len(places.candidates), len(processes))
+    if model is None:
+        asked = places.all.double()
+        selection = Selection([default_process(asked)], asked, places, mean_absolute(1.0))
+        chosen, _ = selection.choose(count)
+        none = places.candidates[:0]
+        return SurveyPlan(places.candidates[chosen], None, none, none[:, 0], none[:, 0].bool())
+
+    asked = coordinates_of(model, places.all, frequency).to(processes[0].places)
+    centres: Sequence = [None] * len(processes)
+    if model.scene.task.is_scalar:
+        centres = model.scene.positions(asked)
+    pairs = zip(processes, centres, strict=True)
+    processes = [with_trend(process, centre) for process, centre in pairs]
+    factor = error_factor(model)
+    chosen, errors = Selection(processes, asked, places, factor).choose(count)
+    box = asked[places.evaluated]
+    if region is None and candidates is not None:
+        box = coordinates_of(model, training_grid(model), frequency).to(processes[0].places)
+    measured = measured_places(processes, box, factor)
+    return SurveyPlan(
+        places.candidates[chosen],
+        errors,
+        measured.places,
+        measured.losses,
+        measured.superfluous,
+        model.scene.task.error_unit,
+        model.scene.frame,
+        measured.error,
+    )
+
+
+class SurveyPlaces(NamedTuple):
+    """Places of a survey.
+
+    Attributes:
+        candidates: Places that can be measured (c, 3) [m].
+        others: Places over which the error is stated (e, 3) [m]; if empty, it is stated over the
+            candidates.
+    """
+
+    candidates: Float[Tensor, "c 3"]
+    others: Float[Tensor, "e 3"]
+
+    @property
+    def all(self) -> Float[Tensor, "g 3"]:
+        """Candidates first."""
+        return torch.cat((self.candidates, self.others))
+
+    @property
+    def evaluated(self) -> slice:
+        """Where the error is stated, among all."""
+        return slice(len(self.candidates) if len(self.others) else 0, None)
+
+
+def survey_places(model: Model | None, region: object, candidates: object) -> SurveyPlaces:
+    """Places of the arguments of ``survey``."""
+    none = torch.zeros(0, 3)
+    even = none
+    if region is not None:
+        box = as_positions("region", region).reshape(-1, 3)
+        if len(box) != 2:
+            advice = "\ngive places that can be measured as candidates" if len(box) > 2 else ""
+            raise ValueError(
+                "region must be two corners [[x, y, z], [x, y, z]] [m], "
+                f"got {len(box)} points{advice}"
+            )
+        even = grid(box[0], box[1])
+    elif candidates is None:
+        if model is None:
+            raise ValueError(
+                "a survey without a model takes a region or candidates, got neither\n"
+                "give one (survey.region=...), or a trained model (folder=runs/...)"
+            )
+        even = training_grid(model)
+    if candidates is None:
+        return SurveyPlaces(even, none)
+    return SurveyPlaces(as_positions("candidates", candidates).reshape(-1, 3), even)
+
+
+def grid(
+    lower: Float[Tensor, "3"],
+    upper: Float[Tensor, "3"],
+    floors: Sequence[float] | Tensor = (),
+    count: int = 1000,
+) -> Float[Tensor, "g 3"]:
+    """Even places in a box, as candidates or for the mean error over it."""
+    return even_places(lower, upper, count, floors)
+
+
+def training_grid(model: Model) -> Float[Tensor, "g 3"]:
+    """Even places in the box of the training transmitters, or on their floors."""
+    return grid(model.scene.lower, model.scene.upper, model.scene.floors)
+
+
+def check_memory(candidates: int, receivers: int, limit: float = 2e9) -> None:
+    """A ``ValueError`` unless the covariances of all receivers take at most ``limit`` bytes."""
+    most = int((limit / 8 / max(1, receivers)) ** 0.5)
+    if not 0 < candidates <= most:
+        raise ValueError(
+            f"a survey takes 1 to {most} candidates, got {candidates}\n"
+            "change candidates, or leave them out"
+        )
+
+
+def coordinates_of(
+    model: Model, places: Float[Tensor, "g 3"], frequency: float | None
+) -> Float[Tensor, "g d"]:
+    """Coordinates of a model's processes at places [m] and a carrier [Hz]."""
+    scene = model.scene
+    frequency = scene.middle_frequency if frequency is None else frequency
+    names = [receiver.name for receiver in scene.receivers]
+    query, _ = Query.from_positions(places, 0, frequency, names, scene.frequencies)
+    return coordinates(scene, query, 1.0)
+
+
+def mean_absolute(deviation: float) -> float:
+    """Mean absolute value of a normal variable."""
+    return math.sqrt(2 / math.pi) * deviation
+
+
+def error_factor(model: Model) -> float:
+    """Mean absolute error of a label over the standard deviation that the model states."""
+    calibration = model.calibration
+    if calibration is None:
+        return mean_absolute(1.0)
+    if not model.scene.task.is_scalar:
+        return calibration.mean_error
+    return mean_absolute(calibration.sizes.square().mean().sqrt().item())
+
+
+class Selection:
+    """Covariances of all receivers at places, given the readings and the chosen candidates.
+
+    Args:
+        processes: Processes of the receivers.
+        asked: Coordinates of all places.
+        places: The places.
+        factor: Mean absolute error of a label over its standard deviation.
+    """
+
+    def __init__(
+        self,
+        processes: Sequence[Process],
+        asked: Float[Tensor, "g d"],
+        places: SurveyPlaces,
+        factor: float,
+    ):
+        self.posteriors = [posterior(process, asked) for process in processes]
+        self.chances = reception_chances(processes, asked)  # (r, g)
+        self.noises = [process.noise for process in processes]
+        self.evaluated = places.evaluated
+        self.factor = factor
+        self.is_free = torch.ones(len(places.candidates), dtype=torch.bool)
+
+    def choose(self, count: int) -> tuple[list[int], Float[Tensor, " n1"]]:
+        """Numbers of so many candidates, or all; and the errors before and after each."""
+        numbers = []
+        errors = [self.error()]
+        for _ in track(range(min(count, len(self.is_free))), "places to measure"):
+            gains = self.gains().cpu().masked_fill(~self.is_free, -math.inf)
+            number = int(gains.argmax())
+            self.measure(number)
+            numbers.append(number)
+            errors.append(self.error())
+        return numbers, torch.tensor(errors)
+
+    def error(self) -> float:
+        """Expected mean error of a new reading."""
+        variances = torch.stack([part.diagonal()[self.evaluated] for part in self.posteriors])
+        variances = variances.clamp_min(0)  # (r, e)
+        deviations = (variances + variances.new_tensor(self.noises)[:, None]).sqrt()
+        return self.factor * mean_of_received(deviations, self.chances[:, self.evaluated])
+
+    def gains(self) -> Float[Tensor, " c"]:
+        """Fall of the summed variances by a reading at each candidate."""
+        count = len(self.is_free)
+        total = torch.zeros_like(self.chances[0, :count])
+        for part, noise, chances in zip(self.posteriors, self.noises, self.chances, strict=True):
+            # A reading at x takes c(x, y)² / (c(x, x) + noise) off the variance at y.
+            squares = part[self.evaluated, :count].square()  # (e, c)
+            falls = chances[:count] * (chances[self.evaluated] @ squares)
+            total = total + falls / (part.diagonal()[:count] + noise)
+        return total
+
+    def measure(self, number: int) -> None:
+        """Adds a reading at a candidate."""
+        self.is_free[number] = False
+        for part, noise, chances in zip(self.posteriors, self.noises, self.chances, strict=True):
+            column = part[number]
+            fall = chances[number] * torch.outer(column, column)
+            part -= fall / (part[number, number] + noise)

@@ -1,0 +1,110 @@
+"""Gaussian processes over places, as survey plans use them."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.core.query import evenly
+from gaigs.kriging.kernel import LIMIT, Process, kernel
+from gaigs.kriging.links import reception_probability
+from gaigs.model import Model
+from gaigs.registry import name_of
+
+
+def processes_of(model: Model) -> list[Process]:
+    """The processes of a model's receivers; raises a ``ValueError`` for a model without."""
+    processes = []
+    for receiver in range(len(model.scene.receivers)):
+        process = model.process_at(receiver)
+        if process is not None:
+            processes.append(process)
+    if not processes:
+        raise ValueError(
+            f"model {name_of(model)!r} has no Gaussian process over places, which plans a survey\n"
+            "train model=gaussian_process, or for RSSI and spectra any model with kriging=true"
+        )
+    return processes
+
+
+def default_process(
+    points: Float[Tensor, "g 3"], length: float = 0.25, nugget: float = 0.6
+) -> Process:
+    """A process without readings and with an unknown constant.
+
+    Its places spread evenly over the points' box.
+
+    Args:
+        points: Candidates and other places [m].
+        length: Correlation length over the diagonal of the box.
+        nugget: Variance of the noise over the variance of the process.
+    """
+    diagonal = (points.amax(0) - points.amin(0)).norm().item()
+    metres = length * diagonal or 1.0
+
+    def covariances(a: Tensor, b: Tensor) -> Tensor:
+        return 100 + kernel(a, b, metres)  # a constant of variance 100 is as good as unknown
+
+    return Process(covariances, points[:0], points[:0, 0], nugget)
+
+
+def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process:
+    """The process with the coefficients of its trend, which readings have to determine too.
+
+    They are a constant and, for labels of one number, a slope over the logarithm of the distance to
+    the receiver, with a standard deviation of twice that of the readings: as much as receivers of
+    one survey may differ.
+    """
+    first = process.places[:1]
+    variance = float(process.covariances(first, first)[0, 0] + process.noise)
+    scale = 2 * variance**0.5
+
+    def decades(places: Tensor) -> Tensor:
+        return (places[:, :3] - receiver).norm(dim=1).clamp_min(0.1).log10()
+
+    middle = decades(process.places).mean() if receiver is not None else 0.0
+
+    def covariances(a: Tensor, b: Tensor) -> Tensor:
+        products = torch.ones(len(a), len(b), dtype=a.dtype, device=a.device)
+        if receiver is not None:
+            products = products + torch.outer(decades(a) - middle, decades(b) - middle)
+        return process.covariances(a, b) + scale**2 * products
+
+    return replace(process, covariances=covariances)
+
+
+def posterior(process: Process, asked: Float[Tensor, "g d"]) -> Float[Tensor, "g g"]:
+    """Covariances of the process at places, given its readings; of many an even part."""
+    rows = evenly(torch.arange(len(process.places)), LIMIT).to(process.places.device)
+    whitened, _ = process.whitened(asked, rows)
+    return process.covariances(asked, asked) - whitened.mT @ whitened
+
+
+def reception_chances(
+    processes: Sequence[Process], asked: Float[Tensor, "g d"]
+) -> Float[Tensor, "r g"]:
+    """Probability that each receiver receives a place, by the measured places around it.
+
+    Measured places are those at the asked carrier, or the nearest one.
+    """
+    places = torch.cat([process.places for process in processes])  # (k, d)
+    if not len(places):
+        return asked.new_ones(len(processes), len(asked))
+    counts = torch.tensor([len(process.places) for process in processes])
+    receivers = torch.repeat_interleave(counts).to(places.device)  # (k,)
+    carrier_distances = (places[:, 3:] - asked[:1, 3:]).abs().sum(1)
+    at_carrier = carrier_distances <= carrier_distances.min() + 1e-6
+    known, rows = places[at_carrier, :3].unique(dim=0, return_inverse=True)
+    is_received = known.new_zeros(len(known), len(processes))
+    is_received[rows, receivers[at_carrier]] = 1
+    for receiver, process in enumerate(processes):
+        if len(process.places) >= LIMIT:  # a part of its readings, so their places do not tell
+            is_received[:, receiver] = 1
+    return reception_probability(asked, known, is_received, is_received.mean(0)).mT
+
+
+def mean_of_received(values: Float[Tensor, "r g"], chances: Float[Tensor, "r g"]) -> float:
+    """Mean over links, weighted by the probability that they are received."""
+    return ((values * chances).sum() / chances.sum()).item()
