@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from contracts.rasterizer import (
+    cast_scene,
+    distance_to_jumps,
+    rasterize_densely,
+    render_with_gradients,
+)
 
 from gaigs.core.geometry import Grid, Rays
 from gaigs.splatting.projection import Plane, Splats
 from gaigs.splatting.projection.direction_cosine import DirectionCosine
 from gaigs.splatting.projection.mercator import Mercator
 from gaigs.splatting.rasterizer.torch import TorchRasterizer
-from gaigs.testing.rasterizer import (
-    cast_scene,
-    distance_to_jumps,
-    rasterize_densely,
-    render_with_gradients,
-)
 
 opencl = pytest.importorskip("gaigs.splatting.rasterizer.opencl", exc_type=ImportError)
 pytestmark = pytest.mark.usefixtures("opencl_works")

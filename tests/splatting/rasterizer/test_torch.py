@@ -1,6 +1,6 @@
 """The torch rasterizer at the seam, in any chunks, in depth order, and its memory.
 
-``gaigs.testing.check_rasterizer``, which tests/test_contracts.py runs, compares it with the
+``contracts.rasterizer.check_rasterizer``, which tests/test_contracts.py runs, compares it with the
 formula.
 """
 
@@ -12,6 +12,7 @@ from fractions import Fraction
 
 import pytest
 import torch
+from contracts.rasterizer import cast_scene, rasterize_densely, render_with_gradients
 
 from gaigs.core.geometry import Grid, Pose, from_spherical
 from gaigs.splatting.projection import Plane, Splats
@@ -19,7 +20,6 @@ from gaigs.splatting.projection.direction_cosine import DirectionCosine
 from gaigs.splatting.projection.mercator import Mercator
 from gaigs.splatting.rasterizer import torch as module
 from gaigs.splatting.rasterizer.torch import TorchRasterizer
-from gaigs.testing.rasterizer import cast_scene, rasterize_densely, render_with_gradients
 
 GRID = Grid.degrees(range(1, 91, 3), [0.3 + 6 * k for k in range(60)])
 HERE = Pose(torch.zeros(3), torch.eye(3))
