@@ -60,7 +60,8 @@ class Ceiling:
         """Time of a pair [s]."""
         start = time.perf_counter()
         self.kernels[way](self.queue, (self.items,), (1,), self.memory, np.int32(chunks)).wait()
-        pairs = self.items * opencl.CHUNK * opencl.ROWS * opencl.COLUMNS * chunks
+        layout = opencl.LAYOUT
+        pairs = self.items * layout.chunk * layout.rows * layout.columns * chunks
         return (time.perf_counter() - start) / pairs
 
 

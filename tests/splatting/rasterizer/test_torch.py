@@ -53,7 +53,10 @@ def test_offsets_are_exact_at_the_seam(dtype):
         torch.cat((b, b.new_tensor([0.25, 2.0, -math.pi]))),
     )
     period = torch.tensor(math.tau, dtype=dtype).item()
-    found, eps = module._nearest(a, b, (period, math.tau - period)), torch.finfo(dtype).eps
+    found, eps = (
+        module._nearest(a, b, module._Period(period, math.tau - period)),
+        torch.finfo(dtype).eps,
+    )
     for x, y, offset in zip(a.tolist(), b.tolist(), found.tolist(), strict=True):
         true = Fraction(x) - Fraction(y)
         true -= round(true / Fraction(math.tau)) * Fraction(math.tau)
@@ -101,7 +104,7 @@ def test_chunks_of_tiles_of_any_size_give_the_same_map(monkeypatch, chunk, proje
     arguments = cast_scene(scene(n=60, projection=projection), "cpu", torch.float64)
     pixels = torch.ones(2, *GRID.shape, dtype=torch.bool)
     usual = render_with_gradients(TorchRasterizer(), arguments, pixels)
-    monkeypatch.setattr(module, "CHUNK", chunk)
+    monkeypatch.setattr(TorchRasterizer, "chunk", chunk)
     for name, found in render_with_gradients(TorchRasterizer(), arguments, pixels).items():
         torch.testing.assert_close(found, usual[name], rtol=1e-12, atol=1e-12)
 
