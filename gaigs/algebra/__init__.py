@@ -264,7 +264,7 @@ def _products(algebra: Algebra) -> tuple[Tensor, Tensor]:
         for j, b in enumerate(blades):
             common = set(a) & set(b)
             # Exchanges of neighbours that bring the vectors of a and b into order.
-            exchanges = sum(sum(v > w for w in b) for v in a)
+            exchanges = sum(v > w for v, w in itertools.product(a, b))
             k = position[frozenset(a) ^ frozenset(b)]
             product[i, j, k] = (-1.0) ** exchanges * _square(algebra, common)
             disjoint[i, j] = not common

@@ -66,7 +66,7 @@ def check_pooling(
             _check_hard_maps(module, inputs.received.detach(), query)
 
 
-class _Inputs(NamedTuple):
+class _PoolingInputs(NamedTuple):
     """What a pooling is called with, and silence of the same shape, with their leaves by name."""
 
     noun: str
@@ -76,20 +76,22 @@ class _Inputs(NamedTuple):
     silent: Tensor
 
 
-def _map_inputs(channels: int, grid: Grid | None, query: Query, dtype: torch.dtype) -> _Inputs:
+def _map_inputs(
+    channels: int, grid: Grid | None, query: Query, dtype: torch.dtype
+) -> _PoolingInputs:
     generator = torch.Generator().manual_seed(0)
     image = torch.randn(len(query), channels, *grid.shape, generator=generator)
     image = image.to(query.transmitters.device, dtype).requires_grad_()
     silence = torch.zeros_like(image).requires_grad_()
-    return _Inputs("maps", image, {"the map": image}, silence, silence)
+    return _PoolingInputs("maps", image, {"the map": image}, silence, silence)
 
 
-def _path_inputs(receiver: Receiver, query: Query, dtype: torch.dtype) -> _Inputs:
+def _path_inputs(receiver: Receiver, query: Query, dtype: torch.dtype) -> _PoolingInputs:
     paths = example_paths(receiver, query, dtype)
     names = ("means", "semi_axes", "amplitudes", "lengths", "coherences", "bandwidth")
     leaves = {name: getattr(paths, name).requires_grad_() for name in names}
     silent = torch.zeros_like(paths.amplitudes).requires_grad_()
-    return _Inputs("paths", paths, leaves, replace(paths, amplitudes=silent), silent)
+    return _PoolingInputs("paths", paths, leaves, replace(paths, amplitudes=silent), silent)
 
 
 def _check_attributes(pooling: Pooling, task: Task) -> Grid | None:
@@ -110,7 +112,7 @@ def _check_attributes(pooling: Pooling, task: Task) -> Grid | None:
     return grid
 
 
-def _check_values(pooling: Pooling, task: Task, inputs: _Inputs, query: Query) -> Tensor:
+def _check_values(pooling: Pooling, task: Task, inputs: _PoolingInputs, query: Query) -> Tensor:
     """Values and gradients for all queries, the last one, none, and silence."""
     noun, received = inputs.noun, inputs.received
     value = pooling(received, query)

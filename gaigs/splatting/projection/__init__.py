@@ -230,7 +230,7 @@ def factor(
     """
     p = (across.square().sum(-1) + variance).sqrt()  # (...)
     unit = across / p[..., None]  # e, (..., k)
-    q = (unit * along).sum(-1)
     area = torch.linalg.cross(unit, along).square().sum(-1)  # |e x along|²
     beside = area + (variance / p.square()) * along.square().sum(-1)
+    q = (unit * along).sum(-1)
     return torch.stack((p, q, (beside + variance).sqrt()), -1)  # (..., 3)

@@ -187,7 +187,7 @@ def _nearest(a: Tensor, b: Tensor, period: _Period | None) -> Tensor:
     return (offset - turns * period.rounded) + (rest - turns * period.rest)
 
 
-class _Inputs(NamedTuple):
+class _FilledSplats(NamedTuple):
     """Splats front to back, and behind them one that does nothing and fills the tiles' lists up."""
 
     means: Tensor  # (n + 1, 2)
@@ -199,7 +199,7 @@ class _Inputs(NamedTuple):
     @classmethod
     def filled(
         cls, means: Tensor, factors: Tensor, signal: Tensor, opacities: Tensor, logs: Tensor | None
-    ) -> "_Inputs":
+    ) -> "_FilledSplats":
         pad = torch.nn.functional.pad
         row = (0, 0, 0, 1)
         return cls(
@@ -232,7 +232,7 @@ class _Weights(NamedTuple):
     left: Tensor
 
 
-def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _Inputs) -> _Weights:
+def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _FilledSplats) -> _Weights:
     """Footprints, opacities and transmittances of a chunk.
 
     Args:
@@ -283,7 +283,7 @@ class _Composite(torch.autograd.Function):
         count, pixels = tiles.down * tiles.across, tiles.edge**2
         image = signal.new_zeros(b, c, count, pixels)
         left = signal.new_ones(b, count, pixels)
-        inputs = _Inputs.filled(means, factors, signal, opacities, logs)
+        inputs = _FilledSplats.filled(means, factors, signal, opacities, logs)
         for chosen, k in tiles.chunks:
             w = _weigh(tiles, chosen, k, inputs)
             # eq. (14): the sum of signal_i A_i T_i over the splats.
@@ -296,7 +296,7 @@ class _Composite(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, image_gradient, left_gradient):
         tiles = ctx.tiles
-        inputs = _Inputs.filled(*ctx.saved_tensors)
+        inputs = _FilledSplats.filled(*ctx.saved_tensors)
         gradients = [None if tensor is None else torch.zeros_like(tensor) for tensor in inputs]
         image_gradient = tiles.split(image_gradient)  # (b, c, t, y x)
         left_gradient = tiles.split(left_gradient)  # (b, t, y x)
@@ -318,9 +318,9 @@ class _Composite(torch.autograd.Function):
 
 
 def _differentiate(
-    w: _Weights, k: Tensor, inputs: _Inputs, towards: Tensor, left_gradient: Tensor, edge: int
+    w: _Weights, k: Tensor, inputs: _FilledSplats, towards: Tensor, left_gradient: Tensor, edge: int
 ) -> tuple[Tensor | None, ...]:
-    """Gradients of a chunk's splats, in the order of ``_Inputs``.
+    """Gradients of a chunk's splats, in the order of ``_FilledSplats``.
 
     Args:
         w: The chunk composited; used up.
