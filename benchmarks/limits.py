@@ -21,12 +21,11 @@ from pathlib import Path
 import numpy as np
 import pyopencl as cl
 import torch
-from scenes import DrawnScene, common, passes
+from scenes import DrawnScene, cast_scene, common, footprints_of, passes
 
 from gaigs.registry import registry
 from gaigs.report.table import markdown
 from gaigs.splatting.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST, opencl
-from gaigs.testing.rasterizer import cast_scene, footprints_of
 
 WAYS = "forward", "backward"
 
@@ -61,7 +60,8 @@ class Ceiling:
         """Time of a pair [s]."""
         start = time.perf_counter()
         self.kernels[way](self.queue, (self.items,), (1,), self.memory, np.int32(chunks)).wait()
-        pairs = self.items * opencl.CHUNK * opencl.ROWS * opencl.COLUMNS * chunks
+        layout = opencl.LAYOUT
+        pairs = self.items * layout.chunk * layout.rows * layout.columns * chunks
         return (time.perf_counter() - start) / pairs
 
 

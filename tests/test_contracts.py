@@ -11,6 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from contracts.deformation import check_deformation
+from contracts.loss import check_loss
+from contracts.projection import check_projection
+from contracts.rasterizer import check_rasterizer
+from contracts.split import check_split
+from contracts.tokenizer import check_tokenizer
+from contracts.training import check_training
 from omegaconf import OmegaConf
 
 import gaigs
@@ -21,17 +28,10 @@ from gaigs.registry import registry
 from gaigs.splatting.pooling.softmax_attention import SoftmaxAttention
 from gaigs.testing import (
     check_data,
-    check_deformation,
-    check_loss,
     check_model,
     check_placement,
     check_pooling,
-    check_projection,
-    check_rasterizer,
-    check_split,
     check_task,
-    check_tokenizer,
-    check_training,
     example_links,
 )
 
@@ -74,7 +74,9 @@ CARRIER = 5e9
 
 def built_in(kind):
     """The names of a kind that do not come from plug-ins."""
-    folder = Path(gaigs.__file__).parent / kind
+    package = Path(gaigs.__file__).parent
+    floors = (package / kind, package / "core" / kind, package / "splatting" / kind)
+    (folder,) = (floor for floor in floors if floor.is_dir())
     return [
         name
         for name in registry(kind).names()

@@ -3,6 +3,7 @@
 import functools
 import itertools
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
@@ -12,12 +13,12 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Algebra:
-    """The Clifford algebra G(p, q, r): of n = p + q + r basis vectors p square to +1, q to -1 and r
-    to 0.
+    """The Clifford algebra G(p, q, r).
 
-    A multivector is the last axis of a tensor: ``k = 2**n`` components, one for each basis blade.
-    The order of basis vectors is null, positive, negative; blades are sorted by grade, then by
-    their vectors. Vectors count from e0 if there is a null vector, else from e1:
+    Of n = p + q + r basis vectors p square to +1, q to -1 and r to 0. A multivector is the last
+    axis of a tensor: ``k = 2**n`` components, one for each basis blade. The order of basis vectors
+    is null, positive, negative; blades are sorted by grade, then by their vectors. Vectors count
+    from e0 if there is a null vector, else from e1:
 
     - G(3,0,1), ``PROJECTIVE``: e0² = 0, e1² = e2² = e3² = 1, components
       ``1, e0, e1, e2, e3, e01, e02, e03, e12, e13, e23, e012, e013, e023, e123, e0123``;
@@ -26,14 +27,20 @@ class Algebra:
 
     Every operation takes any leading axes, device and dtype, and is differentiable.
 
+    Args:
+        p, q, r: The signature.
+
+    Raises:
+        ValueError: There is no basis vector, or a count is negative.
+
     Source: GAI-GS, "Geometric Algebra"; Roelfs & De Keninck, Graded Symmetry Groups, 2023.
 
     Example:
         >>> from gaigs.algebra import PROJECTIVE
         >>> from gaigs.algebra.embedding import embed_plane, embed_point, extract_point
-        >>> wall = embed_plane(torch.tensor([1.0, 0.0, 0.0]), torch.tensor(4.0))  # the plane x = 4 m
+        >>> wall = embed_plane(torch.tensor([1.0, 0.0, 0.0]), torch.tensor(4.0))  # x = 4 m
         >>> place = torch.tensor([1.0, 2.0, 1.5], requires_grad=True)
-        >>> image = extract_point(PROJECTIVE.sandwich(wall, embed_point(place)))  # where a mirror shows it
+        >>> image = extract_point(PROJECTIVE.sandwich(wall, embed_point(place)))  # in the mirror
         >>> image
         tensor([7.0000, 2.0000, 1.5000], grad_fn=<DivBackward0>)
         >>> line = PROJECTIVE.join(embed_point(place), embed_point(image))  # through both
@@ -51,23 +58,22 @@ class Algebra:
 
     @property
     def dimension(self) -> int:
+        """Number of basis vectors n."""
         return self.p + self.q + self.r
 
     @property
     def size(self) -> int:
+        """Number of components k of a multivector."""
         return 2**self.dimension
 
     @property
     def blades(self) -> tuple[str, ...]:
         """Names of the components: "1", "e0", ..., "e0123"."""
         first = 0 if self.r else 1
-        return (
-            "1",
-            *(
-                "e" + "".join(str(v + first) for v in blade)
-                for blade in _vectors(self.dimension)[1:]
-            ),
-        )
+        names = ["1"]
+        for blade in _vectors(self.dimension)[1:]:
+            names.append("e" + "".join(str(vector + first) for vector in blade))
+        return tuple(names)
 
     @property
     def grades(self) -> tuple[int, ...]:
@@ -76,33 +82,34 @@ class Algebra:
 
     @property
     def homogeneous(self) -> int:
-        """Index of the blade of all vectors that are not null: e123, a projective point's
-        homogeneous coordinate.
+        """Index of the blade of all vectors that are not null.
+
+        It is e123, a projective point's homogeneous coordinate.
         """
         return _vectors(self.dimension).index(tuple(range(self.r, self.dimension)))
 
     def product(
         self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
     ) -> Float[Tensor, "*batch k"]:
-        """Geometric product x y; of vectors, x y = x · y + x ∧ y."""
+        """Geometric product x y; of vectors, x y = x · y + x ∧ y, eq. (5) of GAI-GS."""
         return self._multiply("product", x, y)
 
     def wedge(
         self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
     ) -> Float[Tensor, "*batch k"]:
-        """Outer product x ∧ y; in the projective algebra the intersection, such as the line of two
-        planes.
+        """Outer product x ∧ y.
+
+        In the projective algebra it is the intersection, such as the line of two planes.
         """
         return self._multiply("wedge", x, y)
 
     def join(
         self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
     ) -> Float[Tensor, "*batch k"]:
-        """Regressive product x ∨ y, the dual of the duals' wedge; of projective points, the line
-        through them.
+        """Regressive product x ∨ y, the dual of the duals' wedge.
 
-        A mirror changes its sign besides mirroring it: join(ux, uy) = -u join(x, y) for an odd
-        versor u.
+        Of projective points it is the line through them. A mirror changes its sign besides
+        mirroring it: join(ux, uy) = -u join(x, y) for an odd versor u.
         """
         return self._multiply("join", x, y)
 
@@ -116,8 +123,9 @@ class Algebra:
     def inner(
         self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
     ) -> Float[Tensor, "*batch"]:
-        """Invariant inner product, the scalar part of reverse(x) y; blades with a null vector have
-        weight 0.
+        """Invariant inner product, the scalar part of reverse(x) y.
+
+        Blades with a null vector have weight 0.
         """
         return (x * y * self.table("metric", x)).sum(-1)
 
@@ -141,12 +149,16 @@ class Algebra:
         A vector u mirrors at the hyperplane orthogonal to it; products of vectors rotate and
         translate.
 
-        A versor u reverse(u) = 0 has no inverse and raises a ``ValueError``.
+        Raises:
+            ValueError: u reverse(u) is 0, so that u has no inverse.
+
+        Source: GAI-GS, eq. (6) and (7).
         """
         square = self.inner(versor, versor)[..., None]
         if not (square != 0).all():
             raise ValueError(
-                "a versor must be a product of vectors that are not null, got one whose square is zero"
+                "a versor must be a product of vectors that are not null, "
+                "got one whose square is zero"
             )
         # Even and odd parts of x are moved separately: involute(u) has the sign of an odd versor.
         odd = (x - self.involute(x)) / 2
@@ -171,75 +183,55 @@ class Algebra:
         # non-zero terms.
         x, y = torch.broadcast_tensors(x, y)
         batch = x.shape[:-1]
-        rows, columns = (
-            factor.movedim(-1, 0).reshape(self.size, batch.numel()) for factor in (x, y)
-        )
-        result = self.table(name, x).mT @ (rows[:, None] * columns).flatten(0, 1)
+        rows = x.movedim(-1, 0).reshape(self.size, batch.numel())  # (k, batch)
+        columns = y.movedim(-1, 0).reshape(self.size, batch.numel())
+        pairs = (rows[:, None] * columns).flatten(0, 1)  # (k k, batch)
+        result = self.table(name, x).mT @ pairs  # (k or 2 k, batch)
         return result.reshape(len(result), *batch).movedim(0, -1)
 
 
 PROJECTIVE = Algebra(3, 0, 1)
-"""Projective geometric algebra of space, GATr's: planes are vectors, lines bivectors, points
-trivectors.
+"""Projective geometric algebra of space: planes are vectors, lines bivectors, points trivectors.
+
+It is GATr's.
 """
 
 SPACETIME = Algebra(3, 1, 0)
-"""Space-time algebra with the metric (+, +, +, -): events are vectors e1, e2, e3 (space) and e4
-(time).
+"""Space-time algebra with the metric (+, +, +, -), of the paper's section "Geometric Algebra".
+
+Events are vectors e1, e2, e3 (space) and e4 (time).
 """
 
 
 @functools.cache
 def _vectors(dimension: int) -> tuple[tuple[int, ...], ...]:
-    """Basis vectors of every blade."""
-    return tuple(
-        b for grade in range(dimension + 1) for b in itertools.combinations(range(dimension), grade)
-    )
+    """Basis vectors of every blade, by grade."""
+    blades: list[tuple[int, ...]] = []
+    for grade in range(dimension + 1):
+        blades += itertools.combinations(range(dimension), grade)
+    return tuple(blades)
 
 
 @functools.cache
 def _tables(algebra: Algebra) -> dict[str, Tensor]:
-    """The constants of a signature, float64 on the CPU."""
+    """The constants of a signature, float64 on the CPU; ``Algebra.table`` describes them."""
     blades = _vectors(algebra.dimension)
-    position = {frozenset(blade): index for index, blade in enumerate(blades)}
-    squares = [0.0] * algebra.r + [1.0] * algebra.p + [-1.0] * algebra.q
-    square = lambda vectors: math.prod(squares[vector] for vector in vectors)
-    size = algebra.size
-
-    product = torch.zeros(size, size, size, dtype=torch.float64)
-    disjoint = torch.zeros(size, size, 1, dtype=torch.float64)
-    for (i, a), (j, b) in itertools.product(enumerate(blades), repeat=2):
-        common = set(a) & set(b)
-        exchanges = sum(v > w for v in a for w in b)  # bring the vectors of a and b into order
-        product[i, j, position[frozenset(a) ^ frozenset(b)]] = (-1.0) ** exchanges * square(common)
-        disjoint[i, j] = not common
+    product, disjoint = _products(algebra)  # (k, k, k), (k, k, 1)
     wedge = product * disjoint
     dual = wedge[:, :, -1]  # signed complement: blade i times blade j is the pseudoscalar
     join = torch.einsum("ia,jb,abc,kc->ijk", dual, dual, wedge, dual)
-
     count = torch.tensor(algebra.grades)
-    grades = (count == torch.arange(algebra.dimension + 1)[:, None]).double()
-    metric = [square(blade) for blade in blades]
+    metric = [_square(algebra, blade) for blade in blades]
     # Points at infinity: the blades of a point's grade that hold the one null vector, with the
     # metric of the others.
-    infinite = [
-        algebra.r == 1 and len(blade) == algebra.dimension - 1 and 0 in blade for blade in blades
-    ]
-    ideal = [
-        square(blade[1:]) if at_infinity else 0.0
-        for blade, at_infinity in zip(blades, infinite, strict=True)
-    ]
-    reverse = (-1.0) ** (count * (count - 1) // 2).double()
-    # Motions leave null vectors unchanged, so the wedge of a grade with one of their blades, 1
-    # included, is equivariant. Maps are numbered by blade, then by grade.
-    null_blades = [
-        i for i, blade in enumerate(blades) if all(vector < algebra.r for vector in blade)
-    ]
-    first, maps = 0, []
-    for i in null_blades:
-        highest = algebra.dimension - algebra.grades[i]
-        maps.append(first + (count - algebra.grades[i]).clamp(0, highest))
-        first += highest + 1
+    ideal = []
+    for blade in blades:
+        is_ideal = algebra.r == 1 and len(blade) == algebra.dimension - 1 and 0 in blade
+        ideal.append(_square(algebra, blade[1:]) if is_ideal else 0.0)
+    null_blades = []
+    for i, blade in enumerate(blades):
+        if all(vector < algebra.r for vector in blade):
+            null_blades.append(i)
     return {
         "product": product.flatten(0, 1),
         "wedge": wedge.flatten(0, 1),
@@ -247,12 +239,53 @@ def _tables(algebra: Algebra) -> dict[str, Tensor]:
         "product_and_join": torch.cat((product, join), -1).flatten(0, 1),
         "metric": torch.tensor(metric, dtype=torch.float64),
         "ideal": torch.tensor(ideal, dtype=torch.float64),
-        "reverse": reverse,
+        "reverse": (-1.0) ** (count * (count - 1) // 2).double(),
         "involute": (-1.0) ** count.double(),
-        "grades": grades,
+        "grades": (count == torch.arange(algebra.dimension + 1)[:, None]).double(),
         "null_wedges": wedge[null_blades].mT,
-        "linear_maps": torch.stack(maps),
+        "linear_maps": _number_maps(algebra, null_blades),
     }
+
+
+def _square(algebra: Algebra, vectors: Iterable[int]) -> float:
+    """Product of the squares of basis vectors."""
+    squares = [0.0] * algebra.r + [1.0] * algebra.p + [-1.0] * algebra.q
+    return math.prod(squares[vector] for vector in vectors)
+
+
+def _products(algebra: Algebra) -> tuple[Tensor, Tensor]:
+    """Products of all pairs of blades (k, k, k), and 1 for pairs without a common vector."""
+    blades = _vectors(algebra.dimension)
+    position = {frozenset(blade): index for index, blade in enumerate(blades)}
+    size = algebra.size
+    product = torch.zeros(size, size, size, dtype=torch.float64)
+    disjoint = torch.zeros(size, size, 1, dtype=torch.float64)
+    for i, a in enumerate(blades):
+        for j, b in enumerate(blades):
+            common = set(a) & set(b)
+            # Exchanges of neighbours that bring the vectors of a and b into order.
+            exchanges = sum(v > w for v, w in itertools.product(a, b))
+            k = position[frozenset(a) ^ frozenset(b)]
+            product[i, j, k] = (-1.0) ** exchanges * _square(algebra, common)
+            disjoint[i, j] = not common
+    return product, disjoint
+
+
+def _number_maps(algebra: Algebra, null_blades: list[int]) -> Tensor:
+    """Numbers of the equivariant linear maps by blade of null vectors and component (2**r, k).
+
+    Motions leave null vectors unchanged, so the wedge of a grade with one of their blades, 1
+    included, is equivariant. Maps are numbered by blade, then by grade.
+    """
+    grades = torch.tensor(algebra.grades)
+    first = 0
+    maps = []
+    for blade in null_blades:
+        grade = algebra.grades[blade]
+        highest = algebra.dimension - grade
+        maps.append(first + (grades - grade).clamp(0, highest))
+        first += highest + 1
+    return torch.stack(maps)
 
 
 @functools.cache

@@ -16,13 +16,20 @@ from gaigs.algebra import PROJECTIVE
 
 
 def _embed(**components: Tensor) -> Tensor:
+    """Multivectors with these components, and 0 elsewhere."""
     zero = torch.zeros_like(next(iter(components.values())))
     return torch.stack([components.get(blade, zero) for blade in PROJECTIVE.blades], -1)
 
 
 def embed_point(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
-    """Points [m] as trivectors e123 - x e023 + y e013 - z e012, where the planes of their
-    coordinates meet.
+    """Points [m] as trivectors e123 - x e023 + y e013 - z e012.
+
+    They are where the planes of the points' coordinates meet.
+
+    Example:
+        >>> from gaigs.algebra.embedding import embed_point, extract_point
+        >>> extract_point(embed_point(torch.tensor([1.0, 2.0, 1.5])))
+        tensor([1.0000, 2.0000, 1.5000])
     """
     x, y, z = points.unbind(-1)
     return _embed(e123=torch.ones_like(x), e023=-x, e013=y, e012=-z)
@@ -30,26 +37,26 @@ def embed_point(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]
 
 def extract_point(multivectors: Float[Tensor, "*batch 16"]) -> Float[Tensor, "*batch 3"]:
     """Points [m] of trivectors; not finite for directions, whose e123 is zero."""
-    x, y, z, w = (
-        multivectors[..., PROJECTIVE.blades.index(blade)]
-        for blade in ("e023", "e013", "e012", "e123")
-    )
-    return torch.stack((-x, y, -z), -1) / w[..., None]
+    indices = [PROJECTIVE.blades.index(blade) for blade in ("e023", "e013", "e012", "e123")]
+    x, y, z, h = (multivectors[..., index] for index in indices)
+    return torch.stack((-x, y, -z), -1) / h[..., None]
 
 
 def embed_plane(
     normals: Float[Tensor, "*batch 3"], offsets: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 16"]:
-    """Oriented planes {x: normal · x = offset} as vectors; the offset is in [m] where the normal is
-    of unit length.
+    """Oriented planes {x: normal · x = offset} as vectors.
+
+    Args:
+        normals: Normals of any length.
+        offsets: Offsets [m] where the normals are of unit length.
     """
     x, y, z = normals.unbind(-1)
     return _embed(e1=x, e2=y, e3=z, e0=-offsets)
 
 
 def embed_event(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
-    """Points [m] as events at time zero, vectors x e1 + y e2 + z e3 of the space-time algebra
-    G(3,1,0).
+    """Points [m] as events at time zero, vectors x e1 + y e2 + z e3 of space-time, G(3,1,0).
 
     Its motions are rotations, boosts and mirrors about the origin, without translations.
     """

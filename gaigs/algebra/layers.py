@@ -1,5 +1,4 @@
-"""Layers that commute with every motion of space: the Geometric Algebra Transformer (GATr) for any
-signature.
+"""Layers of the Geometric Algebra Transformer (GATr), for any signature.
 
 Tokens carry two kinds of channels, ``multivectors`` (b, tokens, channels, k) and ``scalars`` (b,
 tokens, channels). A layer f is equivariant: f(u x) = u f(x) where u acts by ``Algebra.sandwich``,
@@ -31,6 +30,11 @@ class EquivariantLinear(nn.Module):
     e0, e0 times each grade but the highest. Multiplication by the pseudoscalar is excluded, because
     a mirror changes its sign. Scalars mix with the multivectors' component 1, which has the bias.
 
+    Args:
+        algebra: The algebra.
+        multivectors: Channels of multivectors, in and out.
+        scalars: Channels of scalars, in and out.
+
     Source: GATr, proposition 2.
     """
 
@@ -39,12 +43,9 @@ class EquivariantLinear(nn.Module):
     def __init__(self, algebra: Algebra, multivectors: tuple[int, int], scalars: tuple[int, int]):
         super().__init__()
         self.algebra = algebra
-        self.register_buffer(
-            "maps", algebra.table("linear_maps", torch.empty(0)).long(), persistent=False
-        )
-        self.weight = nn.Parameter(
-            torch.empty(int(self.maps.max()) + 1, multivectors[0], multivectors[1])
-        )
+        maps = algebra.table("linear_maps", torch.empty(0)).long()  # (2**r, k)
+        self.register_buffer("maps", maps, persistent=False)
+        self.weight = nn.Parameter(torch.empty(int(maps.max()) + 1, *multivectors))
         self.from_scalars = nn.Linear(scalars[0], multivectors[1])
         self.to_scalars = nn.Linear(multivectors[0] + scalars[0], scalars[1])
         # Weights of variance 1 / (channels in) keep the components' variance.
@@ -59,14 +60,17 @@ class EquivariantLinear(nn.Module):
         if torch.is_autocast_enabled(device):  # computed in the precision of the weights
             with torch.autocast(device, enabled=False):
                 return self(multivectors.to(self.weight.dtype), scalars.to(self.weight.dtype))
-        null_wedges = self.algebra.table("null_wedges", self.weight)
-        linears = (
+        return Mix.apply(
+            multivectors,
+            scalars,
+            self.weight,
             self.from_scalars.weight,
             self.from_scalars.bias,
             self.to_scalars.weight,
             self.to_scalars.bias,
+            self.maps,
+            self.algebra.table("null_wedges", self.weight),
         )
-        return Mix.apply(multivectors, scalars, self.weight, *linears, self.maps, null_wedges)
 
 
 class GeometricBilinear(nn.Module):
@@ -76,6 +80,9 @@ class GeometricBilinear(nn.Module):
     whose sign it also changes. Without a null vector products alone reach every grade, so there are
     twice as many products and no joins.
 
+    Raises:
+        ValueError: The number of multivectors is odd, and there is a null vector.
+
     Source: GATr, "Geometric bilinears"; Spinner et al., 2024, without joins.
     """
 
@@ -83,7 +90,8 @@ class GeometricBilinear(nn.Module):
         super().__init__()
         if algebra.r and multivectors % 2:
             raise ValueError(
-                f"multivectors must be even, got {multivectors}: one half are products, the other joins"
+                f"multivectors must be even, got {multivectors}: "
+                "one half are products, the other joins"
             )
         self.algebra = algebra
         factors = multivectors if algebra.r else 2 * multivectors
@@ -93,8 +101,8 @@ class GeometricBilinear(nn.Module):
     def forward(
         self, multivectors: Multivectors, scalars: Scalars, reference: Float[Tensor, "... k"]
     ) -> tuple[Multivectors, Scalars]:
-        factors, scalars = self.factors(multivectors, scalars)
-        left, right = factors.chunk(2, -2)
+        factors, scalars = self.factors(multivectors, scalars)  # (..., factors, k)
+        left, right = factors.chunk(2, -2)  # (..., factors / 2, k) each
         if not self.algebra.r:
             return self.output(self.algebra.product(left, right), scalars)
         products, joins = self.algebra.product_and_join(left, right)
@@ -102,15 +110,8 @@ class GeometricBilinear(nn.Module):
         return self.output(torch.cat((products, orientation * joins), -2), scalars)
 
 
-HOMOGENEOUS_FLOOR = 1e-3
-"""Floor of h² in the division of a trivector by its e123 component h, which is 0 for a direction.
-GATr's value.
-"""
-
-
 class GeometricAttention(nn.Module):
-    """Multi-head attention of all tokens to all tokens, by invariants of their multivectors and
-    scalars.
+    """Multi-head attention of all tokens to all tokens, by invariants, eq. (8) of GAI-GS.
 
     The logit of a query and a key is their inner product plus the product of their scalars. The
     inner product ignores components with e0, and with them the positions of projective points. So
@@ -122,9 +123,17 @@ class GeometricAttention(nn.Module):
         multivectors, scalars: Channels, multiples of ``heads``.
         heads: Attention maps, each of an equal share of the channels.
 
-    Source: GATr, "Geometric attention" and, for the distances, appendix "Distance-aware dot-product
-    attention".
+    Attributes:
+        floor: Added to h² in w, as h is 0 for a direction; GATr's value.
+
+    Raises:
+        ValueError: A number of channels is no multiple of ``heads``.
+
+    Source: GAI-GS, eq. (8); GATr, "Geometric attention" and, for the distances, appendix
+    "Distance-aware dot-product attention".
     """
+
+    floor = 1e-3
 
     blades: Tensor
     ideal: Tensor
@@ -134,7 +143,8 @@ class GeometricAttention(nn.Module):
         super().__init__()
         if multivectors % heads or scalars % heads:
             raise ValueError(
-                f"multivectors and scalars must be multiples of {heads} heads, got {multivectors}, {scalars}"
+                f"multivectors and scalars must be multiples of {heads} heads, "
+                f"got {multivectors}, {scalars}"
             )
         self.algebra = algebra
         self.heads = heads
@@ -142,8 +152,10 @@ class GeometricAttention(nn.Module):
             algebra, (multivectors, 3 * multivectors), (scalars, 3 * scalars)
         )
         self.output = EquivariantLinear(algebra, (multivectors, multivectors), (scalars, scalars))
-        metric, ideal = (algebra.table(name, torch.empty(0)) for name in ("metric", "ideal"))
-        seen, ideal_blades = metric.nonzero().flatten(), ideal.nonzero().flatten()
+        metric = algebra.table("metric", torch.empty(0))  # (k,)
+        ideal = algebra.table("ideal", torch.empty(0))  # (k,)
+        seen = metric.nonzero().flatten()
+        ideal_blades = ideal.nonzero().flatten()
         # Logits are a bilinear form of the features; the distance's is -g² y·y - h² x·x + 2 g h
         # x·y.
         form = torch.diag(metric[seen])
@@ -156,87 +168,93 @@ class GeometricAttention(nn.Module):
         self.register_buffer("form", form, persistent=False)
 
     def features(self, multivectors: Multivectors) -> Float[Tensor, "*batch c f"]:
-        """Factors of the logits: components of the inner product, and w(h) (x·x, h², h x) of
-        points.
-        """
+        """Factors of the logits: components of the inner product, and w(h) (x·x, h², h x)."""
         seen, x = multivectors.index_select(-1, self.blades).split(self.parts, -1)
         if not x.shape[-1]:
             return seen
         h = seen[..., -1:]  # the homogeneous coordinate is the last blade without e0
-        weight = h / (h.square() + HOMOGENEOUS_FLOOR)
-        size = (x.square() * self.ideal).sum(-1, keepdim=True)
-        return torch.cat((seen, weight * torch.cat((size, h.square(), h * x), -1)), -1)
+        weight = h / (h.square() + self.floor)  # w(h)
+        size = (x.square() * self.ideal).sum(-1, keepdim=True)  # x·x
+        distances = torch.cat((size, h.square(), h * x), -1)
+        return torch.cat((seen, weight * distances), -1)
 
     def forward(self, multivectors: Multivectors, scalars: Scalars) -> tuple[Multivectors, Scalars]:
-        query, key, value = self._project(multivectors, scalars)
-        return self._read(
-            functional.scaled_dot_product_attention(query, key, value).movedim(-3, -2)
-        )
+        query, key, value = self._project(multivectors, scalars)  # (b, heads, tokens, f) each
+        mixed = functional.scaled_dot_product_attention(query, key, value)
+        return self._read(mixed.movedim(-3, -2))
 
     def look(
         self, multivectors: Multivectors, scalars: Scalars, groups: tuple[int, int]
     ) -> tuple[Multivectors, Scalars]:
-        """Attention of the first token of each group to its group and to the tokens common to all
-        groups.
+        """Attention of the first token of each group to its group and to common tokens.
 
         Args:
-            multivectors, scalars: One group after the other, then any common tokens.
+            multivectors, scalars: One group after the other, then any tokens common to all groups.
             groups: Number of groups, and of tokens in each.
         """
-        query, key, value = self._project(multivectors, scalars)
-        own = math.prod(groups)
-        query = query[:, :own].unflatten(1, groups)[:, :, 0]
-        logits = (
-            (key[:, :own].unflatten(1, groups) @ query[..., None]).squeeze(-1),
-            query @ key[:, own:].mT,
-        )
-        weights = (torch.cat(logits, -1) * query.shape[-1] ** -0.5).softmax(-1)
-        grouped, alike = weights.split((groups[1], key.shape[1] - own), -1)
-        mixed = (grouped[..., None, :] @ value[:, :own].unflatten(1, groups)).squeeze(
-            -2
-        ) + alike @ value[:, own:]
+        query, key, value = self._project(multivectors, scalars)  # (heads, tokens, f) each
+        end = math.prod(groups)
+        count = key.shape[1] - end  # of common tokens
+        query = query[:, :end].unflatten(1, groups)[:, :, 0]  # (heads, groups, f)
+        keys = key[:, :end].unflatten(1, groups)  # (heads, groups, size, f)
+        values = value[:, :end].unflatten(1, groups)
+        # eq. (8): softmax of the logits over the root of their number of features.
+        to_group = (keys @ query[..., None]).squeeze(-1)  # (heads, groups, size)
+        to_common = query @ key[:, end:].mT  # (heads, groups, count)
+        logits = torch.cat((to_group, to_common), -1)
+        weights = (logits * query.shape[-1] ** -0.5).softmax(-1)
+        grouped, common = weights.split((groups[1], count), -1)
+        mixed = (grouped[..., None, :] @ values).squeeze(-2)  # (heads, groups, f)
+        mixed = mixed + common @ value[:, end:]
         return self._read(mixed.movedim(0, 1))
 
     def _project(
         self, multivectors: Multivectors, scalars: Scalars
     ) -> list[Float[Tensor, "*batch heads tokens f"]]:
+        """Query, key and value, each a row of numbers for a head and token."""
         multivectors, scalars = self.project(multivectors, scalars)
         # Query, key and value first, then heads before tokens.
-        multivectors = multivectors.unflatten(-2, (3, self.heads, -1)).movedim((-4, -3), (0, -4))
-        scalars = scalars.unflatten(-1, (3, self.heads, -1)).movedim((-3, -2), (0, -3))
+        multivectors = multivectors.unflatten(-2, (3, self.heads, -1))
+        multivectors = multivectors.movedim((-4, -3), (0, -4))  # (3, *batch, heads, tokens, c, k)
+        scalars = scalars.unflatten(-1, (3, self.heads, -1))
+        scalars = scalars.movedim((-3, -2), (0, -3))  # (3, *batch, heads, tokens, s)
         query_key, value = multivectors.split((2, 1))
         query, key = self.features(query_key)
-        channels = zip((query @ self.form, key, value[0]), scalars, strict=True)
-        return [torch.cat((x.flatten(-2), s), -1) for x, s in channels]
+        rows = []
+        for x, s in zip((query @ self.form, key, value[0]), scalars, strict=True):
+            rows.append(torch.cat((x.flatten(-2), s), -1))
+        return rows
 
     def _read(self, mixed: Float[Tensor, "*tokens heads f"]) -> tuple[Multivectors, Scalars]:
-        width = self.project.to_scalars.out_features // (3 * self.heads)
+        """Multivectors and scalars of the values that attention has mixed."""
+        width = self.project.to_scalars.out_features // (3 * self.heads)  # scalars of a head
         multivectors, scalars = mixed.split((mixed.shape[-1] - width, width), -1)
         multivectors = multivectors.unflatten(-1, (-1, self.algebra.size)).flatten(-3, -2)
         return self.output(multivectors, scalars.flatten(-2))
 
 
-NORM_FLOOR = 0.01
-"""Added to the squared size, which may be zero for large tokens with e0 or light-like ones. GATr's
-value.
-"""
-
-
 def equivariant_norm(
-    algebra: Algebra, multivectors: Multivectors, scalars: Scalars
+    algebra: Algebra, multivectors: Multivectors, scalars: Scalars, floor: float = 0.01
 ) -> tuple[Multivectors, Scalars]:
-    """Layer normalisation: a token's multivectors by their mean size, its scalars by mean and
-    variance.
+    """Layer normalisation: multivectors by their mean size, scalars by mean and variance.
 
     The squared size of a multivector is the sum over its grades of |inner(x, x)|: invariant, and
     without cancellation between grades in a signature of both signs.
 
+    Args:
+        algebra: The algebra.
+        multivectors, scalars: Tokens.
+        floor: Added to the squared size, which may be zero for large tokens with e0 or light-like
+            ones; GATr's value.
+
     Source: GATr, "Layer normalization"; de Haan, Cohen & Brehmer, Euclidean, Projective, Conformal,
     2023.
     """
-    by_grade = (algebra.table("grades", multivectors) * algebra.table("metric", multivectors)).mT
-    size = (multivectors.square() @ by_grade).abs().sum(-1).mean(-1)
-    multivectors = multivectors * torch.rsqrt(size + NORM_FLOOR)[..., None, None]
+    metric = algebra.table("metric", multivectors)
+    by_grade = (algebra.table("grades", multivectors) * metric).mT  # (k, n + 1)
+    sizes = (multivectors.square() @ by_grade).abs().sum(-1)  # (..., c)
+    size = sizes.mean(-1)  # (...)
+    multivectors = multivectors * torch.rsqrt(size + floor)[..., None, None]
     return multivectors, functional.layer_norm(scalars, scalars.shape[-1:])
 
 
@@ -249,8 +267,9 @@ def gated_gelu(multivectors: Multivectors, scalars: Scalars) -> tuple[Multivecto
 
 
 class GATrBlock(nn.Module):
-    """A transformer block: attention, then products and a gated GELU, each on normalised tokens and
-    added to them.
+    """A transformer block: attention, then products and a gated GELU.
+
+    Each takes normalised tokens, and is added to them.
 
     Source: GATr, figure 1.
     """
@@ -267,30 +286,35 @@ class GATrBlock(nn.Module):
     ) -> tuple[Multivectors, Scalars]:
         """Tokens after the block.
 
-        ``reference`` moves with the tokens, such as the mean of the network's inputs; see
-        ``GeometricBilinear``.
+        Args:
+            multivectors, scalars: Tokens.
+            reference: A multivector that moves with the tokens, such as the mean of the network's
+                inputs; see ``GeometricBilinear``.
         """
-        attended = self.attention(*equivariant_norm(self.algebra, multivectors, scalars))
-        return self.transform(multivectors + attended[0], scalars + attended[1], reference)
+        normal = equivariant_norm(self.algebra, multivectors, scalars)
+        attended, attended_scalars = self.attention(*normal)
+        return self.transform(multivectors + attended, scalars + attended_scalars, reference)
 
     def look(
         self, multivectors: Multivectors, scalars: Scalars, groups: tuple[int, int]
     ) -> tuple[Multivectors, Scalars]:
-        """The block's first half for the first token of each group alone; see
-        ``GeometricAttention.look``.
+        """The block's first half for the first token of each group alone.
+
+        Args:
+            multivectors, scalars, groups: As for ``GeometricAttention.look``.
         """
-        attended = self.attention.look(
-            *equivariant_norm(self.algebra, multivectors, scalars), groups
-        )
-        first, first_scalars = (
-            x[: math.prod(groups)].unflatten(0, groups)[:, :1] for x in (multivectors, scalars)
-        )
-        return first + attended[0][:, None], first_scalars + attended[1][:, None]
+        normal = equivariant_norm(self.algebra, multivectors, scalars)
+        attended, attended_scalars = self.attention.look(*normal, groups)  # (groups, ...)
+        end = math.prod(groups)
+        first = multivectors[:end].unflatten(0, groups)[:, :1]  # (groups, 1, c, k)
+        first_scalars = scalars[:end].unflatten(0, groups)[:, :1]  # (groups, 1, s)
+        return first + attended[:, None], first_scalars + attended_scalars[:, None]
 
     def transform(
         self, multivectors: Multivectors, scalars: Scalars, reference: Float[Tensor, "... k"]
     ) -> tuple[Multivectors, Scalars]:
         """The block's second half, for each token alone."""
-        products = self.bilinear(*equivariant_norm(self.algebra, multivectors, scalars), reference)
-        made = self.linear(*gated_gelu(*products))
-        return multivectors + made[0], scalars + made[1]
+        normal = equivariant_norm(self.algebra, multivectors, scalars)
+        products = self.bilinear(*normal, reference)
+        made, made_scalars = self.linear(*gated_gelu(*products))
+        return multivectors + made, scalars + made_scalars

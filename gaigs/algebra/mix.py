@@ -34,15 +34,21 @@ class Mix(torch.autograd.Function):
         null_wedges,
     ) -> tuple[Tensor, Tensor]:
         ctx.shapes = multivectors.shape, scalars.shape
-        x, flat = _components_first(multivectors), scalars.flatten(0, -2)
-        wedges = [x, *((wedge @ x.flatten(1)).view_as(x) for wedge in null_wedges[1:])]
-        matrices = weight.index_select(0, maps.flatten()).view(*maps.shape, *weight.shape[1:])
-        result = torch.bmm(x, matrices[0])
+        x = _components_first(multivectors)  # (k, n, c) for n tokens
+        flat = scalars.flatten(0, -2)  # (n, s)
+        wedges = [x]
+        for wedge in null_wedges[1:]:
+            wedges.append((wedge @ x.flatten(1)).view_as(x))
+        # A matrix for each wedge and component.
+        matrices = weight.index_select(0, maps.flatten())
+        matrices = matrices.view(*maps.shape, *weight.shape[1:])  # (2**r, k, c, c_out)
+        result = torch.bmm(x, matrices[0])  # (k, n, c_out)
         for wedge, matrix in zip(wedges[1:], matrices[1:], strict=True):
             result.baddbmm_(wedge, matrix)
+        # Scalars mix with the components 1, which are invariant too.
         result[0].addmm_(flat, from_weight.mT).add_(from_bias)
-        seen = torch.cat((x[0], flat), -1)
-        mixed = torch.addmm(to_bias, seen, to_weight.mT)
+        seen = torch.cat((x[0], flat), -1)  # (n, c + s)
+        mixed = torch.addmm(to_bias, seen, to_weight.mT)  # (n, s_out)
         ctx.save_for_backward(
             seen, matrices, weight, from_weight, to_weight, maps, null_wedges, *wedges
         )
@@ -56,18 +62,20 @@ class Mix(torch.autograd.Function):
             ctx.saved_tensors
         )
         shape, scalars_shape = ctx.shapes
-        g, flat = _components_first(to_multivectors), to_scalars.flatten(0, -2)
-        x = torch.bmm(g, matrices[0].mT)
+        g = _components_first(to_multivectors)  # (k, n, c_out)
+        flat = to_scalars.flatten(0, -2)  # (n, s_out)
+        x = torch.bmm(g, matrices[0].mT)  # (k, n, c)
         for wedge, matrix in zip(null_wedges[1:], matrices[1:], strict=True):
             x.flatten(1).addmm_(wedge.mT, torch.bmm(g, matrix.mT).flatten(1))
-        of_matrices = torch.cat([torch.bmm(wedge.mT, g) for wedge in wedges])
-        of_weight = torch.zeros_like(weight).index_add_(0, maps.flatten(), of_matrices)
+        matrix_gradients = torch.cat([torch.bmm(wedge.mT, g) for wedge in wedges])
+        weight_gradient = torch.zeros_like(weight)
+        weight_gradient.index_add_(0, maps.flatten(), matrix_gradients)
         ones, scalars = (flat @ to_weight).split((shape[-2], scalars_shape[-1]), -1)
         x[0] += ones
         return (
             x.unflatten(1, shape[:-2]).movedim(0, -1),
             torch.addmm(scalars, g[0], from_weight).view(scalars_shape),
-            of_weight,
+            weight_gradient,
             g[0].mT @ seen[:, shape[-2] :],
             g[0].sum(0),
             flat.mT @ seen,

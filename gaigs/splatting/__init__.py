@@ -1,3 +1,1 @@
-"""The paper's pipeline: Gaussians, their placement, tokens, deformation, projection, rasterizer and
-pooling.
-"""
+"""The paper's pipeline, from Gaussians and their placement to the value that a receiver reports."""

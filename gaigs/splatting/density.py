@@ -1,4 +1,6 @@
-"""Density control: prune, clone and split Gaussians; the optimizer keeps its state of all others.
+"""Density control: prune, clone and split Gaussians.
+
+The optimizer keeps its state of all Gaussians that stay.
 
 Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2.
 """
@@ -14,24 +16,42 @@ from torch.optim import Optimizer
 from gaigs.core.geometry import quaternions_to_rotations
 from gaigs.splatting.gaussians import Gaussians
 
-Pick = Callable[[Tensor], Tensor]
+SelectRows = Callable[[Tensor], Tensor]
 
 
 def prune(gaussians: Gaussians, optimizer: Optimizer, gone: Bool[Tensor, " n"]) -> None:
-    """Removes Gaussians; a ``ValueError`` if none would be left."""
+    """Removes Gaussians.
+
+    Args:
+        gaussians: They lose rows in place.
+        optimizer: Their optimizer.
+        gone: True for each Gaussian to remove.
+
+    Raises:
+        ValueError: All Gaussians would be removed.
+
+    Source: Kerbl et al., 2023, section 5.2.
+    """
     if gone.all():
         raise ValueError(f"pruning would remove all {len(gone)} Gaussians; lower the opacity bound")
     keep = ~gone
-    _rearrange(gaussians, optimizer, lambda values: values[keep], lambda state: state[keep])
+
+    def select(rows: Tensor) -> Tensor:
+        return rows[keep]
+
+    _rearrange(gaussians, optimizer, select, select)
 
 
 def clone(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]) -> None:
-    """Doubles Gaussians in place, each with the opacity a' = 1 - sqrt(1 - a), so that both cover as
-    much as one.
+    """Doubles the chosen Gaussians in place.
+
+    Two of opacity a' = 1 - sqrt(1 - a) cover as much as one of opacity a.
+
+    Source: Kerbl et al., 2023, section 5.2, which copies the opacity too.
     """
     copies = _append(gaussians, optimizer, chosen)
     with torch.no_grad():
-        # The logit of a' from the logit of a, accurate for opacities near 0 and 1.
+        # logit a' = log(exp(softplus(logit a) / 2) - 1): accurate for opacities near 0 and 1.
         logits = gaussians.opacity_logits[copies]
         gaussians.opacity_logits[copies] = nn.functional.softplus(logits).div(2).expm1().log()
 
@@ -42,45 +62,52 @@ def split(
     chosen: Bool[Tensor, " n"],
     generator: torch.Generator,
 ) -> None:
-    """Replaces each chosen Gaussian by two smaller ones drawn from it."""
+    """Replaces each chosen Gaussian by two smaller ones, whose centres are drawn from it.
+
+    Source: Kerbl et al., 2023, section 5.2.
+    """
+    shrinkage = 1.6  # as Kerbl et al. shrink them
     halves = _append(gaussians, optimizer, chosen)
     with torch.no_grad():
-        scales, quats = gaussians.scales[halves], gaussians.quats[halves]
-        steps = torch.randn(scales.shape, generator=generator).to(scales) * scales
-        gaussians.means[halves] += (quaternions_to_rotations(quats) @ steps[..., None]).squeeze(-1)
-        gaussians.log_scales[halves] -= math.log(1.6)  # as Kerbl et al. shrink them
+        scales = gaussians.scales[halves]  # (m, 3) [m]
+        rotations = quaternions_to_rotations(gaussians.quats[halves])  # (m, 3, 3)
+        steps = torch.randn(scales.shape, generator=generator).to(scales) * scales  # own axes [m]
+        gaussians.means[halves] += (rotations @ steps[..., None]).squeeze(-1)
+        gaussians.log_scales[halves] -= math.log(shrinkage)
 
 
 def _append(
     gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]
 ) -> Bool[Tensor, " m"]:
-    """Appends copies of the chosen Gaussians; gives a mask of originals and copies."""
-    copy = lambda values: torch.cat((values, values[chosen]))
-    _rearrange(
-        gaussians,
-        optimizer,
-        copy,
-        lambda state: torch.cat((state, torch.zeros_like(state[chosen]))),
-    )
+    """Appends copies of the chosen Gaussians; returns a mask of originals and copies."""
+
+    def with_copies(rows: Tensor) -> Tensor:
+        return torch.cat((rows, rows[chosen]))
+
+    def with_zeros(rows: Tensor) -> Tensor:
+        # A copy has no history: its moments in the optimizer start at zero.
+        return torch.cat((rows, torch.zeros_like(rows[chosen])))
+
+    _rearrange(gaussians, optimizer, with_copies, with_zeros)
     return torch.cat((chosen, chosen[chosen]))
 
 
-def _rearrange(gaussians: Gaussians, optimizer: Optimizer, pick: Pick, pick_state: Pick) -> None:
+def _rearrange(
+    gaussians: Gaussians, optimizer: Optimizer, select: SelectRows, select_state: SelectRows
+) -> None:
     """Replaces the parameters in the module and in the optimizer."""
     for name in gaussians.PARAMETERS:
         old = getattr(gaussians, name)
-        new = nn.Parameter(pick(old.detach()), old.requires_grad)
+        new = nn.Parameter(select(old.detach()), old.requires_grad)
         setattr(gaussians, name, new)
         for group in optimizer.param_groups:
-            group["params"] = [
-                new if parameter is old else parameter for parameter in group["params"]
-            ]
-        if state := optimizer.state.pop(old, None):
-            # An entry has a row for each Gaussian (in Adafactor without all axes), or is one
-            # number.
-            optimizer.state[new] = {
-                key: pick_state(value)
-                if torch.is_tensor(value) and value.shape[:1] == old.shape[:1]
-                else value
-                for key, value in state.items()
-            }
+            parameters = group["params"]
+            group["params"] = [new if parameter is old else parameter for parameter in parameters]
+        state = optimizer.state.pop(old, None)
+        if not state:
+            continue
+        for key, value in state.items():
+            # A tensor has a row for each Gaussian (Adafactor's lacks other axes), or is one number.
+            if torch.is_tensor(value) and value.shape[:1] == old.shape[:1]:
+                state[key] = select_state(value)
+        optimizer.state[new] = state

@@ -1,5 +1,6 @@
 """Gaussians: parameters, initial lattice, .ply files; Gaussians of a query, and their tokens."""
 
+import itertools
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -21,8 +22,7 @@ SH_DC = 0.5 / math.sqrt(math.pi)
 
 
 class Gaussians(nn.Module):
-    """n anisotropic Gaussians, each a virtual transmitter; parameters are raw, properties are
-    activated.
+    """n anisotropic Gaussians, each a virtual transmitter: raw parameters, activated properties.
 
     Each receiver gets an equal number of Gaussians on a Fibonacci lattice over a zone of the
     sphere, at random distances. ``count`` sets the angular detail: over the upper hemisphere
@@ -42,17 +42,31 @@ class Gaussians(nn.Module):
             to the transmitter.
 
     Attributes:
-        learning_rates: Default learning rate of each parameter, that of ``means`` in [m].
+        learning_rates: Default learning rate of each parameter; the rate of ``means`` in [m].
         degree: Highest degree in use, at first ``degree``; a lower one smooths the signal.
+
+    Raises:
+        ValueError: An option is out of range.
 
     Source: parametrisation of Kerbl et al., 3D Gaussian Splatting, 2023. By reciprocity the
     transmitter takes the camera's place: a receiver sees each Gaussian from one direction only,
     where harmonics would add nothing.
+
+    Example:
+        >>> from gaigs.splatting.gaussians import Gaussians
+        >>> scene = gaigs.links("synthetic", transmitters=20, order=0).scene
+        >>> gaussians = Gaussians(scene, zone=(0.0, 1.5), channels=2, count=50)
+        >>> gaussians.means.shape, gaussians.signal.shape
+        (torch.Size([50, 3]), torch.Size([50, 2, 1]))
     """
 
     learning_rates: Mapping[str, float] = {
-        "means": 5e-3, "quats": 1e-3, "log_scales": 5e-3, "opacity_logits": 1e-2, "signal": 3e-2
-    }  # fmt: skip
+        "means": 5e-3,
+        "quats": 1e-3,
+        "log_scales": 5e-3,
+        "opacity_logits": 1e-2,
+        "signal": 3e-2,
+    }
     PARAMETERS = tuple(learning_rates)
 
     def __init__(
@@ -69,73 +83,81 @@ class Gaussians(nn.Module):
         degree: int = 0,
     ):
         super().__init__()
-        receivers = len(scene.receivers)
         if count < 1:
             raise ValueError(f"gaussians.count must be at least 1, got {count}")
-        count = max(count, receivers)
         if not 0 < near <= far < FAR:
             raise ValueError(
-                f"gaussians.near and far must satisfy 0 < near <= far < {FAR:g} m, got {near} and {far}"
+                f"gaussians.near and far must satisfy 0 < near <= far < {FAR:g} m, "
+                f"got {near} and {far}"
             )
         if not (0 < spread <= 1e6 and 0 < opacity < 1 and 0 <= signal <= 1e6 and degree >= 0):
             raise ValueError(
-                "gaussians.spread must lie in (0, 1e6], opacity in (0, 1), signal in [0, 1e6], and degree must be at "
-                f"least 0, got {spread=}, {opacity=}, {signal=}, {degree=}"
+                "gaussians.spread must lie in (0, 1e6], opacity in (0, 1), signal in [0, 1e6], "
+                f"and degree must be at least 0, got {spread=}, {opacity=}, {signal=}, {degree=}"
             )
         self.degree = degree
-        shares = [count // receivers + (i < count % receivers) for i in range(receivers)]
-        means, scales = [], []
+        receivers = len(scene.receivers)
+        count = max(count, receivers)
         low, high = zone
-        for receiver, share in zip(scene.receivers, shares, strict=True):
-            directions = fibonacci_lattice(share, low, high)
-            distances = near + (far - near) * torch.rand(share)
-            pitch = math.sqrt(2 * math.pi * (math.sin(high) - math.sin(low)) / share)
+        means = []
+        scales = []
+        for i, receiver in enumerate(scene.receivers):
+            share = count // receivers + (i < count % receivers)
+            directions = fibonacci_lattice(share, low, high)  # (share, 3)
+            distances = near + (far - near) * torch.rand(share)  # [m]
             means.append(receiver.pose.world(distances[:, None] * directions))
+            # Angle between neighbours: the root of the zone's solid angle for each of them.
+            pitch = math.sqrt(2 * math.pi * (math.sin(high) - math.sin(low)) / share)  # [rad]
             scales.append(distances * pitch * spread)
-        self.means = nn.Parameter(torch.cat(means))
+        self.means = nn.Parameter(torch.cat(means))  # (n, 3)
         self.quats = nn.Parameter(torch.randn(count, 4))
-        self.log_scales = nn.Parameter(torch.cat(scales).log()[:, None].repeat(1, 3))
+        self.log_scales = nn.Parameter(torch.cat(scales).log()[:, None].repeat(1, 3))  # (n, 3)
         self.opacity_logits = nn.Parameter(torch.full((count,), opacity).logit())
+        constant = signal * torch.randn(count, channels, 1)
+        # Harmonics above the constant start at zero: at first the signal is the same everywhere.
         bands = torch.zeros(count, channels, (degree + 1) ** 2 - 1)
-        self.signal = nn.Parameter(torch.cat((signal * torch.randn(count, channels, 1), bands), -1))
+        self.signal = nn.Parameter(torch.cat((constant, bands), -1))  # (n, c, k)
 
     def __len__(self) -> int:
         return len(self.means)
 
     @property
     def scales(self) -> Float[Tensor, "n 3"]:
+        """Standard deviations along the axes [m]."""
         return self.log_scales.exp()
 
     @property
     def opacities(self) -> Float[Tensor, " n"]:
+        """Opacities in (0, 1)."""
         return self.opacity_logits.sigmoid()
 
     @property
     def unit_quats(self) -> Float[Tensor, "n 4"]:
+        """Quaternions (w, x, y, z) of length 1."""
         return unit_quaternions(self.quats)
 
     @property
     def covariances(self) -> Float[Tensor, "n 3 3"]:
+        """Covariances in the world frame [m²]."""
         axes = semi_axes(self.quats, self.scales)
         return axes @ axes.mT
 
     @property
     def bands(self) -> Float[Tensor, "n c k"]:
+        """Coefficients of the signal up to ``degree``."""
         return self.signal[..., : (self.degree + 1) ** 2]
 
     def resize(self, count: int) -> None:
         """Changes the number of Gaussians; values are undefined."""
         for name in self.PARAMETERS:
             old = getattr(self, name)
-            setattr(
-                self, name, nn.Parameter(old.new_empty(count, *old.shape[1:]), old.requires_grad)
-            )
+            new = nn.Parameter(old.new_empty(count, *old.shape[1:]), old.requires_grad)
+            setattr(self, name, new)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        """Takes the checkpoint's number of Gaussians, which density control has changed since the
-        start.
-        """
-        if (means := state_dict.get(f"{prefix}means")) is not None and len(means) != len(self):
+        """Takes the checkpoint's number of Gaussians, which density control may have changed."""
+        means = state_dict.get(f"{prefix}means")
+        if means is not None and len(means) != len(self):
             self.resize(len(means))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
@@ -146,33 +168,40 @@ class Gaussians(nn.Module):
         three channels are in f_dc_*, missing ones as 0. f_rest_* hold, channel by channel, the
         higher coefficients of these three and all coefficients of further channels.
         """
-        write_ply(
-            path, dict(self.named_parameters()), f"gaigs: {self.signal.shape[1]} signal channels"
-        )
+        comment = f"gaigs: {self.signal.shape[1]} signal channels"
+        write_ply(path, dict(self.named_parameters()), comment)
 
 
 def fibonacci_lattice(count: int, low: float, high: float) -> Float[Tensor, "count 3"]:
-    """Unit vectors evenly over a zone between two elevations [rad]; Swinbank and Purser, Fibonacci
-    grids, 2006.
+    """Unit vectors evenly over a zone of the sphere between two elevations [rad].
+
+    Source: Swinbank and Purser, Fibonacci grids, 2006.
     """
     i = torch.arange(count, dtype=torch.float64) + 0.5
+    # Equal steps in height are equal areas on the sphere; the golden angle separates neighbours.
     heights = math.sin(low) + (math.sin(high) - math.sin(low)) * i / count
     golden = math.pi * (1 + math.sqrt(5))
-    return from_spherical(torch.remainder(golden * i, 2 * math.pi), torch.asin(heights)).float()
+    azimuths = torch.remainder(golden * i, 2 * math.pi)
+    return from_spherical(azimuths, torch.asin(heights)).float()
 
 
 def write_ply(path: str | Path, values: Mapping[str, Tensor], comment: str) -> None:
-    """Writes raw parameters, by the names in ``Gaussians.PARAMETERS``, in the format of
-    ``Gaussians.save_ply``.
+    """Writes raw parameters in the format of ``Gaussians.save_ply``.
+
+    Args:
+        path: The file.
+        values: Parameters by the names in ``Gaussians.PARAMETERS``.
+        comment: A line of the file's header.
     """
-    n, channels, _ = values["signal"].shape
-    parameters = {name: value.detach().cpu().float() for name, value in values.items()} | {
-        "normals": torch.zeros(n, 3)
-    }
-    shown = nn.functional.pad(parameters["signal"], (0, 0, 0, max(0, 3 - channels)))
-    parameters["signal"] = torch.cat(
-        (shown[:, :3, 0], shown[:, :3, 1:].flatten(1), shown[:, 3:].flatten(1)), 1
-    )
+    parameters = {name: value.detach().cpu().float() for name, value in values.items()}
+    signal = parameters["signal"]  # (n, c, k)
+    n, channels, _ = signal.shape
+    signal = nn.functional.pad(signal, (0, 0, 0, max(0, 3 - channels)))  # at least 3 channels
+    colours = signal[:, :3, 0]  # (n, 3)
+    harmonics = signal[:, :3, 1:].flatten(1)
+    others = signal[:, 3:].flatten(1)
+    parameters["signal"] = torch.cat((colours, harmonics, others), 1)
+    parameters["normals"] = torch.zeros(n, 3)
     rest = parameters["signal"].shape[1] - 3
     properties = {  # in the order that viewers expect
         "means": ["x", "y", "z"],
@@ -182,24 +211,22 @@ def write_ply(path: str | Path, values: Mapping[str, Tensor], comment: str) -> N
         "log_scales": [f"scale_{i}" for i in range(3)],
         "quats": [f"rot_{i}" for i in range(4)],
     }
-    rows = torch.cat([parameters[name].reshape(n, -1) for name in properties], 1).numpy()
-    vertices = unstructured_to_structured(
-        rows, names=[name for names in properties.values() for name in names]
-    )
+    columns = torch.cat([parameters[name].reshape(n, -1) for name in properties], 1)
+    names = [*itertools.chain.from_iterable(properties.values())]
+    vertices = unstructured_to_structured(columns.numpy(), names=names)
     with atomic_write(path) as part:
         PlyData([PlyElement.describe(vertices, "vertex")], comments=[comment]).write(str(part))
 
 
 class Placed(NamedTuple):
-    """The Gaussians of each query, before a deformation. Fields that do not depend on the query
-    have b = 1.
+    """The Gaussians of each query before a deformation.
 
     Attributes:
-        means: Centres, world frame (1 or b, n, 3) [m].
-        lengths: Length of each Gaussian's path from transmitter to receiver (b, n) [m]; None:
+        means: Centres, world frame (1 or b, n, 3) [m]; 1 where they do not depend on the query.
+        lengths: Length of each Gaussian's path from transmitter to receiver (b, n) [m]; None if
             unknown.
-        quats, scales, opacities, signal: As of ``Gaussians``; scales (1 or b, n, 3) [m], signal (n,
-            c, 1) or (b, n, c, 1). None: those of the free Gaussians.
+        quats, scales, opacities, signal: As in ``Gaussians``; scales (1 or b, n, 3) [m], signal (n,
+            c, 1) or (b, n, c, 1). None: the free Gaussians have them.
         gains: Complex factor of the signal, phase included (b, n). None: 1.
         coherences: Share of each path's field, in [0, 1] (n,), with a known phase; the rest adds as
             power. None: 1.
@@ -218,14 +245,14 @@ class Placed(NamedTuple):
 
 
 class Tokens(NamedTuple):
-    """Input of a deformation; any width may be 0.
+    """Embeddings that a tokenizer gives to a deformation; any width may be 0.
 
     Attributes:
         scene: CLS for each query.
         gaussians: E(P_x) for each Gaussian, or for each query and Gaussian.
         transmitters: E(P_TX) for each query.
 
-    Source: GAI-GS, "Multi-view Tokenizer".
+    Source: GAI-GS, "Multi-view Tokenizer", eq. (10).
     """
 
     scene: Float[Tensor, "b d_scene"]

@@ -1,4 +1,4 @@
-"""Rules, tolerances, tensors, gradients and random inputs, shared by the checks."""
+"""Rules, tolerances, gradients and random inputs, shared by the checks."""
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any
@@ -20,9 +20,7 @@ def require(holds: object, rule: str) -> None:
 
 
 def require_refusal(call: Callable[[], object], rule: str) -> None:
-    """Raises an ``AssertionError`` with the rule unless a call raises a ``ValueError``, or a type
-    checker's error.
-    """
+    """Requires a ``ValueError`` of a call, or a type checker's error."""
     try:
         call()
     except (ValueError, TypeError):
@@ -34,30 +32,30 @@ def require_refusal(call: Callable[[], object], rule: str) -> None:
 
 def require_close(actual: Tensor, expected: Tensor, tolerance: float, rule: str) -> None:
     """Requires equality to within a fraction of the largest expected value, at least 1."""
-    largest = max(1.0, expected.abs().max().item()) if expected.numel() else 1.0
+    largest = max(1.0, _largest(expected))
     wide = torch.complex128 if expected.is_complex() else torch.float64
-    torch.testing.assert_close(
-        actual.to(wide),
-        expected.to(wide),
-        rtol=0,
-        atol=tolerance * largest,
-        msg=lambda detail: f"{rule}\n{detail}",
-    )
+    _require_within(actual.to(wide), expected.to(wide), tolerance * largest, rule)
 
 
 def require_same(actual: Tensor, expected: Tensor, rule: str) -> None:
-    """Requires equality; but for rounding on a GPU, which adds in any order."""
-    if actual.device.type == "cpu" or not (actual.is_floating_point() or actual.is_complex()):
+    """Requires equal bits; on a GPU, which adds in any order, equality but for rounding."""
+    rounds = actual.is_floating_point() or actual.is_complex()
+    if actual.device.type == "cpu" or not rounds:
         require(torch.equal(actual, expected), rule)
     else:
-        least = (
-            1e3
-            * torch.finfo(actual.dtype).eps
-            * (expected.abs().max().item() if expected.numel() else 0.0)
-        )
-        torch.testing.assert_close(
-            actual, expected, rtol=0, atol=least, msg=lambda detail: f"{rule}\n{detail}"
-        )
+        rounding = 1e3 * torch.finfo(actual.dtype).eps * _largest(expected)
+        _require_within(actual, expected, rounding, rule)
+
+
+def _largest(values: Tensor) -> float:
+    return values.abs().max().item() if values.numel() else 0.0
+
+
+def _require_within(actual: Tensor, expected: Tensor, most: float, rule: str) -> None:
+    def explain(detail: str) -> str:
+        return f"{rule}\n{detail}"
+
+    torch.testing.assert_close(actual, expected, rtol=0, atol=most, msg=explain)
 
 
 def require_tensor(
@@ -68,57 +66,56 @@ def require_tensor(
     device: torch.device | str | None = None,
 ) -> None:
     """Requires a finite tensor of that shape, dtype and type of device."""
-    require(
-        tuple(tensor.shape) == tuple(shape),
-        f"{name} must be of shape {tuple(shape)}, got {tuple(tensor.shape)}",
-    )
+    shapes = tuple(shape), tuple(tensor.shape)
+    require(shapes[0] == shapes[1], f"{name} must be of shape {shapes[0]}, got {shapes[1]}")
     require(tensor.dtype == dtype, f"{name} must be {dtype} as its input, got {tensor.dtype}")
-    same = device is None or tensor.device.type == torch.device(device).type
-    require(same, f"{name} must be on {device} as its input, got {tensor.device}")
+    stays = device is None or tensor.device.type == torch.device(device).type
+    require(stays, f"{name} must be on {device} as its input, got {tensor.device}")
     require(tensor.isfinite().all(), f"{name} must be finite")
 
 
 def require_independence(
     result: Any, again: Any, alone: Any, per_query: Collection[str], tolerance: float
 ) -> None:
-    """Requires named tuples of two calls to be the same, and one of the last query alone to equal
-    the last row.
+    """Requires that a call can be repeated, and that queries do not depend on each other.
+
+    Args:
+        result, again: Named tuples of two equal calls.
+        alone: Named tuple of a call with the last query only.
+        per_query: Fields that may have a row for each query.
+        tolerance: As for ``require_close``.
     """
-    for name, whole, twice, single in zip(result._fields, result, again, alone, strict=True):
-        if whole is None:
-            require(
-                twice is None and single is None,
-                f"{name} must be given for all queries or for none",
-            )
+    for name, first, second, last in zip(result._fields, result, again, alone, strict=True):
+        if first is None:
+            missing = second is None and last is None
+            require(missing, f"{name} must be given for all queries or for none")
             continue
-        require_same(whole, twice, f"two calls must give the same {name}")
-        own = whole[-1:] if name in per_query else whole
-        require_close(single, own, tolerance, f"{name} must not depend on the other queries")
+        require_same(first, second, f"two calls must give the same {name}")
+        row = first[-1:] if name in per_query else first
+        require_close(last, row, tolerance, f"{name} must not depend on the other queries")
 
 
 def require_gradients(outputs: Iterable[Tensor | None], leaves: Mapping[str, Tensor]) -> None:
-    """Requires finite gradients of a fixed function of the outputs; a leaf that has no influence
-    needs none.
-    """
-    given = [
-        output
-        for output in outputs
-        if output is not None and output.requires_grad and output.numel()
-    ]
-    if not given or not leaves:
+    """Requires finite gradients of a fixed function of the outputs; an unused leaf needs none."""
+    sums = []
+    for output in outputs:
+        if output is not None and output.requires_grad and output.numel():
+            sums.append(fixed_sum(output))
+    if not sums or not leaves:
         return
     gradients = torch.autograd.grad(
-        sum(map(fixed_sum, given)), [*leaves.values()], allow_unused=True, retain_graph=True
+        sum(sums), [*leaves.values()], allow_unused=True, retain_graph=True
     )
     for name, gradient in zip(leaves, gradients, strict=True):
-        require(
-            gradient is None or gradient.isfinite().all(), f"the gradient of {name} must be finite"
-        )
+        is_finite = gradient is None or gradient.isfinite().all()
+        require(is_finite, f"the gradient of {name} must be finite")
 
 
 def require_groups(groups: Mapping[str, Iterable[nn.Parameter]], module: nn.Module) -> None:
-    """Requires that each parameter of a module is in exactly one group."""
-    grouped = [id(parameter) for group in groups.values() for parameter in group]
+    """Requires each parameter of a module in exactly one group."""
+    grouped: list[int] = []
+    for group in groups.values():
+        grouped += map(id, group)
     rule = "each parameter must be in one of parameter_groups"
     require(sorted(grouped) == sorted(map(id, module.parameters())), rule)
 
@@ -132,7 +129,7 @@ def fixed_sum(values: Tensor) -> Tensor:
 
 
 def random_places(scene: Scene, count: int, generator: torch.Generator) -> Tensor:
-    """Uniform in the box of the training transmitters (count, 3) [m]."""
+    """Places uniform in the box of the training transmitters (count, 3) [m]."""
     return torch.lerp(scene.lower, scene.upper, torch.rand(count, 3, generator=generator))
 
 
@@ -143,23 +140,24 @@ def random_query(
     dtype: torch.dtype,
     device: torch.device | str,
 ) -> Query:
-    """Links from random places to the receivers in turn, at the scene's carriers in turn where
-    there are any.
-    """
+    """Links from random places to the receivers in turn, at the scene's carriers in turn."""
     number = torch.arange(count)
-    frequencies = (
-        scene.frequencies[number % len(scene.frequencies)] if len(scene.frequencies) else None
-    )
+    frequencies = None
+    if len(scene.frequencies):
+        frequencies = scene.frequencies[number % len(scene.frequencies)]
     places = random_places(scene, count, generator).to(dtype)
     return Query(places, number % len(scene.receivers), frequencies).to(device)
 
 
 def flat(state: object) -> list:
-    """The content of nested lists and dicts as one list that can be compared."""
+    """The content of nested lists and dictionaries as one list that can be compared."""
     if isinstance(state, Tensor):
         return [str(state.dtype), state.tolist()]
     if isinstance(state, dict):
-        return [x for key, part in state.items() for x in (key, *flat(part))]
-    if isinstance(state, list | tuple):
-        return [x for part in state for x in flat(part)]
-    return [state]
+        state = [*state.items()]
+    if not isinstance(state, list | tuple):
+        return [state]
+    content = []
+    for part in state:
+        content += flat(part)
+    return content

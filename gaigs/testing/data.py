@@ -19,11 +19,6 @@ from gaigs.core.task.spectrum import MIN_MAX, Spectrum
 from gaigs.data import Links, Split
 from gaigs.testing.checks import flat, require, require_tensor
 
-POSES = (
-    Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)),
-    Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0)),
-)
-
 
 def example_links(task: str = "spectrum", carrier: float | None = None) -> Links:
     """A made-up data set: 24 links to two turned receivers.
@@ -39,10 +34,14 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
         ValueError: There is no such task here.
     """
     generator = torch.Generator().manual_seed(0)
-    places = torch.rand(24, 3, generator=generator) * torch.tensor([6.0, 4.0, 2.0])
-    heard_by = torch.arange(24) % 2
-    rows = torch.arange(24) // 2
+    places = torch.rand(24, 3, generator=generator) * torch.tensor([6.0, 4.0, 2.0])  # (24, 3) [m]
+    receivers = torch.arange(24) % 2
+    rows: Tensor | None = torch.arange(24) // 2
     array = Array.single()
+    poses = (
+        Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)),
+        Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0)),
+    )
     made: Task
     match task:
         case "spectrum":
@@ -50,31 +49,26 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
             made = Spectrum(grid.elevations, grid.azimuths, "none" if carrier is None else MIN_MAX)
             if carrier is not None:
                 array = Array.planar(3, 3, speed_of_light / carrier / 2, "cosine")
-            labels, rows = torch.rand(24, *grid.shape, generator=generator), None
+            labels = torch.rand(24, *grid.shape, generator=generator)
+            rows = None
         case "rssi":
-            made, places = Rssi(), places[:12].repeat_interleave(2, 0)
+            made = Rssi()
+            places = places[:12].repeat_interleave(2, 0)
             labels = -60 - 10 * torch.rand(24, generator=generator)
         case "csi":
-            array, places = (
-                Array.planar(2, 2, speed_of_light / 2.44e9 / 2),
-                places[:12].repeat_interleave(2, 0),
-            )
+            array = Array.planar(2, 2, speed_of_light / 2.44e9 / 2)
+            places = places[:12].repeat_interleave(2, 0)
             frequencies = 2.44e9 + torch.linspace(-1e7, 1e7, 5, dtype=torch.float64)
             made = Csi(len(array), frequencies)
             noise = torch.randn(24, *made.shape, dtype=torch.complex64, generator=generator)
-            elements = torch.stack(
-                [pose.to(array.elements).world(array.elements) for pose in POSES]
-            )[heard_by]
-            distances = (places[:, None] - elements).double().norm(dim=-1)[..., None]
-            direct = torch.polar(
-                1 / distances, -2 * math.pi * frequencies / speed_of_light * distances
-            )
-            labels = direct.to(torch.complex64) + 0.1 * noise
+            turned = [pose.to(array.elements).world(array.elements) for pose in poses]
+            elements = torch.stack(turned)[receivers]  # (24, 4, 3) [m]
+            labels = _direct_waves(places, elements, frequencies) + 0.1 * noise
         case _:
             raise ValueError(f"task must be spectrum, rssi or csi, got {task!r}")
     return Links(
-        query=Query(places, heard_by, None if carrier is None else torch.full((24,), carrier)),
-        receivers=tuple(Receiver(f"gateway{i}", pose, array) for i, pose in enumerate(POSES)),
+        query=Query(places, receivers, None if carrier is None else torch.full((24,), carrier)),
+        receivers=tuple(Receiver(f"gateway{i}", pose, array) for i, pose in enumerate(poses)),
         labels=labels,
         task=made,
         rows=rows,
@@ -84,83 +78,62 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
     )
 
 
+def _direct_waves(places: Tensor, elements: Tensor, frequencies: Tensor) -> Tensor:
+    """Waves of free space (b, e, s): exp(-j 2 pi f d / c) / d, with d from place to element."""
+    distances = (places[:, None] - elements).double().norm(dim=-1)[..., None]  # (b, e, 1) [m]
+    phases = -2 * math.pi * frequencies / speed_of_light * distances  # (b, e, s) [rad]
+    return torch.polar(1 / distances, phases).to(torch.complex64)
+
+
 def check_data(links: Links) -> None:
-    """Checks a reader's links: shapes, ranges, repeatable labels, parts without overlap, a storable
-    scene.
+    """Checks links: shapes, ranges, repeatable labels, disjoint parts, a scene that can be stored.
 
     The contract is that of ``gaigs.data.Links``.
     """
-    n = len(links)
     _check_query(links)
-    for receiver in links.receivers:
-        elements = receiver.array.elements
-        require_tensor(
-            f"the position of {receiver.name}", receiver.pose.position, (3,), torch.float32
-        )
-        require_tensor(
-            f"the elements of {receiver.name}", elements, (len(elements), 3), elements.dtype
-        )
-        require(
-            elements.dtype.is_floating_point, f"the elements of {receiver.name} must be floats [m]"
-        )
-    width = links.bandwidth
-    known = width is None or 0 <= width < math.inf
-    require(known, f"bandwidth must be 0 or more [Hz], or None where it is unknown, got {width}")
-    names = [receiver.name for receiver in links.receivers]
-    require(len({*names}) == len(names), "receivers must have different names")
+    _check_receivers(links)
     require_tensor("edges", links.edges, (len(links.edges), 2, 3), torch.float32)
+    width = links.bandwidth
+    is_known = width is None or 0 <= width < math.inf
+    require(is_known, f"bandwidth must be 0 or more [Hz], or None where it is unknown, got {width}")
     _check_rows(links)
-    with contextlib.suppress(
-        FileNotFoundError
-    ):  # a missing index file prevents the official split only
+    with contextlib.suppress(FileNotFoundError):  # without its file only the official split fails
         if links.official is not None:
             train, test = links.official()
-            check_parts({"train": train, "test": test}, n)
+            check_parts({"train": train, "test": test}, len(links))
     if links.split is not None:
-        check_parts(links.split.parts(), n)
+        check_parts(links.split.parts(), len(links))
     _check_labels(links)
-    everything = torch.arange(n)
-    state = replace(
-        links, split=links.split or Split("all", everything, everything[:0], everything[:0])
-    ).scene.state()
-    require(
-        flat(state) == flat(Scene.from_state(state).state()),
-        "the scene must come back from its state as it was",
-    )
+    everything = torch.arange(len(links))
+    split = links.split or Split("all", everything, everything[:0], everything[:0])
+    state = replace(links, split=split).scene.state()
+    again = Scene.from_state(state).state()
+    require(flat(state) == flat(again), "the scene must come back from its state as it was")
 
 
 def check_parts(parts: dict[str, Tensor], n: int) -> None:
-    """Checks parts of n links: ascending numbers without repetition, with links to train and to
-    test on.
-    """
+    """Checks the parts of n links: ascending, without repetition, with links to train and test."""
     for name, part in parts.items():
-        require(
-            part.ndim == 1 and part.dtype == torch.long,
-            f"{name} must be the numbers of links, got {part.dtype}",
-        )
+        is_index = part.ndim == 1 and part.dtype == torch.long
+        require(is_index, f"{name} must be the numbers of links, got {part.dtype}")
         require(part.diff().gt(0).all(), f"{name} must ascend")
     everything = torch.cat([*parts.values()])
-    require(
-        len(everything.unique()) == len(everything),
-        f"no link may stand twice in {', '.join(parts)}",
-    )
+    once = len(everything.unique()) == len(everything)
+    require(once, f"no link may stand twice in {', '.join(parts)}")
     require((everything.lt(n) & everything.ge(0)).all(), f"the split must point at the {n} links")
-    require(
-        len(parts["train"]) and len(parts["test"]),
-        "the split must leave links to train and to test on",
-    )
+    is_usable = len(parts["train"]) and len(parts["test"])
+    require(is_usable, "the split must leave links to train and to test on")
 
 
 def _check_query(links: Links) -> None:
-    n, index, frequencies = len(links), links.query.receivers, links.query.frequencies
+    n = len(links)
+    index = links.query.receivers
     require_tensor("transmitters", links.query.transmitters, (n, 3), torch.float32)
-    require(
-        tuple(index.shape) == (n,) and index.dtype == torch.long,
-        "receivers must hold an integer for each link",
-    )
-    require(
-        (index.lt(len(links.receivers)) & index.ge(0)).all(), "the query must point into receivers"
-    )
+    is_index = tuple(index.shape) == (n,) and index.dtype == torch.long
+    require(is_index, "receivers must hold an integer for each link")
+    points = index.lt(len(links.receivers)) & index.ge(0)
+    require(points.all(), "the query must point into receivers")
+    frequencies = links.query.frequencies
     if frequencies is not None:
         require_tensor("frequencies", frequencies, (n,), frequencies.dtype)
         require(frequencies.dtype.is_floating_point, "frequencies must be floats [Hz]")
@@ -169,45 +142,47 @@ def _check_query(links: Links) -> None:
         require(inside.all(), f"frequencies must be from {low:g} to {high:g} Hz")
 
 
+def _check_receivers(links: Links) -> None:
+    names = [receiver.name for receiver in links.receivers]
+    require(len({*names}) == len(names), "receivers must have different names")
+    for receiver in links.receivers:
+        position = receiver.pose.position
+        elements = receiver.array.elements
+        require_tensor(f"the position of {receiver.name}", position, (3,), torch.float32)
+        noun = f"the elements of {receiver.name}"
+        require_tensor(noun, elements, (len(elements), 3), elements.dtype)
+        require(elements.dtype.is_floating_point, f"{noun} must be floats [m]")
+
+
 def _check_rows(links: Links) -> None:
     if links.rows is None:
         return
-    rows, places = links.rows, links.query.transmitters
-    require(
-        tuple(rows.shape) == (len(links),) and rows.dtype == torch.long,
-        "rows must hold an integer for each link",
-    )
+    rows = links.rows
+    places = links.query.transmitters
+    is_index = tuple(rows.shape) == (len(links),) and rows.dtype == torch.long
+    require(is_index, "rows must hold an integer for each link")
     require(rows.ge(0).all(), "rows must count from 0")
     _, which = rows.unique(return_inverse=True)
-    first = torch.zeros(int(which.max()) + 1, dtype=torch.long).scatter_(
-        0, which, torch.arange(len(rows))
-    )
-    require(
-        torch.equal(places[first[which]], places),
-        "links of one row must have one transmitter position",
-    )
+    members = torch.zeros(int(which.max()) + 1, dtype=torch.long)
+    members.scatter_(0, which, torch.arange(len(rows)))  # one link of each row
+    at_one_place = torch.equal(places[members[which]], places)
+    require(at_one_place, "links of one row must have one transmitter position")
 
 
 def _check_labels(links: Links) -> None:
     task = links.task
-    some = torch.linspace(0, len(links) - 1, 9).long().flip(0)
-    labels, batch = links.labels[some], links.batch(some)
-    require_tensor("labels", labels, (len(some), *task.shape), task.dtype)
-    require(torch.equal(labels, links.labels[some]), "labels read twice must be the same")
-    require(
-        torch.equal(labels[-1:], links.labels[some[-1:]]),
-        "a label must not depend on the others that are read",
-    )
+    index = torch.linspace(0, len(links) - 1, 9).long().flip(0)
+    labels = links.labels[index]
+    require_tensor("labels", labels, (len(index), *task.shape), task.dtype)
+    require(torch.equal(labels, links.labels[index]), "labels read twice must be the same")
+    alone = torch.equal(labels[-1:], links.labels[index[-1:]])
+    require(alone, "a label must not depend on the others that are read")
+    batch = links.batch(index)
     require(torch.equal(batch.labels, labels), "a batch must have the labels of its links")
     if task.directions is not None:
         require((labels.ge(0) & labels.le(1)).all(), "spectra must lie in [0, 1]")
-        require(
-            task.directions.elevations.abs().max() <= math.pi / 2 + 1e-6,
-            "elevations must be in radians",
-        )
-        require(
-            task.directions.azimuths.abs().max() <= 2 * math.pi + 1e-6,
-            "azimuths must be in radians",
-        )
+        elevations, azimuths = task.directions.elevations.abs(), task.directions.azimuths.abs()
+        require(elevations.max() <= math.pi / 2 + 1e-6, "elevations must be in radians")
+        require(azimuths.max() <= 2 * math.pi + 1e-6, "azimuths must be in radians")
     best = task.scores(labels, labels)[task.monitor]
     require(best.isfinite().all(), "each label must have a score")

@@ -4,6 +4,7 @@ import copy
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -13,6 +14,7 @@ from gaigs.core.antenna import Receiver
 from gaigs.core.geometry import Grid
 from gaigs.core.query import Query
 from gaigs.core.scene import Scene
+from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.splatting.pooling import Pooling
 from gaigs.splatting.pooling.paths import PathPooling, ReceivedPaths
@@ -29,138 +31,133 @@ from gaigs.testing.checks import (
 def check_pooling(
     build: Callable[[Scene], Pooling], links: Links, device: torch.device | str = "cpu"
 ) -> None:
-    """Checks a pooling: the task's value for each map or set of paths, finite gradients,
-    independence of the batch.
+    """Checks a pooling: values, finite gradients, independence of the batch.
 
-    ``build`` makes it for a scene. It is fitted to links of its task, and its twin has the same
-    state. Silent maps and paths are among the inputs. A pooling of maps without a grid of its own
-    is given maps over the label's directions and over a list of some of them. Any other is called
-    with such a list. A pooling of maps whose label is one real number must also take maps that are
-    constant, span 12 decades or are of half precision. The contract is that of
-    ``gaigs.splatting.pooling.Pooling``.
+    It is fitted to links of its task, and its twin has the same state. Silent maps and paths are
+    among the inputs. A pooling of maps without a grid is given maps over the label's directions and
+    over a list of some of them; any other is called with such a list. A pooling of maps to one real
+    number must also take maps that are constant, span 12 decades or are of half precision.
+    The contract is that of ``gaigs.splatting.pooling.Pooling``.
+
+    Args:
+        build: Makes the pooling for a scene.
+        links: Links of its task, with a split.
+        device: Device of the pooling and its inputs.
     """
-    pooling, task = build(links.scene), links.task
-    takes_paths, grid = isinstance(pooling, PathPooling), pooling.grid
-    require(
-        isinstance(pooling.channels, int), f"channels must be a number, got {pooling.channels!r}"
-    )
-    require(
-        not takes_paths or pooling.channels == 2,
-        f"paths have 2 channels, got channels {pooling.channels}",
-    )
-    low, high = pooling.zone
-    require(
-        -math.pi / 2 <= low < high <= math.pi / 2,
-        f"zone must be two elevations [rad], got {pooling.zone}",
-    )
-    require(
-        grid is None or isinstance(grid, Grid),
-        f"grid must be a Grid or None, got {type(grid).__name__}",
-    )
-    if grid is None:
-        grid = task.directions
-    require(
-        takes_paths or grid is not None, f"labels of task {task.name!r} need a pooling with a grid"
-    )
+    pooling = build(links.scene)
+    grid = _check_attributes(pooling, links.task)
     pooling.fit(links)
     twin = build(links.scene)
     twin.load_state_dict(pooling.state_dict())
     receiver = links.query.receivers[0]
     same_receiver = (links.query.receivers == receiver).nonzero()[:, 0]
     for b, dtype in ((3, torch.float32), (1, torch.float32), (3, torch.float64)):
-        module, other = (copy.deepcopy(part).to(device, dtype).eval() for part in (pooling, twin))
+        module = copy.deepcopy(pooling).to(device, dtype).eval()
         query = links.query[same_receiver[:b]].to(device)
-        received: Tensor | ReceivedPaths
-        if takes_paths:
-            noun, paths = "paths", example_paths(links.receivers[int(receiver)], query, dtype)
-            names = ("means", "semi_axes", "amplitudes", "lengths", "coherences", "bandwidth")
-            leaves = {name: getattr(paths, name).requires_grad_() for name in names}
-            silent = torch.zeros_like(paths.amplitudes).requires_grad_()
-            received, silence = paths, replace(paths, amplitudes=silent)
+        if isinstance(pooling, PathPooling):
+            inputs = _path_inputs(links.receivers[int(receiver)], query, dtype)
         else:
-            noun, generator = "maps", torch.Generator().manual_seed(0)
-            image = torch.randn(b, pooling.channels, *grid.shape, generator=generator).to(
-                device, dtype
-            )
-            leaves = {"the map": image.requires_grad_()}
-            received, silence = image, (silent := torch.zeros_like(image).requires_grad_())
-        value = module(received, query)
-        wanted = dtype.to_complex() if task.dtype.is_complex else dtype
-        require_tensor("the value", value, (b, *task.shape), wanted, device)
-        require_same(value, module(received, query), "two calls must give the same value")
-        require_same(value, other(received, query), "a pooling's state dict must restore it")
-        alone = module(rows_of(received, slice(-1, None)), query[-1:])
-        require_close(
-            alone, value[-1:], PRECISION[dtype], f"a value must not depend on the other {noun}"
-        )
-        require_gradients([value], dict(module.named_parameters()) | leaves)
-        quiet = module(silence, query)
-        require(quiet.isfinite().all(), "the value of silence must be finite")
-        require_gradients([quiet], {f"silent {noun}": silent})
-        none = module(rows_of(received, slice(0, 0)), query[:0])
-        require(
-            tuple(none.shape) == (0, *task.shape),
-            f"no {noun} must give no values, got {tuple(none.shape)}",
-        )
-        if not takes_paths and pooling.grid is None:
-            row = image.flatten(2)[:, :, None, ::3]
-            single = module(row, query)
-            require_tensor(
-                "the value of a list of rays", single, (b, *row.shape[2:]), wanted, device
-            )
-            rule = "a list of rays must have the values of their pixels"
-            require_close(single[:, 0], value.flatten(1)[:, ::3], PRECISION[dtype], rule)
-        elif task.directions is not None:
-            rays = task.directions.flatten()[1::3].to(device)
-            rule = "fewer directions must get the same values"
-            require_close(
-                module(received, query, rays), value.flatten(1)[:, 1::3], PRECISION[dtype], rule
-            )
-        if not takes_paths and task.is_scalar:
-            _check_hard_maps(module, image.detach(), query)
+            inputs = _map_inputs(pooling.channels, grid, query, dtype)
+        value = _check_values(module, links.task, inputs, query)
+        restored = copy.deepcopy(twin).to(device, dtype).eval()(inputs.received, query)
+        require_same(value, restored, "a pooling's state dict must restore it")
+        _check_directions(module, links.task, inputs.received, query, value)
+        if isinstance(inputs.received, Tensor) and links.task.is_scalar:
+            _check_hard_maps(module, inputs.received.detach(), query)
 
 
-def example_paths(
-    receiver: Receiver, query: Query, dtype: torch.dtype, n: int = 9
-) -> ReceivedPaths:
-    """Random paths to a receiver, partly coherent over a band, at the carriers of a query or else
-    at 5 GHz.
-    """
-    generator = torch.Generator().manual_seed(1)
-    b, random = (
-        len(query),
-        lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64),
-    )
-    carriers = torch.full((b,), 5e9) if query.frequencies is None else query.frequencies
-    amplitudes = torch.randn(b, n, generator=generator, dtype=torch.complex128)
-    to = lambda part: part.to(query.transmitters.device, dtype)
-    directions = torch.nn.functional.normalize(random(b, n, 3) - 0.5, dim=-1)
-    points = to(directions * (1 + 5 * random(b, n, 1)))
-    return ReceivedPaths(
-        means=receiver.pose.to(points).world(points),
-        semi_axes=to(0.3 * (random(b, n, 3, 3) - 0.5)),
-        amplitudes=amplitudes.to(points.device, dtype.to_complex()),
-        lengths=to(1 + 20 * random(b, n)),
-        coherences=to(random(n)),
-        bandwidth=to(torch.tensor(4e8)),
-        receiver=receiver,
-        carriers=to(carriers),
-    )
+class _PoolingInputs(NamedTuple):
+    """What a pooling is called with, and silence of the same shape, with their leaves by name."""
+
+    noun: str
+    received: Tensor | ReceivedPaths
+    leaves: dict[str, Tensor]
+    silence: Tensor | ReceivedPaths
+    silent: Tensor
 
 
-def rows_of(received: Tensor | ReceivedPaths, rows: slice) -> Tensor | ReceivedPaths:
-    """Some queries' maps or paths."""
-    if isinstance(received, Tensor):
-        return received[rows]
-    names = ("means", "semi_axes", "amplitudes", "lengths", "carriers")
-    return replace(received, **{name: getattr(received, name)[rows] for name in names})
+def _map_inputs(
+    channels: int, grid: Grid | None, query: Query, dtype: torch.dtype
+) -> _PoolingInputs:
+    generator = torch.Generator().manual_seed(0)
+    image = torch.randn(len(query), channels, *grid.shape, generator=generator)
+    image = image.to(query.transmitters.device, dtype).requires_grad_()
+    silence = torch.zeros_like(image).requires_grad_()
+    return _PoolingInputs("maps", image, {"the map": image}, silence, silence)
+
+
+def _path_inputs(receiver: Receiver, query: Query, dtype: torch.dtype) -> _PoolingInputs:
+    paths = example_paths(receiver, query, dtype)
+    names = ("means", "semi_axes", "amplitudes", "lengths", "coherences", "bandwidth")
+    leaves = {name: getattr(paths, name).requires_grad_() for name in names}
+    silent = torch.zeros_like(paths.amplitudes).requires_grad_()
+    return _PoolingInputs("paths", paths, leaves, replace(paths, amplitudes=silent), silent)
+
+
+def _check_attributes(pooling: Pooling, task: Task) -> Grid | None:
+    """Checks channels, zone and grid; returns the directions of a map, if there is one."""
+    channels = pooling.channels
+    require(isinstance(channels, int), f"channels must be a number, got {channels!r}")
+    takes_paths = isinstance(pooling, PathPooling)
+    suits = not takes_paths or channels == 2
+    require(suits, f"paths have 2 channels, got channels {channels}")
+    low, high = pooling.zone
+    is_zone = -math.pi / 2 <= low < high <= math.pi / 2
+    require(is_zone, f"zone must be two elevations [rad], got {pooling.zone}")
+    grid = task.directions if pooling.grid is None else pooling.grid
+    is_grid = grid is None or isinstance(grid, Grid)
+    require(is_grid, f"grid must be a Grid or None, got {type(grid).__name__}")
+    is_given = takes_paths or grid is not None
+    require(is_given, f"labels of task {task.name!r} need a pooling with a grid")
+    return grid
+
+
+def _check_values(pooling: Pooling, task: Task, inputs: _PoolingInputs, query: Query) -> Tensor:
+    """Values and gradients for all queries, the last one, none, and silence."""
+    noun, received = inputs.noun, inputs.received
+    value = pooling(received, query)
+    real = _real_dtype(received)
+    dtype = real.to_complex() if task.dtype.is_complex else real
+    device = query.transmitters.device
+    require_tensor("the value", value, (len(query), *task.shape), dtype, device)
+    require_same(value, pooling(received, query), "two calls must give the same value")
+    alone = pooling(rows_of(received, slice(-1, None)), query[-1:])
+    rule = f"a value must not depend on the other {noun}"
+    require_close(alone, value[-1:], PRECISION[real], rule)
+    require_gradients([value], dict(pooling.named_parameters()) | inputs.leaves)
+    quiet = pooling(inputs.silence, query)
+    require(quiet.isfinite().all(), "the value of silence must be finite")
+    require_gradients([quiet], {f"silent {noun}": inputs.silent})
+    none = tuple(pooling(rows_of(received, slice(0, 0)), query[:0]).shape)
+    require(none == (0, *task.shape), f"no {noun} must give no values, got {none}")
+    return value
+
+
+def _check_directions(
+    pooling: Pooling, task: Task, received: Tensor | ReceivedPaths, query: Query, value: Tensor
+) -> None:
+    """Values for a list of the label's directions."""
+    tolerance = PRECISION[_real_dtype(received)]
+    if isinstance(received, Tensor) and pooling.grid is None:
+        row = received.flatten(2)[:, :, None, ::3]  # (b, c, 1, k)
+        values = pooling(row, query)
+        shape = (len(query), *row.shape[2:])
+        require_tensor("the value of a list of rays", values, shape, value.dtype, value.device)
+        rule = "a list of rays must have the values of their pixels"
+        require_close(values[:, 0], value.flatten(1)[:, ::3], tolerance, rule)
+    elif task.directions is not None:
+        rays = task.directions.flatten()[1::3].to(value.device)
+        values = pooling(received, query, rays)
+        rule = "fewer directions must get the same values"
+        require_close(values, value.flatten(1)[:, 1::3], tolerance, rule)
 
 
 def _check_hard_maps(
     pooling: Pooling, image: Float[Tensor, "b c rows columns"], query: Query
 ) -> None:
-    """Levels and their gradients are finite; float32 where the map is of half precision, whose
-    steps are 0.06 dB.
+    """Levels and their gradients are finite.
+
+    They are float32 where the map is of half precision, whose steps are 0.06 dB.
     """
     decades = torch.linspace(-6, 6, image[0].numel()).reshape(image.shape[1:]).to(image)
     maps = {
@@ -176,3 +173,46 @@ def _check_hard_maps(
         dtype = torch.float32 if leaf.dtype == torch.half else leaf.dtype
         require_tensor(f"the value of {name}", value, value.shape, dtype)
         require_gradients([value], {**dict(pooling.named_parameters()), name: leaf})
+
+
+def _real_dtype(received: Tensor | ReceivedPaths) -> torch.dtype:
+    """The real dtype of maps or paths."""
+    return received.dtype if isinstance(received, Tensor) else received.lengths.dtype
+
+
+def rows_of(received: Tensor | ReceivedPaths, rows: slice) -> Tensor | ReceivedPaths:
+    """Maps or paths of a few queries."""
+    if isinstance(received, Tensor):
+        return received[rows]
+    names = ("means", "semi_axes", "amplitudes", "lengths", "carriers")
+    return replace(received, **{name: getattr(received, name)[rows] for name in names})
+
+
+def example_paths(
+    receiver: Receiver, query: Query, dtype: torch.dtype, n: int = 9
+) -> ReceivedPaths:
+    """Random paths to a receiver, partly coherent over a band of 0.4 GHz.
+
+    They are at the carriers of the query, or else at 5 GHz.
+    """
+    generator = torch.Generator().manual_seed(1)
+    device = query.transmitters.device
+    b = len(query)
+
+    def random(*shape: int) -> Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    amplitudes = torch.randn(b, n, generator=generator, dtype=torch.complex128)
+    directions = torch.nn.functional.normalize(random(b, n, 3) - 0.5, dim=-1)
+    points = (directions * (1 + 5 * random(b, n, 1))).to(device, dtype)  # receiver's frame [m]
+    carriers = torch.full((b,), 5e9) if query.frequencies is None else query.frequencies
+    return ReceivedPaths(
+        means=receiver.pose.to(points).world(points),
+        semi_axes=(0.3 * (random(b, n, 3, 3) - 0.5)).to(device, dtype),
+        amplitudes=amplitudes.to(device, dtype.to_complex()),
+        lengths=(1 + 20 * random(b, n)).to(device, dtype),
+        coherences=random(n).to(device, dtype),
+        bandwidth=torch.tensor(4e8).to(device, dtype),
+        receiver=receiver,
+        carriers=carriers.to(device, dtype),
+    )

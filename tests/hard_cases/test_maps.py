@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import pytest
 import torch
+from contracts.rasterizer import distance_to_jumps, rasterize_densely
 from precision import build_rasterizer
 
 from gaigs.core.geometry import Grid, Pose, from_spherical, semi_axes
 from gaigs.registry import registry
 from gaigs.splatting.projection import NEAR, Plane
 from gaigs.splatting.rasterizer import ALPHA_MAX, ALPHA_MIN
-from gaigs.testing.rasterizer import distance_to_jumps, rasterize_densely
 
 VALUES, GRADIENTS = 1e-4, 5e-3
 """Tolerances of float32, of the largest value or of 1, and of the largest gradient."""

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from contracts.rasterizer import rasterize_densely
 from pipeline import MEAN_POWER, NONE, PARTS, SOFTMAX, trained, two_branch, watch
 from torch import nn
 
@@ -15,7 +16,6 @@ from gaigs.registry import registry
 from gaigs.splatting.gaussians import Placed, Tokens
 from gaigs.splatting.placement import Placement
 from gaigs.testing import check_model, example_links
-from gaigs.testing.rasterizer import rasterize_densely
 
 
 def excite(model, query):

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from contracts.loss import check_loss
 from scipy.constants import speed_of_light
 from scipy.special import factorial, lpmv, sph_harm_y
 from splatting import build, composed, repository
@@ -16,7 +17,7 @@ from gaigs.core.geometry import Rays, from_spherical, to_spherical
 from gaigs.core.query import Batch, Query
 from gaigs.splatting import density
 from gaigs.splatting.gaussians import Gaussians
-from gaigs.testing import check_loss, check_pooling, example_links
+from gaigs.testing import check_pooling, example_links
 
 with repository():
     from gaigs.registry import registry

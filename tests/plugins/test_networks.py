@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import splatting
 import torch
+from contracts.training import check_training
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import CSVLogger
 from scipy.interpolate import BSpline
@@ -24,7 +25,7 @@ from gaigs.model import Model, Prediction
 from gaigs.registry import registry
 from gaigs.report.curves import read_curves
 from gaigs.splatting.loss.absolute import Absolute
-from gaigs.testing import check_training, example_links
+from gaigs.testing import example_links
 from gaigs.training.batches import Batches, InOrder
 
 ROOT = Path(__file__).parents[2]

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from contracts.rasterizer import rasterize_densely
 from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 from scipy.special import sph_harm_y
@@ -16,7 +17,6 @@ from gaigs.core.geometry import semi_axes
 from gaigs.registry import registry
 from gaigs.splatting.gaussians import SH_DC
 from gaigs.testing import check_model, example_links
-from gaigs.testing.rasterizer import rasterize_densely
 
 with repository():
     registry("model").get("rf_3dgs")  # which puts the package in reach

@@ -5,6 +5,9 @@ import functools
 import numpy as np
 import pytest
 import torch
+from contracts.deformation import check_deformation
+from contracts.rasterizer import rasterize_densely
+from contracts.tokenizer import check_tokenizer
 from splatting import build, composed
 from torch.nn.functional import normalize
 
@@ -12,8 +15,7 @@ from gaigs.core.geometry import semi_axes
 from gaigs.core.query import Query
 from gaigs.splatting.deformation.two_branch import INITIAL_ATTENUATION, LEAST_ATTENUATION
 from gaigs.splatting.gaussians import Placed
-from gaigs.testing import check_deformation, check_pooling, check_tokenizer, example_links
-from gaigs.testing.rasterizer import rasterize_densely
+from gaigs.testing import check_pooling, example_links
 
 LINKS = example_links()
 SMALL = ("model=wrf_gs", "gaussians.count=40", "deformation.width=16", "rasterizer=torch")

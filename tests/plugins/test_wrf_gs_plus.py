@@ -5,13 +5,15 @@ import functools
 import numpy as np
 import pytest
 import torch
+from contracts.deformation import check_deformation
+from contracts.rasterizer import rasterize_densely
+from contracts.tokenizer import check_tokenizer
 from splatting import build, composed
 from torch.nn.functional import normalize
 
 from gaigs.core.geometry import semi_axes
 from gaigs.splatting.gaussians import Placed
-from gaigs.testing import check_deformation, check_tokenizer, example_links
-from gaigs.testing.rasterizer import rasterize_densely
+from gaigs.testing import example_links
 
 LINKS = example_links()
 SMALL = ("model=wrf_gs_plus", "gaussians.count=40", "deformation.width=16", "rasterizer=torch")

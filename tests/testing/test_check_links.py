@@ -1,10 +1,10 @@
-"""The checks of data, splits, tasks and models find faults; the example links keep their contracts."""
+"""The checks of data, tasks and models find faults; the example links keep their contracts."""
 
 from dataclasses import replace
 
 import pytest
 import torch
-from faults import broken, having
+from contracts.faults import broken, having
 from torch import nn
 
 from gaigs.core.geometry import Rays
@@ -12,11 +12,10 @@ from gaigs.core.query import Query
 from gaigs.core.task.csi import Csi
 from gaigs.core.task.rssi import Rssi
 from gaigs.core.task.spectrum import Spectrum
-from gaigs.data import Split
 from gaigs.io.images import GreyImages
 from gaigs.model import Model, Prediction
 from gaigs.registry import registry
-from gaigs.testing import check_data, check_model, check_split, check_task, example_links
+from gaigs.testing import check_data, check_model, check_task, example_links
 
 LINKS, RSSI = example_links(), example_links("rssi")
 
@@ -124,55 +123,6 @@ def test_a_missing_index_file_prevents_the_official_split_only():
         raise FileNotFoundError("train_index.txt")
 
     check_data(replace(LINKS, official=read))
-
-
-# --- splits ---
-
-
-def taking(choose):
-    """A split of the RSSI's links by a function of a generator, and the name of the seed."""
-
-    def build(seed):
-        test = choose(torch.Generator().manual_seed(seed))
-        rest = torch.tensor(sorted({*range(24)} - {*test.tolist()}))
-        return Split(f"by row, seed {seed}", rest, rest[:0], test)
-
-    return build
-
-
-def by_row(generator):
-    rows = torch.randperm(12, generator=generator)[:3].sort().values
-    return (2 * rows[:, None] + torch.arange(2)).flatten()
-
-
-def overlapping(seed):
-    split = taking(by_row)(seed)
-    return replace(split, validation=split.train[:2])
-
-
-BY_LINK = taking(lambda generator: torch.randperm(24, generator=generator)[:6].sort().values)
-GLOBAL = taking(lambda _: by_row(torch.Generator().manual_seed(int(torch.randint(1000, ())))))
-
-
-@pytest.mark.parametrize(
-    ("build", "message"),
-    [
-        (BY_LINK, "links of one row must be in one"),
-        (taking(lambda generator: by_row(generator).flip(0)), "test must ascend"),
-        (taking(lambda generator: torch.arange(4)), "another seed must give another split"),
-        (overlapping, "no link may stand twice in train, validation, test"),
-        (
-            lambda seed: replace(taking(by_row)(seed), name="by row"),
-            "a split's name must differ between seeds",
-        ),
-        (GLOBAL, "the same seed must give the same split in any random state"),
-    ],
-)
-def test_a_faulty_split_is_found(build, message):
-    check_split(taking(by_row), RSSI)
-    check_split(BY_LINK, RSSI, parts_rows=True)
-    with pytest.raises(AssertionError, match=message):
-        check_split(build, RSSI)
 
 
 # --- tasks ---

@@ -4,12 +4,13 @@ from functools import partial
 
 import pytest
 import torch
+from contracts.training import check_training
 from fitting import OPTIONS, Plane
 from torch import nn
 
 from gaigs.model import Model, Prediction
 from gaigs.registry import registry
-from gaigs.testing import check_training, example_links
+from gaigs.testing import example_links
 from gaigs.training.descent import Descent
 
 SIMPLE = OPTIONS | {"name": "descent", "thinning": {}}

@@ -1,4 +1,4 @@
-"""Deformations predict the change of each Gaussian for a query from the tokens."""
+"""Deformations predict from the tokens how each Gaussian changes for a query."""
 
 from abc import ABC, abstractmethod
 from typing import NamedTuple
@@ -13,8 +13,14 @@ from gaigs.splatting.gaussians import Placed, Tokens
 class Residuals(NamedTuple):
     """Changes of the Gaussians for a query; None: no change.
 
-    Source: GAI-GS, "Scene Mapping Network": d_rotation, d_scaling, d_signal, d_attn and the
-    attenuation delta.
+    Attributes:
+        delta_quats: d_rotation, added to the unit quaternions.
+        delta_scales: d_scaling, added to the standard deviations [m].
+        delta_signal: d_signal, added to the coefficients of the signal.
+        delta_opacities: d_attn, added to the opacities.
+        attenuations: delta in (0, 1], the share that passes a Gaussian.
+
+    Source: GAI-GS, "Scene Mapping Network"; delta is of eq. (11).
     """
 
     delta_quats: Float[Tensor, "b n 4"] | None = None
@@ -25,8 +31,9 @@ class Residuals(NamedTuple):
 
 
 class Deformation(nn.Module, ABC):
-    """The contract of kind ``deformation``; a constructor may take ``scene``, ``channels`` and
-    ``tokenizer_widths``.
+    """The contract of kind ``deformation``.
+
+    A constructor may take ``scene``, ``channels`` and ``tokenizer_widths``.
 
     Attributes:
         reads_tokens: True if it needs tokens; if False, no tokenizer is built.
@@ -38,7 +45,7 @@ class Deformation(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
-        """Changes for each query.
+        """Predicts the changes for each query.
 
         Args:
             tokens: Tokens of the queries and Gaussians; None if ``reads_tokens`` is False.

@@ -9,7 +9,14 @@ from gaigs.core.task import Task
 
 
 class MeanError(ABC):
-    """A mean over the errors of all links and directions, in the label's unit."""
+    """A mean over the errors of all links and directions.
+
+    Args:
+        task: Task of the labels.
+
+    Raises:
+        ValueError: The labels are complex.
+    """
 
     def __init__(self, task: Task):
         if task.dtype.is_complex:
@@ -18,9 +25,9 @@ class MeanError(ABC):
             )
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
-        """The loss, and the mean absolute error."""
-        errors = values - batch.labels
-        return self.mean(values, batch.labels), {"mae": errors.abs().mean()}
+        """The loss, and the mean absolute error in the label's unit."""
+        mean_error = (values - batch.labels).abs().mean()
+        return self.mean(values, batch.labels), {"mae": mean_error}
 
     @abstractmethod
     def mean(self, values: Tensor, labels: Tensor) -> Tensor:

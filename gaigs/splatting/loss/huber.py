@@ -15,6 +15,9 @@ class Huber(MeanError):
     Args:
         delta: Error at which the square turns into a line, in the label's unit (dB for RSSI).
 
+    Raises:
+        ValueError: ``delta`` is not positive, or the labels are complex.
+
     Source: Huber, Robust estimation of a location parameter, 1964.
     """
 

@@ -20,9 +20,13 @@ class L1Ssim:
     grid, at least 3 and at most all pixels of the thinned grid.
 
     Args:
+        task: Task of the labels, which has directions.
         ssim: Weight of the SSIM term, the paper's 1 - beta.
 
-    Source: GAI-GS, "Results": L_MAE and L_SSIM.
+    Raises:
+        ValueError: The weight is out of range, or the labels have no directions.
+
+    Source: GAI-GS, "Results", eq. (15). Its penalty on d_attn is a penalty of the model.
     """
 
     def __init__(self, task: Task, ssim: float = 0.2):
@@ -32,7 +36,8 @@ class L1Ssim:
             raise ValueError(
                 f"loss 'l1_ssim' compares spectra, not labels of task {task.name!r}; take another"
             )
-        self.ssim, self.pitch = ssim, task.directions.pitch
+        self.ssim = ssim
+        self.pitch = task.directions.pitch  # [rad]
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, and its terms ``l1`` and ``ssim``.
@@ -44,15 +49,21 @@ class L1Ssim:
         window = find_window("l1_ssim", batch.directions, self.pitch, SSIM_WINDOW)
         similarity = structural_similarity(values, batch.labels, window)
         terms = {"l1": (values - batch.labels).abs().mean(), "ssim": 1 - similarity}
+        # eq. (15): beta L_MAE + (1 - beta) L_SSIM.
         return (1 - self.ssim) * terms["l1"] + self.ssim * terms["ssim"], terms
 
 
 def find_window(loss: str, directions: Directions | None, pitch: float, pixels: int) -> int:
-    """Edge [pixels] of the window on a thinned grid that spans the angle of ``pixels`` (odd) on the
-    label's own grid.
+    """Edge of an SSIM window on a thinned grid [pixels].
 
-    ``pitch`` is the angle between neighbouring rows of the label's own grid [rad], ``loss`` a name
-    for errors.
+    Args:
+        loss: Name of the loss, for errors.
+        directions: The thinned grid.
+        pitch: Angle between neighbouring rows of the label's own grid [rad].
+        pixels: Edge of the window on the label's own grid, odd; its angle is kept.
+
+    Raises:
+        ValueError: The directions are a list, or fewer than 3 x 3.
     """
     if not isinstance(directions, Grid):
         raise ValueError(
@@ -62,23 +73,36 @@ def find_window(loss: str, directions: Directions | None, pitch: float, pixels: 
     if smallest < 3:
         raise ValueError(f"loss {loss!r} needs at least 3 x 3 directions, got {directions.shape}")
     step = max(1, round(directions.pitch / pitch))
-    return min(max(3, round((pixels - 1) / step / 2) * 2 + 1), (smallest - 1) // 2 * 2 + 1)
+    same_angle = max(3, round((pixels - 1) / step / 2) * 2 + 1)
+    largest = (smallest - 1) // 2 * 2 + 1  # odd too
+    return min(same_angle, largest)
 
 
 def structural_similarity(
     values: Float[Tensor, "b rows columns"], labels: Float[Tensor, "b rows columns"], window: int
 ) -> Float[Tensor, ""]:
-    """Mean SSIM over all windows within the image: uniform weights, sample covariances, data range
-    1.
+    """Mean SSIM over all windows within the images.
 
-    A window of 7 on the full grid gives the reported score, scikit-image's, with gradients.
+    Weights are uniform, covariances those of a sample, and the data range is 1. A window of 7 on
+    the full grid gives the reported score, scikit-image's, with gradients.
 
-    Source: Wang et al., Image Quality Assessment, 2004, with the constants 0.01² and 0.03².
+    Args:
+        values, labels: Spectra in [0, 1].
+        window: Edge of the window [pixels].
+
+    Source: Wang et al., Image Quality Assessment, 2004, eq. (13), with the constants 0.01² and
+    0.03².
+
+    Example:
+        >>> from gaigs.splatting.loss.l1_ssim import structural_similarity
+        >>> spectra = torch.rand(2, 18, 36)
+        >>> structural_similarity(spectra, spectra, window=7)
+        tensor(1.)
     """
     # The labels' means are separate, as they need no gradient.
     x, xx, xy = window_means(torch.stack((values, values.square(), values * labels)), window)
     y, yy = window_means(torch.stack((labels, labels.square())), window)
-    unbiased = window**2 / (window**2 - 1)
+    unbiased = window**2 / (window**2 - 1)  # of a sample's covariance
     variances = unbiased * (xx - x.square() + yy - y.square())
     covariance = unbiased * (xy - x * y)
     numerator = (2 * x * y + 0.01**2) * (2 * covariance + 0.03**2)
@@ -88,8 +112,7 @@ def structural_similarity(
 def window_means(
     images: Float[Tensor, "*batch rows columns"], window: int
 ) -> Float[Tensor, "*batch r c"]:
-    """Means over every square window within an image, as of ``torch.nn.functional.avg_pool2d`` with
-    stride 1.
+    """Means over every square window within an image, as ``avg_pool2d`` with stride 1 gives them.
 
     On a CPU ``avg_pool2d`` adds window² pixels for each mean; here whole images are added along
     rows, then columns.
@@ -98,6 +121,8 @@ def window_means(
 
 
 class _WindowMeans(torch.autograd.Function):
+    """``window_means`` with its gradient, which spreads each mean's over the window."""
+
     @staticmethod
     def forward(ctx, images, window):
         ctx.window = window
@@ -111,8 +136,8 @@ class _WindowMeans(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, of_means):
-        gradient = of_means / ctx.window**2
+    def backward(ctx, means_gradient):
+        gradient = means_gradient / ctx.window**2
         for axis in (-2, -1):
             count = gradient.shape[axis]
             shape = list(gradient.shape)

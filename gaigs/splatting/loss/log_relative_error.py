@@ -10,15 +10,15 @@ from gaigs.splatting.loss.relative_error import RelativeError
 
 @register("loss", "log_relative_error")
 class LogRelativeError(RelativeError):
-    """The mean over the links of ln((1 + r / floor) / (1 + r floor)), r = |h - h'|² / |h|²: the SNR
-    between two bounds.
+    """The mean over the links of ln((1 + r / floor) / (1 + r floor)), r = |h - h'|² / |h|².
 
-    Between the bounds of -10 log10(floor) and 10 log10(floor) dB the loss is linear in the SNR in
-    dB, so all links have equal weight. Beyond the bounds a link pulls less and less.
+    It is the SNR between two bounds, -10 log10(floor) and 10 log10(floor) dB. Between these the
+    loss is linear in the SNR in dB, so all links have equal weight. Beyond them a link pulls less
+    and less.
 
     Args:
-        floor: Relative error at the upper bound, its inverse is that at the lower one; 1e-3 is 30
-            dB.
+        task: Task of the labels, which are complex.
+        floor: Relative error at the upper bound; its inverse is at the lower one. 1e-3 is 30 dB.
 
     Raises:
         ValueError: The floor is not in (0, 1), or the labels are real.
@@ -35,4 +35,6 @@ class LogRelativeError(RelativeError):
         self.floor = floor
 
     def mean(self, errors: Float[Tensor, " b"]) -> Float[Tensor, ""]:
-        return ((errors / self.floor).log1p() - (errors * self.floor).log1p()).mean()
+        above = (errors / self.floor).log1p()
+        below = (errors * self.floor).log1p()
+        return (above - below).mean()

@@ -11,10 +11,18 @@ from gaigs.registry import register
 
 @register("loss", "relative_error")
 class RelativeError:
-    """The mean over the links of r = |h - h'|² / |h|², with labels aligned by ``Task.align``.
+    """The mean over the links of r = |h - h'|² / |h|².
+
+    Labels are aligned by ``Task.align``, which takes off a phase or delay that nobody knows.
 
     A link in deep shadow outweighs all others: predictions near zero minimise this mean over a
     room. ``log_relative_error`` does not have that fault.
+
+    Args:
+        task: Task of the labels, which are complex.
+
+    Raises:
+        ValueError: The labels are real.
 
     Source: NeWRF, 2024, where it is called NMSE.
     """
@@ -30,13 +38,12 @@ class RelativeError:
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """The loss, which is its only term."""
+        labels = self.task.align(batch.labels, values).flatten(1)  # (b, e s)
         # Scaled by the strongest entry, so that squares of weak channels do not underflow;
         # denormals have no inverse.
-        labels = self.task.align(batch.labels, values).flatten(1)
-        largest = labels.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
-        errors, powers = (
-            (part / largest).abs().square().sum(1) for part in (values.flatten(1) - labels, labels)
-        )
+        largest = labels.abs().amax(1, keepdim=True).clamp_min(FAINTEST)  # (b, 1)
+        errors = ((values.flatten(1) - labels) / largest).abs().square().sum(1)  # (b,)
+        powers = (labels / largest).abs().square().sum(1)  # (b,)
         loss = self.mean(errors / powers)
         return loss, {self.name: loss}
 

@@ -8,7 +8,7 @@ from gaigs.splatting.loss.errors import MeanError
 
 @register("loss", "squared")
 class Squared(MeanError):
-    """The mean squared error; the mean of the labels at a place minimises it."""
+    """Mean squared error; the mean of the labels at a place minimises it."""
 
     def mean(self, values: Tensor, labels: Tensor) -> Tensor:
         return (values - labels).square().mean()

@@ -8,10 +8,10 @@ from gaigs.splatting.placement import Placement
 
 @register("placement", "free")
 class Free(Placement):
-    """The Gaussians' own means.
+    """Gaussians at their own means, whatever the query.
 
     Source: GAI-GS, section "Framework".
     """
 
     def forward(self, gaussians: Gaussians, query: Query) -> Placed:
-        return Placed(gaussians.means[None])
+        return Placed(gaussians.means[None])  # (1, n, 3)

@@ -21,6 +21,8 @@ class Pooling(nn.Module, ABC):
             directions.
         zone: Lowest and highest elevation from which the receiver hears anything [rad]; read where
             ``grid`` is set.
+
+    Source: the final step of GAI-GS, "Projection and Render Module".
     """
 
     channels: int = 2
@@ -43,7 +45,15 @@ class Pooling(nn.Module, ABC):
 
 
 def sphere(option: str, shape: Sequence[int]) -> Grid:
-    """A pooling's own grid from its option [rows, columns]."""
+    """A pooling's own grid from its option [rows, columns].
+
+    Args:
+        option: The option, for errors.
+        shape: Rows and columns of the map over the full sphere.
+
+    Raises:
+        ValueError: There are not two numbers.
+    """
     if len(shape) != 2:
         raise ValueError(f"{option} must be [rows, columns], got {list(shape)}")
     return Grid.sphere(*shape)

@@ -18,11 +18,19 @@ from gaigs.splatting.pooling.beamformer import Beamformer
 
 @register("pooling", "array_response")
 class ArrayResponsePooling(Pooling):
-    """Beamforming with the field at each element: the complex map over the solid angle, times the
-    element's pattern.
+    """The conventional beamformer on the fields of a map at the array's elements.
+
+    A field is the sum of the complex map over the solid angle, times the element's pattern.
 
     Args:
+        scene: Its task has the directions, its receivers the arrays.
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
+
+    Raises:
+        ValueError: The labels are no spectra scaled to [0, 1], or an array has a single element.
+
+    Source: Van Trees, Optimum Array Processing, 2002, section 2.2, for the fields; ``Beamformer``
+    for the rest.
     """
 
     def __init__(self, scene: Scene, grid: Sequence[int] = (24, 48)):
@@ -37,13 +45,18 @@ class ArrayResponsePooling(Pooling):
         query: Query,
         directions: Directions | None = None,
     ) -> Float[Tensor, "b ..."]:
-        waves = torch.complex(*image.flatten(2).unbind(1))
+        real, imaginary = image.flatten(2).unbind(1)  # (b, p) each, p pixels
+        waves = torch.complex(real, imaginary)
         array = self.beamformer.array(query)
-        vectors = self.grid.flatten().vectors().to(image)
-        weights = self.grid.solid_angles.flatten().to(image) * array.gain(vectors)
-        lags = waves.new_zeros(len(query), len(array.lags[2]))
-        for carrier, own in self.beamformer.by_carrier(query):
-            phases = 2 * math.pi * carrier / speed_of_light * (vectors @ array.elements.to(image).T)
-            fields = waves[own] @ torch.polar(weights[:, None].expand_as(phases), phases)
-            lags = lags.index_add(0, own, array.by_lag(fields[:, :, None] * fields[:, None].conj()))
+        vectors = self.grid.flatten().vectors().to(image)  # (p, 3)
+        weights = self.grid.solid_angles.flatten().to(image) * array.gain(vectors)  # (p,)
+        positions = array.elements.to(image)  # (e, 3) [m]
+        lags = waves.new_zeros(len(query), len(array.lags[2]))  # (b, l)
+        for carrier, links in self.beamformer.by_carrier(query):
+            # A wave from u leads at x by 2 pi x . u / lambda [rad].
+            phases = 2 * math.pi * carrier / speed_of_light * (vectors @ positions.T)  # (p, e)
+            steering = torch.polar(weights[:, None].expand_as(phases), phases)  # (p, e)
+            fields = waves[links] @ steering  # (b, e)
+            covariances = fields[:, :, None] * fields[:, None].conj()  # (b, e, e)
+            lags = lags.index_add(0, links, array.by_lag(covariances))
         return self.beamformer(lags, query, directions)

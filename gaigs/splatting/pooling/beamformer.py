@@ -1,9 +1,8 @@
-"""The conventional beamformer: from the covariance of an array's elements to the label of a
-spectrum.
-"""
+"""The conventional beamformer: from the covariance of an array's elements to a spectrum's label."""
 
 import math
 from collections.abc import Iterator
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Complex, Float, Int
@@ -17,20 +16,36 @@ from gaigs.core.scene import Scene, carriers
 from gaigs.core.task.spectrum import MIN_MAX
 
 
+class FoundLags(NamedTuple):
+    """Covariances of which labels are the spectra.
+
+    Attributes:
+        lags: Covariance at each of ``array.lags``, but for each label's scale.
+        unexplained: Share of each label's squared norm that is no such spectrum.
+    """
+
+    lags: Complex[Tensor, "b l"]
+    unexplained: Float[Tensor, " b"]
+
+
 class Beamformer:
     """The amplitude of the conventional beamformer, scaled as the labels are.
 
-        s(u) = sqrt(sum_D n_D R(D) exp(-j 2 pi D . u / lambda)),   label = (s - min s) / (max s -
-        min s)
+        s(u) = sqrt(sum_D n_D R(D) exp(-j 2 pi D . u / lambda))
+        label = (s - min s) / (max s - min s)
 
-    with R(D) the mean covariance of the n_D pairs of elements that are D apart.
+    with R(D) the mean covariance of the n_D pairs of elements that are D apart. It is the root of
+    the paper's |a^H y|², eq. (4).
 
     Args:
         owner: Component named in errors.
         scene: Its task has the directions and the normalisation, its receivers the arrays.
 
-    Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the
-    spectra of NeRF².
+    Raises:
+        ValueError: The labels are no spectra scaled to [0, 1], or an array has a single element.
+
+    Source: GAI-GS, eq. (4); Bartlett, Smoothing periodograms from time series with continuous
+    spectra, 1948; the spectra of NeRF².
     """
 
     def __init__(self, owner: str, scene: Scene):
@@ -38,17 +53,20 @@ class Beamformer:
         if task.directions is None:
             raise ValueError(
                 f"{owner} gives spectra, not labels of task {task.name!r}\n"
-                "take a pooling of that task, such as mean_power for RSSI or element_sum for channels"
+                "take a pooling of that task, such as mean_power for RSSI or element_sum for "
+                "channels"
             )
         if task.normalisation != MIN_MAX:
             raise ValueError(
-                f"{owner} takes labels scaled by {MIN_MAX}, got {task.normalisation!r}; take pooling=spectrum"
+                f"{owner} takes labels scaled by {MIN_MAX}, got {task.normalisation!r}; "
+                "take pooling=spectrum"
             )
         for receiver in scene.receivers:
-            if len(receiver.array) < 2:
+            count = len(receiver.array)
+            if count < 2:
                 raise ValueError(
-                    f"{owner} takes arrays of at least 2 elements, got {len(receiver.array)} of {receiver.name}; set "
-                    "elements and frequency of the data"
+                    f"{owner} takes arrays of at least 2 elements, got {count} of {receiver.name}; "
+                    "set elements and frequency of the data"
                 )
         self.scene = scene
         is_cosine = all(receiver.array.pattern == "cosine" for receiver in scene.receivers)
@@ -57,139 +75,151 @@ class Beamformer:
         # quarter of that.
         step = max(1, task.directions.shape[0] // 16)
         self.coarse = task.directions.thin(slice(None, None, step), slice(None, None, step))
-        self._kept: dict[tuple, Tensor] = {}
+        self._bases: dict[tuple, Tensor] = {}
 
     def __call__(
         self, lags: Complex[Tensor, "b l"], query: Query, directions: Directions | None = None
     ) -> Float[Tensor, "b ..."]:
-        """Spectra from covariances at the lags of the receiver's array.
+        """Computes spectra from covariances at the lags of the receiver's array.
 
         Args:
             lags: Mean covariance of the pairs of elements at each of ``array.lags``.
             query: The link of each row; all to one receiver.
             directions: Wanted directions; None: the task's.
         """
-        own = self.scene.task.directions
-        asked = own if directions is None else directions
-        half = lags.shape[1] // 2
-        power = lags[:, half].real
+        grid = self.scene.task.directions
+        asked = grid if directions is None else directions
+        has_extremes = asked is grid or grid.matches(asked)
+        # The lags are symmetric: the middle one is the power, the later half determines the rest.
+        middle = lags.shape[1] // 2
+        power = lags[:, middle].real  # (b,)
         # Relative to the power, so that no scale of the fields overflows; silence has no spectrum,
         # and 0 stands for it.
-        relative = lags[:, half:] / torch.where(power < FAINTEST, 1, power)[:, None]
-        parts = torch.cat((relative.real, relative.imag), 1)
-        is_whole = asked is own or own.matches(asked)
-        spectra, order = (
-            [parts.new_zeros(0, math.prod(asked.shape))],
-            [torch.zeros(0).long().to(parts.device)],
-        )
+        relative = lags[:, middle:] / torch.where(power < FAINTEST, 1, power)[:, None]
+        parts = torch.cat((relative.real, relative.imag), 1)  # (b, m)
+        spectra = [parts.new_zeros(0, math.prod(asked.shape))]
+        order = [torch.zeros(0).long().to(parts.device)]
         for carrier, links in self.by_carrier(query):
-            amplitudes = self._look(parts[links], carrier, query, asked)
+            amplitudes = self._look(parts[links], carrier, query, asked)  # (b, k)
             shown = amplitudes
-            if not is_whole:
-                shown = torch.cat(
-                    (amplitudes, self._look(parts[links], carrier, query, self.coarse)), 1
-                )
-            # Pixels are many, and each pass over them in memory costs as much as the beamformer
-            # itself. Gradients of amin and amax take four, those of min and max hardly one; without
-            # gradients amin and amax are faster.
-            if shown.requires_grad:
-                low, high = shown.min(1, keepdim=True).values, shown.max(1, keepdim=True).values
-                scaled = (amplitudes - low) / torch.where(high > low, high - low, 1)
-            else:
-                low, high = shown.amin(1, keepdim=True), shown.amax(1, keepdim=True)
-                scaled = amplitudes.sub_(low).div_(torch.where(high > low, high - low, 1))
-            spectra.append(scaled)
+            if not has_extremes:
+                coarse = self._look(parts[links], carrier, query, self.coarse)
+                shown = torch.cat((amplitudes, coarse), 1)
+            spectra.append(_scaled(amplitudes, shown))
             order.append(links)
-        whole = spectra[1] if len(spectra) == 2 else torch.cat(spectra)[torch.cat(order).argsort()]
-        return whole.unflatten(1, asked.shape)
+        if len(spectra) == 2:  # a single carrier
+            values = spectra[1]
+        else:
+            values = torch.cat(spectra)[torch.cat(order).argsort()]
+        return values.unflatten(1, asked.shape)
 
-    def lags(
-        self, labels: Float[Tensor, "b rows columns"], query: Query
-    ) -> tuple[Complex[Tensor, "b l"], Float[Tensor, " b"]]:
-        """Covariances of which labels are the spectra, and the share of each label that is no such
-        spectrum; float64.
+    def lags(self, labels: Float[Tensor, "b rows columns"], query: Query) -> FoundLags:
+        """Computes the covariances of which labels are the spectra, float64.
 
-        The covariances are the inverse of a call, but for each label's scale. The share is that of
-        the squared norm.
+        They are the inverse of a call, but for each label's scale. A label of zeros has covariances
+        of 0.
 
         A label y is s - m but for a scale, with the least amplitude m. So y² + 2 m y + m² is linear
         in the covariances, and they and m are the solution of least squares. What the directions
         hardly show is left out: of an array of closely spaced elements the noise of the labels
-        would swamp it. A label of zeros has covariances of 0.
+        would swamp it.
         """
-        own = self.scene.task.directions
-        rows, columns = (
-            slice(None, None, max(1, size // 40)) for size in own.shape
-        )  # at least 40 x 40 pixels
-        thin, labels = own.thin(rows, columns), labels[:, rows, columns].flatten(1).double()
-        found = torch.zeros(len(labels), len(self.array(query).lags[0]), dtype=torch.complex128)
-        left = torch.zeros(len(labels), dtype=torch.float64)
+        grid = self.scene.task.directions
+        # At least 40 x 40 pixels.
+        rows, columns = (slice(None, None, max(1, size // 40)) for size in grid.shape)
+        thin = grid.thin(rows, columns)
+        labels = labels[:, rows, columns].flatten(1).double()  # (b, k)
+        count = len(self.array(query).lags[0])
+        lags = torch.zeros(len(labels), count, dtype=torch.complex128)
+        unexplained = torch.zeros(len(labels), dtype=torch.float64)
         for carrier, links in self.by_carrier(query):
-            basis = self._basis(carrier, query, thin)
+            basis = self._basis(carrier, query, thin)  # (m, k)
             half = len(basis) // 2
             basis = torch.cat((basis[:half], basis[half + 1 :]))  # the lag 0 is real
-            inverse = torch.linalg.pinv(basis, rtol=1e-3)
-            squares, doubles = labels[links].square(), 2 * labels[links]
-            rests = [part - part @ inverse @ basis for part in (squares, doubles)]
-            least = -(rests[0] * rests[1]).sum(1) / rests[1].square().sum(1).clamp_min(1e-30)
+            inverse = torch.linalg.pinv(basis, rtol=1e-3)  # (k, m)
+            squares = labels[links].square()
+            doubles = 2 * labels[links]
+            # The part of y² + 2 m y that no covariances give is least at this m, at least 0.
+            square_rest = squares - squares @ inverse @ basis
+            double_rest = doubles - doubles @ inverse @ basis
+            product = (square_rest * double_rest).sum(1)  # (b,)
+            least = -product / double_rest.square().sum(1).clamp_min(1e-30)
             least = least.clamp_min(0)[:, None]
-            powers = squares + least * doubles + least.square()
-            parts = powers @ inverse
+            powers = squares + least * doubles + least.square()  # (b, k)
+            parts = powers @ inverse  # (b, m)
             rest = (powers - parts @ basis).square().sum(1)
-            left[links] = rest / powers.square().sum(1).clamp_min(1e-30)
-            later = torch.complex(
-                parts[:, :half], torch.cat((0 * parts[:, :1], parts[:, half:]), 1)
-            )
-            found[links] = torch.cat((later[:, 1:].conj().flip(1), later), 1)
-        return found, left
+            unexplained[links] = rest / powers.square().sum(1).clamp_min(1e-30)
+            imaginary = torch.cat((0 * parts[:, :1], parts[:, half:]), 1)
+            later = torch.complex(parts[:, :half], imaginary)  # (b, half)
+            lags[links] = torch.cat((later[:, 1:].conj().flip(1), later), 1)
+        return FoundLags(lags, unexplained)
 
     def array(self, query: Query) -> Array:
         """The array of a query's receiver."""
         return self.scene.receivers[int(query.receivers[0]) if len(query) else 0].array
 
     def by_carrier(self, query: Query) -> Iterator[tuple[float, Int[Tensor, " k"]]]:
-        """The different carriers [Hz], and the links of each."""
+        """Yields the different carriers [Hz], and the links of each."""
         frequencies = carriers(self.scene, query)
         for carrier in frequencies.unique().tolist():
             yield carrier, (frequencies == carrier).nonzero()[:, 0]
 
-    def _look(self, parts: Tensor, carrier: float, query: Query, directions: Directions) -> Tensor:
-        """Amplitudes of the beamformer in some directions (b, k)."""
-        key, basis = None, None
-        if isinstance(
-            directions, Grid
-        ):  # training thins one grid in a few ways; rays hardly come back
-            axes = (
-                axis.cpu().numpy().tobytes()
-                for axis in (directions.elevations, directions.azimuths)
-            )
-            key = int(query.receivers[0]), carrier, parts.dtype, parts.device, *axes
-            basis = self._kept.get(key)
-        if basis is None:
-            basis = self._basis(carrier, query, directions).to(parts)
-            if key is not None:
-                if len(self._kept) >= 64:  # thinning by a stride of 4 has 16 grids
-                    self._kept.clear()
-                self._kept[key] = basis
-        power = parts @ basis
+    def _look(
+        self, parts: Float[Tensor, "b m"], carrier: float, query: Query, directions: Directions
+    ) -> Float[Tensor, "b k"]:
+        """Amplitudes of the beamformer in a few directions."""
+        power = parts @ self._stored_basis(parts, carrier, query, directions)  # (b, k)
         least = 1e-6  # of the mean power: sums of tens of float32 terms round at this
-        return (
-            power.clamp_min(least).sqrt()
-            if torch.is_grad_enabled()
-            else power.clamp_min_(least).sqrt_()
-        )
+        if torch.is_grad_enabled():
+            return power.clamp_min(least).sqrt()
+        return power.clamp_min_(least).sqrt_()
+
+    def _stored_basis(
+        self, parts: Tensor, carrier: float, query: Query, directions: Directions
+    ) -> Float[Tensor, "m k"]:
+        """``_basis`` in the dtype and on the device of ``parts``, stored for grids.
+
+        Training thins one grid in a few ways; lists of rays hardly come back.
+        """
+        if not isinstance(directions, Grid):
+            return self._basis(carrier, query, directions).to(parts)
+        elevations = directions.elevations.cpu().numpy().tobytes()
+        azimuths = directions.azimuths.cpu().numpy().tobytes()
+        receiver = int(query.receivers[0])
+        key = receiver, carrier, parts.dtype, parts.device, elevations, azimuths
+        if key not in self._bases:
+            if len(self._bases) >= 64:  # thinning by a stride of 4 has 16 grids
+                self._bases.clear()
+            self._bases[key] = self._basis(carrier, query, directions).to(parts)
+        return self._bases[key]
 
     def _basis(self, carrier: float, query: Query, directions: Directions) -> Float[Tensor, "m k"]:
-        """Contribution of the real and then the imaginary part of each lag to the power in each
-        direction, float64.
+        """Contribution of each lag to the power in each direction, float64.
+
+        Rows are the real and then the imaginary part of each lag of the later half.
         """
         array = self.array(query)
         steps, _, counts = array.lags
-        half = len(steps) // 2
+        middle = len(steps) // 2
         # Of two opposite lags, which are each other's conjugates, one stands for both.
-        weights = (
-            counts[half:] / len(array) * torch.where(torch.arange(len(steps) - half) > 0, 2, 1)
-        )
-        vectors = directions.to(steps).flatten().vectors()
-        phases = 2 * math.pi * carrier / speed_of_light * (steps[half:] @ vectors.T)
-        return torch.cat((phases.cos() * weights[:, None], phases.sin() * weights[:, None]))
+        pairs = torch.where(torch.arange(len(steps) - middle) > 0, 2, 1)
+        weights = (counts[middle:] / len(array) * pairs)[:, None]  # (half, 1)
+        vectors = directions.to(steps).flatten().vectors()  # (k, 3)
+        phases = 2 * math.pi * carrier / speed_of_light * (steps[middle:] @ vectors.T)  # (half, k)
+        return torch.cat((phases.cos() * weights, phases.sin() * weights))
+
+
+def _scaled(amplitudes: Float[Tensor, "b k"], shown: Float[Tensor, "b j"]) -> Float[Tensor, "b k"]:
+    """Amplitudes between the least and the largest of those shown, from 0 to 1.
+
+    Pixels are many, and each pass over them in memory costs as much as the beamformer itself.
+    Gradients of amin and amax take four passes, those of min and max hardly one; without gradients
+    amin and amax are faster.
+    """
+    if shown.requires_grad:
+        low = shown.min(1, keepdim=True).values  # (b, 1)
+        high = shown.max(1, keepdim=True).values
+        return (amplitudes - low) / torch.where(high > low, high - low, 1)
+    low = shown.amin(1, keepdim=True)
+    high = shown.amax(1, keepdim=True)
+    return amplitudes.sub_(low).div_(torch.where(high > low, high - low, 1))

@@ -26,6 +26,9 @@ class ChannelPooling(Pooling):
         sign: Sign with which phases follow the direct distance, -1 for the time dependence exp(+j
             omega t) or 1; 0 for neither, as without a common clock that the data do not declare.
         array_sign: Sign between the elements and subcarriers of a link, -1 or 1.
+
+    Raises:
+        ValueError: The labels are no channels, or the arrays do not have their elements.
     """
 
     strength: Tensor
@@ -49,14 +52,18 @@ class ChannelPooling(Pooling):
         return task.frequencies
 
     def pad(self, channels: Complex[Tensor, "b e s"]) -> Complex[Tensor, "b most s"]:
-        """Channels with zeros at the elements that other receivers' arrays have alone."""
-        return torch.nn.functional.pad(channels, (0, 0, 0, self.task.elements - channels.shape[1]))
+        """Adds zeros for the elements that only other receivers' arrays have."""
+        missing = self.task.elements - channels.shape[1]
+        return torch.nn.functional.pad(channels, (0, 0, 0, missing))
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
         train = links.split.train
-        labels, query = links.labels[train].to(torch.complex128), links.query[train]
-        waves = direct_waves(self.scene, query, self.frequencies)
+        query = links.query[train]
+        labels = links.labels[train].to(torch.complex128)  # (b, e, s)
+        waves = direct_waves(self.scene, query, self.frequencies)  # (b, e, s)
         self.strength.fill_(strength(labels, waves, query.receivers))
         self.sign.fill_(self.task.phase_sign(labels, waves, query.receivers))
-        self.array_sign.copy_(self.sign if self.sign else torch.tensor(array_sign(labels, waves)))
+        # Without a common clock the phases of a link's own entries still tell the convention.
+        relative = torch.tensor(array_sign(labels, waves)) if self.sign == 0 else self.sign
+        self.array_sign.copy_(relative)

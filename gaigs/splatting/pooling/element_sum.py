@@ -18,8 +18,9 @@ from gaigs.splatting.pooling.channels import ChannelPooling
 
 @register("pooling", "element_sum")
 class ElementSum(ChannelPooling):
-    """h(e, f) = g F(d, f) sum_u w(u) a(u) m_f(u) exp(-s j 2 pi f / c x_e . u) over the map's
-    directions u.
+    """Sums the waves of a map, from all of its directions u, at each element.
+
+        h(e, f) = g F(d, f) sum_u w(u) a(u) m_f(u) exp(-s j 2 pi f / c x_e . u)
 
     m_f is the map at subcarrier f, complex: its real parts are the map's channels before all
     imaginary ones. x_e is an element's place, a its pattern, w the share of the direction's solid
@@ -28,7 +29,13 @@ class ElementSum(ChannelPooling):
     the labels' the map is that of the nearest one.
 
     Args:
+        scene: Its task has the subcarriers, its receivers the elements.
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
+
+    Raises:
+        ValueError: The labels are no channels.
+
+    Source: ours; Van Trees, Optimum Array Processing, 2002, section 2.2, for the phases.
     """
 
     def __init__(self, scene: Scene, grid: Sequence[int] = (8, 16)):
@@ -45,26 +52,25 @@ class ElementSum(ChannelPooling):
     ) -> Complex[Tensor, "b e s"]:
         """Channels at the elements of the receiver of these links."""
         if not len(query):
-            return torch.zeros(
-                0, *self.scene.task.shape, dtype=image.dtype.to_complex(), device=image.device
-            )
-        nearest = (self.learnt - self.frequencies[:, None]).abs().argmin(1)
-        waves = torch.complex(*image.flatten(2).unflatten(1, (2, -1)).unbind(1))[:, nearest]
+            shape = (0, *self.scene.task.shape)
+            return torch.zeros(shape, dtype=image.dtype.to_complex(), device=image.device)
+        nearest = (self.learnt - self.frequencies[:, None]).abs().argmin(1)  # (s,)
+        real, imaginary = image.flatten(2).unflatten(1, (2, -1)).unbind(1)  # (b, s, p) each
+        waves = torch.complex(real, imaginary)[:, nearest]
         steering = self._steering(int(query.receivers[0]), int(self.array_sign)).to(waves)
-        channels = (waves.permute(1, 0, 2) @ steering).permute(1, 2, 0)
+        channels = waves.permute(1, 0, 2) @ steering  # (s, b, e)
+        channels = channels.permute(1, 2, 0)  # (b, e, s)
         direct = direct_waves(
             self.scene, query, self.frequencies, int(self.sign), at_elements=False
-        )
+        )  # (b, 1, s)
         return self.pad(channels * (self.strength.double() * direct).to(waves))
 
     def _steering(self, receiver: int, sign: int) -> Complex[Tensor, "s p e"]:
         """Contribution of a wave from each direction of the map to each element, float64."""
-        array, directions = (
-            self.scene.receivers[receiver].array,
-            self.grid.flatten().vectors().double(),
-        )
+        array = self.scene.receivers[receiver].array
+        directions = self.grid.flatten().vectors().double()  # (p, 3)
         # A wave from the direction u reaches an element at x earlier by x . u / c than the middle.
-        delays = directions @ array.elements.double().T / speed_of_light
-        phases = -sign * 2 * math.pi * self.frequencies[:, None, None] * delays
-        weights = self.grid.solid_angles.flatten().double() * array.gain(directions)
+        delays = directions @ array.elements.double().T / speed_of_light  # (p, e) [s]
+        phases = -sign * 2 * math.pi * self.frequencies[:, None, None] * delays  # (s, p, e) [rad]
+        weights = self.grid.solid_angles.flatten().double() * array.gain(directions)  # (p,)
         return torch.polar(weights[:, None].expand_as(phases), phases)

@@ -14,16 +14,21 @@ from gaigs.splatting.pooling import Pooling, sphere
 
 @register("pooling", "mean_power")
 class MeanPower(Pooling):
-    """The mean over the grid's solid angle of |C_0|^2, or |C_0|^2 + |C_1|^2, and the receiver's
-    noise, in dB.
+    """The mean power over the grid's solid angle and the receiver's noise, in dB.
 
-    Powers add, so paths do not cancel: RSSI is averaged over bandwidth and time. A receiver hears
-    its own noise even where nothing arrives, so a silent map is at the floor, with a gradient of 0.
+    The power of a pixel is |C_0|^2, or |C_0|^2 + |C_1|^2, eq. (3). Powers add, so paths do not
+    cancel: RSSI is averaged over bandwidth and time. A receiver hears its own noise even where
+    nothing arrives, so a silent map is at the floor, with a gradient of 0.
 
     Args:
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
         channels: 1 (real) or 2 (complex).
         floor_db: Power of the noise relative to the model's trend, between -300 and 0 [dB].
+
+    Raises:
+        ValueError: An option is out of range, or a map has another number of pixels.
+
+    Source: GAI-GS, eq. (3), for the level; the noise is ours.
     """
 
     weights: Tensor
@@ -32,7 +37,8 @@ class MeanPower(Pooling):
         super().__init__()
         if channels not in (1, 2):
             raise ValueError(
-                f"pooling 'mean_power' renders 1 real or 2 complex channels, got channels={channels}"
+                "pooling 'mean_power' renders 1 real or 2 complex channels, "
+                f"got channels={channels}"
             )
         self.channels = channels
         self.floor = noise_amplitude(floor_db)
@@ -46,19 +52,23 @@ class MeanPower(Pooling):
         directions: Directions | None = None,
     ) -> Float[Tensor, " b"]:
         """Level relative to the model's trend [dB]; float32 where the map is of half precision."""
-        if image.shape[2:] != self.weights.shape:
-            raise ValueError(
-                f"maps must have {tuple(self.weights.shape)} pixels, got {tuple(image.shape[2:])}"
-            )
+        pixels = tuple(image.shape[2:])
+        if pixels != tuple(self.weights.shape):
+            raise ValueError(f"maps must have {tuple(self.weights.shape)} pixels, got {pixels}")
         image = image.to(torch.promote_types(image.dtype, torch.float32))
         # Scaled by the largest, squares neither overflow nor underflow.
-        largest = image.detach().abs().amax((1, 2, 3)).clamp(min=self.floor)
-        power = (image / largest[:, None, None, None]).square().sum(1).mul(self.weights).sum((1, 2))
+        largest = image.detach().abs().amax((1, 2, 3)).clamp(min=self.floor)  # (b,)
+        powers = (image / largest[:, None, None, None]).square().sum(1)  # (b, rows, columns)
+        power = powers.mul(self.weights).sum((1, 2))  # (b,)
         return 20 * largest.log10() + 10 * (power + (self.floor / largest).square()).log10()
 
 
 def noise_amplitude(floor_db: float) -> float:
-    """Amplitude of a receiver's noise from its level [dB]."""
+    """Amplitude of a receiver's noise from its level [dB].
+
+    Raises:
+        ValueError: The level is out of range.
+    """
     if not -300 <= floor_db <= 0:
         raise ValueError(f"pooling option floor_db must lie between -300 and 0 dB, got {floor_db}")
     return 10 ** (floor_db / 20)

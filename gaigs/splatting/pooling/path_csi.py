@@ -16,8 +16,9 @@ from gaigs.splatting.pooling.paths import PathPooling, ReceivedPaths, element_fi
 
 @register("pooling", "path_csi")
 class PathCsi(ChannelPooling, PathPooling):
-    """h(e, f) = g lambda / (4 pi) y(e, f), with y the field of the paths over the unit of 1 /
-    distance.
+    """h(e, f) = g lambda / (4 pi) y(e, f), with y the field of the paths [1/m].
+
+    Source: GAI-GS, eq. (2), for the sum; Friis' lambda / (4 pi); ``element_fields``.
     """
 
     def __init__(self, scene: Scene):
@@ -25,19 +26,17 @@ class PathCsi(ChannelPooling, PathPooling):
 
     def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b e s"]:
         """Field at each element and subcarrier over the unit of 1 / distance."""
-        return element_fields(
-            paths, self.frequencies.to(paths.carriers)[None] - paths.carriers[:, None]
-        )
+        offsets = self.frequencies.to(paths.carriers)[None] - paths.carriers[:, None]  # (b, s) [Hz]
+        return element_fields(paths, offsets)
 
     def read(
         self, received: Complex[Tensor, "b e s"], query: Query, directions: Directions | None = None
     ) -> Complex[Tensor, "b most s"]:
         frequencies = self.frequencies.to(received.real)
-        value = received * (
-            self.strength.to(frequencies) * speed_of_light / (4 * math.pi * frequencies)
-        )
+        # Free space: the amplitude at 1 m is lambda / (4 pi).
+        gains = self.strength.to(frequencies) * speed_of_light / (4 * math.pi * frequencies)  # (s,)
+        value = received * gains
         if self.sign == 0:  # no common clock: the phase of the direct path is taken off
-            value = value * direct_waves(
-                self.scene, query, frequencies, 1, at_elements=False
-            ).sgn().to(value)
+            direct = direct_waves(self.scene, query, frequencies, 1, at_elements=False)  # (b, 1, s)
+            value = value * direct.sgn().to(value)
         return self.pad(value.conj() if self.array_sign > 0 else value)

@@ -16,7 +16,13 @@ class PathRssi(LagPooling):
     """The mean power at the elements and the receiver's noise, in dB relative to a path of 1 m.
 
     Args:
+        scene: Its receivers have planar arrays.
         floor_db: Power of the noise relative to the model's trend, between -300 and 0 [dB].
+
+    Raises:
+        ValueError: The floor is out of range, or an array is not planar.
+
+    Source: GAI-GS, eq. (3), for the level; ``LagPooling`` for the power.
     """
 
     def __init__(self, scene: Scene, floor_db: float = -120.0):

@@ -13,7 +13,17 @@ from gaigs.splatting.pooling.paths import LagPooling
 
 @register("pooling", "path_spectrum")
 class PathSpectrum(LagPooling):
-    """Beamforming with the covariance of the array's elements."""
+    """The conventional beamformer on the covariance of the array's elements.
+
+    Args:
+        scene: Its task has the directions, its receivers the arrays, which are planar.
+
+    Raises:
+        ValueError: The labels are no spectra scaled to [0, 1], or an array is a point or not
+            planar.
+
+    Source: ``LagPooling`` for the covariance, ``Beamformer`` for the spectrum.
+    """
 
     def __init__(self, scene: Scene):
         super().__init__(scene)

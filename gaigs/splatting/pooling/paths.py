@@ -2,8 +2,8 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Complex, Float
@@ -20,14 +20,15 @@ from gaigs.splatting.pooling import Pooling
 
 @dataclass(frozen=True)
 class ReceivedPaths:
-    """Propagation paths to one receiver. A path arrives from a Gaussian, whose extent is the path's
-    angular spread.
+    """Propagation paths to one receiver.
+
+    A path arrives from a Gaussian, whose extent is the path's angular spread.
 
     Attributes:
         means: Centres of the Gaussians, world frame (b, n, 3) [m].
-        semi_axes: Of the Gaussians, world frame, a column for each axis (1 or b, n, 3, 3) [m].
+        semi_axes: Axes of the Gaussians, world frame, a column each (1 or b, n, 3, 3) [m].
         amplitudes: Complex field of each path at the carrier, in the middle of the array (b, n).
-        lengths: From the transmitter to the middle of the array (b, n) [m].
+        lengths: Way from the transmitter to the middle of the array (b, n) [m].
         coherences: Share of each path's field whose phase is known, in [0, 1] (n,). The rest adds
             as power.
         bandwidth: Band over which powers are averaged, a scalar [Hz]; None for the carrier alone.
@@ -62,21 +63,33 @@ class PathPooling(Pooling):
 
     @abstractmethod
     def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b ..."]:
-        """Sum of the paths at the elements of the receiver's array."""
+        """Sums the paths at the elements of the receiver's array."""
 
     @abstractmethod
     def read(
         self, received: Complex[Tensor, "b ..."], query: Query, directions: Directions | None = None
     ) -> Tensor:
-        """The label from the result of ``sum_paths``; arguments as for ``forward``."""
+        """Computes the label from the result of ``sum_paths``; arguments as for ``forward``."""
 
 
 class LagPooling(PathPooling):
     """Base of poolings that read the covariance of the array's elements, in which powers add.
 
     Args:
-        scene: Its receivers have planar arrays; others raise a ``ValueError``.
+        scene: Its receivers have planar arrays.
+
+    Attributes:
+        least_spread: Least standard deviation of a path's direction cosines where powers add: the
+            one of a pixel of 24 x 48.
+
+    Raises:
+        ValueError: An array is not planar.
+
+    Source: Van Trees, Optimum Array Processing, 2002, section 5.2, for covariances by lags; the
+    partial coherence is ours.
     """
+
+    least_spread: float = Grid.sphere(24, 48).pitch / math.sqrt(12)
 
     def __init__(self, scene: Scene):
         super().__init__()
@@ -85,90 +98,110 @@ class LagPooling(PathPooling):
             height = receiver.array.elements[:, 2].abs().max()
             if height > 1e-6:  # [m]; float32 places metres no better
                 raise ValueError(
-                    f"a pooling of path powers takes planar arrays, got z up to {height:.3g} m in {receiver.name}\n"
-                    "take projection=mercator rasterizer=fastest and a pooling of maps, such as array_response"
+                    f"a pooling of path powers takes planar arrays, got z up to {height:.3g} m in "
+                    f"{receiver.name}\ntake projection=mercator rasterizer=fastest and a pooling "
+                    "of maps, such as array_response"
                 )
 
     def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b l"]:
-        """Mean covariance of the pairs of elements that are ``array.lags`` apart; at lag 0 it is
-        the power.
+        """Mean covariance of the pairs of elements that are ``array.lags`` apart.
 
-        Where powers add, elements a lag D apart, in wavelengths, have
+        At lag 0 it is the power. Where powers add, elements a lag D apart, in wavelengths, have
 
             sum |A|² exp(-(2 pi)² D' S D / 2 + j 2 pi D . u)
 
         with u a path's direction cosines, which shrink to 0 within ``NEAREST`` of the array's
-        middle, and S their covariance: the Gaussian's, and that of ``LEAST_SPREAD``. Two paths
+        middle, and S their covariance: the Gaussian's, and the one of ``least_spread``. Two paths
         interfere by the product of their coherences, and over a band by sinc(bandwidth (t - t')),
         with t their delays: the mean over the band of cos(2 pi f (t - t')).
         """
-        array, amplitudes, coherences = paths.receiver.array, paths.amplitudes, paths.coherences
-        steps = array.lags[0].to(paths.lengths)
-        if array.is_point:  # a power has no directions
-            heard = lambda places: amplitudes.new_ones(1, 1, len(places))
-        else:
-            heard = _steering(paths)
-        # Half of the lags are the conjugates of the others.
+        array = paths.receiver.array
+        amplitudes = paths.amplitudes  # (b, n)
+        coherences = paths.coherences  # (n,)
+        steering = _Steering(paths, self.least_spread)
+        steps = array.lags[0].to(paths.lengths)  # (l, 3) [m]
+        # Powers add of the share of each path whose phase is unknown. Half of the lags are the
+        # conjugates of the others.
         powers = torch.view_as_real(amplitudes).square().sum(-1) * (1 - coherences.square())
-        later = (powers[..., None] * heard(steps[len(steps) // 2 :])).sum(1)
-        found = torch.cat((later[:, 1:].conj().flip(1), later), 1)
-        sure = coherences.nonzero()[:, 0]  # the others have no phase
-        if not len(sure):
-            return found
-        waves = ((amplitudes * coherences)[..., None] * heard(array.elements.to(steps)))[:, sure]
+        later = (powers[..., None] * steering.at(steps[len(steps) // 2 :])).sum(1)
+        lags = torch.cat((later[:, 1:].conj().flip(1), later), 1)  # (b, l)
+        coherent = coherences.nonzero()[:, 0]
+        if not len(coherent):
+            return lags
+        # The others interfere: eq. (2) at each element, and the products of two elements.
+        response = steering.at(array.elements.to(steps))  # (b, n, e)
+        waves = ((amplitudes * coherences)[..., None] * response)[:, coherent]
         if paths.bandwidth is None:
-            field = waves.sum(1)[..., None]
-            covariance = field @ field.mH
-        else:
-            turns = paths.bandwidth / speed_of_light * paths.lengths[:, sure]
-            likeness = sinc(turns[:, :, None] - turns[:, None])
-            alike = likeness @ torch.view_as_real(waves).flatten(
-                2
-            )  # real products take half the time of complex ones
-            covariance = torch.view_as_complex(alike.unflatten(2, (-1, 2))).mT @ waves.conj()
-        return found + array.by_lag(covariance)
+            field = waves.sum(1)[..., None]  # (b, e, 1)
+            return lags + array.by_lag(field @ field.mH)
+        turns = paths.bandwidth / speed_of_light * paths.lengths[:, coherent]  # (b, n)
+        likeness = sinc(turns[:, :, None] - turns[:, None])  # (b, n, n)
+        # Real products take half the time of complex ones.
+        parts = torch.view_as_real(waves).flatten(2)  # (b, n, 2 e)
+        alike = (likeness @ parts).unflatten(2, (-1, 2))  # (b, n, e, 2)
+        covariance = torch.view_as_complex(alike).mT @ waves.conj()  # (b, e, e)
+        return lags + array.by_lag(covariance)
 
 
-LEAST_SPREAD = Grid.sphere(24, 48).pitch / math.sqrt(12)
-"""Least standard deviation of a path's direction cosines where powers add: that of a pixel of 24 x
-48.
-"""
+class _Steering:
+    """Responses of an array to paths, by steps D in its plane from the middle.
 
-
-def _steering(paths: ReceivedPaths) -> Callable[[Float[Tensor, "k 3"]], Complex[Tensor, "b n k"]]:
-    """exp(-(2 pi)² D' S D / 2 + j 2 pi D . u) of each path at steps D in the array's plane [m]."""
-    points, wavenumbers, across = _seen(paths)
-    angles = wavenumbers * points / points.norm(dim=-1, keepdim=True).clamp_min(NEAREST)
-
-    def response(steps: Tensor) -> Tensor:
-        least = (LEAST_SPREAD * wavenumbers).square() * steps.square().sum(-1)
-        return polar(((_spreads(across, steps) + least) / -2).exp(), angles @ steps.T)
-
-    return response
-
-
-def _seen(
-    paths: ReceivedPaths,
-) -> tuple[Float[Tensor, "b n 3"], Float[Tensor, "b 1 1"], Float[Tensor, "b n 3 3"]]:
-    """Gaussians' centres in the array's frame [m], wavenumbers [1/m], and semi-axes across the way
-    [rad/m].
-
-    The last are angles as the middle of the array sees them, times the wavenumber.
+    Args:
+        paths: The paths.
+        least_spread: As for ``LagPooling``.
     """
+
+    def __init__(self, paths: ReceivedPaths, least_spread: float):
+        self.amplitudes = paths.amplitudes
+        self.is_point = paths.receiver.array.is_point
+        if self.is_point:  # a power has no directions
+            return
+        points, wavenumbers, self.across = _see(paths)
+        distances = points.norm(dim=-1, keepdim=True).clamp_min(NEAREST)  # (b, n, 1)
+        self.angles = wavenumbers * points / distances  # (b, n, 3) [rad/m]
+        self.least = (least_spread * wavenumbers).square()  # (b, 1, 1) [rad²/m²]
+
+    def at(self, steps: Float[Tensor, "k 3"]) -> Complex[Tensor, "*b n k"]:
+        """exp(-(2 pi)² D' S D / 2 + j 2 pi D . u) of each path at steps [m]."""
+        if self.is_point:
+            return self.amplitudes.new_ones(1, 1, len(steps))
+        spreads = _spreads(self.across, steps)  # (b, n, k)
+        least = self.least * steps.square().sum(-1)  # (b, 1, k)
+        return polar(((spreads + least) / -2).exp(), self.angles @ steps.T)
+
+
+class _Seen(NamedTuple):
+    """Gaussians as an array sees them.
+
+    Attributes:
+        points: Centres in the array's frame [m].
+        wavenumbers: 2 pi / lambda of each query [rad/m].
+        across: Semi-axes across the way, as angles at the middle of the array times the wavenumber
+            [rad/m].
+    """
+
+    points: Float[Tensor, "b n 3"]
+    wavenumbers: Float[Tensor, "b 1 1"]
+    across: Float[Tensor, "b n 3 3"]
+
+
+def _see(paths: ReceivedPaths) -> _Seen:
     pose = paths.receiver.pose.to(paths.means)
-    points, semi_axes = pose.local(paths.means), pose.rotation.mT @ paths.semi_axes
+    points = pose.local(paths.means)  # (b, n, 3)
+    semi_axes = pose.rotation.mT @ paths.semi_axes  # (1 or b, n, 3, 3)
     wavenumbers = 2 * math.pi / speed_of_light * paths.carriers.to(points)[:, None, None]
-    ways = points.norm(dim=-1, keepdim=True).clamp_min(NEAREST)
-    units = (points / ways)[..., None]
+    distances = points.norm(dim=-1, keepdim=True).clamp_min(NEAREST)  # (b, n, 1)
+    units = (points / distances)[..., None]  # (b, n, 3, 1)
     across = semi_axes - units * (units * semi_axes).sum(-2, keepdim=True)
-    return points, wavenumbers, across * (wavenumbers / ways)[..., None]
+    return _Seen(points, wavenumbers, across * (wavenumbers / distances)[..., None])
 
 
 def _spreads(
     across: Float[Tensor, "b n 3 3"], steps: Float[Tensor, "k 3"]
 ) -> Float[Tensor, "b n k"]:
     """(2 pi)² D' S D of each path at each step D [m]."""
-    turns = (steps @ across.movedim(-2, 0).flatten(1)).view(len(steps), *across.shape[:2], 3)
+    rows = across.movedim(-2, 0).flatten(1)  # (3, b n 3)
+    turns = (steps @ rows).view(len(steps), *across.shape[:2], 3)  # (k, b, n, 3)
     return turns.square().sum(-1).movedim(0, -1)
 
 
@@ -176,50 +209,100 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
     """Field at each element and frequency, all paths interfering.
 
     The wave of a path is spherical about the path's Gaussian, at an array of any shape and
-    orientation. An element at x, in wavelengths from the middle, hears a path of the amplitude A,
-    from the direction u, as
+    orientation. An element at x, in wavelengths from the middle, receives a path of the amplitude
+    A, from the direction u, as
 
         A exp(-(2 pi)² x' S x / 2 - j 2 pi (|p - x| - |p|)) |p| / |p - x|
 
     with p the Gaussian's centre and S its covariance in direction cosines.
 
-    ``offsets`` are frequencies over the carrier [Hz].
+    Args:
+        paths: Paths to one receiver.
+        offsets: Frequencies over the carrier [Hz].
 
-    Source: ours; the Fourier transform of a Gaussian, and Van Trees, Optimum Array Processing,
-    2002, section 2.2.
+    Source: GAI-GS, eq. (2), for the sum; the Fourier transform of a Gaussian; Van Trees, Optimum
+    Array Processing, 2002, section 2.2. Their combination is ours.
     """
-    amplitudes, lengths = paths.amplitudes, paths.lengths
-    points, wavenumbers, across = _seen(paths)
-    elements, exact = paths.receiver.array.elements.to(points), points.norm(dim=-1, keepdim=True)
+    points, wavenumbers, across = _see(paths)
+    elements = paths.receiver.array.elements.to(points)  # (e, 3) [m]
+    longer = _path_differences(points, elements)
+    spreads = _spreads(across, elements)  # (b, n, e)
+    decays = (spreads / -2).exp() * longer.ratios
+    waves = paths.amplitudes[..., None] * polar(decays, -wavenumbers * longer.differences)
+    reach = float(elements.norm(dim=-1).amax()) / speed_of_light  # [s]
+    rates = -2 * math.pi * offsets.to(paths.lengths)  # (b, s) [rad/s]
+    # Phase of the band over the array [rad].
+    widest = reach * float(rates.abs().amax()) if rates.numel() else 0.0
+    if widest > 3:
+        delays = (paths.lengths[..., None] + longer.differences) / speed_of_light  # (b, n, e)
+        turns = _unit_waves(delays[..., None] * rates[:, None, None])  # (b, n, e, s)
+        return (waves[..., None] * turns).sum(1)
+    return _sum_by_series(paths.lengths, longer.differences, waves, rates, reach, widest)
+
+
+class _PathDifferences(NamedTuple):
+    """Ways to the elements beside the way to the middle.
+
+    Attributes:
+        differences: |p - x| - |p| [m].
+        ratios: |p| / |p - x|, each at least ``NEAREST``.
+    """
+
+    differences: Float[Tensor, "b n e"]
+    ratios: Float[Tensor, "b n e"]
+
+
+def _path_differences(
+    points: Float[Tensor, "b n 3"], elements: Float[Tensor, "e 3"]
+) -> _PathDifferences:
+    to_middle = points.norm(dim=-1, keepdim=True)  # |p|, (b, n, 1)
     # Plain differences: by the matrix product an element far from a near point would lose its
     # digits.
-    own = torch.cdist(points, elements, compute_mode="donot_use_mm_for_euclid_dist")
-    to_elements, ways = own.clamp_min(NEAREST), exact.clamp_min(NEAREST)
-    # The difference of two lengths, without the digits that it would lose.
-    both = own + exact
-    longer = (elements.square().sum(-1) - 2 * points @ elements.T) / torch.where(both > 0, both, 1)
-    longer = longer + (to_elements - own) - (ways - exact)
-    spreads = _spreads(across, elements)
-    waves = amplitudes[..., None] * polar(
-        (spreads / -2).exp() * (ways / to_elements), -wavenumbers * longer
-    )
-    reach = float(elements.norm(dim=-1).amax()) / speed_of_light
-    rates = -2 * math.pi * offsets.to(lengths)
-    turned = lambda delays: torch.polar(torch.ones_like(delays), delays)
-    widest = (
-        reach * float(rates.abs().amax()) if rates.numel() else 0.0
-    )  # phase of the band over the array [rad]
-    if widest > 3:
-        delays = (lengths[..., None] + longer) / speed_of_light
-        return (waves[..., None] * turned(delays[..., None] * rates[:, None, None])).sum(1)
-    # exp(j rate (t + dt)) = exp(j rate t) sum_k (j rate dt)^k / k!: one product of matrices, and no
-    # wave of each path, element and frequency. |dt| is at most the reach. Up to 3 rad the terms of
-    # the series stay small.
-    terms, size = [waves], widest
+    to_elements = torch.cdist(points, elements, compute_mode="donot_use_mm_for_euclid_dist")
+    far_elements = to_elements.clamp_min(NEAREST)
+    far_middle = to_middle.clamp_min(NEAREST)
+    # |p - x| - |p| = (x² - 2 p . x) / (|p - x| + |p|), without the digits that a difference loses.
+    both = to_elements + to_middle
+    squares = elements.square().sum(-1) - 2 * points @ elements.T  # (b, n, e)
+    longer = squares / torch.where(both > 0, both, 1)
+    longer = longer + (far_elements - to_elements) - (far_middle - to_middle)
+    return _PathDifferences(longer, far_middle / far_elements)
+
+
+def _sum_by_series(
+    lengths: Float[Tensor, "b n"],
+    longer: Float[Tensor, "b n e"],
+    waves: Complex[Tensor, "b n e"],
+    rates: Float[Tensor, "b s"],
+    reach: float,
+    widest: float,
+) -> Complex[Tensor, "b e s"]:
+    """Sum over the paths by one product of matrices, without a wave of each path and frequency.
+
+        exp(j rate (t + dt)) = exp(j rate t) sum_k (j rate dt)^k / k!
+
+    |dt| is at most the reach. Up to 3 rad the terms of the series stay small.
+
+    Args:
+        lengths: From the transmitter to the middle of the array [m].
+        longer: Further way to each element [m].
+        waves: Field of each path at each element, at the carrier.
+        rates: Change of phase by delay at each frequency [rad/s].
+        reach: Largest delay over the array [s].
+        widest: Largest phase of the band over the array [rad].
+    """
+    terms = [waves]
+    size = widest
     while size > torch.finfo(lengths.dtype).eps:
-        terms.append(terms[-1] * (longer * (1j / (reach * speed_of_light * len(terms)))))
+        step = longer * (1j / (reach * speed_of_light * len(terms)))
+        terms.append(terms[-1] * step)
         size *= widest / len(terms)
-    middle = turned(lengths[..., None] / speed_of_light * rates[:, None])
+    middle = _unit_waves(lengths[..., None] / speed_of_light * rates[:, None])  # (b, n, s)
     sums = torch.stack(terms, 2).flatten(2).mT @ middle  # (b, terms x e, s)
-    powers = (reach * rates)[:, None] ** torch.arange(len(terms), device=rates.device)[:, None]
+    exponents = torch.arange(len(terms), device=rates.device)[:, None]
+    powers = (reach * rates)[:, None] ** exponents  # (b, terms, s)
     return (sums.unflatten(1, (len(terms), -1)) * powers[:, :, None]).sum(1)
+
+
+def _unit_waves(phases: Float[Tensor, "*shape"]) -> Complex[Tensor, "*shape"]:
+    return torch.polar(torch.ones_like(phases), phases)

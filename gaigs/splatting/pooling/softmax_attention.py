@@ -29,7 +29,10 @@ class SoftmaxAttention(Pooling):
         learn: Train both, as the temperature's logarithm and the prior's logit, which keeps them in
             their ranges.
 
-    Source: GAI-GS, section "Mapping, Projection and Render Module".
+    Raises:
+        ValueError: An option is out of range.
+
+    Source: GAI-GS, section "Mapping, Projection and Render Module", "RSSI map construction".
     """
 
     channels = 1
@@ -53,10 +56,11 @@ class SoftmaxAttention(Pooling):
         if learn and prior in (0, 1):
             raise ValueError(f"a learnt prior must start between 0 and 1, got {prior}; e.g. 0.1")
         self.grid = sphere("pooling.grid", grid)
-        for name, value in (
-            ("log_temperature", torch.tensor(math.log(temperature))),
-            ("prior_logit", torch.tensor(float(prior)).logit()),
-        ):
+        values = {
+            "log_temperature": torch.tensor(math.log(temperature)),
+            "prior_logit": torch.tensor(float(prior)).logit(),
+        }
+        for name, value in values.items():
             if learn:
                 self.register_parameter(name, nn.Parameter(value))
             else:
@@ -64,10 +68,12 @@ class SoftmaxAttention(Pooling):
 
     @property
     def temperature(self) -> Float[Tensor, ""]:
+        """Temperature of the attention [bel]."""
         return self.log_temperature.exp()
 
     @property
     def prior(self) -> Float[Tensor, ""]:
+        """Share of the uniform weights."""
         return self.prior_logit.sigmoid()
 
     def forward(
@@ -77,10 +83,11 @@ class SoftmaxAttention(Pooling):
         directions: Directions | None = None,
     ) -> Float[Tensor, " b"]:
         """Level relative to the model's trend [dB]; float32 where the map is of half precision."""
-        bels = image.to(torch.promote_types(image.dtype, torch.float32)).flatten(1)
+        bels = image.to(torch.promote_types(image.dtype, torch.float32)).flatten(1)  # (b, pixels)
         # The paper subtracts the mean, and later the maximum, in which the mean cancels.
         # Subtracting the maximum alone is the same, and exact for the pixels that count, where one
         # huge value makes the mean swallow the others.
         below = bels - bels.amax(1, keepdim=True).detach()
-        attention = (below / self.temperature).softmax(1)
+        attention = (below / self.temperature).softmax(1)  # (b, pixels)
+        # "Attention weights blended with a uniform prior to ensure coverage."
         return 10 * ((1 - self.prior) * (attention * bels).sum(1) + self.prior * bels.mean(1))

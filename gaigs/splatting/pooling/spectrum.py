@@ -16,6 +16,11 @@ class SpectrumPooling(Pooling):
 
     Args:
         channels: 1 (real) or 2 (complex).
+
+    Raises:
+        ValueError: There are other channels.
+
+    Source: GAI-GS, eq. (14), whose R_k is the map; ours are its channels and the magnitude.
     """
 
     def __init__(self, channels: int = 2):
@@ -33,6 +38,7 @@ class SpectrumPooling(Pooling):
         directions: Directions | None = None,
     ) -> Float[Tensor, "b rows columns"]:
         """The predicted spectrum; where the map is 0, so is its gradient."""
-        return (
-            image[:, 0].abs() if self.channels == 1 else magnitudes(torch.complex(*image.unbind(1)))
-        )
+        if self.channels == 1:
+            return image[:, 0].abs()
+        real, imaginary = image.unbind(1)
+        return magnitudes(torch.complex(real, imaginary))

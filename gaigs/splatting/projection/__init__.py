@@ -14,9 +14,7 @@ from gaigs.core.geometry import Directions, Grid, Pose, semi_axes
 from gaigs.registry import is_built, name_of, registry
 
 NEAR = 1e-6
-"""Distance below which float32 resolves no direction, and the determinant of a footprint may
-overflow [m].
-"""
+"""Distance below which float32 resolves no direction, and a footprint may overflow [m]."""
 
 
 @dataclass(frozen=True)
@@ -38,9 +36,10 @@ class Splats:
 
     @property
     def covariances2d(self) -> Float[Tensor, "b n 2 2"]:
-        """The factor times its transpose, less exact for long and thin splats."""
-        p, q, r = self.factors.unbind(-1)
-        return torch.stack((p * p, p * q, p * q, q * q + r * r), -1).unflatten(-1, (2, 2))
+        """Covariances, the factor times its transpose; less exact for long and thin splats."""
+        p, q, r = self.factors.unbind(-1)  # (b, n) each
+        entries = torch.stack((p * p, p * q, p * q, q * q + r * r), -1)  # (b, n, 4)
+        return entries.unflatten(-1, (2, 2))
 
 
 @dataclass(frozen=True)
@@ -59,6 +58,7 @@ class Plane:
 
     @property
     def shape(self) -> tuple[int, int]:
+        """Rows and columns of the label."""
         return self.v.shape[0], self.u.shape[1]
 
 
@@ -98,16 +98,23 @@ class Projection(ABC):
         """u repeats after this; None: it does not."""
 
     def check_sees(self, directions: Directions) -> None:
-        """Raises a ``ValueError`` if directions below the array's plane would fall on those above."""
+        """Checks that no direction below the array's plane would fall on one above it.
+
+        Raises:
+            ValueError: The projection folds directions up.
+        """
         if not self.sees_below and directions.elevations.min() < 0:
             raise ValueError(
-                f"the grid reaches below the array's plane, which {name_of(self)} folds up; take mercator"
+                f"the grid reaches below the array's plane, which {name_of(self)} folds up; "
+                "take mercator"
             )
 
     def plane(self, directions: Directions) -> Plane:
         """Plane coordinates of a label's pixel centres; a list of rays becomes a single row."""
-        vectors = directions.vectors()
-        u, v = self.coordinates(vectors if vectors.ndim == 3 else vectors[None]).unbind(-1)
+        vectors = directions.vectors()  # (rows, columns, 3) or (k, 3)
+        if vectors.ndim == 2:
+            vectors = vectors[None]
+        u, v = self.coordinates(vectors).unbind(-1)  # (rows, columns) each
         return Plane(u, v, self.period)
 
     def project(
@@ -122,16 +129,19 @@ class Projection(ABC):
             receiver: Pose of the antenna array.
         """
         receiver = receiver.to(means)
-        points = receiver.local(means)
-        depths = points.norm(dim=-1)
+        points = receiver.local(means)  # (*b, n, 3) [m]
+        depths = points.norm(dim=-1)  # [m]
         visible = ~(depths < NEAR)  # NaN stays visible
         # A Gaussian on the receiver has no direction: a stand-in keeps values and gradients finite,
         # `visible` hides it.
-        points = torch.where(visible[..., None], points, points.new_tensor([1.0, 0.0, 0.0]))
-        across, along = (self.jacobian(points) @ receiver.rotation.mT @ semi_axes).unbind(-2)
-        return Splats(
-            self.coordinates(points), factor(across, along, self.pixel_variance), depths, visible
-        )
+        stand_in = points.new_tensor([1.0, 0.0, 0.0])
+        points = torch.where(visible[..., None], points, stand_in)
+        # EWA splatting: the footprint's covariance is J S J', with J the map's linearisation and S
+        # the covariance in the receiver's frame, here by its factors (2, 3) a Gaussian.
+        linearised = self.jacobian(points) @ receiver.rotation.mT @ semi_axes  # (b, n, 2, 3)
+        across, along = linearised.unbind(-2)
+        factors = factor(across, along, self.pixel_variance)
+        return Splats(self.coordinates(points), factors, depths, visible)
 
 
 def project(
@@ -161,13 +171,22 @@ def project(
         The splats, and the pixels on the plane; differentiable in means, quaternions and scales.
         Each input may have a leading axis b of transmitters.
 
+    Raises:
+        ValueError: A shape is wrong, the pixel's size is unknown, or a direction is not in radians
+            or not on the plane.
+
+    Source: GAI-GS, "Projection and Render Module"; Zwicker et al., EWA Splatting, 2002.
+
     Example:
         >>> from gaigs.splatting.projection import project
         >>> means, quats = torch.tensor([[3.0, 0.0, 1.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
         >>> pose = gaigs.Pose.from_xyzw([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-        >>> splats, plane = project(means, quats, torch.full((1, 3), 0.1), receiver=pose, grid=gaigs.Grid.degrees())
-        >>> splats.means2d.shape, splats.covariances2d.shape, plane.shape  # (azimuth, stretched elevation)
-        (torch.Size([1, 2]), torch.Size([1, 1, 2, 2]), (90, 360))
+        >>> scales, grid = torch.full((1, 3), 0.1), gaigs.Grid.degrees()
+        >>> splats, plane = project(means, quats, scales, receiver=pose, grid=grid)
+        >>> splats.means2d.shape, plane.shape  # (azimuth, stretched elevation)
+        (torch.Size([1, 2]), (90, 360))
+        >>> splats.covariances2d.shape
+        torch.Size([1, 1, 2, 2])
     """
     n = means.shape[-2]
     for name, values, size in (("means", means, 3), ("quats", quats, 4), ("scales", scales, 3)):
@@ -176,22 +195,28 @@ def project(
                 f"{name} must be ({n}, {size}) or (b, {n}, {size}), got {tuple(values.shape)}"
             )
     if pixel is None and isinstance(grid, Grid):
-        pixel = (
-            grid.pitch
-            or grid.thin(slice(1), slice(None)).azimuths.diff().abs().sum().item() / grid.shape[1]
-        )
+        pixel = grid.pitch or _pitch_of_row(grid)
     if not is_built(projection) and not pixel:
         raise ValueError(
-            "pixel must be given for rays and for a single pixel, in rad: e.g. gaigs.Grid.degrees().pitch"
+            "pixel must be given for rays and for a single pixel, in rad: "
+            "e.g. gaigs.Grid.degrees().pitch"
         )
     if not (grid.elevations.abs() <= math.pi / 2 + 1e-4).all():
         raise ValueError("elevations must lie within 1.5708 rad; gaigs.Grid.degrees takes degrees")
     chosen = registry("projection").build(projection, pixel=pixel)
     grid = grid.to(means)
     chosen.check_sees(grid)
-    axes = semi_axes(quats, scales)
+    axes = semi_axes(quats, scales)  # ([b,] n, 3, 3)
+    if axes.ndim == 3:
+        axes = axes[None]
     pose = getattr(receiver, "pose", receiver)
-    return chosen.project(means, axes if axes.ndim == 4 else axes[None], pose), chosen.plane(grid)
+    return chosen.project(means, axes, pose), chosen.plane(grid)
+
+
+def _pitch_of_row(grid: Grid) -> float:
+    """Mean step of azimuth of a grid of one row [rad]; 0 for a single pixel."""
+    steps = grid.thin(slice(1), slice(None)).azimuths.diff().abs()
+    return steps.sum().item() / grid.shape[1]
 
 
 def factor(
@@ -203,9 +228,9 @@ def factor(
     Roots are of sums of squares alone, so no digit is lost to a difference, however long and thin
     the ellipse is.
     """
-    p = (across.square().sum(-1) + variance).sqrt()
-    unit = across / p[..., None]
-    beside = torch.linalg.cross(unit, along).square().sum(-1) + (
-        variance / p.square()
-    ) * along.square().sum(-1)
-    return torch.stack((p, (unit * along).sum(-1), (beside + variance).sqrt()), -1)
+    p = (across.square().sum(-1) + variance).sqrt()  # (...)
+    unit = across / p[..., None]  # e, (..., k)
+    area = torch.linalg.cross(unit, along).square().sum(-1)  # |e x along|²
+    beside = area + (variance / p.square()) * along.square().sum(-1)
+    q = (unit * along).sum(-1)
+    return torch.stack((p, q, (beside + variance).sqrt()), -1)  # (..., 3)

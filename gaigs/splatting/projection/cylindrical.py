@@ -14,9 +14,12 @@ class Cylindrical(Projection):
     """u = azimuth, with period 2 pi, and v = f(elevation).
 
     Args:
-        pixel: As of ``Projection`` [rad].
+        pixel: As for ``Projection`` [rad].
         limit_deg: Elevations are clamped to this absolute value [deg], in (0, 90): towards the pole
             the azimuth of a small step diverges as 1 / cos(elevation).
+
+    Raises:
+        ValueError: The limit is out of range.
     """
 
     period = 2 * math.pi
@@ -37,19 +40,20 @@ class Cylindrical(Projection):
         return torch.stack((azimuths, v), -1)
 
     def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
-        azimuths, elevations, distances = to_spherical(points)
+        azimuths, elevations, distances = to_spherical(points)  # (...) each
         clamped = elevations.clamp(-self.limit, self.limit)
         _, slope = self.stretch(clamped)
+        # Unit vectors of growing azimuth and of growing elevation.
         sin, cos = torch.sin(azimuths), torch.cos(azimuths)
-        # Unit vectors of growing azimuth and of growing elevation, and their rates per metre.
-        east = torch.stack((-sin, cos, torch.zeros_like(sin)), -1)
+        east = torch.stack((-sin, cos, torch.zeros_like(sin)), -1)  # (..., 3)
         height, horizontal = torch.sin(elevations), torch.cos(elevations)
-        north = torch.stack((-height * cos, -height * sin, horizontal), -1)
-        rates = torch.stack((1 / torch.cos(clamped), slope), -1) / distances[..., None]
-        return rates[..., None] * torch.stack((east, north), -2)
+        north = torch.stack((-height * cos, -height * sin, horizontal), -1)  # (..., 3)
+        # Changes of u and v along these [1/m]: du = east / (r cos el), dv = f'(el) north / r.
+        rates = torch.stack((1 / torch.cos(clamped), slope), -1) / distances[..., None]  # (..., 2)
+        return rates[..., None] * torch.stack((east, north), -2)  # (..., 2, 3)
 
     def plane(self, directions: Directions) -> Plane:
         """Plane coordinates; u and v of a grid are separable."""
         v, _ = self.stretch(directions.elevations.clamp(-self.limit, self.limit))
-        rows = v[:, None] if isinstance(directions, Grid) else v[None]
-        return Plane(directions.azimuths[None], rows, self.period)
+        v = v[:, None] if isinstance(directions, Grid) else v[None]  # (rows, 1) or (1, k)
+        return Plane(directions.azimuths[None], v, self.period)

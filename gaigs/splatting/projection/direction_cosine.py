@@ -10,12 +10,12 @@ from gaigs.splatting.projection import Projection
 
 @register("projection", "direction_cosine")
 class DirectionCosine(Projection):
-    """(u, v) = (l, m) = (cos(el) cos(az), cos(el) sin(az)), in which a planar array's response is
-    shift-invariant.
+    """(u, v) = (cos(el) cos(az), cos(el) sin(az)), the direction cosines l and m.
 
-    No seam and no pole: smooth on the whole hemisphere. As with a planar array, a direction below
-    the array's plane and its mirror image above are one. Rows and columns of a spectrum mix, so
-    ``plane`` gives full grids.
+    A planar array's response is shift-invariant in them. There is no seam and no pole: the map is
+    smooth on the whole hemisphere. As with a planar array, a direction below the array's plane and
+    its mirror image above are one. Rows and columns of a spectrum mix, so ``plane`` gives full
+    grids.
 
     Source: Van Trees, Optimum Array Processing, 2002, chapter 4.
     """
@@ -27,7 +27,8 @@ class DirectionCosine(Projection):
         return (points / points.norm(dim=-1, keepdim=True))[..., :2]
 
     def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
-        distances = points.norm(dim=-1)[..., None, None]
-        unit = points[..., None, :] / distances
+        distances = points.norm(dim=-1)[..., None, None]  # (..., 1, 1) [m]
+        unit = points[..., None, :] / distances  # (..., 1, 3)
+        # A direction changes only by the part of a step that is across it: (I - e e') / r.
         identity = torch.eye(3, dtype=points.dtype, device=points.device)
-        return (identity - unit.mT @ unit)[..., :2, :] / distances
+        return (identity - unit.mT @ unit)[..., :2, :] / distances  # (..., 2, 3)

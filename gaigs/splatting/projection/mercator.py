@@ -11,9 +11,9 @@ from gaigs.splatting.projection.cylindrical import Cylindrical
 
 @register("projection", "mercator")
 class Mercator(Cylindrical):
-    """u = azimuth, v = alpha asinh(tan(elevation)), which equals the paper's alpha log tan(pi/4 +
-    elevation/2).
+    """u = azimuth, v = alpha log tan(pi / 4 + elevation / 2).
 
+    It is computed as the equal v = alpha asinh(tan(elevation)), which is exact near the horizon.
     alpha maps the elevation limit to the plane's edge v = pi, so that the plane is as high as it is
     wide. At the default limit, atan(sinh(pi)) = 85.0511 degrees, alpha is 1 and the projection
     conformal: a small round Gaussian stays round wherever it lies.
@@ -28,4 +28,5 @@ class Mercator(Cylindrical):
         self.alpha = math.pi / math.asinh(math.tan(self.limit))
 
     def stretch(self, elevations: Tensor) -> tuple[Tensor, Tensor]:
-        return self.alpha * torch.asinh(torch.tan(elevations)), self.alpha / torch.cos(elevations)
+        v = self.alpha * torch.asinh(torch.tan(elevations))
+        return v, self.alpha / torch.cos(elevations)

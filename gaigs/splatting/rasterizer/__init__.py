@@ -12,21 +12,21 @@ from gaigs.registry import registry
 from gaigs.splatting.projection import Plane, Projection, Splats, project
 
 ALPHA_MIN = 1 / 255
-"""A splat acts on a pixel where its opacity a G is at least this, the customary bound (one grey
-level).
-"""
+"""Least opacity a G of a splat that acts on a pixel, the customary bound (one grey level)."""
 
 ALPHA_MAX = 0.99
 """Largest opacity a G of one splat at a pixel, the customary bound: log(1 - a G) stays finite."""
 
 OPAQUE = -(2.0**18)
-"""The logarithm of an attenuation of 0: G times this is in effect minus infinity, and its products
-stay finite.
+"""Logarithm of an attenuation of 0.
+
+G times this is in effect minus infinity, and its products stay finite.
 """
 
 STEEPEST = 1e-30
-"""Below this attenuation the logarithm's gradient is divided by this value, lest float32 overflows;
-at 0 it is 0.
+"""Attenuation below which the logarithm's gradient is divided by this value.
+
+Without it float32 would overflow; at an attenuation of 0 the gradient is 0.
 """
 
 
@@ -36,7 +36,7 @@ class Rasterizer(Protocol):
 
     Front to back by ``depths`` (ties by index), with a_i the opacity and d_i the attenuation in [0,
     1], G_i the footprint exp(-x' C^-1 x / 2) at the pixel, A_i = min(a_i G_i, ALPHA_MAX), or 0
-    below ALPHA_MIN:
+    below ALPHA_MIN, eq. (13) and (14) are
 
         map = sum_i signal_i A_i T_i        T_i = prod_{j<i} (1 - A_j) d_j^{G_j}
 
@@ -44,11 +44,12 @@ class Rasterizer(Protocol):
     periodic. Splats that are not ``visible`` do nothing. Every input but depths and visible is
     differentiable.
 
-    ``used`` names the rasterizer of the last map, and its device where there is a choice, for a
-    run's metrics.
+    Attributes:
+        used: Name of the rasterizer that drew the last map, and its device where there is a choice,
+            for a run's metrics.
 
-    Source: GAI-GS, "Mapping, Projection and Render Module"; the area over which d_j acts is ours
-    (docs/methods.md).
+    Source: GAI-GS, "Mapping, Projection and Render Module", eq. (13) and (14); the area over which
+    d_j acts is ours (docs/methods.md).
     """
 
     used: str | None
@@ -61,7 +62,7 @@ class Rasterizer(Protocol):
         attenuations: Float[Tensor, "b n"] | None,
         plane: Plane,
     ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
-        """The map, and the transmittance left behind the last splat."""
+        """Draws the map, and the transmittance behind the last splat."""
         ...
 
 
@@ -79,11 +80,10 @@ def rasterize(
     rasterizer: str | Mapping | Rasterizer = "fastest",
     pixel: float | None = None,
 ) -> tuple[Tensor, Tensor]:
-    """The map that Gaussians make at a receiver. Quaternions are (w, x, y, z) of any length, in the
-    world frame.
+    """Draws the map that Gaussians make at a receiver.
 
     Gaussians are composited front to back by their distance to the receiver; ``Rasterizer`` has the
-    equation.
+    equation. Quaternions are (w, x, y, z) of any length, in the world frame.
 
     Args:
         means: Centres, world frame (n, 3) [m].
@@ -91,7 +91,7 @@ def rasterize(
             the world frame.
         scales: Standard deviations along these axes (n, 3) [m].
         opacities: In [0, 1] (n,).
-        signal: Of each Gaussian, any number of real channels (n, c); a complex channel is two, real
+        signal: Any number of real channels of each Gaussian (n, c); a complex channel is two, real
             and imaginary part.
         attenuations: Share of the field from behind that each lets through, in [0, 1] (n,). None:
             1.
@@ -107,15 +107,18 @@ def rasterize(
     Raises:
         TypeError, ValueError: An input is no tensor of its shape and dtype, or is out of range.
 
-    Source: GAI-GS, "Projection and Render Module"; Zwicker et al., EWA Splatting, 2002.
+    Source: GAI-GS, "Projection and Render Module", eq. (13) and (14); Zwicker et al., EWA
+    Splatting, 2002.
 
     Example:
         >>> means = torch.tensor([[2.0, 0.0, 1.0], [0.0, 3.0, 1.0]], requires_grad=True)
-        >>> quats, scales = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(2, 4), torch.full((2, 3), 0.3)
-        >>> opacities, signal = torch.tensor([0.9, 0.8]), torch.tensor([[1.0], [0.5]])
-        >>> pose = gaigs.Pose.from_xyzw([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])  # of the receiver, scipy's order
+        >>> quats = torch.tensor([[1.0, 0.0, 0.0, 0.0]]).expand(2, 4)
+        >>> scales, opacities = torch.full((2, 3), 0.3), torch.tensor([0.9, 0.8])
+        >>> signal = torch.tensor([[1.0], [0.5]])
+        >>> pose = gaigs.Pose.from_xyzw([0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])  # scipy's order
+        >>> view = {"receiver": pose, "grid": gaigs.Grid.degrees(), "rasterizer": "torch"}
         >>> image, transmittance = gaigs.rasterize(
-        ...     means, quats, scales, opacities, signal, receiver=pose, grid=gaigs.Grid.degrees(), rasterizer="torch"
+        ...     means, quats, scales, opacities, signal, **view
         ... )
         >>> image.shape, transmittance.shape
         (torch.Size([1, 90, 360]), torch.Size([90, 360]))
@@ -123,66 +126,92 @@ def rasterize(
         >>> means.grad.shape
         torch.Size([2, 3])
     """
-    given = (means, quats, scales, opacities, signal) + (
-        () if attenuations is None else (attenuations,)
-    )
-    if not all(isinstance(values, Tensor) and values.ndim for values in given):
-        raise TypeError(
-            "means, quats, scales, opacities, signal and attenuations must be torch tensors with axes"
-        )
-    n, c = means.shape[-2] if means.ndim > 1 else 0, signal.shape[-1]
-    inputs = {
-        "means": (means, (n, 3)),
-        "quats": (quats, (n, 4)),
-        "scales": (scales, (n, 3)),
-        "signal": (signal, (n, c)),
+    tensors = {
+        "means": means,
+        "quats": quats,
+        "scales": scales,
+        "signal": signal,
+        "opacities": opacities,
     }
-    rest = {"opacities": opacities} | (
-        {} if attenuations is None else {"attenuations": attenuations}
-    )
-    inputs |= {name: (values[..., None], (n, 1)) for name, values in rest.items()}
-    sizes = {1}
-    for name, (values, shape) in inputs.items():
-        if values.ndim not in (2, 3) or tuple(values.shape[-2:]) != shape:
-            raise ValueError(f"{name} must have {n} rows of {shape[1]}, got {tuple(values.shape)}")
+    if attenuations is not None:
+        tensors["attenuations"] = attenuations
+    leading = _check_shapes(tensors)
+    _check_range("scales", scales, math.inf, "take their exp")
+    for name in ("opacities", "attenuations"):
+        if name in tensors:
+            _check_range(name, tensors[name], 1.0, "pass them through a sigmoid")
+    chosen = registry("rasterizer").build(rasterizer)
+    b = max(leading, default=1)
+    n, c = means.shape[-2], signal.shape[-1]
+    signal = signal.expand(b, n, c)
+    opacities = opacities.expand(b, n)
+    if attenuations is not None:
+        attenuations = attenuations.expand(b, n)
+    # Gaussians that stand still are drawn for all transmitters at once, others one by one.
+    moves = means.ndim == 3
+    maps = []
+    lefts = []
+    for row in [slice(k, k + 1) for k in range(b)] if moves else [slice(None)]:
+        places = means[row.start if len(means) > 1 else 0] if moves else means  # (n, 3)
+        shape = [_rows(values, row) for values in (quats, scales)]
+        splats, plane = project(
+            places, *shape, receiver=receiver, grid=grid, projection=projection, pixel=pixel
+        )
+        passing = None if attenuations is None else attenuations[row]
+        image, left = chosen(splats, signal[row], opacities[row], passing, plane)
+        maps.append(image)
+        lefts.append(left)
+    image = cat(maps)  # (b, c, rows, columns)
+    left = cat(lefts)  # (b, rows, columns)
+    if isinstance(grid, Rays):
+        image = image[..., 0, :]
+        left = left[..., 0, :]
+    return (image, left) if leading else (image[0], left[0])
+
+
+def _rows(values: Tensor, row: slice) -> Tensor:
+    """Values of a few transmitters, or those that all transmitters share."""
+    return values[row] if values.ndim == 3 and len(values) > 1 else values
+
+
+def _check_shapes(tensors: Mapping[str, Tensor]) -> set[int]:
+    """Checks types and shapes of the inputs by name.
+
+    Returns:
+        Numbers of transmitters in leading axes: none if no input has such an axis.
+
+    Raises:
+        TypeError: An input is no tensor with axes.
+        ValueError: Rows, columns, dtypes or numbers of transmitters do not fit.
+    """
+    if not all(isinstance(values, Tensor) and values.ndim for values in tensors.values()):
+        raise TypeError(
+            "means, quats, scales, opacities, signal and attenuations must be torch tensors "
+            "with axes"
+        )
+    means = tensors["means"]
+    n = means.shape[-2] if means.ndim > 1 else 0
+    columns = {"means": 3, "quats": 4, "scales": 3, "signal": tensors["signal"].shape[-1]}
+    leading: set[int] = set()
+    for name, values in tensors.items():
+        rows = values if name in columns else values[..., None]  # (n, k) or (b, n, k)
+        size = columns.get(name, 1)
+        if rows.ndim not in (2, 3) or tuple(rows.shape[-2:]) != (n, size):
+            raise ValueError(f"{name} must have {n} rows of {size}, got {tuple(rows.shape)}")
         if values.dtype != means.dtype or not values.is_floating_point():
             raise ValueError(
                 f"{name} must be real numbers of means' {means.dtype}, got {values.dtype}"
             )
-        sizes |= set(values.shape[:-2])
-    for name, values in {"scales": scales, **rest}.items():
-        most, advice = (
-            (math.inf, "take their exp")
-            if name == "scales"
-            else (1.0, "pass them through a sigmoid")
-        )
-        if len(wrong := values[(values < 0) | (values > most)]):  # NaN passes, and shows in the map
-            raise ValueError(
-                f"{name} must lie in [0, {most:g}], got {wrong[0]:.3g}; {advice} first"
-            )
-    if len(sizes) > 2:
-        raise ValueError(
-            f"inputs must have one number of transmitters, got {', '.join(map(str, sorted(sizes - {1})))}"
-        )
-    chosen = registry("rasterizer").build(rasterizer)
-    is_batch = any(values.ndim == 3 for values, _ in inputs.values())
-    b = max(sizes)
-    signal, opacities = signal.expand(b, n, c), opacities.expand(b, n)
-    attenuations = None if attenuations is None else attenuations.expand(b, n)
-    rows = [slice(k, k + 1) for k in range(b)] if means.ndim == 3 else [slice(None)]
-    maps = []
-    for row in rows:
-        geometry = [means[row.start if len(means) > 1 else 0] if means.ndim == 3 else means]
-        geometry += [
-            values[row] if values.ndim == 3 and len(values) > 1 else values
-            for values in (quats, scales)
-        ]
-        splats, plane = project(
-            *geometry, receiver=receiver, grid=grid, projection=projection, pixel=pixel
-        )
-        own = None if attenuations is None else attenuations[row]
-        maps.append(chosen(splats, signal[row], opacities[row], own, plane))
-    image, left = (cat(parts) for parts in zip(*maps, strict=True))
-    if isinstance(grid, Rays):
-        image, left = image[..., 0, :], left[..., 0, :]
-    return (image, left) if is_batch else (image[0], left[0])
+        leading |= set(rows.shape[:-2])
+    several = sorted(leading - {1})
+    if len(several) > 1:
+        numbers = ", ".join(map(str, several))
+        raise ValueError(f"inputs must have one number of transmitters, got {numbers}")
+    return leading
+
+
+def _check_range(name: str, values: Tensor, most: float, advice: str) -> None:
+    """Raises a ``ValueError`` for values outside [0, most]; NaN passes, and shows in the map."""
+    wrong = values[(values < 0) | (values > most)]
+    if len(wrong):
+        raise ValueError(f"{name} must lie in [0, {most:g}], got {wrong[0]:.3g}; {advice} first")

@@ -7,14 +7,16 @@ import pyopencl as cl
 
 
 def devices() -> list[str]:
-    """The OpenCL devices of this machine, each as "platform: device (kind)"; a ``RuntimeError``
-    without a driver.
+    """Lists the OpenCL devices of this machine, each as "platform: device (kind)".
+
+    Raises:
+        RuntimeError: No driver lists a device.
     """
     return [name_of(device) for device in _devices()]
 
 
 def default_device() -> str:
-    """The default of ``devices``."""
+    """The device of ``devices`` that is used unless another is named."""
     return name_of(_choose(os.environ.get("GAIGS_OPENCL_DEVICE")))
 
 
@@ -25,42 +27,53 @@ def _process() -> int:
 
 
 def is_forked() -> bool:
-    """True in a process forked from one that uses OpenCL: it lacks the driver's threads, and would
-    wait for ever.
+    """True in a process forked from one that uses OpenCL.
+
+    It lacks the driver's threads, and would wait for ever.
     """
     return _process() != os.getpid()
 
 
 def _devices() -> list:
-    """The devices of all drivers. A broken driver is an error only where no other lists a device."""
+    """The devices of all drivers; a broken driver is an error only if no other lists a device."""
     _process()  # drivers start threads here, too
-    found, causes = [], []
+    devices = []
+    causes = []
     try:
         for platform in cl.get_platforms():
             try:
-                found += platform.get_devices()
+                devices += platform.get_devices()
             except cl.Error as error:
                 causes.append(f"; {platform.name} lists no devices ({error})")
     except cl.Error as error:  # with no platform, too
         causes.append(f" ({error})")
-    if not found:
-        needs = "rasterizer 'opencl' needs an OpenCL driver: pip install 'pyopencl[pocl]', or use rasterizer=torch"
-        raise RuntimeError(needs + "".join(causes))
-    return found
+    if not devices:
+        raise RuntimeError(
+            "rasterizer 'opencl' needs an OpenCL driver: pip install 'pyopencl[pocl]', "
+            f"or use rasterizer=torch{''.join(causes)}"
+        )
+    return devices
 
 
 def name_of(device) -> str:
-    """As ``devices`` lists it."""
-    kinds = (
-        kind
-        for kind in ("CPU", "GPU", "ACCELERATOR")
-        if device.type & getattr(cl.device_type, kind)
-    )
+    """The name of a device, as ``devices`` lists it."""
+    kinds = []
+    for kind in ("CPU", "GPU", "ACCELERATOR"):
+        if device.type & getattr(cl.device_type, kind):
+            kinds.append(kind)
     return f"{device.platform.name}: {device.name} ({' '.join(kinds)})"
 
 
 def open_queue(name: str | None) -> cl.CommandQueue:
-    """The queue of a device, made once; the name is as for ``OpenCLRasterizer``."""
+    """The queue of a device, made once.
+
+    Args:
+        name: As for ``OpenCLRasterizer``.
+
+    Raises:
+        RuntimeError: The process is forked, no driver works, or the device cannot be opened.
+        ValueError: No device has this name.
+    """
     if is_forked():
         raise RuntimeError(
             "rasterizer 'opencl' does not work in a process forked from one that has used it\n"
@@ -82,14 +95,14 @@ def _open(name: str | None) -> cl.CommandQueue:
 
 
 def _choose(name: str | None):
-    """The first device with this part of a name; for None the first CPU, or else the first device."""
-    found = _devices()
+    """The first device with this part of a name; for None the first CPU, else the first device."""
+    devices = _devices()
     if name:
-        chosen = [device for device in found if name.lower() in name_of(device).lower()]
+        chosen = [device for device in devices if name.lower() in name_of(device).lower()]
     else:
-        chosen = [device for device in found if device.type & cl.device_type.CPU] or found
+        chosen = [device for device in devices if device.type & cl.device_type.CPU] or devices
     if not chosen:
-        listed = "; ".join(map(name_of, found))
+        listed = "; ".join(map(name_of, devices))
         raise ValueError(
             f"rasterizer 'opencl': no OpenCL device is called {name!r}; there are: {listed}"
         )
@@ -98,8 +111,9 @@ def _choose(name: str | None):
 
 @functools.cache
 def find_fault(queue: cl.CommandQueue) -> str | None:
-    """The driver's reason why a device, such as a processor unknown to its compiler, builds no
-    kernels; or None.
+    """The driver's reason why a device builds no kernels, or None.
+
+    The device may be a processor that the driver's compiler does not know.
     """
     try:
         cl.Program(queue.context, "kernel void probe(global int *value) { value[0] = 1; }").build()
@@ -111,7 +125,6 @@ def find_fault(queue: cl.CommandQueue) -> str | None:
 def cause_of(error: cl.Error) -> str:
     """The first error in a build's log, or else its last line."""
     lines = [line.strip() for line in str(error).splitlines()]
-    lines = [
-        line for line in lines if line and not line.startswith("(")
-    ]  # pyopencl's notes on options and source
+    # Lines in brackets are pyopencl's notes on options and source.
+    lines = [line for line in lines if line and not line.startswith("(")]
     return next((line for line in lines if "error:" in line), lines[-1])

@@ -12,10 +12,10 @@ log = logging.getLogger(__name__)
 
 @register("rasterizer", "fastest")
 class FastestRasterizer:
-    """``opencl`` for float32 on the CPU where a driver builds kernels, else ``torch``, also in a
-    forked process.
+    """``opencl`` for float32 on the CPU where a driver builds kernels, else ``torch``.
 
-    The two agree to 2e-6 of the image's maximum, so a checkpoint may be rendered by either.
+    A forked process uses ``torch``. The two agree to 2e-6 of the image's maximum, so a checkpoint
+    may be rendered by either.
     """
 
     used: str | None = None

@@ -1,9 +1,11 @@
-"""The rasterizer in OpenCL: float32 tensors on the CPU, any OpenCL device; the kernels stand in
-kernels/*.cl.
+"""The rasterizer in OpenCL: float32 tensors on the CPU, any OpenCL device.
+
+The kernels are in kernels/*.cl.
 """
 
 import ctypes
 import functools
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,52 +19,76 @@ from gaigs.splatting.projection import Plane, Splats
 from gaigs.splatting.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
 from gaigs.splatting.rasterizer.devices import cause_of, find_fault, is_forked, name_of, open_queue
 
-ROWS, COLUMNS = 16, 8
-"""Edges of a tile in pixels, as in the kernels."""
 
-WORD, BLOCK, CHUNK, GEOMETRY, MOMENTS = 32, 16, 32, 8, 5
-"""Splats a word of bits, words a block, entries a checkpoint, and lengths of rows in buffers, as in
-the kernels.
-"""
+@dataclass(frozen=True)
+class KernelLayout:
+    """Sizes that the kernels have too, and the largest shares of a work-item.
 
-GROUP = 8
-"""Most transmitters of one work-item, where they share footprints; more would leave the nearest
-cache.
-"""
+    Attributes:
+        rows, columns: Edges of a tile [pixels].
+        word: Splats in a word of bits.
+        block: Words in a block.
+        chunk: Entries of a list between two checkpoints.
+        geometry: Numbers in a splat's row of the geometry.
+        moments: Numbers in an entry's row of the moments.
+        group: Most transmitters of one work-item, where they share footprints; more would leave the
+            nearest cache.
+        channels: Channels composited at a time: the registers hold a row of each.
+    """
 
-CHANNELS = 8
-"""Channels composited at a time: the registers hold a row of each."""
+    rows: int = 16
+    columns: int = 8
+    word: int = 32
+    block: int = 16
+    chunk: int = 32
+    geometry: int = 8
+    moments: int = 5
+    group: int = 8
+    channels: int = 8
 
-SPLATS = 2**24
-"""Number of splats that is too large: an entry of a list has 24 bits for the splat."""
+
+LAYOUT = KernelLayout()
 
 
 @register("rasterizer", "opencl")
 class OpenCLRasterizer:
-    """Tiles of 16 rows of 8 pixels, a work-item each, their rows in vector registers; the gradient
-    is written by hand.
+    """Tiles of 16 rows of 8 pixels, a work-item each, their rows in vector registers.
 
     Splats are sorted by depth once, and listed by the tiles that their ellipses reach: once for all
-    transmitters where these share covariances, which then share footprints too. A CPU device reads
-    tensors without a copy. Two runs give the same bits.
+    transmitters where these share covariances, which then share footprints too. The gradient is
+    written by hand. A CPU device reads tensors without a copy. Two runs give the same bits.
 
     Args:
         device: Part of a name that ``devices`` lists, e.g. "cpu" or "pocl". None: the environment
             variable GAIGS_OPENCL_DEVICE, and without it the first CPU, for which the kernels are
             made.
+
+    Attributes:
+        too_many: Number of splats that is too large: an entry of a list has 24 bits for the splat.
+
+    Raises:
+        RuntimeError: No driver works, or the device builds no kernels.
+        ValueError: No device has this name.
+
+    Source: tiles of Kerbl et al., 3D Gaussian Splatting, 2023, section 6; GAI-GS, "Projection and
+    Render Module", eq. (13) and (14).
     """
+
+    too_many = 2**24
 
     def __init__(self, device: str | None = None):
         self.device = device
         queue = open_queue(device)
-        if fault := find_fault(queue):
+        fault = find_fault(queue)
+        if fault:
             raise RuntimeError(
-                f"rasterizer 'opencl': {name_of(queue.device)} cannot build kernels ({fault}); use rasterizer=torch, "
-                "or install a newer driver"
+                f"rasterizer 'opencl': {name_of(queue.device)} cannot build kernels ({fault}); "
+                "use rasterizer=torch, or install a newer driver"
             )
 
     @property
     def used(self) -> str:
+        """The device, for a run's metrics."""
         return f"opencl on {name_of(open_queue(self.device).device)}"
 
     def takes(
@@ -74,18 +100,13 @@ class OpenCLRasterizer:
         plane: Plane,
     ) -> bool:
         """True if dtypes, devices and counts suit, and OpenCL works in this process."""
-        floats = (
-            splats.means2d,
-            splats.factors,
-            splats.depths,
-            signal,
-            opacities,
-            attenuations,
-            plane.u,
-            plane.v,
-        )
-        suits = (x is None or (x.dtype == torch.float32 and x.device.type == "cpu") for x in floats)
-        return not is_forked() and all(suits) and signal.shape[2] >= 1 and signal.shape[1] < SPLATS
+        floats = [splats.means2d, splats.factors, splats.depths, signal, opacities]
+        floats += [plane.u, plane.v]
+        if attenuations is not None:
+            floats.append(attenuations)
+        suit = all(x.dtype == torch.float32 and x.device.type == "cpu" for x in floats)
+        _, n, c = signal.shape
+        return not is_forked() and suit and c >= 1 and n < self.too_many
 
     def __call__(
         self,
@@ -95,36 +116,80 @@ class OpenCLRasterizer:
         attenuations: Tensor | None,
         plane: Plane,
     ) -> tuple[Tensor, Tensor]:
-        _check(splats, signal, opacities, attenuations, plane)
-        common = (
-            open_queue(self.device),
-            splats,
-            plane,
-            torch.is_grad_enabled(),
-            splats.means2d,
-            splats.factors,
-        )
-        chunks = [
-            _CompositeByKernels.apply(*common, part, opacities, attenuations)
-            for part in signal.split(CHANNELS, 2)
-        ]
-        images, transmittances = zip(*chunks, strict=True)
-        return torch.cat(images, 1) if len(images) > 1 else images[0], transmittances[0]
+        self._check(splats, signal, opacities, attenuations, plane)
+        queue = open_queue(self.device)
+        images = []
+        lefts = []
+        for part in signal.split(LAYOUT.channels, 2):
+            image, left = _CompositeByKernels.apply(
+                queue,
+                splats,
+                plane,
+                torch.is_grad_enabled(),
+                splats.means2d,
+                splats.factors,
+                part,
+                opacities,
+                attenuations,
+            )
+            images.append(image)
+            lefts.append(left)
+        return torch.cat(images, 1) if len(images) > 1 else images[0], lefts[0]
+
+    def _check(
+        self,
+        splats: Splats,
+        signal: Tensor,
+        opacities: Tensor,
+        attenuations: Tensor | None,
+        plane: Plane,
+    ) -> None:
+        """Raises where tensors do not fit: kernels check nothing."""
+        b, n, c = signal.shape
+        height, width = plane.shape
+        tensors: dict[str, tuple[Tensor, list[tuple[int, ...]]]] = {
+            "means2d": (splats.means2d, [(n, 2)]),
+            "factors": (splats.factors, [(1, n, 3), (b, n, 3)]),
+            "depths": (splats.depths, [(n,)]),
+            "visible": (splats.visible, [(n,)]),
+            "signal": (signal, [(b, n, c)]),
+            "opacities": (opacities, [(b, n)]),
+            "plane.u": (plane.u, [(1, width), (height, width)]),
+            "plane.v": (plane.v, [(height, 1), (height, width)]),
+        }
+        if attenuations is not None:
+            tensors["attenuations"] = attenuations, [(b, n)]
+        for name, (tensor, shapes) in tensors.items():
+            dtype = torch.bool if name == "visible" else torch.float32
+            if tensor.dtype != dtype or tensor.device.type != "cpu":
+                raise TypeError(
+                    f"rasterizer 'opencl' takes {name} as {dtype} on the CPU, "
+                    f"got {tensor.dtype} on {tensor.device}; use rasterizer=torch"
+                )
+            if tuple(tensor.shape) not in shapes:
+                allowed = " or ".join(map(str, shapes))
+                shape = tuple(tensor.shape)
+                raise ValueError(
+                    f"{name} must be {allowed} where signal is {(b, n, c)}, got {shape}"
+                )
+        if c < 1 or n >= self.too_many:
+            raise ValueError(
+                "rasterizer 'opencl' takes at least 1 channel and fewer than 2^24 splats, "
+                f"got {c} and {n}; use rasterizer=torch"
+            )
 
 
 @functools.cache
 def _pool(queue: cl.CommandQueue) -> cl.tools.MemoryPool:
-    """Buffers that live on from call to call: fresh memory would cost a page fault every 4 KiB."""
+    """Buffers that live from call to call: fresh memory would cost a page fault every 4 KiB."""
     return cl.tools.MemoryPool(cl.tools.ImmediateAllocator(queue))
 
 
 def _source() -> str:
     """All kernels, in the order in which they use each other's functions."""
     folder = Path(__file__).parent / "kernels"
-    return "\n".join(
-        (folder / f"{name}.cl").read_text()
-        for name in ("footprint", "bin", "composite", "gradient")
-    )
+    names = ("footprint", "bin", "composite", "gradient")
+    return "\n".join((folder / f"{name}.cl").read_text() for name in names)
 
 
 @functools.cache
@@ -137,50 +202,17 @@ def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel
     except cl.Error as error:
         device = name_of(queue.device)
         raise RuntimeError(
-            f"rasterizer 'opencl': {device} cannot build the kernels ({cause_of(error)}); use rasterizer=torch"
+            f"rasterizer 'opencl': {device} cannot build the kernels ({cause_of(error)}); "
+            "use rasterizer=torch"
         ) from error
     return {kernel.function_name: kernel for kernel in program.all_kernels()}
 
 
-def _check(
-    splats: Splats, signal: Tensor, opacities: Tensor, attenuations: Tensor | None, plane: Plane
-) -> None:
-    """Raises where tensors do not fit: kernels check nothing."""
-    b, n, c = signal.shape
-    height, width = plane.shape
-    tensors: dict[str, tuple[Tensor, list[tuple[int, ...]]]] = {
-        "means2d": (splats.means2d, [(n, 2)]),
-        "factors": (splats.factors, [(1, n, 3), (b, n, 3)]),
-        "depths": (splats.depths, [(n,)]),
-        "visible": (splats.visible, [(n,)]),
-        "signal": (signal, [(b, n, c)]),
-        "opacities": (opacities, [(b, n)]),
-        "plane.u": (plane.u, [(1, width), (height, width)]),
-        "plane.v": (plane.v, [(height, 1), (height, width)]),
-    }
-    if attenuations is not None:
-        tensors["attenuations"] = attenuations, [(b, n)]
-    for name, (tensor, shapes) in tensors.items():
-        dtype = torch.bool if name == "visible" else torch.float32
-        if tensor.dtype != dtype or tensor.device.type != "cpu":
-            raise TypeError(
-                f"rasterizer 'opencl' takes {name} as {dtype} on the CPU, got {tensor.dtype} on {tensor.device}; "
-                "use rasterizer=torch"
-            )
-        if tuple(tensor.shape) not in shapes:
-            allowed = " or ".join(map(str, shapes))
-            raise ValueError(
-                f"{name} must be {allowed} where signal is {(b, n, c)}, got {tuple(tensor.shape)}"
-            )
-    if c < 1 or n >= SPLATS:
-        allowed = "at least 1 channel and fewer than 2^24 splats"
-        raise ValueError(
-            f"rasterizer 'opencl' takes {allowed}, got {c} and {n}; use rasterizer=torch"
-        )
-
-
 class _CompositeByKernels(torch.autograd.Function):
-    """Autograd differentiates by the arguments; ``_Render`` finds the same tensors in the splats."""
+    """``_Render`` with its gradient.
+
+    Autograd differentiates by the arguments; ``_Render`` has the same tensors in the splats.
+    """
 
     @staticmethod
     def forward(
@@ -199,8 +231,17 @@ class _Sizes(ctypes.Structure):
     """The kernels' ``sizes_t``."""
 
     _fields_ = [
-        (name, ctypes.c_int32)
-        for name in "transmitters sets groups group splats words height width down across entries".split()
+        ("transmitters", ctypes.c_int32),
+        ("sets", ctypes.c_int32),  # of lists
+        ("groups", ctypes.c_int32),
+        ("group", ctypes.c_int32),  # transmitters in a group, which share a work-item
+        ("splats", ctypes.c_int32),
+        ("words", ctypes.c_int32),  # of splats, the last one filled up
+        ("height", ctypes.c_int32),  # of the image [pixels]
+        ("width", ctypes.c_int32),
+        ("down", ctypes.c_int32),  # of the image [tiles]
+        ("across", ctypes.c_int32),
+        ("entries", ctypes.c_int32),  # of all lists
     ]
 
 
@@ -213,130 +254,114 @@ class _Render:
 
     def __init__(self, queue, splats, signal, opacities, attenuations, plane):
         self.queue = queue
-        b, n, self.channels = signal.shape
-        height, width = plane.shape
-        sets = len(splats.factors)
-        groups = b if sets > 1 else max(1, -(-b // GROUP))
-        group = -(-b // groups)
-        down, across, words = -(-height // ROWS), -(-width // COLUMNS), -(-n // WORD)
-        self.sizes = _Sizes(b, sets, groups, group, n, words, height, width, down, across)
-        self.tiles, self.lists = down * across, sets * down * across
-        self.groups_per_list = groups if sets == 1 else 1
+        self.channels = signal.shape[2]
         self.attenuates = attenuations is not None
-        appearance_size = (
-            1 + self.attenuates + self.channels
-        )  # opacity, attenuation, signal: of one transmitter
-        self.group_capacity = 1 if group == 1 else GROUP
-        self.partials = MOMENTS + self.group_capacity * appearance_size
-        separable = plane.u.shape[0] == plane.v.shape[1] == 1
-        macros = {
+        self.sizes = _measure(splats, signal, plane)
+        sizes = self.sizes
+        self.tiles = sizes.down * sizes.across
+        self.lists = sizes.sets * self.tiles
+        self.groups_per_list = sizes.groups if sizes.sets == 1 else 1
+        self.group_capacity = 1 if sizes.group == 1 else LAYOUT.group
+        # Opacity, attenuation and signal of one transmitter.
+        self.appearance_size = 1 + self.attenuates + self.channels
+        self.partials = LAYOUT.moments + self.group_capacity * self.appearance_size
+        self.is_separable = plane.u.shape[0] == plane.v.shape[1] == 1
+        self.kernels = _kernels(queue, **self._macros(plane.period))
+        self.order = self._share(_front_to_back(splats.depths))
+        self._list_splats(splats, signal, opacities, attenuations, plane)
+        self.loudest = self._share(np.abs(signal.detach().numpy()).max((1, 2), initial=0))
+
+    def _macros(self, period: float | None) -> dict[str, str | int]:
+        """What the kernels are built with."""
+        macros: dict[str, str | int] = {
             "CHANNELS": self.channels,
             "ATTENUATION": int(self.attenuates),
             "TRANSMITTERS": self.group_capacity,
+            "SEPARABLE": int(self.is_separable),
+            "ALPHA_MIN": _literal(ALPHA_MIN),
+            "ALPHA_MAX": _literal(ALPHA_MAX),
+            "OPAQUE": _literal(OPAQUE),
+            "STEEPEST": _literal(STEEPEST),
         }
-        bounds = {
-            "ALPHA_MIN": ALPHA_MIN,
-            "ALPHA_MAX": ALPHA_MAX,
-            "OPAQUE": OPAQUE,
-            "STEEPEST": STEEPEST,
-        }
-        macros |= {"SEPARABLE": int(separable)} | {
-            name: _literal(value) for name, value in bounds.items()
-        }
-        if plane.period is not None:
-            rest = plane.period - float(np.float32(plane.period))
-            macros |= {"PERIOD": _literal(plane.period), "PERIOD_REST": _literal(rest)}
-        self.kernels = _kernels(queue, **macros)
+        if period is not None:
+            rest = period - float(np.float32(period))
+            macros |= {"PERIOD": _literal(period), "PERIOD_REST": _literal(rest)}
+        return macros
 
-        order = self._share(_front_to_back(splats.depths))
-        coordinates = [
-            (part.detach().numpy().tobytes(), tuple(part.shape)) for part in (plane.u, plane.v)
-        ]
-        u, v, spans, edges = _tiling(queue, *coordinates, plane.period)
-        geometry = self._empty(sets * words * WORD * GEOMETRY)
-        appearance = self._empty(words * WORD * b * appearance_size)
-        hits = self._empty(sets * words * (across + down if separable else 2 * self.tiles))
-        tensors = splats.means2d, splats.factors, splats.visible, signal, opacities, attenuations
-        inputs = [
-            self._share(tensor) for tensor in tensors
-        ]  # named, so that they outlive the kernels
-        self._run("prepare", sets * words, order, *inputs, spans, geometry, appearance, hits)
+    def _list_splats(self, splats, signal, opacities, attenuations, plane):
+        """Lists the splats that reach each tile, front to back."""
+        sizes = self.sizes
+        u, v, spans, edges = _tiling(self.queue, _content(plane.u), _content(plane.v), plane.period)
+        rows = sizes.words * LAYOUT.word
+        geometry = self._empty(sizes.sets * rows * LAYOUT.geometry)
+        appearance = self._empty(rows * sizes.transmitters * self.appearance_size)
+        spans_of_tiles = sizes.across + sizes.down if self.is_separable else 2 * self.tiles
+        hits = self._empty(sizes.sets * sizes.words * spans_of_tiles)
+        tensors = (
+            splats.means2d,
+            splats.factors,
+            splats.visible,
+            signal,
+            opacities,
+            attenuations,
+        )
+        inputs = [self._share(tensor) for tensor in tensors]  # they outlive the kernels
+        outputs = (geometry, appearance, hits)
+        self._run("prepare", sizes.sets * sizes.words, self.order, *inputs, spans, *outputs)
 
         counts = np.empty(self.lists, np.int32)
         shared_counts = self._share(counts)
         self._run("count", self.lists, hits, shared_counts)
         self._finish(shared_counts)
         offsets = self._share(np.cumsum(counts, dtype=np.int32) - counts)
-        self.sizes.entries = counts.sum()
-        self.blocks = -(-words // BLOCK)
-        blocks, entries = (
-            self._empty(self.lists * (self.blocks + 1)),
-            self._empty(self.sizes.entries),
-        )
-        self._run(
-            "list",
-            self.lists,
-            hits,
-            spans,
-            edges,
-            geometry,
-            offsets,
-            blocks,
-            entries,
-            shared_counts,
-        )
+        sizes.entries = counts.sum()
+        self.blocks = -(-sizes.words // LAYOUT.block)
+        blocks = self._empty(self.lists * (self.blocks + 1))
+        entries = self._empty(sizes.entries)
+        tests = (hits, spans, edges, geometry)
+        self._run("list", self.lists, *tests, offsets, blocks, entries, shared_counts)
         self.scene = u, v, offsets, shared_counts, entries, geometry, appearance
-        self.order, self.bounds = order, blocks
-        self.loudest = self._share(np.abs(signal.detach().numpy()).max((1, 2), initial=0))
+        self.bounds = blocks
 
     def forward(self, differentiate):
-        """The map and the transmittance; to ``differentiate``, checkpoints for the way back are
-        kept.
+        """Draws the map and the transmittance.
+
+        Args:
+            differentiate: True to keep checkpoints for the way back.
         """
         sizes = self.sizes
-        image = torch.empty(
-            sizes.transmitters, self.channels, sizes.height, sizes.width, dtype=torch.float32
-        )
-        left = torch.empty(sizes.transmitters, sizes.height, sizes.width, dtype=torch.float32)
+        shape = (sizes.transmitters, self.channels, sizes.height, sizes.width)
+        image = torch.empty(shape, dtype=torch.float32)
+        left = torch.empty(shape[:1] + shape[2:], dtype=torch.float32)
         outputs = self._share(image), self._share(left)
-        ends, checkpoints, bounds = self._empty(sizes.groups * self.tiles), None, None
+        items = sizes.groups * self.tiles
+        ends = self._empty(items)
+        checkpoints, bounds = None, None
         if differentiate:
-            size = self.groups_per_list * (sizes.entries // CHUNK + self.lists)
-            checkpoints = self._empty(size * self.group_capacity * ROWS * COLUMNS)
-            bounds = self._empty(size * 2)
-        self._run(
-            "forward",
-            sizes.groups * self.tiles,
-            *self.scene,
-            self.loudest,
-            *outputs,
-            ends,
-            checkpoints,
-            bounds,
-        )
+            count = self.groups_per_list * (sizes.entries // LAYOUT.chunk + self.lists)
+            pixels = LAYOUT.rows * LAYOUT.columns
+            checkpoints = self._empty(count * self.group_capacity * pixels)
+            bounds = self._empty(count * 2)
         self.path = ends, checkpoints, bounds
+        self._run("forward", items, *self.scene, self.loudest, *outputs, *self.path)
         self._finish(*outputs)
         return image, left
 
     def backward(self, image_gradient, left_gradient):
+        """Gradients of centres, factors, signal, opacities and attenuations."""
         sizes = self.sizes
-        b, n = sizes.transmitters, sizes.splats
         images = self._share(image_gradient), self._share(left_gradient)
         partials = self._empty(self.groups_per_list * sizes.entries * self.partials)
-        self._run("backward", sizes.groups * self.tiles, *self.scene, *self.path, *images, partials)
-        shapes = (
-            (n, 2),
-            (sizes.sets, n, 3),
-            (b, n, self.channels),
-            (b, n),
-            (b, n) if self.attenuates else None,
-        )
-        gradients = [
-            None if shape is None else torch.empty(shape, dtype=torch.float32) for shape in shapes
-        ]
+        items = sizes.groups * self.tiles
+        self._run("backward", items, *self.scene, *self.path, *images, partials)
+        b, n = sizes.transmitters, sizes.splats
+        shapes = [(n, 2), (sizes.sets, n, 3), (b, n, self.channels), (b, n)]
+        gradients = [torch.empty(shape, dtype=torch.float32) for shape in shapes]
+        gradients.append(torch.empty((b, n), dtype=torch.float32) if self.attenuates else None)
         outputs = [self._share(gradient) for gradient in gradients]
+        ends, *_ = self.path
         *_, entries, geometry, appearance = self.scene
-        inverse = self.order, self.bounds, self.path[0], entries, geometry, appearance
+        inverse = self.order, self.bounds, ends, entries, geometry, appearance
         self._run("gather", self.blocks, *inverse, partials, *outputs)
         self._finish(*outputs)
         return gradients
@@ -361,69 +386,101 @@ class _Render:
     def _finish(self, *buffers):
         """Waits until the kernels' results are in the host's memory."""
         for buffer in filter(None, buffers):
-            cl.enqueue_map_buffer(
-                self.queue, buffer, cl.map_flags.READ, 0, (buffer.size,), np.uint8
-            )
+            shape = (buffer.size,)
+            cl.enqueue_map_buffer(self.queue, buffer, cl.map_flags.READ, 0, shape, np.uint8)
         self.queue.finish()  # no kernel outlives the host's memory, even without outputs
 
 
+def _measure(splats: Splats, signal: Tensor, plane: Plane) -> _Sizes:
+    """Sizes of a call; the entries of its lists are counted later."""
+    b, n, _ = signal.shape
+    height, width = plane.shape
+    sets = len(splats.factors)
+    groups = b if sets > 1 else max(1, -(-b // LAYOUT.group))
+    return _Sizes(
+        transmitters=b,
+        sets=sets,
+        groups=groups,
+        group=-(-b // groups),
+        splats=n,
+        words=-(-n // LAYOUT.word),
+        height=height,
+        width=width,
+        down=-(-height // LAYOUT.rows),
+        across=-(-width // LAYOUT.columns),
+    )
+
+
 def _literal(value: float) -> str:
+    """A float32 as the kernels' compiler reads it."""
     return float(np.float32(value)).hex() + "f"
+
+
+def _content(tensor: Tensor) -> tuple[bytes, tuple[int, ...]]:
+    """A tensor's bytes and shape, which tell planes apart."""
+    return tensor.detach().numpy().tobytes(), tuple(tensor.shape)
 
 
 def _front_to_back(depths: Tensor) -> np.ndarray:
     """Indices by depth, ties by index: sorted as integers, whose low half is the index."""
     bits = np.ascontiguousarray(depths.detach().numpy()).view(np.int32)
-    bits = bits ^ (
-        bits >> 31 & 0x7FFFFFFF
-    )  # integers in the order of the floats, negative ones too
+    # Integers in the order of the floats, negative ones too.
+    bits = bits ^ (bits >> 31 & 0x7FFFFFFF)
     keys = (bits.astype(np.int64) << 32) + np.arange(len(bits))
     keys.sort()
     return (keys & 0xFFFFFFFF).astype(np.int32)
 
 
-@functools.lru_cache(
-    maxsize=64
-)  # a training that thins has a plane for each row and column it may start from
+# A training that thins has a plane for each row and column it may start from.
+@functools.lru_cache(maxsize=64)
 def _tiling(
     queue: cl.CommandQueue,
-    of_u: tuple[bytes, tuple],
-    of_v: tuple[bytes, tuple],
+    u_content: tuple[bytes, tuple],
+    v_content: tuple[bytes, tuple],
     period: float | None,
 ) -> list[cl.Buffer | None]:
-    """A plane in whole tiles, as the kernels read it, from the bytes and shapes of u and v.
+    """A plane in whole tiles, as the kernels read it.
 
-    Returns u and v, filled up by repetition, one a column and one a row where the plane is
-    separable; spans (centre, half size) of u, then of v; and edges, the least v of the rows of each
-    span of v and then their largest.
+    Args:
+        queue: Of the device.
+        u_content, v_content: Bytes and shapes of u and v.
+        period: As in ``Plane``.
+
+    Returns:
+        u and v, filled up by repetition, one a column and one a row where the plane is separable;
+        spans (centre, half size) of u, then of v; and edges, the least v of the rows of each span
+        of v and then their largest.
     """
-    u, v = (np.frombuffer(data, np.float32).reshape(shape) for data, shape in (of_u, of_v))
+    u, v = (
+        np.frombuffer(data, np.float32).reshape(shape) for data, shape in (u_content, v_content)
+    )
     height, width = len(v), u.shape[1]
-    down, across = -(-height // ROWS), -(-width // COLUMNS)
-    y, x = (
-        np.minimum(np.arange(down * ROWS), height - 1),
-        np.minimum(np.arange(across * COLUMNS), width - 1),
-    )
+    down, across = -(-height // LAYOUT.rows), -(-width // LAYOUT.columns)
+    y = np.minimum(np.arange(down * LAYOUT.rows), height - 1)
+    x = np.minimum(np.arange(across * LAYOUT.columns), width - 1)
+    # Axes of the tiles: (down, rows of a tile, across, columns of a tile).
     if len(u) == v.shape[1] == 1:
-        u, v = u[:, x], v[y]
-        u_tiles, v_tiles = u.reshape(1, 1, across, COLUMNS), v.reshape(down, ROWS, 1, 1)
+        u = u[:, x]
+        v = v[y]
+        u_tiles = u.reshape(1, 1, across, LAYOUT.columns)
+        v_tiles = v.reshape(down, LAYOUT.rows, 1, 1)
     else:
-        u, v = (np.broadcast_to(coordinate, (height, width))[np.ix_(y, x)] for coordinate in (u, v))
-        u_tiles, v_tiles = (
-            coordinate.reshape(down, ROWS, across, COLUMNS) for coordinate in (u, v)
-        )
-    slack = 1e-6 * (
-        np.abs(u).max(initial=0) + np.abs(v).max(initial=0) + (period or 0)
-    )  # for rounding
-    columns = u_tiles.min((1, 3)).ravel(), u_tiles.max((1, 3)).ravel()
-    rows = v_tiles.min(3), v_tiles.max(3)  # (down, ROWS, spans in a row of tiles)
-    edges = np.stack((rows[0] - slack, rows[1] + slack), 1).transpose(0, 3, 1, 2)
-    low, high = map(
-        np.concatenate, zip(columns, (rows[0].min(1).ravel(), rows[1].max(1).ravel()), strict=True)
-    )
+        u = np.broadcast_to(u, (height, width))[np.ix_(y, x)]
+        v = np.broadcast_to(v, (height, width))[np.ix_(y, x)]
+        u_tiles = u.reshape(down, LAYOUT.rows, across, LAYOUT.columns)
+        v_tiles = v.reshape(down, LAYOUT.rows, across, LAYOUT.columns)
+    # For rounding.
+    slack = 1e-6 * (np.abs(u).max(initial=0) + np.abs(v).max(initial=0) + (period or 0))
+    row_low = v_tiles.min(3)  # (down, rows, spans in a row of tiles)
+    row_high = v_tiles.max(3)
+    edges = np.stack((row_low - slack, row_high + slack), 1).transpose(0, 3, 1, 2)
+    low = np.concatenate((u_tiles.min((1, 3)).ravel(), row_low.min(1).ravel()))
+    high = np.concatenate((u_tiles.max((1, 3)).ravel(), row_high.max(1).ravel()))
     spans = np.stack((0.5 * (low + high), 0.5 * (high - low) + slack), -1)
     flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
-    arrays = (np.ascontiguousarray(array, np.float32) for array in (u, v, spans, edges))
-    return [
-        cl.Buffer(queue.context, flags, hostbuf=array) if array.size else None for array in arrays
-    ]
+    buffers = []
+    for values in (u, v, spans, edges):
+        array = np.ascontiguousarray(values, np.float32)
+        buffer = cl.Buffer(queue.context, flags, hostbuf=array) if array.size else None
+        buffers.append(buffer)
+    return buffers

@@ -11,27 +11,29 @@ from gaigs.registry import register
 from gaigs.splatting.projection import Plane, Splats
 from gaigs.splatting.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
 
-TILE = 16
-"""Edge of a tile [pixels]."""
-
-CHUNK, LARGE_CHUNK = 2**20, 2**24
-"""(transmitter, splat, pixel) triples worked on at a time, on the CPU and on others: an array of
-float32 then has 4 MiB, which a core's cache holds, or 64 MiB, since a GPU starts an operation as
-slowly as it does a million triples. Some sixteen arrays live at a time."""
-
 
 @register("rasterizer", "torch")
 class TorchRasterizer:
-    """Tiles of 16 x 16 pixels, each against the splats that reach it; the gradient is written by
-    hand.
+    """Tiles of 16 x 16 pixels, each against the splats that reach it, with a gradient by hand.
 
     Splats are sorted by depth once, for all transmitters. A tile keeps those whose bounding box, at
     the opacity ``ALPHA_MIN`` and over all transmitters, meets it. Tiles with lists of similar
     length are composited together, in small chunks that the backward pass computes anew: memory
     does not grow with the number of (splat, pixel) pairs.
+
+    Attributes:
+        chunk: (transmitter, splat, pixel) triples worked on at a time on the CPU: an array of
+            float32 then has 4 MiB, which a core's cache holds. Some sixteen arrays live at a time.
+        large_chunk: Triples on other devices, 64 MiB: a GPU starts an operation as slowly as it
+            does a million triples.
+
+    Source: tiles of Kerbl et al., 3D Gaussian Splatting, 2023, section 6; GAI-GS, "Projection and
+    Render Module", eq. (13) and (14).
     """
 
     used = "torch"
+    chunk = 2**20
+    large_chunk = 2**24
 
     def __call__(
         self,
@@ -41,105 +43,137 @@ class TorchRasterizer:
         attenuations: Tensor | None,
         plane: Plane,
     ) -> tuple[Tensor, Tensor]:
+        # "Primitives are sorted in depth to preserve physically consistent signal accumulation."
         order = torch.argsort(splats.depths, stable=True)
         order = order[splats.visible[order]]
-        factors = splats.factors[:, order]
+        means = splats.means2d[order]  # (n, 2)
+        factors = splats.factors[:, order]  # (1 or b, n, 3)
+        opacities = opacities[:, order]  # (b, n)
+        triples = self.chunk if means.device.type == "cpu" else self.large_chunk
         with torch.no_grad():
-            tiles = _Tiles(plane, splats.means2d[order], factors, opacities[:, order])
-        own = None if attenuations is None else attenuations[:, order]
-        return _Composite.apply(
-            tiles, splats.means2d[order], factors, signal[:, order], opacities[:, order], own
-        )
+            tiles = _Tiles(plane, means, factors, opacities, triples)
+        passing = None if attenuations is None else attenuations[:, order]
+        return _Composite.apply(tiles, means, factors, signal[:, order], opacities, passing)
+
+
+class _Period(NamedTuple):
+    """A period rounded to the dtype, and the remainder."""
+
+    rounded: float
+    rest: float
 
 
 class _Tiles:
-    """Which splats reach which tile, in chunks of tiles whose lists have similar lengths."""
+    """Lists of the splats that reach each tile, in chunks of tiles with lists of similar lengths.
 
-    def __init__(self, plane: Plane, means: Tensor, factors: Tensor, opacities: Tensor):
+    Args:
+        plane: The pixels.
+        means, factors, opacities: Splats front to back.
+        triples: (transmitter, splat, pixel) triples of a chunk.
+
+    Attributes:
+        edge: Edge of a tile [pixels].
+        u, v: Coordinates of the tiles' pixels (t, y or 1, x or 1).
+        chunks: Tiles (t,), and the splats of each (t, k), where n fills the lists up.
+    """
+
+    edge = 16
+
+    def __init__(
+        self, plane: Plane, means: Tensor, factors: Tensor, opacities: Tensor, triples: int
+    ):
         self.shape = plane.shape
         self.period = None
-        if plane.period is not None:  # rounded to the dtype, and the remainder
+        if plane.period is not None:
             rounded = torch.tensor(plane.period, dtype=plane.u.dtype).item()
-            self.period = rounded, plane.period - rounded
-        self.down, self.across = (-(-edge // TILE) for edge in self.shape)
-        self.u, self.v = self._cut(plane.u), self._cut(plane.v)
+            self.period = _Period(rounded, plane.period - rounded)
+        self.down, self.across = (-(-size // self.edge) for size in self.shape)
+        self.u = self._cut(plane.u)
+        self.v = self._cut(plane.v)
         self.chunks: list[tuple[Tensor, Tensor]] = []
-        if not len(opacities):
-            return
+        if len(opacities):
+            touches = self._find_touched(means, factors, opacities)
+            self.chunks = self._chunks(touches, triples // (len(opacities) * self.edge**2))
+
+    def _find_touched(self, means: Tensor, factors: Tensor, opacities: Tensor) -> Tensor:
+        """True where a splat reaches a tile (tiles, n).
+
+        Comparisons with NaN keep the splat, so that NaN shows in the map.
+        """
         # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box
-        # has these halves. Comparisons with NaN keep the splat, so that NaN shows in the map.
-        reach = (2 * (opacities / ALPHA_MIN).log().clamp_min(0)).sqrt()
+        # has these halves.
+        reach = (2 * (opacities / ALPHA_MIN).log().clamp_min(0)).sqrt()  # (b, n)
         p, q, r = factors.unbind(-1)
-        halves = (reach[..., None] * torch.stack((p, torch.hypot(q, r)), -1)).amax(0)
+        boxes = torch.stack((p, torch.hypot(q, r)), -1)  # (1 or b, n, 2)
+        halves = (reach[..., None] * boxes).amax(0)  # (n, 2)
         touches = ~(opacities.amax(0) < ALPHA_MIN).expand(self.down * self.across, -1)
-        for axis, (coordinate, period) in enumerate(((self.u, self.period), (self.v, None))):
+        axes = ((self.u, self.period), (self.v, None))
+        for axis, (coordinate, period) in enumerate(axes):
             coordinate = coordinate.flatten(1)
-            low, high = coordinate.amin(1, keepdim=True), coordinate.amax(1, keepdim=True)
-            offset = _nearest(means[:, axis], (low + high) / 2, period).abs()
+            low = coordinate.amin(1, keepdim=True)  # (tiles, 1)
+            high = coordinate.amax(1, keepdim=True)
+            offset = _nearest(means[:, axis], (low + high) / 2, period).abs()  # (tiles, n)
             # A few roundings' slack: splats listed needlessly are dropped pixel by pixel.
-            touches = touches & ~(offset > (halves[:, axis] + (high - low) / 2) * (1 + 1e-5) + 1e-6)
-        self.chunks = self._chunks(touches, len(opacities))
+            most = (halves[:, axis] + (high - low) / 2) * (1 + 1e-5) + 1e-6
+            touches = touches & ~(offset > most)
+        return touches
 
     def _cut(self, coordinate: Tensor) -> Tensor:
-        """A plane coordinate (rows or 1, columns or 1) as tiles (t, y or 1, x or 1), filled up by
-        repetition.
+        """Cuts a plane coordinate (rows or 1, columns or 1) into tiles (t, y or 1, x or 1).
+
+        Repetition fills the last tiles up.
         """
-        for axis, (size, tiles) in enumerate(
-            zip(self.shape, (self.down, self.across), strict=True)
-        ):
+        for axis, tiles in enumerate((self.down, self.across)):
+            size = self.shape[axis]
             if coordinate.shape[axis] == size:
-                filled = torch.arange(tiles * TILE, device=coordinate.device).clamp_max(size - 1)
-                coordinate = coordinate.index_select(axis, filled)
-        y, x = (TILE if edge > 1 else 1 for edge in coordinate.shape)
-        cut = coordinate.unflatten(1, (-1, x)).unflatten(0, (-1, y)).transpose(1, 2)
+                pixels = torch.arange(tiles * self.edge, device=coordinate.device)
+                coordinate = coordinate.index_select(axis, pixels.clamp_max(size - 1))
+        y, x = (self.edge if size > 1 else 1 for size in coordinate.shape)
+        cut = coordinate.unflatten(1, (-1, x)).unflatten(0, (-1, y))  # (down, y, across, x)
+        cut = cut.transpose(1, 2)  # (down, across, y, x)
         return cut.expand(self.down, self.across, y, x).reshape(-1, y, x)
 
-    def _chunks(self, touches: Tensor, transmitters: int) -> list[tuple[Tensor, Tensor]]:
-        """(tiles, splats of each (t, k) with n as the filling) a chunk, longest lists first."""
-        counts = touches.sum(1)
+    def _chunks(self, touches: Tensor, pairs: int) -> list[tuple[Tensor, Tensor]]:
+        """Lists tiles with their splats in chunks of so many pairs, longest lists first."""
+        counts = touches.sum(1)  # (tiles,)
         n = touches.shape[1]
         # Sorting the indices with "not touched" pushed behind keeps the depth order in front.
         splats = torch.where(touches, torch.arange(n, device=counts.device), n).sort(1).values
-        lengths, tiles = counts.sort(descending=True)
-        lengths, chunks, start = lengths.tolist(), [], 0
-        triples = (CHUNK if counts.device.type == "cpu" else LARGE_CHUNK) // (
-            transmitters * TILE * TILE
-        )
+        sorted_counts, tiles = counts.sort(descending=True)
+        lengths = sorted_counts.tolist()
+        chunks = []
+        start = 0
         while start < len(lengths) and lengths[start]:
-            shortest = bisect_right(
-                lengths, -lengths[start] / 2, key=operator.neg
-            )  # fillings at most double the work
-            size = min(max(1, triples // lengths[start]), shortest - start)
+            longest = lengths[start]
+            # Lists down to half the longest: fillings at most double the work.
+            end = bisect_right(lengths, -longest / 2, key=operator.neg)
+            size = min(max(1, pairs // longest), end - start)
             chosen = tiles[start : start + size]
-            chunks.append((chosen, splats[chosen, : lengths[start]]))
+            chunks.append((chosen, splats[chosen, :longest]))
             start += size
         return chunks
 
     def join(self, tiled: Tensor) -> Tensor:
-        """Tiles (..., t, y x) as an image (..., rows, columns)."""
-        image = tiled.unflatten(-1, (TILE, TILE)).unflatten(-3, (self.down, self.across))
-        return (
-            image.transpose(-3, -2)
-            .flatten(-4, -3)
-            .flatten(-2)[..., : self.shape[0], : self.shape[1]]
-        )
+        """Joins tiles (..., t, y x) to an image (..., rows, columns)."""
+        rows, columns = self.shape
+        image = tiled.unflatten(-1, (self.edge, self.edge))  # (..., t, y, x)
+        image = image.unflatten(-3, (self.down, self.across))  # (..., down, across, y, x)
+        image = image.transpose(-3, -2)  # (..., down, y, across, x)
+        return image.flatten(-4, -3).flatten(-2)[..., :rows, :columns]
 
     def split(self, image: Tensor) -> Tensor:
-        """The inverse of ``join``; pixels outside the image are 0."""
+        """Splits an image into tiles, the inverse of ``join``; pixels outside the image are 0."""
         rows, columns = self.shape
-        image = torch.nn.functional.pad(
-            image, (0, self.across * TILE - columns, 0, self.down * TILE - rows)
-        )
-        tiled = (
-            image.unflatten(-1, (self.across, TILE))
-            .unflatten(-3, (self.down, TILE))
-            .transpose(-3, -2)
-        )
+        margins = (0, self.across * self.edge - columns, 0, self.down * self.edge - rows)
+        image = torch.nn.functional.pad(image, margins)
+        tiled = image.unflatten(-1, (self.across, self.edge))
+        tiled = tiled.unflatten(-3, (self.down, self.edge))  # (..., down, y, across, x)
+        tiled = tiled.transpose(-3, -2)  # (..., down, across, y, x)
         return tiled.flatten(-2).flatten(-3, -2)
 
 
-def _nearest(a: Tensor, b: Tensor, period: tuple[float, float] | None) -> Tensor:
-    """a - b taken to the nearest image, by a rounded period and its remainder.
+def _nearest(a: Tensor, b: Tensor, period: _Period | None) -> Tensor:
+    """a - b taken to the nearest image.
 
     The period is subtracted from the exact a - b = offset + rest (Knuth's two-sum), so no digit is
     lost at the seam.
@@ -149,13 +183,44 @@ def _nearest(a: Tensor, b: Tensor, period: tuple[float, float] | None) -> Tensor
         return offset
     back = offset - a
     rest = (a - (offset - back)) - (b + back)
-    turns = (offset / period[0]).round_()
-    return (offset - turns * period[0]) + (rest - turns * period[1])
+    turns = (offset / period.rounded).round_()
+    return (offset - turns * period.rounded) + (rest - turns * period.rest)
+
+
+class _FilledSplats(NamedTuple):
+    """Splats front to back, and behind them one that does nothing and fills the tiles' lists up."""
+
+    means: Tensor  # (n + 1, 2)
+    factors: Tensor  # (1 or b, n + 1, 3)
+    signal: Tensor  # (b, n + 1, c)
+    opacities: Tensor  # (b, n + 1)
+    logs: Tensor | None  # (b, n + 1), logarithms of the attenuations
+
+    @classmethod
+    def filled(
+        cls, means: Tensor, factors: Tensor, signal: Tensor, opacities: Tensor, logs: Tensor | None
+    ) -> "_FilledSplats":
+        pad = torch.nn.functional.pad
+        row = (0, 0, 0, 1)
+        return cls(
+            pad(means, row),
+            pad(factors, row, value=1.0),
+            pad(signal, row),
+            pad(opacities, (0, 1)),
+            None if logs is None else pad(logs, (0, 1)),
+        )
 
 
 class _Weights(NamedTuple):
-    """One chunk composited: all is (b, t, k, y x) but ``left`` (b, t, y x), and ``s`` and ``y`` of
-    ``_weigh``.
+    """One chunk composited, for b transmitters, t tiles, k splats a tile, y x pixels a tile.
+
+    Attributes:
+        s, y: (du, dv) of the pixels, in units of the splat's factor (1 or b, t, k, y or 1, x or 1).
+        footprint: G (b, t, k, y x).
+        alpha: A = a G within its bounds (b, t, k, y x).
+        live: True where a splat acts (b, t, k, y x).
+        transmittance: T, in front of each splat (b, t, k, y x).
+        left: Transmittance behind the last splat (b, t, y x).
     """
 
     s: Tensor
@@ -167,61 +232,63 @@ class _Weights(NamedTuple):
     left: Tensor
 
 
-def _weigh(
-    tiles: _Tiles,
-    chosen: Tensor,
-    k: Tensor,
-    means: Tensor,
-    factors: Tensor,
-    opacities: Tensor,
-    logs: Tensor | None,
-) -> _Weights:
-    """Footprints, opacities and transmittances of one chunk: tiles ``chosen`` (t,) and their splats
-    (t, k).
+def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _FilledSplats) -> _Weights:
+    """Footprints, opacities and transmittances of a chunk.
+
+    Args:
+        tiles: All tiles.
+        chosen: Tiles of the chunk (t,).
+        k: Splats of each tile (t, k).
+        inputs: All splats.
     """
-    u, v = means[k][..., None, None].unbind(-3)
-    du = _nearest(tiles.u[chosen][:, None], u, tiles.period)
+    u, v = inputs.means[k][..., None, None].unbind(-3)  # (t, k, 1, 1) each
+    du = _nearest(tiles.u[chosen][:, None], u, tiles.period)  # (t, k, y or 1, x)
     dv = tiles.v[chosen][:, None] - v
-    p, q, r = (part[..., None, None] for part in factors[:, k].unbind(-1))
+    p, q, r = (part[..., None, None] for part in inputs.factors[:, k].unbind(-1))
     # With (s, y) = L^-1 (du, dv) the exponent loses the fewest digits where a splat is long and
     # thin.
     s = du / p
     y = dv / r - (q / r) * s
     exponent = torch.addcmul(-0.5 * s * s, y, y, value=-0.5)
-    footprint = exponent.exp_().flatten(-2)
-    alpha = footprint * opacities[:, k, None]
+    footprint = exponent.exp_().flatten(-2)  # G
+    alpha = footprint * inputs.opacities[:, k, None]
     live = alpha >= ALPHA_MIN
     alpha = alpha.clamp_max(ALPHA_MAX).mul_(live)
+    # eq. (13) and (14): log T_i = sum_{j<i} log(1 - A_j) + G_j log d_j.
     passed = torch.log1p(-alpha)
-    if logs is not None:
-        passed.addcmul_(footprint * live, logs[:, k, None])
-    total = passed.cumsum(-2)
+    if inputs.logs is not None:
+        passed.addcmul_(footprint * live, inputs.logs[:, k, None])
+    total = passed.cumsum(-2)  # up to and with each splat
     left = total[..., -1, :].exp()
     before = torch.nn.functional.pad(total[..., :-1, :], (0, 0, 1, 0))
     return _Weights(s, y, footprint, alpha, live, before.exp_(), left)
 
 
 class _Composite(torch.autograd.Function):
-    """Composites sorted splats. Below, D_i = signal_i . gradient and S_i = sum_{j>i} D_j A_j T_j +
-    left gradient_left: d/dA_i = T_i D_i - S_i / (1 - A_i), and a change of log T behind splat i
-    acts with S_i."""
+    """Composites sorted splats, with the gradient by hand.
+
+    With D_i = signal_i . gradient and S_i = sum_{j>i} D_j A_j T_j + left gradient_left, the
+    derivative by A_i is T_i D_i - S_i / (1 - A_i), and a change of log T behind splat i acts with
+    S_i.
+    """
 
     @staticmethod
     def forward(ctx, tiles, means, factors, signal, opacities, attenuations):
         ctx.tiles = tiles
-        logs = (
-            None
-            if attenuations is None
-            else torch.where(attenuations == 0, OPAQUE, attenuations.log())
-        )
+        logs = None
+        if attenuations is not None:
+            logs = torch.where(attenuations == 0, OPAQUE, attenuations.log())
         ctx.save_for_backward(means, factors, signal, opacities, logs)
         b, _, c = signal.shape
-        image = signal.new_zeros(b, c, tiles.down * tiles.across, TILE * TILE)
-        left = signal.new_ones(b, tiles.down * tiles.across, TILE * TILE)
-        means, factors, signal, opacities, logs = _filled(means, factors, signal, opacities, logs)
+        count, pixels = tiles.down * tiles.across, tiles.edge**2
+        image = signal.new_zeros(b, c, count, pixels)
+        left = signal.new_ones(b, count, pixels)
+        inputs = _FilledSplats.filled(means, factors, signal, opacities, logs)
         for chosen, k in tiles.chunks:
-            w = _weigh(tiles, chosen, k, means, factors, opacities, logs)
-            image[:, :, chosen] = (signal[:, k].mT @ w.transmittance.mul_(w.alpha)).transpose(1, 2)
+            w = _weigh(tiles, chosen, k, inputs)
+            # eq. (14): the sum of signal_i A_i T_i over the splats.
+            drawn = inputs.signal[:, k].mT @ w.transmittance.mul_(w.alpha)  # (b, t, c, y x)
+            image[:, :, chosen] = drawn.transpose(1, 2)
             left[:, chosen] = w.left
         return tiles.join(image), tiles.join(left)
 
@@ -229,84 +296,87 @@ class _Composite(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, image_gradient, left_gradient):
         tiles = ctx.tiles
-        inputs = _filled(*ctx.saved_tensors)
-        means, factors, signal, opacities, logs = inputs
+        inputs = _FilledSplats.filled(*ctx.saved_tensors)
         gradients = [None if tensor is None else torch.zeros_like(tensor) for tensor in inputs]
-        image_gradient = tiles.split(image_gradient)
-        left_gradient = tiles.split(left_gradient)
+        image_gradient = tiles.split(image_gradient)  # (b, c, t, y x)
+        left_gradient = tiles.split(left_gradient)  # (b, t, y x)
         for chosen, k in tiles.chunks:
-            w = _weigh(tiles, chosen, k, means, factors, opacities, logs)
-            towards = image_gradient[:, :, chosen].transpose(1, 2)
-            blend = w.alpha * w.transmittance
-            d_signal = blend @ towards.mT
-            d = signal[:, k] @ towards
-            flow = blend.mul_(d)
-            behind = flow.flip(-2).cumsum(-2).flip(-2).sub_(flow)
-            behind += (w.left * left_gradient[:, chosen])[..., None, :]
-            # Gradient by the opacity itself, 0 where the splat does nothing or is clamped.
-            d_alpha = (d.mul_(w.transmittance) - behind / (1 - w.alpha)).mul_(
-                w.live & (w.alpha < ALPHA_MAX)
-            )
-            d_opacity = (d_alpha * w.footprint).sum(-1)
-            d_exponent = d_alpha.mul_(w.alpha)
-            d_logs = None
-            if logs is not None:
-                covered = behind.mul_(w.footprint).mul_(w.live)
-                d_logs = covered.sum(-1)
-                d_exponent = d_exponent + covered * logs[:, k][..., None]
-            d_means, d_factors = _moments(
-                d_exponent.unflatten(-1, (TILE, TILE)), w.s, w.y, factors[:, k]
-            )
-            found = (
-                d_means.sum(0),
-                d_factors.sum_to_size(factors[:, k].shape),
-                d_signal,
-                d_opacity,
-                d_logs,
-            )
-            for gradient, part, axis in zip(gradients, found, (0, 1, 1, 1, 1), strict=True):
+            w = _weigh(tiles, chosen, k, inputs)
+            towards = image_gradient[:, :, chosen].transpose(1, 2)  # (b, t, c, y x)
+            parts = _differentiate(w, k, inputs, towards, left_gradient[:, chosen], tiles.edge)
+            for gradient, part, axis in zip(gradients, parts, (0, 1, 1, 1, 1), strict=True):
                 if gradient is not None:
                     gradient.index_add_(axis, k.flatten(), part.flatten(axis, axis + 1))
-        if logs is not None:
-            gradients[-1] /= logs.exp().clamp_min(STEEPEST)
-        means, factors, *others = gradients  # the last splat is the filling
+        if inputs.logs is not None:
+            gradients[-1] /= inputs.logs.exp().clamp_min(STEEPEST)
+        means, *others = gradients  # the last splat is the filling
         return (
             None,
             means[:-1],
-            factors[:, :-1],
             *(None if other is None else other[:, :-1] for other in others),
         )
 
 
-def _filled(means, factors, signal, opacities, logs):
-    """The splats and, behind them, one that does nothing: it fills the tiles' lists up."""
-    pad, row = torch.nn.functional.pad, (0, 0, 0, 1)
-    logs = None if logs is None else pad(logs, (0, 1))
-    return (
-        pad(means, row),
-        pad(factors, row, value=1.0),
-        pad(signal, row),
-        pad(opacities, (0, 1)),
-        logs,
-    )
+def _differentiate(
+    w: _Weights, k: Tensor, inputs: _FilledSplats, towards: Tensor, left_gradient: Tensor, edge: int
+) -> tuple[Tensor | None, ...]:
+    """Gradients of a chunk's splats, in the order of ``_FilledSplats``.
+
+    Args:
+        w: The chunk composited; used up.
+        k: Splats of each tile (t, k).
+        inputs: All splats.
+        towards: Gradient of the map's pixels (b, t, c, y x).
+        left_gradient: Gradient of the transmittance left (b, t, y x).
+        edge: Edge of a tile [pixels].
+    """
+    blend = w.alpha * w.transmittance  # A T
+    d_signal = blend @ towards.mT  # (b, t, k, c)
+    d = inputs.signal[:, k] @ towards  # D, (b, t, k, y x)
+    flow = blend.mul_(d)
+    behind = flow.flip(-2).cumsum(-2).flip(-2).sub_(flow)
+    behind += (w.left * left_gradient)[..., None, :]  # S
+    # Gradient by the opacity itself, 0 where the splat does nothing or is clamped.
+    d_alpha = d.mul_(w.transmittance) - behind / (1 - w.alpha)
+    d_alpha = d_alpha.mul_(w.live & (w.alpha < ALPHA_MAX))
+    d_opacity = (d_alpha * w.footprint).sum(-1)  # (b, t, k)
+    d_exponent = d_alpha.mul_(w.alpha)
+    d_logs = None
+    if inputs.logs is not None:
+        covered = behind.mul_(w.footprint).mul_(w.live)
+        d_logs = covered.sum(-1)  # (b, t, k)
+        d_exponent = d_exponent + covered * inputs.logs[:, k][..., None]
+    factors = inputs.factors[:, k]
+    d_exponent = d_exponent.unflatten(-1, (edge, edge))  # (b, t, k, y, x)
+    d_means, d_factors = _moments(d_exponent, w.s, w.y, factors)
+    return d_means.sum(0), d_factors.sum_to_size(factors.shape), d_signal, d_opacity, d_logs
 
 
 def _moments(d_exponent: Tensor, s: Tensor, y: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from that of the exponents (b, t,
-    k, y, x).
+    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from those of the exponents.
 
     Sums run over s and y themselves: those over du and dv would cancel where a splat is long and
     thin.
+
+    Args:
+        d_exponent: Gradients of the exponents (b, t, k, y, x).
+        s, y: As in ``_Weights``.
+        factors: Factors of the covariances (1 or b, t, k, 3).
     """
     d_y = d_exponent * y
-    yy = (d_y * y).sum((-2, -1))
+    yy = (d_y * y).sum((-2, -1))  # (b, t, k)
     if s.shape[-2] == 1:  # the same in all rows: contract the columns first
-        d_s, ss = (d_exponent @ torch.cat((s, s * s), -2).mT).sum(-2).unbind(-1)
-        d_y, sy = (d_y @ torch.cat((torch.ones_like(s), s), -2).mT).sum(-2).unbind(-1)
+        powers = torch.cat((s, s * s), -2).mT  # (1 or b, t, k, x, 2)
+        d_s, ss = (d_exponent @ powers).sum(-2).unbind(-1)
+        powers = torch.cat((torch.ones_like(s), s), -2).mT
+        d_y, sy = (d_y @ powers).sum(-2).unbind(-1)
     else:
         weighed = d_exponent * s
-        d_s, ss = weighed.sum((-2, -1)), (weighed * s).sum((-2, -1))
-        d_y, sy = d_y.sum((-2, -1)), (d_y * s).sum((-2, -1))
+        d_s = weighed.sum((-2, -1))
+        ss = (weighed * s).sum((-2, -1))
+        sy = (d_y * s).sum((-2, -1))
+        d_y = d_y.sum((-2, -1))
     p, q, r = factors.unbind(-1)
     d_means = torch.stack(((d_s - q / r * d_y) / p, d_y / r), -1)
-    return d_means, torch.stack(((ss - q / r * sy) / p, sy / r, yy / r), -1)
+    d_factors = torch.stack(((ss - q / r * sy) / p, sy / r, yy / r), -1)
+    return d_means, d_factors

@@ -16,16 +16,19 @@ MAX_OCTAVE = 30
 """Bound of octaves: float32 resolves no positions in waves of a nanometre or a million km."""
 
 BAND_FREQUENCIES = math.pi * 2.0 ** torch.arange(-1, 3)
-"""Of features of the carrier's position in the band, -1 to 1: periods from twice the band to a
-quarter.
+"""Angular frequencies for the carrier's position in the band, -1 to 1.
+
+Their periods are from twice the band to a quarter of it.
 """
 
 
 @register("tokenizer", "euclidean")
 class EuclideanTokenizer(nn.Module):
-    """Fourier features of the Gaussians, and of the transmitter through a two-layer network.
+    """Position embeddings E(P_x) and E(P_TX), and no scene token.
 
-    For data with several carriers the network's input also has the carrier's position in the band.
+    E(P_x) are Fourier features of the Gaussian's centre. E(P_TX) are Fourier features of the
+    transmitter through a two-layer network. For data with several carriers the network's input
+    also has the carrier's position in the band.
 
     Args:
         scene: The middles of the transmitters' box and of the receivers are the origins of
@@ -37,7 +40,10 @@ class EuclideanTokenizer(nn.Module):
         width: Width of E(P_TX). With None for both there is no network, and E(P_TX) are the
             features themselves.
 
-    Source: GAI-GS, "Multi-view Tokenizer"; Tancik et al., Fourier Features, 2020.
+    Raises:
+        ValueError: One of ``hidden`` and ``width`` is None, or a number is out of range.
+
+    Source: GAI-GS, "Multi-view Tokenizer", eq. (10); Tancik et al., Fourier Features, 2020.
     """
 
     scene_width = 0
@@ -58,16 +64,19 @@ class EuclideanTokenizer(nn.Module):
         given = [count for count in (hidden, width) if count is not None]
         if len(given) == 1 or min(given, default=1) < 1:
             raise ValueError(
-                f"tokenizer options hidden and width must both be given, at least 1, or be null, got {hidden}, {width}"
+                "tokenizer options hidden and width must both be given, at least 1, or be null, "
+                f"got {hidden}, {width}"
             )
         self.scene = scene
         self.register_buffer("receivers_middle", scene.positions(scene.lower).mean(0))
         self.register_buffer("transmitters_middle", (scene.lower + scene.upper) / 2)
-        transmitter_octaves = transmitter_octaves or learnable_octaves(scene)
-        for name, limits in (("gaussian", gaussian_octaves), ("transmitter", transmitter_octaves)):
-            self.register_buffer(
-                f"{name}_frequencies", octaves(f"tokenizer option {name}_octaves", *limits)
-            )
+        limits = {
+            "gaussian": gaussian_octaves,
+            "transmitter": transmitter_octaves or learnable_octaves(scene),
+        }
+        for name, pair in limits.items():
+            frequencies = octaves(f"tokenizer option {name}_octaves", *pair)
+            self.register_buffer(f"{name}_frequencies", frequencies)
         self.gaussian_width = 3 * (1 + 2 * len(self.gaussian_frequencies))
         features = 3 * (1 + 2 * len(self.transmitter_frequencies))
         if scene.has_band:
@@ -80,17 +89,17 @@ class EuclideanTokenizer(nn.Module):
             )
 
     def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
-        means = placed.means[0] if len(placed.means) == 1 else placed.means
+        # Features are computed once if the Gaussians are at the same places for all queries.
+        means = placed.means[0] if len(placed.means) == 1 else placed.means  # ([b,] n, 3)
         gaussians = fourier_features(means - self.receivers_middle, self.gaussian_frequencies)
-        features = fourier_features(
-            query.transmitters - self.transmitters_middle, self.transmitter_frequencies
-        )
+        transmitters = query.transmitters - self.transmitters_middle  # (b, 3)
+        features = fourier_features(transmitters, self.transmitter_frequencies)
         if self.scene.has_band:
-            band = fourier_features(
-                self.scene.band_positions(query)[:, None], BAND_FREQUENCIES.to(features)
-            )
+            positions = self.scene.band_positions(query)[:, None]  # (b, 1), from -1 to 1
+            band = fourier_features(positions, BAND_FREQUENCIES.to(features))
             features = torch.cat((features, band), 1)
-        return Tokens(features.new_zeros(len(query), 0), gaussians, self.network(features))
+        no_scene = features.new_zeros(len(query), 0)
+        return Tokens(no_scene, gaussians, self.network(features))
 
 
 def learnable_octaves(scene: Scene) -> tuple[int, int]:
@@ -101,30 +110,44 @@ def learnable_octaves(scene: Scene) -> tuple[int, int]:
     limit. For noisy labels they are at least 16 m: an RSSI scatters by decibels at any distance,
     and the network finds how sharp a wall's shadow is.
     """
-    edge = (scene.upper - scene.lower).max().item()
-    # 16 distances: chosen on validation parts of rfid-s23-200 and the built-in room.
-    highest = min(round(-math.log2(16 * scene.spacing)), MAX_OCTAVE)
+    neighbours = 16  # chosen on validation parts of rfid-s23-200 and the built-in room
+    highest = min(round(-math.log2(neighbours * scene.spacing)), MAX_OCTAVE)
     if scene.task.is_noisy:
-        highest = min(
-            highest, -4
-        )  # 16 m: chosen by leaving out one of the robot's training runs in ble-flat
+        # 2^4 m: chosen by leaving out one of the robot's training runs in ble-flat.
+        highest = min(highest, -4)
+    edge = (scene.upper - scene.lower).max().item()  # [m]
     return min(highest, math.floor(-math.log2(2 * edge))), highest
 
 
 def octaves(option: str, *limits: int) -> Float[Tensor, " octaves"]:
-    """Angular frequencies 2 pi 2^k [rad/m] for k from the lowest to the highest limit."""
+    """Angular frequencies 2 pi 2^k [rad/m] for k from the lowest to the highest limit.
+
+    Args:
+        option: The option that sets the limits, for errors.
+        limits: Lowest and highest k.
+
+    Raises:
+        ValueError: There are not two limits in order, or they are out of range.
+    """
     if len(limits) != 2 or not -MAX_OCTAVE <= limits[0] <= limits[1] <= MAX_OCTAVE:
-        raise ValueError(
-            f"{option} must be [lowest, highest] within {-MAX_OCTAVE}..{MAX_OCTAVE}, got {list(limits)}"
-        )
+        bounds = f"{-MAX_OCTAVE}..{MAX_OCTAVE}"
+        raise ValueError(f"{option} must be [lowest, highest] within {bounds}, got {list(limits)}")
     return 2 * math.pi * 2.0 ** torch.arange(limits[0], limits[1] + 1)
 
 
 def fourier_features(
     points: Float[Tensor, "*batch d"], frequencies: Float[Tensor, " octaves"]
 ) -> Float[Tensor, "*batch features"]:
-    """[x, sin(w x), cos(w x)] for every coordinate x and angular frequency w: d (1 + 2 octaves)
-    numbers.
+    """[x, sin(w x), cos(w x)] for every coordinate x [m] and angular frequency w [rad/m].
+
+    They are d (1 + 2 octaves) numbers for each point.
+
+    Source: Tancik et al., Fourier Features, 2020.
+
+    Example:
+        >>> from gaigs.splatting.tokenizer.euclidean import fourier_features, octaves
+        >>> fourier_features(torch.zeros(5, 3), octaves("octaves", -1, 2)).shape
+        torch.Size([5, 27])
     """
-    phases = (points[..., None] * frequencies).flatten(-2)
+    phases = (points[..., None] * frequencies).flatten(-2)  # (..., d octaves) [rad]
     return torch.cat((points, phases.sin(), phases.cos()), -1)

@@ -1,6 +1,4 @@
-"""A scene token by geometric-algebra attention between the transmitter and the most opaque
-Gaussians.
-"""
+"""A scene token by geometric-algebra attention between transmitter and most opaque Gaussians."""
 
 import torch
 from jaxtyping import Float
@@ -14,18 +12,15 @@ from gaigs.core.scene import Scene
 from gaigs.registry import register
 from gaigs.splatting.gaussians import Placed, Tokens
 
-ALGEBRAS = {"projective": (PROJECTIVE, embed_point), "spacetime": (SPACETIME, embed_event)}
-
 
 @register("tokenizer", "ga")
 class GATokenizer(nn.Module):
-    """CLS of a Geometric Algebra Transformer (GATr) over CLS, the transmitter and anchors; no
-    position embeddings.
+    """CLS of a Geometric Algebra Transformer (GATr) over CLS, transmitter and anchors.
 
     Tokens are [CLS, TX, anchors]: CLS is a learnable point; anchors are the centres of the most
     opaque Gaussians, chosen at every call, without a gradient. Each is a multivector with two
     scalars for its type; for data with several carriers a third scalar has the carrier's position
-    in the band.
+    in the band. There are no position embeddings.
 
     Positions are relative to the middle of the box around transmitters and receivers, and divided
     by half its longest edge, so that they are of order one and motions remain motions.
@@ -43,7 +38,11 @@ class GATokenizer(nn.Module):
             ``spacetime``, G(3,1,0) with rotations, boosts and mirrors about the middle (the paper's
             preliminaries), whose points are events at time zero.
 
-    Source: GAI-GS, "Multi-view Tokenizer"; Brehmer et al., Geometric Algebra Transformer, 2023.
+    Raises:
+        ValueError: An option is out of range, or all transmitters and receivers are at one point.
+
+    Source: GAI-GS, "Multi-view Tokenizer", eq. (8) and (10); Brehmer et al., Geometric Algebra
+    Transformer, 2023.
     """
 
     gaussian_width = 0
@@ -63,22 +62,24 @@ class GATokenizer(nn.Module):
         algebra: str = "projective",
     ):
         super().__init__()
-        if algebra not in ALGEBRAS:
+        algebras = {"projective": (PROJECTIVE, embed_point), "spacetime": (SPACETIME, embed_event)}
+        if algebra not in algebras:
             raise ValueError(
-                f"tokenizer option algebra must be one of {', '.join(ALGEBRAS)}, got {algebra!r}"
+                f"tokenizer option algebra must be one of {', '.join(algebras)}, got {algebra!r}"
             )
         counts = {
             "anchors": anchors,
             "blocks": blocks,
+            "multivectors": multivectors,
             "scalars": scalars,
             "heads": heads,
             "width": width,
         }
-        for option, count in (counts | {"multivectors": multivectors}).items():
+        for option, count in counts.items():
             if count < 1:
                 raise ValueError(f"tokenizer option {option} must be at least 1, got {count}")
         lower, upper = scene.box
-        scale = (upper - lower).max() / 2
+        scale = (upper - lower).max() / 2  # [m]
         if not scale > 0:
             raise ValueError(
                 f"transmitters and receivers must not all be at one point, got {lower.tolist()}"
@@ -87,13 +88,12 @@ class GATokenizer(nn.Module):
         self.register_buffer("scale", scale)
         self.anchors = anchors
         self.scene_width = width
-        self.algebra, self.embed = ALGEBRAS[algebra]
+        self.algebra, self.embed = algebras[algebra]
         self.cls = nn.Parameter(torch.zeros(3))
-        self.types = nn.Parameter(torch.randn(3, 2))
+        self.types = nn.Parameter(torch.randn(3, 2))  # of CLS, transmitter and anchors
         self.scene = scene
-        self.first = EquivariantLinear(
-            self.algebra, (1, multivectors), (2 + scene.has_band, scalars)
-        )
+        type_width = 2 + scene.has_band
+        self.first = EquivariantLinear(self.algebra, (1, multivectors), (type_width, scalars))
         self.blocks = nn.ModuleList(
             GATrBlock(self.algebra, multivectors, scalars, heads) for _ in range(blocks)
         )
@@ -101,47 +101,68 @@ class GATokenizer(nn.Module):
         self.read_out = nn.Linear(self.algebra.size + 2, width)
 
     def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
-        """CLS for every query; of the opacities only the order matters."""
-        means, transmitters = placed.means.detach(), query.transmitters
-        b, m = len(query), min(self.anchors, means.shape[1])
-        anchors = means[:, opacities.topk(m).indices]
-        tx, anchors = (
-            (positions - self.middle) / self.scale for positions in (transmitters, anchors)
-        )
-        parts = [self.cls.expand(b, 1, 3), tx[:, None]]
+        """CLS for every query; only the order of the opacities matters."""
+        means = placed.means.detach()  # (1 or b, n, 3)
+        b = len(query)
+        # "Selecting the top-M highest-opacity primitives as anchors".
+        m = min(self.anchors, means.shape[1])
+        anchors = means[:, opacities.topk(m).indices]  # (1 or b, m, 3)
+        anchors = (anchors - self.middle) / self.scale
+        transmitters = (query.transmitters - self.middle) / self.scale  # (b, 3)
         *blocks, final = self.blocks
         # With a single block anchors stay the same for all queries: their outputs are not read.
-        alike = len(anchors) == 1 and not blocks and not self.scene.has_band
-        if not alike:
-            parts.append(anchors.expand(b, m, 3))
-        tokens = torch.cat(parts, 1)
-        groups = (b, tokens.shape[1])
-        types = torch.cat((self.types[:2], self.types[2:].expand(m, 2)))
-        types = types[: groups[1]].expand(*groups, 2).flatten(0, 1)
-        tokens = tokens.flatten(0, 1)
-        if alike:
-            tokens, types = (
-                torch.cat((tokens, anchors[0])),
-                torch.cat((types, self.types[2:].expand(m, 2))),
-            )
-        if self.scene.has_band:
-            band = self.scene.band_positions(query).repeat_interleave(groups[1])
-            types = torch.cat((types, band[:, None]), 1)
+        is_shared = len(anchors) == 1 and not blocks and not self.scene.has_band
+        groups = (b, 2 if is_shared else 2 + m)  # queries, and the tokens of each
+        points, types = self._tokens(query, transmitters, anchors, groups)
 
-        points = self.embed(tokens)
-        multivectors, scalars = self.first(points[:, None], types)
-        reference = points[: b * groups[1]].unflatten(0, groups)[
-            :, 1
-        ]  # the transmitter moves with the room
+        points = self.embed(points)  # (tokens, k)
+        multivectors, scalars = self.first(points[:, None], types)  # (tokens, channels, k)
+        # The transmitter moves with the room, as the reference of joins has to.
+        reference = points[: b * groups[1]].unflatten(0, groups)[:, 1]  # (b, k)
         if blocks:
-            multivectors, scalars = multivectors.unflatten(0, groups), scalars.unflatten(0, groups)
+            multivectors = multivectors.unflatten(0, groups)  # (b, tokens, channels, k)
+            scalars = scalars.unflatten(0, groups)
             for block in blocks:
                 multivectors, scalars = block(multivectors, scalars, reference)
-            multivectors, scalars = multivectors.flatten(0, 1), scalars.flatten(0, 1)
-        # Only CLS is read, so the final block computes CLS alone.
-        multivectors, scalars = final.transform(
-            *final.look(multivectors, scalars, groups), reference
-        )
-        multivectors, scalars = self.last(multivectors, scalars)
-        scene = self.read_out(torch.cat((multivectors.flatten(1), scalars.flatten(1)), -1))
-        return Tokens(scene, means.new_zeros(means.shape[1], 0), transmitters.new_zeros(b, 0))
+            multivectors = multivectors.flatten(0, 1)
+            scalars = scalars.flatten(0, 1)
+        # Only CLS is read, so the final block computes CLS alone, eq. (8).
+        first = final.look(multivectors, scalars, groups)
+        multivectors, scalars = final.transform(*first, reference)
+        multivectors, scalars = self.last(multivectors, scalars)  # (b, 1, 1, k), (b, 1, 2)
+        read = torch.cat((multivectors.flatten(1), scalars.flatten(1)), -1)  # (b, k + 2)
+        no_gaussians = means.new_zeros(means.shape[1], 0)
+        no_transmitters = query.transmitters.new_zeros(b, 0)
+        return Tokens(self.read_out(read), no_gaussians, no_transmitters)
+
+    def _tokens(
+        self,
+        query: Query,
+        transmitters: Float[Tensor, "b 3"],
+        anchors: Float[Tensor, "sets m 3"],
+        groups: tuple[int, int],
+    ) -> tuple[Float[Tensor, "tokens 3"], Float[Tensor, "tokens d"]]:
+        """Points and type scalars of all tokens: one group a query, then any shared anchors.
+
+        Args:
+            query: The links.
+            transmitters, anchors: Positions relative to the box, of order one.
+            groups: Number of queries, and of tokens in the group of each; with 2 in a group the
+                anchors are shared.
+        """
+        b, size = groups
+        m = anchors.shape[1]
+        anchor_types = self.types[2:].expand(m, 2)
+        points = [self.cls.expand(b, 1, 3), transmitters[:, None]]
+        if size > 2:
+            points.append(anchors.expand(b, m, 3))
+        tokens = torch.cat(points, 1).flatten(0, 1)  # (b size, 3)
+        types = torch.cat((self.types[:2], anchor_types))[:size]  # (size, 2)
+        types = types.expand(b, size, 2).flatten(0, 1)  # (b size, 2)
+        if size == 2:
+            tokens = torch.cat((tokens, anchors[:1].flatten(0, 1)))  # (b size + m, 3)
+            types = torch.cat((types, anchor_types))
+        if self.scene.has_band:
+            band = self.scene.band_positions(query).repeat_interleave(size)
+            types = torch.cat((types, band[:, None]), 1)  # (b size, 3)
+        return tokens, types

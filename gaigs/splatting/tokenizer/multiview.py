@@ -19,7 +19,7 @@ class MultiviewTokenizer(nn.Module):
         ga: Tokenizer of the scene token: its name, configuration or the object.
         euclidean: Tokenizer of the position embeddings, likewise.
 
-    Source: GAI-GS, "Multi-view Tokenizer".
+    Source: GAI-GS, "Multi-view Tokenizer", eq. (10).
     """
 
     def __init__(
@@ -36,5 +36,7 @@ class MultiviewTokenizer(nn.Module):
         self.transmitter_width = self.euclidean.transmitter_width
 
     def forward(self, placed: Placed, opacities: Float[Tensor, " n"], query: Query) -> Tokens:
+        # eq. (10): CLS, E(P_x), E(P_TX) = F_mv(P_x, P_TX).
         _, gaussians, transmitters = self.euclidean(placed, opacities, query)
-        return Tokens(self.ga(placed, opacities, query).scene, gaussians, transmitters)
+        scene = self.ga(placed, opacities, query).scene
+        return Tokens(scene, gaussians, transmitters)

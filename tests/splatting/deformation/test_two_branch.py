@@ -7,7 +7,6 @@ import torch
 
 from gaigs.core.query import Query
 from gaigs.splatting.deformation.two_branch import (
-    HEADS,
     INITIAL_ATTENUATION,
     LEAST_ATTENUATION,
     TokenLinear,
@@ -18,9 +17,16 @@ from gaigs.splatting.gaussians import Placed, Tokens
 B, N, CHANNELS, WIDTH = 3, 7, 2, 8
 WIDTHS = (5, 4, 6)
 SUBSETS = [
-    list(subset) for subset in chain.from_iterable(combinations(HEADS, size) for size in range(6))
+    list(subset)
+    for subset in chain.from_iterable(combinations(TwoBranch.all_heads, size) for size in range(6))
 ]
-SHAPES = dict(zip(HEADS, ((B, N, 4), (B, N, 3), (B, N, CHANNELS, 1), (B, N), (B, N)), strict=True))
+SHAPES = dict(
+    zip(
+        TwoBranch.all_heads,
+        ((B, N, 4), (B, N, 3), (B, N, CHANNELS, 1), (B, N), (B, N)),
+        strict=True,
+    )
+)
 
 
 def make_tokens(widths=WIDTHS, b=B, n=N, scale=1.0):
@@ -54,7 +60,7 @@ def seed():
 @pytest.mark.parametrize("heads", SUBSETS, ids="-".join)
 def test_a_head_left_out_does_not_exist_and_costs_nothing(heads):
     network = make_network(heads)
-    residuals = dict(zip(HEADS, residuals_of(network, make_tokens()), strict=True))
+    residuals = dict(zip(TwoBranch.all_heads, residuals_of(network, make_tokens()), strict=True))
     assert {name for name, residual in residuals.items() if residual is not None} == set(heads)
     for name in heads:
         assert residuals[name].shape == SHAPES[name]
@@ -88,7 +94,7 @@ def test_the_number_of_parameters_is_that_of_the_papers_layers():
 
 
 def test_residuals_start_at_zero_and_the_attenuation_nearly_clear():
-    residuals = residuals_of(make_network(list(HEADS)), make_tokens(scale=10.0))
+    residuals = residuals_of(make_network(list(TwoBranch.all_heads)), make_tokens(scale=10.0))
     for residual in (residuals.delta_quats, residuals.delta_scales, residuals.delta_opacities):
         assert not residual.any()
     torch.testing.assert_close(residuals.attenuations, torch.full((B, N), INITIAL_ATTENUATION))

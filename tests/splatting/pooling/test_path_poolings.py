@@ -13,7 +13,7 @@ from gaigs.core.antenna import Array, Receiver
 from gaigs.core.geometry import Pose
 from gaigs.core.propagation import NEAREST, free_space
 from gaigs.splatting.pooling.path_rssi import PathRssi
-from gaigs.splatting.pooling.paths import LEAST_SPREAD, ReceivedPaths, element_fields
+from gaigs.splatting.pooling.paths import LagPooling, ReceivedPaths, element_fields
 from gaigs.testing import example_links
 from gaigs.testing.checks import PRECISION, fixed_sum, require_close
 
@@ -70,7 +70,7 @@ def sum_lags(points, semi_axes, amplitudes, lengths, coherences, bandwidth, arra
     """The covariance of each pair of elements over all pairs of paths; its mean over the pairs of
     each lag.
     """
-    elements, seen = array.elements.to(lengths), (points, semi_axes, LEAST_SPREAD)
+    elements, seen = array.elements.to(lengths), (points, semi_axes, LagPooling.least_spread)
     apart = (lengths[:, :, None] - lengths[:, None]) / speed_of_light
     likeness = torch.ones_like(apart) if bandwidth is None else torch.sinc(bandwidth * apart)
     steering, waves = footprints(*seen, elements, carriers), amplitudes * coherences
@@ -303,7 +303,7 @@ def test_lags_of_a_band_are_averages_over_its_frequencies(bandwidth):
     seen = draw(spread=0.2)
     nodes, weights = np.polynomial.legendre.leggauss(400)
     offsets = torch.from_numpy(nodes * bandwidth / 2).expand(2, -1)
-    fields = plane_waves(*seen, ARRAY, offsets, LEAST_SPREAD).numpy()
+    fields = plane_waves(*seen, ARRAY, offsets, LagPooling.least_spread).numpy()
     each = mean_products(np.moveaxis(fields, 2, 1).reshape(-1, len(ARRAY)), ARRAY).reshape(
         2, 400, -1
     )
@@ -317,7 +317,7 @@ def test_lags_of_a_band_are_averages_over_its_frequencies(bandwidth):
 def test_where_powers_add_lags_are_averages_over_phases(monkeypatch):
     """Over phases k j 2 pi / 7 of path k, the interference of any two paths cancels."""
     points, axes, amplitudes, lengths = draw()
-    monkeypatch.setattr("gaigs.splatting.pooling.paths.LEAST_SPREAD", 0.0)
+    monkeypatch.setattr("gaigs.splatting.pooling.paths.LagPooling.least_spread", 0.0)
     average = 0
     for j in range(7):
         turned = amplitudes * torch.exp(2j * math.pi * j / 7 * torch.arange(6, dtype=torch.float64))
@@ -333,7 +333,7 @@ def test_coherence_is_the_share_of_interference(monkeypatch):
     """The interference of two paths is in proportion to the product of their coherences."""
     seen = draw(n=2)
     monkeypatch.setattr(
-        "gaigs.splatting.pooling.paths.LEAST_SPREAD", 0.0
+        "gaigs.splatting.pooling.paths.LagPooling.least_spread", 0.0
     )  # the spread of a path weakens its own coherent part
     lags = lambda *shares: lags_of(*seen, torch.tensor(shares).double(), None, ARRAY, carriers())
     powers, whole = lags(0, 0), lags(1, 1)

@@ -54,7 +54,7 @@ def test_opencl_draws_float32_maps_of_any_number_of_channels(channels):
     ids=str,
 )
 def test_torch_draws_maps_that_opencl_refuses(options, monkeypatch):
-    monkeypatch.setattr(opencl, "SPLATS", 13)  # a scene of 2^24 takes seconds
+    monkeypatch.setattr(opencl.OpenCLRasterizer, "too_many", 13)  # a scene of 2^24 takes seconds
     fastest, arguments = FastestRasterizer(), scene(**options)
     fastest(*scene())
     assert fastest.used != "torch"
@@ -69,7 +69,7 @@ def test_shapes_that_do_not_fit_are_an_error_and_no_reason_to_take_torch():
     splats, signal, opacities, *others = scene()
     assert FastestRasterizer().opencl.takes(splats, signal, opacities[:, 1:], *others)
     with pytest.raises(ValueError, match=r"opacities must be \(3, 12\)"):
-        opencl._check(splats, signal, opacities[:, 1:], *others)
+        opencl.OpenCLRasterizer()._check(splats, signal, opacities[:, 1:], *others)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows has no forks")

@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import pytest
 import torch
+from contracts.rasterizer import (
+    cast_scene,
+    distance_to_jumps,
+    rasterize_densely,
+    render_with_gradients,
+)
 
 from gaigs.core.geometry import Grid, Rays
 from gaigs.splatting.projection import Plane, Splats
 from gaigs.splatting.projection.direction_cosine import DirectionCosine
 from gaigs.splatting.projection.mercator import Mercator
 from gaigs.splatting.rasterizer.torch import TorchRasterizer
-from gaigs.testing.rasterizer import (
-    cast_scene,
-    distance_to_jumps,
-    rasterize_densely,
-    render_with_gradients,
-)
 
 opencl = pytest.importorskip("gaigs.splatting.rasterizer.opencl", exc_type=ImportError)
 pytestmark = pytest.mark.usefixtures("opencl_works")
@@ -226,7 +226,10 @@ def test_an_attenuation_of_0_has_the_gradient_of_the_float64_rasterizer():
 def test_channels_beyond_those_of_a_chunk_change_no_other(c, own):
     splats, signal, *others = random_scene(c=c, own=own, attenuations=(0.3, 1.0))
     image, left = opencl.OpenCLRasterizer()(splats, signal, *others)
-    for part in (slice(first, first + opencl.CHANNELS) for first in range(0, c, opencl.CHANNELS)):
+    for part in (
+        slice(first, first + opencl.LAYOUT.channels)
+        for first in range(0, c, opencl.LAYOUT.channels)
+    ):
         alone, same_left = opencl.OpenCLRasterizer()(splats, signal[..., part], *others)
         assert torch.equal(image[:, part], alone)
         assert torch.equal(left, same_left)
@@ -294,7 +297,7 @@ def test_tensors_it_cannot_read_are_errors_that_say_what_to_do(monkeypatch):
     }
     for message, arguments in bad.items():
         with pytest.raises((TypeError, ValueError), match=message):
-            opencl._check(*arguments, None, plane)
-    monkeypatch.setattr(opencl, "SPLATS", 60)  # a scene of 2^24 takes seconds
+            opencl.OpenCLRasterizer()._check(*arguments, None, plane)
+    monkeypatch.setattr(opencl.OpenCLRasterizer, "too_many", 60)  # a scene of 2^24 takes seconds
     with pytest.raises(ValueError, match="got 2 and 60; use rasterizer=torch"):
         opencl.OpenCLRasterizer()(splats, signal, opacities, None, plane)

@@ -1,6 +1,6 @@
 """The torch rasterizer at the seam, in any chunks, in depth order, and its memory.
 
-``gaigs.testing.check_rasterizer``, which tests/test_contracts.py runs, compares it with the
+``contracts.rasterizer.check_rasterizer``, which tests/test_contracts.py runs, compares it with the
 formula.
 """
 
@@ -12,6 +12,7 @@ from fractions import Fraction
 
 import pytest
 import torch
+from contracts.rasterizer import cast_scene, rasterize_densely, render_with_gradients
 
 from gaigs.core.geometry import Grid, Pose, from_spherical
 from gaigs.splatting.projection import Plane, Splats
@@ -19,7 +20,6 @@ from gaigs.splatting.projection.direction_cosine import DirectionCosine
 from gaigs.splatting.projection.mercator import Mercator
 from gaigs.splatting.rasterizer import torch as module
 from gaigs.splatting.rasterizer.torch import TorchRasterizer
-from gaigs.testing.rasterizer import cast_scene, rasterize_densely, render_with_gradients
 
 GRID = Grid.degrees(range(1, 91, 3), [0.3 + 6 * k for k in range(60)])
 HERE = Pose(torch.zeros(3), torch.eye(3))
@@ -53,7 +53,10 @@ def test_offsets_are_exact_at_the_seam(dtype):
         torch.cat((b, b.new_tensor([0.25, 2.0, -math.pi]))),
     )
     period = torch.tensor(math.tau, dtype=dtype).item()
-    found, eps = module._nearest(a, b, (period, math.tau - period)), torch.finfo(dtype).eps
+    found, eps = (
+        module._nearest(a, b, module._Period(period, math.tau - period)),
+        torch.finfo(dtype).eps,
+    )
     for x, y, offset in zip(a.tolist(), b.tolist(), found.tolist(), strict=True):
         true = Fraction(x) - Fraction(y)
         true -= round(true / Fraction(math.tau)) * Fraction(math.tau)
@@ -101,7 +104,7 @@ def test_chunks_of_tiles_of_any_size_give_the_same_map(monkeypatch, chunk, proje
     arguments = cast_scene(scene(n=60, projection=projection), "cpu", torch.float64)
     pixels = torch.ones(2, *GRID.shape, dtype=torch.bool)
     usual = render_with_gradients(TorchRasterizer(), arguments, pixels)
-    monkeypatch.setattr(module, "CHUNK", chunk)
+    monkeypatch.setattr(TorchRasterizer, "chunk", chunk)
     for name, found in render_with_gradients(TorchRasterizer(), arguments, pixels).items():
         torch.testing.assert_close(found, usual[name], rtol=1e-12, atol=1e-12)
 
