@@ -16,7 +16,7 @@ import torch
 
 import gaigs
 from gaigs import processes
-from gaigs.report.curves import read_curves
+from gaigs.report.training_log import read_curves
 from gaigs.training.checkpoints import KeepLast
 
 SMALL = (

@@ -42,7 +42,7 @@ from gaigs.model import Model, call_optional
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging, predicted
 from gaigs.registry import name_of, registry
-from gaigs.report.table import metrics_table, verdict
+from gaigs.report.scores import metrics_table, verdict
 
 log = logging.getLogger(__name__)
 
