@@ -14,8 +14,8 @@ from common import Row, grouped, number, table
 from trainings import Axis, Score, Trainings, command_line, sections, written
 
 from gaigs.registry import registry
-from gaigs.report.systems import read_published
-from gaigs.report.table import monitor_names, task_class
+from gaigs.report.published import read_published
+from gaigs.report.scores import monitor_names, task_class
 
 SYSTEMS, LOOK_UPS = "system", "look-up"
 """Axes of all systems, and of the task's baselines, which have no training."""

@@ -41,8 +41,8 @@ from gaigs.core.query import Query
 from gaigs.data import Links, load
 from gaigs.model import Model
 from gaigs.registry import register, registry
+from gaigs.runs.descent import descend
 from gaigs.runs.evaluation import validate
-from gaigs.runs.training import descend
 from gaigs.splatting.gaussians import Placed, Tokens
 from gaigs.splatting.tokenizer.ga import GATokenizer
 from gaigs.splatting.tokenizer.multiview import MultiviewTokenizer

@@ -22,10 +22,8 @@ from gaigs.configuration import run_folder
 from gaigs.data import load
 from gaigs.processes import lacks_memory
 from gaigs.registry import listed
-from gaigs.report.curves import read_validations
-from gaigs.report.runs import train_seconds
-from gaigs.report.systems import COSTS
-from gaigs.report.table import monitor_names, task_class
+from gaigs.report.scores import COSTS, monitor_names, task_class, train_seconds
+from gaigs.report.training_log import read_validations
 
 
 class Axis(NamedTuple):

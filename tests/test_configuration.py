@@ -130,7 +130,7 @@ def test_systems_are_swept_over_as_far_as_they_are_installed(
     assert {*swept} <= {*registry("model").names()}
     assert swept[-2:] == ["gaigs", "mirrored"]
     assert settings.sweep.dir == f"runs/systems_{task}"
-    assert settings.callbacks.report["_target_"] == "gaigs.report.at_end.AtEnd"
+    assert settings.callbacks.report["_target_"] == "gaigs.report.hydra_callback.MultirunReport"
 
 
 def test_a_choice_by_task_exists_or_is_replaced():

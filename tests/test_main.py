@@ -22,8 +22,8 @@ import gaigs
 from gaigs import runs
 from gaigs.commands import agreement, command_line
 from gaigs.processes import Stopped, only_run
-from gaigs.report.curves import read_curves
 from gaigs.report.multirun import report
+from gaigs.report.training_log import read_curves
 
 pytestmark = pytest.mark.usefixtures("files_read_once", "unchecked")
 

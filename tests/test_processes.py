@@ -18,7 +18,7 @@ import torch
 import gaigs
 from gaigs import processes
 from gaigs.io.tables import check_empty
-from gaigs.report.curves import read_curves
+from gaigs.report.training_log import read_curves
 from gaigs.training.checkpoints import KeepLast
 
 SMALL = (

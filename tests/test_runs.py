@@ -33,7 +33,7 @@ from gaigs.planes.channel_links import SLABS, SlabRoom
 from gaigs.planes.channel_search import ChannelSearch
 from gaigs.processes import Stopped, stopping
 from gaigs.registry import registry
-from gaigs.report.curves import read_curves
+from gaigs.report.training_log import read_curves
 from gaigs.runs import evaluation
 from gaigs.runs.folder import claim
 from gaigs.testing import example_links

@@ -20,7 +20,7 @@ from omegaconf import DictConfig, OmegaConf
 from gaigs import commands, configuration, processes
 from gaigs.io.files import LOCK
 from gaigs.registry import registry
-from gaigs.report import at_end
+from gaigs.report import hydra_callback
 
 log = logging.getLogger("gaigs")
 
@@ -201,10 +201,10 @@ def main() -> None:
     handlers = {number: signal.signal(number, stop) for number in processes.STOPPING[1:]}
     try:
         compose_and_run()
-        at_end.write()
+        hydra_callback.write_requested()
     except SystemExit as end:
         if end.code == 1 and not signals:  # a job has failed, and the others have ended
-            at_end.write()
+            hydra_callback.write_requested()
         raise
     except KeyboardInterrupt as stop:
         print("gaigs: stopped", file=sys.stderr)

@@ -2,74 +2,91 @@
 model states.
 """
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Float, Shaped
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from numpy import ndarray
 
 from gaigs.core.task import Task
-from gaigs.report.figures import own_scores
+from gaigs.report.predictions import own_scores
 from gaigs.report.style import PAGE, STYLE, looks
-
-BINS = 12
-"""Points of the second panel, each of as many test links."""
 
 
 def intervals(folder: Path, task: Task, split: str) -> Figure | None:
-    """Shares of labels within intervals of each level, and the error of test links by their
-    deviation; None without.
+    """Shares of labels within intervals of each level, and errors of test links by deviation.
+
+    The result is None for a run without intervals.
     """
-    shares = own_scores(folder / "predictions.npz", "shares")
-    with np.load(folder / "predictions.npz") as run:
+    file = folder / "predictions.npz"
+    shares = own_scores(file, "shares")
+    with np.load(file) as run:
         if not shares or "deviation" not in run.files:
             return None
-        labels, predictions, deviations = (
-            run[name] for name in ("labels", "prediction", "deviation")
-        )
+        labels = run["labels"]
+        predictions = run["prediction"]
+        deviations = run["deviation"]
     labels = task.align(torch.from_numpy(labels), torch.from_numpy(predictions)).numpy()
-    flat = lambda numbers: np.abs(numbers).astype(float).reshape(len(labels), -1)
-    exists = ~np.isnan(flat(deviations))  # elements of the array
-    errors, stated = (
-        np.sqrt(np.mean(flat(part) ** 2, 1, where=exists))
-        for part in (predictions - labels, deviations)
-    )
-    parts = [part for part in np.array_split(np.argsort(stated), BINS) if len(part)]
-    levels = np.linspace(0, 1, len(next(iter(shares.values()))) + 2)[1:-1]
+    exists = ~np.isnan(_magnitudes(deviations))  # elements of the array
+    errors = np.sqrt(np.mean(_magnitudes(predictions - labels) ** 2, 1, where=exists))
+    stated = np.sqrt(np.mean(_magnitudes(deviations) ** 2, 1, where=exists))
     with rc_context(STYLE):
         figure = Figure(figsize=(PAGE, 0.46 * PAGE), layout="compressed")
         left, right = figure.subplots(1, 2)
-        for (name, share), (colour, dash) in zip(
-            shares.items(), looks(shares).values(), strict=True
-        ):
-            left.plot(levels, share, color=colour, linestyle=dash, label=name)
-        left.axline((0, 0), slope=1, color="0.3", linewidth=0.7)
-        left.set(
-            xlim=(0, 1),
-            ylim=(0, 1),
-            aspect="equal",
-            xlabel="level of the interval",
-            ylabel="share of labels inside",
-        )
+        _draw_shares(left, shares)
         left.set_title(f"split {split}")
         left.legend()
-        across, up = (
-            np.array([np.sqrt((part[rows] ** 2).mean()) for rows in parts])
-            for part in (stated, errors)
+        name = next(iter(shares))
+        (colour, _) = looks(shares)[name]
+        count = _draw_errors(right, stated, errors, colour)
+        unit = task.error_unit
+        label = f" [{unit}]" if unit else ""
+        right.set(
+            xlabel=f"stated standard deviation{label}", ylabel=f"root mean square error{label}"
         )
-        right.plot(across, up, "o", color=looks(shares)[next(iter(shares))][0], markersize=4)
-        furthest = 1.08 * max(across.max(), up.max()) or 1.0
-        right.axline((0, 0), slope=1, color="0.3", linewidth=0.7)
-        unit = f" [{task.error_unit}]" if task.error_unit else ""
-        right.set(xlim=(0, furthest), ylim=(0, furthest), aspect="equal")
-        for axis in (right.xaxis, right.yaxis):
-            axis.set_major_locator(MaxNLocator(5))
-        right.ticklabel_format(scilimits=(-3, 4))
-        right.set(xlabel=f"stated standard deviation{unit}", ylabel=f"root mean square error{unit}")
-        right.set_title(f"{next(iter(shares))}, {len(errors):,} test links in {len(parts)} groups")
+        right.set_title(f"{name}, {len(errors):,} test links in {count} groups")
         for ax in (left, right):
+            ax.axline((0, 0), slope=1, color="0.3", linewidth=0.7)
             ax.grid()
             ax.set_axisbelow(True)
     return figure
+
+
+def _magnitudes(numbers: Shaped[ndarray, "..."]) -> Float[ndarray, "k numbers"]:
+    return np.abs(numbers).astype(float).reshape(len(numbers), -1)
+
+
+def _draw_shares(ax: Axes, shares: Mapping[str, Float[ndarray, " levels"]]) -> None:
+    """Shares of labels inside, one line a model."""
+    count = len(next(iter(shares.values())))
+    levels = np.linspace(0, 1, count + 2)[1:-1]
+    for name, (colour, dash) in looks(shares).items():
+        ax.plot(levels, shares[name], color=colour, linestyle=dash, label=name)
+    ax.set(xlim=(0, 1), ylim=(0, 1), aspect="equal")
+    ax.set(xlabel="level of the interval", ylabel="share of labels inside")
+
+
+def _draw_errors(
+    ax: Axes,
+    stated: Float[ndarray, " k"],
+    errors: Float[ndarray, " k"],
+    colour: str,
+    groups: int = 12,
+) -> int:
+    """Root mean square errors of groups of links, by deviation; returns the number of groups."""
+    parts = [part for part in np.array_split(np.argsort(stated), groups) if len(part)]
+    across = np.array([np.sqrt((stated[part] ** 2).mean()) for part in parts])
+    up = np.array([np.sqrt((errors[part] ** 2).mean()) for part in parts])
+    ax.plot(across, up, "o", color=colour, markersize=4)
+    furthest = 1.08 * max(across.max(), up.max()) or 1.0
+    ax.set(xlim=(0, furthest), ylim=(0, furthest), aspect="equal")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_locator(MaxNLocator(5))
+    ax.ticklabel_format(scilimits=(-3, 4))
+    return len(parts)

@@ -2,6 +2,9 @@
 planes and paths.
 """
 
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -20,11 +23,38 @@ from gaigs.planes.room_paths import LearntPath
 from gaigs.report.style import BLUE, GREEN, ORANGE, STYLE
 from gaigs.splatting.gaussians import SH_DC, Gaussians
 
-SHOWN = 0.001
-"""Smallest share of the power of a plane that is drawn."""
 
-VIEWS = ((1, 2), (2, 1))
-"""Upward axis and line of sight of plan and side view."""
+class _View(NamedTuple):
+    """A panel with x to the right."""
+
+    ax: Axes
+    up: int  # number of the upward axis
+    along: int  # number of the axis along the line of sight
+
+    def project(self, points: Float[ndarray, "*shape 3"]) -> Float[ndarray, "*shape 2"]:
+        """Points as the panel shows them."""
+        return points[..., [0, self.up]]
+
+
+class _Views(NamedTuple):
+    """Plan and side view of one scale, and the length of arrows in them [m]."""
+
+    figure: Figure
+    panels: tuple[_View, _View]
+    arrow: np.floating
+
+    @property
+    def axes(self) -> list[Axes]:
+        return [view.ax for view in self.panels]
+
+
+class _Cloud(NamedTuple):
+    """The Gaussians that are drawn, and the number of all."""
+
+    means: Float[ndarray, "k 3"]  # [m]
+    covariances: Float[ndarray, "k 3 3"]  # [m²]
+    strengths: Float[ndarray, " k"]  # |signal| times opacity, ascending
+    count: int
 
 
 @torch.no_grad()
@@ -38,199 +68,192 @@ def room(
     along each axis. Line widths of learnt planes grow with their share of the power. Colour shows
     the loss by obstacles along the line of sight.
     """
-    train, test = (
-        links.query.transmitters[part].numpy() for part in (links.split.train, links.split.test)
-    )
-    receivers, edges = _receivers(links), links.edges.numpy()
-    has_axes = all(
-        len(one.array) > 1 or links.task.directions is not None for one in links.receivers
-    )
-    corners = [train, test, receivers, edges.reshape(-1, 3)]
-    if gaussians is not None:
-        strengths = (
-            (gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)).cpu().numpy()
-        )
-        strongest = np.argsort(strengths)[-600:]  # more would hide each other
-        parts = gaussians.means.cpu().numpy(), gaussians.covariances.cpu().numpy(), strengths
-        means, covariances, strengths = (part[strongest] for part in parts)
-        corners.append(np.quantile(means, (0.1, 0.9), axis=0))
-    if learnt is not None:
-        corners += [plane.corners for plane in learnt.planes if plane.share >= SHOWN]
+    cloud = None if gaussians is None else _strongest(gaussians)
+    planes = _drawn_planes(learnt)
+    matter = None if learnt is None else learnt.matter
+    edges = links.edges.numpy()
+    corners = [links.query.transmitters[links.split.train].numpy()]
+    corners.append(links.query.transmitters[links.split.test].numpy())
+    corners += [_receivers(links), edges.reshape(-1, 3)]
+    if cloud is not None:
+        corners.append(np.quantile(cloud.means, (0.1, 0.9), axis=0))
+    corners += [plane.corners for plane in planes]
     with rc_context(STYLE):
-        figure, axes, arrow = _views(np.concatenate(corners))
-        obstacles = []
-        for ax, (up, along) in zip(axes, VIEWS, strict=True):
-            view = [0, up]
-            if learnt is not None and learnt.matter is not None:
-                obstacles.append(_draw_matter(ax, learnt.matter, up, along))
-            if gaussians is not None:
-                ellipses = _draw_gaussians(
-                    ax, means[:, view], covariances[:, view][:, :, view], strengths
-                )
-            if learnt is not None:
-                _draw_planes(ax, learnt.planes, view, along)
-            _draw_walls(ax, edges[..., view])
-            ax.plot(*train[:, view].T, ".", color="0.2", markersize=2, label="transmitters, train")
-            ax.plot(*test[:, view].T, ".", color=ORANGE, markersize=3, label="transmitters, test")
-            _draw_receivers(
-                ax, receivers[:, view], "receivers, axes of the array" if has_axes else "receivers"
-            )
-            for receiver in links.receivers if has_axes else ():
-                _draw_axes(
-                    ax,
-                    receiver.pose.position.numpy()[view],
-                    arrow * receiver.pose.rotation.numpy()[view],
-                )
-        bar = {"aspect": 30, "shrink": 0.7}
-        if gaussians is not None:
-            label = f"|signal| × opacity, {len(means):,} strongest of {len(gaussians.means):,} Gaussians"
-            figure.colorbar(ellipses, ax=axes, label=label, extend="max", **bar)
-        if obstacles:
-            # The scale spans at least 1 dB, so that a negligible loss is pale, and 40 dB, where
-            # nothing is left to see.
-            highest = min(
-                40.0, max(1.0, *(np.quantile(image.get_array().data, 0.99) for image in obstacles))
-            )
-            for image in obstacles:
-                image.set_clim(0, highest)
+        views = _views(np.concatenate(corners))
+        losses = []
+        for view in views.panels:
+            if matter is not None:
+                losses.append(_draw_matter(view, matter))
+            if cloud is not None:
+                ellipses = _draw_gaussians(view, cloud)
+            _draw_planes(view, planes)
+            _draw_walls(view, edges)
+            _draw_links(view, links, views.arrow)
+        bar: dict[str, Any] = {"ax": views.axes, "extend": "max", "aspect": 30, "shrink": 0.7}
+        if cloud is not None:
+            shown = f"{len(cloud.means):,} strongest of {cloud.count:,} Gaussians"
+            views.figure.colorbar(ellipses, label=f"|signal| × opacity, {shown}", **bar)
+        if losses:
+            _scale_losses(losses)
             label = "loss by obstacles along the line of sight [dB]"
-            figure.colorbar(obstacles[0], ax=axes, label=label, extend="max", **bar)
-        _legend(figure, axes[0])
-    return figure
+            views.figure.colorbar(losses[0], label=label, **bar)
+        _legend(views)
+    return views.figure
 
 
 def paths(links: Links, learnt: LearntRoom) -> Figure:
     """The learnt paths of a transmitter, at least one, folded through the room, in plan (x, y) and
     side view (x, z).
     """
-    receivers, edges = _receivers(links), links.edges.numpy()
+    receivers = _receivers(links)
+    edges = links.edges.numpy()
+    planes = _drawn_planes(learnt)
     points = [path.points for path in learnt.paths]
     corners = [receivers, edges.reshape(-1, 3), *points]
-    corners += [plane.corners for plane in learnt.planes if plane.share >= SHOWN]
+    corners += [plane.corners for plane in planes]
+    transmitter = points[0][0]
     with rc_context(STYLE):
-        figure, axes, _ = _views(np.concatenate(corners))
-        for ax, (up, along) in zip(axes, VIEWS, strict=True):
-            view = [0, up]
-            _draw_planes(ax, learnt.planes, view, along)
-            _draw_walls(ax, edges[..., view])
-            lines = _draw_paths(ax, learnt.paths, view)
-            _draw_receivers(ax, receivers[:, view], "receivers")
-            ax.plot(
-                *points[0][0, view], "o", color=ORANGE, markeredgecolor="white", label="transmitter"
-            )
-        x, y, z = points[0][0]
-        axes[0].set_title(
-            f"The {len(points)} strongest paths of a transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m"
-        )
+        views = _views(np.concatenate(corners))
+        for view in views.panels:
+            _draw_planes(view, planes)
+            _draw_walls(view, edges)
+            lines = _draw_paths(view, learnt.paths)
+            _draw_receivers(view, receivers, "receivers")
+            look = {"color": ORANGE, "markeredgecolor": "white"}
+            view.ax.plot(*view.project(transmitter), "o", label="transmitter", **look)
+        place = ", ".join(f"{number:.2f}" for number in transmitter)
+        title = f"The {len(points)} strongest paths of a transmitter at ({place}) m"
+        views.axes[0].set_title(title)
         label = "power over that of the strongest path [dB]"
-        figure.colorbar(lines, ax=axes, label=label, aspect=30, shrink=0.7)
-        _legend(figure, axes[0])
-    return figure
+        views.figure.colorbar(lines, ax=views.axes, label=label, aspect=30, shrink=0.7)
+        _legend(views)
+    return views.figure
 
 
 def _receivers(links: Links) -> Float[ndarray, "receivers 3"]:
     return np.stack([receiver.pose.position.numpy() for receiver in links.receivers])
 
 
-def _draw_walls(ax: Axes, edges: Float[ndarray, "k 2 2"]) -> None:
+def _drawn_planes(learnt: LearntRoom | None, least: float = 0.001) -> list[LearntPlane]:
+    """Learnt planes with a share of the power that is worth a line."""
+    planes = [] if learnt is None else learnt.planes
+    return [plane for plane in planes if plane.share >= least]
+
+
+def _strongest(gaussians: Gaussians, most: int = 600) -> _Cloud:
+    """The strongest Gaussians; more would hide each other."""
+    signal = gaussians.signal[..., 0].norm(dim=-1)  # (n,)
+    strengths = (gaussians.opacities * SH_DC * signal).cpu().numpy()
+    chosen = np.argsort(strengths)[-most:]
+    means = gaussians.means.cpu().numpy()[chosen]
+    covariances = gaussians.covariances.cpu().numpy()[chosen]
+    return _Cloud(means, covariances, strengths[chosen], len(gaussians.means))
+
+
+def _draw_walls(view: _View, edges: Float[ndarray, "k 2 3"]) -> None:
     label = "walls and furniture" if len(edges) else "_nothing"
-    ax.add_collection(LineCollection(edges, colors="0.5", linewidths=0.8, label=label))
+    lines = LineCollection(view.project(edges), colors="0.5", linewidths=0.8, label=label)
+    view.ax.add_collection(lines)
 
 
-def _draw_receivers(ax: Axes, places: Float[ndarray, "receivers 2"], label: str) -> None:
-    ax.plot(*places.T, "s", color=GREEN, markersize=5, markeredgecolor="white", label=label)
+def _draw_receivers(view: _View, places: Float[ndarray, "receivers 3"], label: str) -> None:
+    look = {"color": GREEN, "markersize": 5, "markeredgecolor": "white"}
+    view.ax.plot(*view.project(places).T, "s", label=label, **look)
 
 
-def _views(corners: Float[ndarray, "k 3"]) -> tuple[Figure, tuple[Axes, Axes], np.floating]:
-    """Empty plan and side view that contain some points [m], and the length of arrows in them [m]."""
-    lower, upper = corners.min(0), corners.max(0)
+def _draw_links(view: _View, links: Links, arrow: np.floating) -> None:
+    """Transmitters, receivers, and the axes of arrays, each as long as an arrow [m]."""
+    train = links.query.transmitters[links.split.train].numpy()
+    test = links.query.transmitters[links.split.test].numpy()
+    dots = {"color": "0.2", "markersize": 2, "label": "transmitters, train"}
+    view.ax.plot(*view.project(train).T, ".", **dots)
+    dots = {"color": ORANGE, "markersize": 3, "label": "transmitters, test"}
+    view.ax.plot(*view.project(test).T, ".", **dots)
+    has_directions = links.task.directions is not None
+    has_axes = all(len(one.array) > 1 or has_directions for one in links.receivers)
+    label = "receivers, axes of the array" if has_axes else "receivers"
+    _draw_receivers(view, _receivers(links), label)
+    for receiver in links.receivers if has_axes else ():
+        # The axes are the columns of the rotation.
+        axes = arrow * receiver.pose.rotation.numpy().T
+        _draw_axes(view, receiver.pose.position.numpy(), axes)
+
+
+def _views(corners: Float[ndarray, "k 3"]) -> _Views:
+    """Empty plan and side view that contain some points [m]."""
+    lower = corners.min(0)
+    upper = corners.max(0)
     arrow = 0.1 * (upper - lower).max()
-    lower, upper = lower - 1.2 * arrow, upper + 1.2 * arrow
+    lower = lower - 1.2 * arrow
+    upper = upper + 1.2 * arrow
     width, depth, height = upper - lower
     inches = min(5.8 / width, 6.8 / (depth + height))  # of one metre on the page
-    figure = Figure(
-        figsize=(width * inches + 1.3, (depth + height) * inches + 1.0), layout="compressed"
-    )
+    size = (width * inches + 1.3, (depth + height) * inches + 1.0)
+    figure = Figure(figsize=size, layout="compressed")
     plan, side = figure.subplots(2, 1, sharex=True, height_ratios=(depth, height))
-    for ax, (up, _) in zip((plan, side), VIEWS, strict=True):
-        ax.set(
-            xlim=(lower[0], upper[0]),
-            ylim=(lower[up], upper[up]),
-            ylabel="xyz"[up] + " [m]",
-            aspect="equal",
-        )
+    for ax, up in ((plan, 1), (side, 2)):
+        ax.set(xlim=(lower[0], upper[0]), ylim=(lower[up], upper[up]))
+        ax.set(ylabel="xyz"[up] + " [m]", aspect="equal")
     side.set_xlabel("x [m]")
-    return figure, (plan, side), arrow
+    return _Views(figure, (_View(plan, up=1, along=2), _View(side, up=2, along=1)), arrow)
 
 
-def _legend(figure: Figure, ax: Axes) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    columns = 3 if figure.get_figwidth() > 5.5 and len(labels) <= 3 else 2
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, markerscale=1.5)
+def _legend(views: _Views) -> None:
+    handles, labels = views.axes[0].get_legend_handles_labels()
+    columns = 3 if views.figure.get_figwidth() > 5.5 and len(labels) <= 3 else 2
+    look: dict[str, Any] = {"ncols": columns, "markerscale": 1.5}
+    views.figure.legend(handles, labels, loc="outside lower center", **look)
 
 
-def _draw_gaussians(
-    ax: Axes,
-    means: Float[ndarray, "n 2"],
-    covariances: Float[ndarray, "n 2 2"],
-    strengths: Float[ndarray, " n"],
-) -> EllipseCollection:
+def _draw_gaussians(view: _View, cloud: _Cloud) -> EllipseCollection:
+    flat = [0, view.up]
+    covariances = cloud.covariances[:, flat][:, :, flat]  # (k, 2, 2)
     variances, axes = np.linalg.eigh(covariances)  # ascending
-    minor, major = (
-        2 * np.sqrt(variances.clip(0)).T
-    )  # rounding can leave a flat ellipse a variance below zero
+    # Rounding can leave a flat ellipse a variance below zero.
+    minor, major = 2 * np.sqrt(variances.clip(0)).T
     ellipses = EllipseCollection(
         major,
         minor,
         np.rad2deg(np.arctan2(axes[:, 1, 1], axes[:, 0, 1])),
         units="xy",
-        offsets=means,
-        offset_transform=ax.transData,
-        array=strengths,
+        offsets=view.project(cloud.means),
+        offset_transform=view.ax.transData,
+        array=cloud.strengths,
         cmap="Blues",
-        clim=(0, np.quantile(strengths, 0.98)),  # one outlier must not pale all others
+        clim=(0, np.quantile(cloud.strengths, 0.98)),  # one outlier must not pale all others
         alpha=0.6,
         edgecolors="white",
         linewidths=0.3,
     )
-    ax.add_collection(ellipses)
+    view.ax.add_collection(ellipses)
     return ellipses
 
 
-def _draw_planes(ax: Axes, planes: list[LearntPlane], view: list[int], along: int) -> None:
+def _draw_planes(view: _View, planes: Sequence[LearntPlane]) -> None:
     """Outlines with their share of the power. A plane that faces the reader would cover the room
     and is left out.
     """
     # The limit is above 1 / sqrt(2), so that each plane is in one view at least.
-    shown = [plane for plane in planes if abs(plane.normal[along]) < 0.77 and plane.share >= SHOWN]
+    shown = [plane for plane in planes if abs(plane.normal[view.along]) < 0.77]
     if not shown:
         return
     polygons = PolyCollection(
-        [plane.corners[:, view] for plane in shown],
+        [view.project(plane.corners) for plane in shown],
         facecolors=to_rgba(BLUE, 0.06),
         edgecolors=to_rgba(BLUE, 0.45),
         linewidths=[0.6 + 5 * plane.share**0.5 for plane in shown],
         label="learnt planes, by share of power",
     )
-    ax.add_collection(polygons)
-    width, height = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
-    needed = np.array((0.14 * width, 0.04 * max(width, height)))  # of a label
+    view.ax.add_collection(polygons)
     taken: list[ndarray] = []
     for plane in shown:
-        outward = plane.normal[view] / np.linalg.norm(plane.normal[view])
-        flat = plane.corners[:, view] - plane.corners[:, view].mean(0)
-        edge = plane.corners[:, view].mean(0) + (flat @ outward).max() * outward
-        sideways = np.array((-outward[1], outward[0])) * np.ptp(flat @ (-outward[1], outward[0]))
-        places = [edge + share * sideways for share in (0, 0.2, -0.2, 0.4, -0.4)]
-        free = (
-            place
-            for place in places
-            if all((np.abs(place - other) > needed).any() for other in taken)
-        )
-        place = next(free, edge)
+        normal = view.project(plane.normal)
+        outward = normal / np.linalg.norm(normal)
+        place = _free_place(view, plane, outward, taken)
         taken.append(place)
+        # Texts stand outside of the room: their anchors follow from the direction.
         across, upwards = np.round(outward).astype(int) + 1
-        ax.annotate(
+        view.ax.annotate(
             f"{plane.number}: {100 * plane.share:.2g} %",
             place,
             5 * outward,
@@ -243,47 +266,87 @@ def _draw_planes(ax: Axes, planes: list[LearntPlane], view: list[int], along: in
         )
 
 
-def _draw_matter(ax: Axes, matter: Matter, up: int, along: int) -> AxesImage:
+def _free_place(
+    view: _View, plane: LearntPlane, outward: Float[ndarray, "2"], taken: Sequence[ndarray]
+) -> Float[ndarray, "2"]:
+    """A place for the label of a plane at its outer edge, clear of others if there is one."""
+    width = np.ptp(view.ax.get_xlim())
+    height = np.ptp(view.ax.get_ylim())
+    needed = np.array((0.14 * width, 0.04 * max(width, height)))  # of a label
+    corners = view.project(plane.corners)
+    middle = corners.mean(0)
+    flat = corners - middle
+    edge = middle + (flat @ outward).max() * outward
+    along = (-outward[1], outward[0])
+    sideways = np.array(along) * np.ptp(flat @ along)
+    for share in (0, 0.2, -0.2, 0.4, -0.4):
+        place = edge + share * sideways
+        if all((np.abs(place - other) > needed).any() for other in taken):
+            return place
+    return edge
+
+
+def _draw_matter(view: _View, matter: Matter) -> AxesImage:
     """Loss of a path through all obstacles along the line of sight [dB]."""
-    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    left, right = view.ax.get_xlim()
+    bottom, top = view.ax.get_ylim()
     pixel = max(right - left, top - bottom) / 300
-    x, y = np.arange(left + pixel / 2, right, pixel), np.arange(bottom + pixel / 2, top, pixel)
-    columns = matter.densities * np.sqrt(2 * np.pi) * matter.widths[:, along]
-    across, upwards = (
-        np.exp(-(((values[:, None] - matter.centres[:, axis]) / matter.widths[:, axis]) ** 2) / 2)
-        for values, axis in ((x, 0), (y, up))
-    )
+    x = np.arange(left + pixel / 2, right, pixel)
+    y = np.arange(bottom + pixel / 2, top, pixel)
+    # The integral of a Gaussian density over the line of sight.
+    columns = matter.densities * np.sqrt(2 * np.pi) * matter.widths[:, view.along]
+    across = _bells(x, matter, 0)
+    upwards = _bells(y, matter, view.up)
     extent = (left, left + len(x) * pixel, bottom, bottom + len(y) * pixel)
-    losses = (upwards * columns) @ across.T
-    return ax.imshow(losses, origin="lower", extent=extent, cmap="Purples", alpha=0.8)
+    losses = (upwards * columns) @ across.T  # (y, x)
+    return view.ax.imshow(losses, origin="lower", extent=extent, cmap="Purples", alpha=0.8)
 
 
-def _draw_paths(ax: Axes, paths: list[LearntPath], view: list[int]) -> LineCollection:
+def _bells(values: Float[ndarray, " n"], matter: Matter, axis: int) -> Float[ndarray, "n k"]:
+    """The Gaussian functions of obstacles along one axis."""
+    offsets = (values[:, None] - matter.centres[:, axis]) / matter.widths[:, axis]  # (n, k)
+    return np.exp(-(offsets**2) / 2)
+
+
+def _scale_losses(images: Sequence[AxesImage]) -> None:
+    """One scale of colours of all views.
+
+    It spans at least 1 dB, so that a negligible loss is pale, and at most 40 dB, where nothing is
+    left to see.
+    """
+    highest = [np.quantile(image.get_array().data, 0.99) for image in images]
+    for image in images:
+        image.set_clim(0, min(40.0, max(1.0, *highest)))
+
+
+def _draw_paths(view: _View, paths: Sequence[LearntPath]) -> LineCollection:
     """The strongest on top."""
     ordered = sorted(paths, key=lambda path: path.power_db)
     powers = np.array([path.power_db for path in ordered])
     lowest = min(-10.0, powers.min())
+    visible = colormaps["plasma_r"](np.linspace(0.12, 1, 256))  # paler colours vanish on white
     lines = LineCollection(
-        [path.points[:, view] for path in ordered],
+        [view.project(path.points) for path in ordered],
         array=powers,
-        cmap=ListedColormap(
-            colormaps["plasma_r"](np.linspace(0.12, 1, 256))
-        ),  # paler colours vanish on white
+        cmap=ListedColormap(visible),
         clim=(lowest, 0),
         linewidths=0.8 + 1.4 * (1 - powers / lowest),
     )
-    ax.add_collection(lines)
+    view.ax.add_collection(lines)
     return lines
 
 
-def _draw_axes(ax: Axes, position: Float[ndarray, "2"], axes: Float[ndarray, "2 3"]) -> None:
-    lengths = np.hypot(*axes)
-    for name, axis, length in zip("xyz", axes.T, lengths, strict=True):
+def _draw_axes(view: _View, position: Float[ndarray, "3"], axes: Float[ndarray, "3 3"]) -> None:
+    """Arrows from a position along axes, one a row, with their names."""
+    start = view.project(position)
+    ends = view.project(axes)  # (3, 2)
+    lengths = np.hypot(*ends.T)
+    for name, end, length in zip("xyz", ends, lengths, strict=True):
         if length > 0.3 * lengths.max():  # an axis along the line of sight would be a dot
-            ax.annotate(
+            view.ax.annotate(
                 name,
-                position,
-                position + 1.15 * axis,
+                start,
+                start + 1.15 * end,
                 ha="center",
                 va="center",
                 weight="bold",

@@ -11,26 +11,29 @@ from gaigs.data import Links
 from gaigs.model import Model
 from gaigs.report import figures, style
 from gaigs.report.csi import CsiFigures
-from gaigs.report.curves import loss_curves, read_log
+from gaigs.report.curves import loss_curves
 from gaigs.report.intervals import intervals
 from gaigs.report.room import paths, room
 from gaigs.report.scalar import ScalarFigures
 from gaigs.report.spectrum import SpectrumFigures
-
-BUILT_IN = {Csi: CsiFigures, Scalar: ScalarFigures, Spectrum: SpectrumFigures}
+from gaigs.report.training_log import read_log
 
 
 def figures_of(task: type[Task]) -> figures.TaskFigures:
-    """Figures of a task: those registered for its class or else for the nearest base class."""
-    known = BUILT_IN | figures.registered
-    return next((known[kind] for kind in task.__mro__ if kind in known), figures.TaskFigures)()
+    """Figures of a task: registered ones of its class or else of the nearest base class."""
+    known = {Csi: CsiFigures, Scalar: ScalarFigures, Spectrum: SpectrumFigures}
+    known |= figures.registered
+    for base in task.__mro__:
+        if base in known:
+            return known[base]()
+    return figures.TaskFigures()
 
 
 def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
-    """Draws the room, the losses and the figures of the task from the files of a run into
-    ``figures``.
+    """Draws the room, the losses and the figures of the task into ``figures``.
 
-    The model's ``primitives`` and ``learnt_room`` are drawn if it has them.
+    The model's ``primitives`` and ``learnt_room`` are drawn if it has them. All else comes from the
+    files of the run.
     """
     learnt = model.learnt_room(links)
     drawn = {"room": room(links, model.primitives, learnt)}

@@ -3,6 +3,7 @@ print.
 """
 
 import math
+import textwrap
 from collections.abc import Iterable
 from functools import cache
 from pathlib import Path
@@ -10,14 +11,18 @@ from zlib import crc32
 
 import yaml
 from matplotlib import rc_context
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from gaigs.configuration import conf_dir
 from gaigs.io.files import atomic_write
 from gaigs.report.formats import chosen
 
-COLUMN, PAGE = 3.5, 7.16
-"""Widths of one column and of a page of two columns [inch]."""
+COLUMN = 3.5
+"""Width of one column [inch]."""
+
+PAGE = 7.16
+"""Width of a page of two columns [inch]."""
 
 DPI = 200
 """Pixels per inch of the files."""
@@ -41,45 +46,67 @@ STYLE = {
     "pdf.fonttype": 42,  # fonts that editors and publishers can use
 }
 
-BLUE, ORANGE, GREEN, PURPLE, SKY, GREY = (
-    "#0072B2",
-    "#D55E00",
-    "#009E73",
-    "#CC79A7",
-    "#56B4E9",
-    "#6E6E6E",
-)
+BLUE = "#0072B2"
+ORANGE = "#D55E00"
+GREEN = "#009E73"
+PURPLE = "#CC79A7"
+SKY = "#56B4E9"
+GREY = "#6E6E6E"
 
-COLOURS = (BLUE, GREY, ORANGE, GREEN, PURPLE, SKY)
 
-DASHES = ("-", "--", "-.", ":", (0, (7, 2)), (0, (4, 1, 1, 1, 1, 1)))
+def _line(number: int) -> tuple:
+    """Colour and dash of a line: after six lines each colour has the next dash."""
+    colours = (BLUE, GREY, ORANGE, GREEN, PURPLE, SKY)
+    dashes = ("-", "--", "-.", ":", (0, (7, 2)), (0, (4, 1, 1, 1, 1, 1)))
+    return colours[number % 6], dashes[(number + number // 6) % 6]
 
-LINES = tuple((COLOURS[i], DASHES[(i + shift) % 6]) for shift in range(6) for i in range(6))
+
+LINES = [_line(number) for number in range(36)]
 """Colour and dash of the first, second, ... line, no two of 36 alike."""
 
-PLACED = {
-    "gaigs": 0, "mirrored": 26, "mean": 1, "knn": 3, "gaussian_process": 4, "path_loss": 5, "friis": 17,
-    "nearest_frequency": 7,
-}  # fmt: skip
-"""Lines of built-in models, our two predictors unbroken; systems of ``conf/published.yaml`` have
-the next free ones.
-"""
 
-MARKERS = tuple(
-    {"marker": marker, "color": colour, "markeredgecolor": "white", "markeredgewidth": 0.5}
-    for marker in "os^Dv"
-    for colour in (BLUE, ORANGE, GREEN, PURPLE, SKY)
-)
+def _marker(number: int) -> dict:
+    """Look of a point: after five points comes the next shape."""
+    colour = (BLUE, ORANGE, GREEN, PURPLE, SKY)[number % 5]
+    edge = {"markeredgecolor": "white", "markeredgewidth": 0.5}
+    return {"marker": "os^Dv"[number // 5], "color": colour} | edge
+
+
+MARKERS = [_marker(number) for number in range(25)]
 """Looks of the points of up to 25 runs."""
 
 
 def save(figure: Figure, file: Path) -> list[Path]:
-    """Writes a figure in the formats of ``figure_formats``, with their endings; returns the files."""
+    """Writes a figure in the formats of ``figure_formats``, with their endings.
+
+    Returns:
+        The files.
+    """
     files = [file.with_suffix(f".{ending}") for ending in chosen.get()]
     for file in files:
         with atomic_write(file) as part, rc_context(STYLE):
             figure.savefig(part, dpi=DPI)
     return files
+
+
+def panels(figure: Figure, count: int, columns: int, xlabel: str, ylabel: str) -> list[Axes]:
+    """Panels with common axes, row by row; only outer ones have labels and numbers."""
+    rows = math.ceil(count / columns)
+    axes = [*figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat]
+    for ax in axes[count:]:
+        ax.remove()
+    for index, ax in enumerate(axes[:count]):
+        if index % columns == 0:
+            ax.set_ylabel(ylabel)
+        if index + columns >= count:  # the lowest panel of its column
+            ax.set_xlabel(xlabel)
+            ax.tick_params(labelbottom=True)
+    return axes[:count]
+
+
+def wrapped(label: str) -> str:
+    """The label of an axis in lines that fit a figure of one column."""
+    return textwrap.fill(label, width=48)
 
 
 def looks(systems: Iterable[str]) -> dict[str, tuple]:
@@ -89,43 +116,60 @@ def looks(systems: Iterable[str]) -> dict[str, tuple]:
     A baseline looks as the system of its name. A model without its kriging has the model's colour,
     and dots.
     """
-    placed, titles = _places()
-    names = {name: name.removesuffix(" (baseline)").removesuffix("_trend") for name in systems}
-    models = {name: titles.get(base, base) for name, base in names.items()}
-    for (
-        name,
-        model,
-    ) in models.items():  # the first variant of a system, such as "GAI-GS split=blocks"
-        own = next(
-            (known for title, known in titles.items() if model.startswith(f"{title} ")), model
-        )
-        models[name] = model if own in models.values() else own
-    known = {*placed.values()}
-    taken = {placed[model] for model in models.values() if model in placed}
+    models = _models([*systems])
+    places = {**_places()}
+    known = {*places.values()}
+    taken = {places[model] for model in models.values() if model in places}
     found = {}
     for name, model in models.items():
-        if model not in placed:
+        if model not in places:
+            # A place that follows from the name; the next one where a known system has it.
             turn = crc32(model.encode()) % len(LINES)
-            places = [*range(turn, len(LINES)), *range(turn)]
-            places.sort(
-                key=lambda place: (place in taken, place in known)
-            )  # where no known system is, if possible
-            place = places[0]
-            taken.add(place)
-            placed = placed | {model: place}
-        colour, dash = LINES[placed[model]]
+            order = [*range(turn, len(LINES)), *range(turn)]
+            places[model] = min(order, key=lambda place: (place in taken, place in known))
+            taken.add(places[model])
+        colour, dash = LINES[places[model]]
         found[name] = colour, ":" if name.endswith("_trend") else dash
     return found
 
 
+def _models(systems: Iterable[str]) -> dict[str, str]:
+    """The model of each system; the first variant, as "GAI-GS split=a", is the model itself."""
+    titles = {title: name for name, title in _titles().items()}
+    models = {}
+    for name in systems:
+        base = name.removesuffix(" (baseline)").removesuffix("_trend")
+        models[name] = titles.get(base, base)
+    for name, model in models.items():
+        variants = (known for title, known in titles.items() if model.startswith(f"{title} "))
+        original = next(variants, model)
+        models[name] = model if original in models.values() else original
+    return models
+
+
 @cache
-def _places() -> tuple[dict[str, int], dict[str, str]]:
-    """Numbers of known systems in ``LINES``, and the models of titles."""
-    titles = yaml.safe_load((conf_dir() / "published.yaml").read_text(encoding="utf-8"))["names"]
-    free = (place for place in range(len(LINES)) if place not in PLACED.values())
-    return PLACED | {name: next(free) for name in titles if name not in PLACED}, {
-        t: name for name, t in titles.items()
+def _titles() -> dict[str, str]:
+    """Titles of models by name."""
+    content = yaml.safe_load((conf_dir() / "published.yaml").read_text(encoding="utf-8"))
+    return content["names"]
+
+
+@cache
+def _places() -> dict[str, int]:
+    """Numbers of known systems in ``LINES``: our two predictors unbroken, others as they come."""
+    places = {
+        "gaigs": 0,
+        "mirrored": 26,
+        "mean": 1,
+        "knn": 3,
+        "gaussian_process": 4,
+        "path_loss": 5,
+        "friis": 17,
+        "nearest_frequency": 7,
     }
+    free = [place for place in range(len(LINES)) if place not in places.values()]
+    others = [name for name in _titles() if name not in places]
+    return places | dict(zip(others, free, strict=False))
 
 
 def round_step(span: float, most: int) -> float:

@@ -4,39 +4,24 @@ import math
 import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import yaml
 from matplotlib.figure import Figure
 from rich.markup import escape
 from rich.table import Table
 
-from gaigs.configuration import conf_dir, plugin_conf_dirs
+from gaigs.core.task import Metric
 from gaigs.io.files import write_text
-from gaigs.report.curves import learning_curves, read_validations
+from gaigs.report.curves import learning_curves
+from gaigs.report.predictions import as_baseline
+from gaigs.report.published import read_published
 from gaigs.report.run_figures import figures_of
-from gaigs.report.runs import Run, as_baseline, by_seed, train_seconds
+from gaigs.report.run_folders import Run, by_seed
+from gaigs.report.scores import COSTS, monitor_names, task_class, train_seconds
 from gaigs.report.style import save
-from gaigs.report.table import (
-    Spread,
-    markdown,
-    monitor_names,
-    task_class,
-    terminal,
-    write_csv,
-    written,
-)
-
-COSTS = {
-    "train_seconds": "training [s]",
-    "inference_ms": "inference [ms]",
-    "render_ms": "rendering [ms]",
-    "num_parameters": "parameters",
-    "num_gaussians": "Gaussians",
-    "checkpoint_bytes": "checkpoint [MB]",
-}
-"""Titles of the costs in ``metrics.json``, in the order of the table."""
+from gaigs.report.table import Spread, best_in_bold, markdown, terminal, write_csv, written
+from gaigs.report.training_log import read_validations
 
 
 class System(NamedTuple):
@@ -48,105 +33,76 @@ class System(NamedTuple):
         runs: Runs that ended, one a seed; empty for a baseline.
         values: Values of each metric and cost, one a run.
         failures: Seed and cause of each run that has not ended.
-        varied: True if its runs differ from others in more than model and seed.
+        is_varied: True if its runs differ from others in more than model and seed.
     """
 
     model: str
     name: str
-    runs: list[Run]
+    runs: Sequence[Run]
     values: dict[str, list[float]]
     failures: Sequence[str] = ()
-    varied: bool = False
-
-
-def read_published() -> dict[str, dict]:
-    """Contents of ``published.yaml`` of gaigs and of plug-ins; a ValueError for a file of another
-    form.
-
-    ``names`` of models are in the order of the rows. ``scores`` and ``costs`` have for each task
-    columns with ``title``, ``source``, and ``figures`` by model.
-    """
-    found: dict[str, dict] = {"names": {}, "scores": {}, "costs": {}}
-    for file in (folder / "published.yaml" for folder in (conf_dir(), *plugin_conf_dirs())):
-        if not file.is_file():
-            continue
-        try:
-            content = yaml.safe_load(file.read_text())
-            found["names"].update(content.get("names", {}))
-            for part in ("scores", "costs"):
-                for task, columns in content.get(part, {}).items():
-                    columns = [
-                        {key: column[key] for key in ("title", "source", "figures")}
-                        for column in columns
-                    ]
-                    found[part].setdefault(task, []).extend(columns)
-        except (AttributeError, KeyError, TypeError, ValueError, yaml.YAMLError) as error:
-            raise ValueError(
-                f"{file} must have the form of conf/published.yaml: {error!r}"
-            ) from error
-    return found
+    is_varied: bool = False
 
 
 def find_systems(
     runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapping, names: Mapping
 ) -> list[System]:
-    """Rows of the table. Runs that differ in the seed alone are one row. Baselines that are not
-    systems come last.
+    """Rows of the table. Runs that differ in the seed alone are one row.
+
+    They are in the order of ``names``. Baselines that are not systems come last.
     """
-    rows = []
-    for group in by_seed(runs):
-        overrides = group[0].overrides
-        # A seed that was run twice, in two multiruns, counts once.
-        ended = {run.metrics["seed"]: run for run in reversed(group) if run.metrics is not None}
-        done = [ended[seed] for seed in sorted(ended)]
-        model = overrides.get("model") or (
-            next(iter(done[0].metrics["models"])) if done else group[0].name
-        )
-        varied = [
-            f"{key}={overrides[key]}" for key in overrides if key not in ("model", "seed", *shared)
-        ]
-        values: dict[str, list[float]] = {}
-        for run in done:
-            for key, value in (
-                next(iter(run.metrics["models"].values())) | _costs(run.metrics)
-            ).items():
-                if value is not None:
-                    values.setdefault(key, []).append(value)
-        failures = []
-        for run in group:
-            if run.metrics is None:
-                seed = (
-                    f"seed {run.overrides['seed']}: "
-                    if len(group) > 1 and run.overrides.get("seed")
-                    else ""
-                )
-                failures.append(f"{seed}{run.failure or 'unfinished'}")
-        name = " ".join([names.get(model, model), *varied])
-        rows.append(System(model, name, done, values, failures, bool(varied)))
-    order = [*names]
-    rows.sort(
-        key=lambda row: (order.index(row.model) if row.model in order else len(order), row.name)
-    )
-    own = {row.model: row.values for row in rows}
+    systems = [_system(group, shared, names) for group in by_seed(runs)]
+    order = {model: place for place, model in enumerate(names)}
+    systems.sort(key=lambda system: (order.get(system.model, len(order)), system.name))
+    values = {system.model: system.values for system in systems}
     for row in baselines:
+        model = row["model"]
         scores = {key: [value] for key, value in row.items() if isinstance(value, float)}
-        same = own.get(row["model"], {})
-        if same and all(
-            written(same[key][0]) == written(values[0])
-            for key, values in scores.items()
-            if key in same
-        ):
-            continue
-        name = as_baseline(row["model"]) if row["model"] in own else row["model"]
-        rows.append(
-            System(row["model"], " ".join(filter(None, (name, row.get("split")))), [], scores)
-        )
-    return rows
+        if not _scores_alike(values.get(model, {}), scores):
+            name = as_baseline(model) if model in values else model
+            title = " ".join(filter(None, (name, row.get("split"))))
+            systems.append(System(model, title, [], scores))
+    return systems
+
+
+def _system(group: Sequence[Run], shared: Mapping, names: Mapping) -> System:
+    """The row of runs that differ in the seed alone."""
+    overrides = group[0].overrides
+    # A seed that was run twice, in two multiruns, counts once.
+    ended = {run.metrics["seed"]: run for run in reversed(group) if run.metrics is not None}
+    runs = [ended[seed] for seed in sorted(ended)]
+    model = overrides.get("model")
+    if not model:
+        model = next(iter(runs[0].metrics["models"])) if runs else group[0].name
+    usual = ("model", "seed", *shared)
+    varied = [f"{key}={value}" for key, value in overrides.items() if key not in usual]
+    values: dict[str, list[float]] = {}
+    for run in runs:
+        scores = next(iter(run.metrics["models"].values()))
+        for key, value in (scores | _costs(run.metrics)).items():
+            if value is not None:
+                values.setdefault(key, []).append(value)
+    failures = []
+    for run in group:
+        if run.metrics is None:
+            seed = run.overrides.get("seed") if len(group) > 1 else None
+            cause = run.failure or "unfinished"
+            failures.append(f"seed {seed}: {cause}" if seed else cause)
+    name = " ".join([names.get(model, model), *varied])
+    return System(model, name, runs, values, failures, bool(varied))
+
+
+def _scores_alike(system: Mapping[str, Sequence], baseline: Mapping[str, Sequence]) -> bool:
+    """True if a system has the scores of a baseline, as printed."""
+    common = system.keys() & baseline.keys()
+    alike = [written(system[key][0]) == written(baseline[key][0]) for key in common]
+    return bool(system) and all(alike)
 
 
 def _costs(metrics: Mapping) -> dict[str, float | None]:
     """Costs of one run; 0 Gaussians become None."""
-    costs = {key: metrics.get(key) for key in COSTS} | {"train_seconds": train_seconds(metrics)}
+    costs = {key: metrics.get(key) for key in COSTS}
+    costs["train_seconds"] = train_seconds(metrics)
     costs["num_gaussians"] = costs["num_gaussians"] or None
     if costs["checkpoint_bytes"] is not None:
         costs["checkpoint_bytes"] /= 1e6
@@ -156,59 +112,54 @@ def _costs(metrics: Mapping) -> dict[str, float | None]:
 def _cells(
     systems: Sequence[System], published: Sequence[Mapping], titles: Mapping[str, str]
 ) -> list[dict]:
-    """Rows by title: published figures of systems in their usual setting, then ours; empty columns
-    are left out.
+    """Rows by title: published figures of systems in their usual setting, then ours.
+
+    Columns without a value are left out.
     """
     rows = []
     for system in systems:
-        figures = {
-            f"published {column['title']}": column["figures"].get(system.model)
-            for column in published
-        }
-        if not system.runs or system.varied:
-            figures = dict.fromkeys(figures)
-        ours = {title: system.values.get(key, ()) for key, title in titles.items()}
-        rows.append(
-            figures
-            | {
-                title: Spread.of(v) if len(v) > 1 else next(iter(v), None)
-                for title, v in ours.items()
-            }
-        )
-    return [
-        {
-            title: value
-            for title, value in row.items()
-            if any(other[title] is not None for other in rows)
-        }
-        for row in rows
-    ]
+        row: dict[str, float | Spread | None] = {}
+        is_usual = system.runs and not system.is_varied
+        for column in published:
+            figure = column["figures"].get(system.model) if is_usual else None
+            row[f"published {column['title']}"] = figure
+        for key, title in titles.items():
+            values = system.values.get(key, ())
+            row[title] = Spread.of(values) if len(values) > 1 else next(iter(values), None)
+        rows.append(row)
+    known = [title for title in rows[0] if any(row[title] is not None for row in rows)]
+    return [{title: row[title] for title in known} for row in rows]
 
 
-def _texts(rows: Sequence[Mapping], better: Mapping[str, bool], bold: str) -> list[list[str]]:
-    """Lines of a table as text, in the format ``bold`` all that print as the best of a column with
-    an entry in ``better``."""
-    mean = lambda value: value.mean if isinstance(value, Spread) else value
-    best = {}
-    for title in better.keys() & rows[0].keys():
-        means = [mean(row[title]) for row in rows if row[title] is not None]
-        best[title] = written((max if better[title] else min)(means)) if len(means) > 1 else None
-
-    def text(title: str, value: Any) -> str:
-        is_best = value is not None and written(mean(value)) == best.get(title)
-        return bold.format(written(value)) if is_best else written(value)
-
-    return [[text(title, value) for title, value in row.items()] for row in rows]
+def _lines(
+    names: Sequence[str],
+    rows: Sequence[Mapping],
+    metrics: Mapping[str, Metric],
+    bold: str = "[bold]{}[/bold]",
+) -> list[list[str]]:
+    """Lines of a table as text; the best value of each metric that several systems have is bold."""
+    known = {metric.title: metric for metric in metrics.values()}
+    columns: list[Sequence[str]] = [names]
+    for title in rows[0]:
+        values = [row[title] for row in rows]
+        if title in known and sum(value is not None for value in values) > 1:
+            columns.append(best_in_bold(values, known[title].higher_is_better, bold))
+        else:
+            columns.append([written(value) for value in values])
+    return [[*line] for line in zip(*columns, strict=True)]
 
 
 def write_systems(
-    folder: Path, runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapping, known: Mapping
+    folder: Path,
+    runs: Sequence[Run],
+    baselines: Sequence[Mapping],
+    shared: Mapping,
+    metrics: Mapping[str, Metric],
 ) -> Table | None:
     """Writes ``systems.md``, ``systems.csv`` and the figures that compare the systems.
 
-    ``baselines`` and ``shared`` are results of ``gaigs.report.multirun.ablation``, ``known`` the
-    metrics of the task. The result is None, and there are no files, unless runs of several models
-    have ended.
+    ``baselines`` and ``shared`` are results of ``gaigs.report.ablation``, ``metrics`` of the task.
+    The result is None, and there are no files, unless runs of several models have ended.
     """
     published = read_published()
     systems = find_systems(runs, baselines, shared, published["names"])
@@ -216,93 +167,112 @@ def write_systems(
     if len({system.model for system in done}) < 2:
         return None
     task = done[0].runs[0].metrics["task"]
-    failed = [f"{system.name}: {failure}" for system in systems for failure in system.failures]
+    failed = []
+    for system in systems:
+        failed += [f"{system.name}: {failure}" for failure in system.failures]
     systems = [system for system in systems if system.values]
-    columns = [published[part].get(task, []) for part in ("scores", "costs")]
-    better = {metric.title: metric.higher_is_better for metric in known.values()}
-    titles = {name: metric.title for name, metric in known.items()}
-    scores, costs = (
-        _cells(systems, *parts) for parts in zip(columns, (titles, COSTS), strict=True)
-    )
+    titles = {name: metric.title for name, metric in metrics.items()}
+    published_scores = published["scores"].get(task, [])
+    published_costs = published["costs"].get(task, [])
+    scores = _cells(systems, published_scores, titles)
+    costs = _cells(systems, published_costs, COSTS)
+    rows = [ours | theirs for ours, theirs in zip(scores, costs, strict=True)]
 
-    lines = [*zip(systems, scores, costs, strict=True)]
-    rows = [{"system": system.name, "model": system.model} | a | b for system, a, b in lines]
-    write_csv(folder / "systems.csv", rows, (", sd",))
-    notes = [", ".join(f"{key}={value}" for key, value in shared.items())]
-    notes += [
-        f"- published {column['title']}: {column['source']}" for part in columns for column in part
-    ]
-    notes += [f"- without a result: {failure}" for failure in failed]
-    pages = []
+    heads = [{"system": system.name, "model": system.model} for system in systems]
+    lines = [head | row for head, row in zip(heads, rows, strict=True)]
+    write_csv(folder / "systems.csv", lines, (", sd",))
+    names = [system.name for system in systems]
+    page = ""
     for part in (scores, costs):
-        rows = [{"system": system.name} | row for system, row in zip(systems, part, strict=True)]
-        pages.append(markdown([[*rows[0]], *_texts(rows, better, "**{}**")]))
-    write_text(folder / "systems.md", "\n".join([*pages, *notes]) + "\n")
-    for name, figure in _figures(done, task, known).items():
+        cells = _lines(names, part, metrics, bold="**{}**")
+        page += f"{markdown([['system', *part[0]], *cells])}\n"
+    page += ", ".join(f"{key}={value}" for key, value in shared.items()) + "\n"
+    for column in (*published_scores, *published_costs):
+        page += f"- published {column['title']}: {column['source']}\n"
+    page += "".join(f"- without a result: {failure}\n" for failure in failed)
+    write_text(folder / "systems.md", page)
+    for name, figure in _figures(done, task, metrics).items():
         save(figure, folder / f"systems_{name}.png")
-
-    brief = [title for title in scores[0] if title.startswith("published ")][-1:]
-    brief += [
-        metric.title for metric in known.values() if metric.is_brief and metric.title in scores[0]
-    ]
-    brief += [
-        COSTS[key]
-        for key in ("train_seconds", "inference_ms", "num_parameters")
-        if COSTS[key] in costs[0]
-    ]
-    rows = [
-        {"system": escape(system.name)} | {title: (a | b)[title] for title in brief}
-        for system, a, b in lines
-    ]
+    brief = _brief(scores[0], costs[0], metrics)
+    shown = [{title: row[title] for title in brief} for row in rows]
+    cells = _lines([escape(name) for name in names], shown, metrics)
     caption = "".join(f"{failure}\n" for failure in failed) + "all columns in systems.md"
     styles = [None if system.runs else "dim" for system in systems]
     heads = {"system": False} | dict.fromkeys(brief, True)
-    return terminal("Systems", heads, _texts(rows, better, "[bold]{}[/bold]"), caption, styles)
+    return terminal("Systems", heads, cells, caption, styles)
 
 
-def _figures(rows: Sequence[System], task: str, known: Mapping) -> dict[str, Figure]:
-    """The task's figures of several systems, if they share the test links, and the validation
-    scores over time.
+def _brief(scores: Mapping, costs: Mapping, metrics: Mapping[str, Metric]) -> list[str]:
+    """Titles of the columns on a terminal: a published score, brief metrics and three costs."""
+    published = [title for title in scores if title.startswith("published ")]
+    measured = [metric.title for metric in metrics.values() if metric.is_brief]
+    spent = [COSTS[key] for key in ("train_seconds", "inference_ms", "num_parameters")]
+    columns = published[-1:]
+    columns += [title for title in measured if title in scores]
+    return columns + [title for title in spent if title in costs]
+
+
+def _figures(
+    systems: Sequence[System], task: str, metrics: Mapping[str, Metric]
+) -> dict[str, Figure]:
+    """Figures of the first seed that all systems have, if they share the split.
+
+    The task's figures need the same test links. Validation scores over time need a log of time.
     """
-    shared = set.intersection(*({run.metrics["seed"] for run in row.runs} for row in rows))
-    firsts = {
-        row.name: next(
-            (run for run in row.runs if run.metrics["seed"] == min(shared, default=None)),
-            row.runs[0],
-        )
-        for row in rows
-    }
-    splits = {run.metrics["split"] for run in firsts.values()}
+    runs = _first_seeds(systems)
+    splits = {run.metrics["split"] for run in runs.values()}
     if len(splits) > 1:
         return {}
     figures: dict[str, Figure] = {}
     kind = task_class(task)
-    files = {name: run.folder / "predictions.npz" for name, run in firsts.items()}
+    files = {name: run.folder / "predictions.npz" for name, run in runs.items()}
     files = {name: file for name, file in files.items() if file.is_file()}
-    labels = set()  # the same labels: the same test links
-    for file in files.values():
-        try:
-            with (
-                file.open("rb") as stream,
-                np.load(stream) as run,
-            ):  # numpy would not close a damaged file
-                labels.add(hash(run["labels"].tobytes()))
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
-            labels.add(file)  # like no other: no figure
-    if len(labels) == 1:
+    if _have_same_labels([*files.values()]):
         figures |= figures_of(kind).of_systems(kind, files, *splits)
     monitor, mean = monitor_names(task)
     curves = {}
-    for name, run in firsts.items():
-        if points := [
-            point for _, *point in read_validations(run.folder, monitor) if math.isfinite(point[0])
-        ]:
-            curves[name] = tuple(zip(*points, strict=True))
+    for name, run in runs.items():
+        validations = read_validations(run.folder, monitor)
+        known = [one for one in validations if math.isfinite(one.seconds)]
+        if known:
+            times = tuple(one.seconds for one in known)
+            curves[name] = times, tuple(one.score for one in known)
     if curves and mean is not None:
-        own = {next(iter(firsts[name].metrics["models"])) for name in curves}
-        own |= {f"{name}_trend" for name in own}  # a run's own model without its kriging
-        validations = (run.metrics.get("validation") for run in firsts.values())
-        validation: dict[str, dict] = next(filter(None, validations), {})
-        lines = {name: scores[mean] for name, scores in validation.items() if name not in own}
-        figures["curves"] = learning_curves(curves, lines, known[mean])
+        scores = _baseline_scores(runs, [*curves], mean)
+        figures["curves"] = learning_curves(curves, scores, metrics[mean])
     return figures
+
+
+def _first_seeds(systems: Sequence[System]) -> dict[str, Run]:
+    """The run of each system with the first common seed, or else its first run, by name."""
+    seeds = [{run.metrics["seed"] for run in system.runs} for system in systems]
+    seed = min(set.intersection(*seeds), default=None)
+    runs = {}
+    for system in systems:
+        same = (run for run in system.runs if run.metrics["seed"] == seed)
+        runs[system.name] = next(same, system.runs[0])
+    return runs
+
+
+def _have_same_labels(files: Sequence[Path]) -> bool:
+    """True if all ``predictions.npz`` have the same labels, thus the same test links."""
+    labels = set()
+    for file in files:
+        try:
+            # Numpy would not close a damaged file.
+            with file.open("rb") as stream, np.load(stream) as arrays:
+                labels.add(hash(arrays["labels"].tobytes()))
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return False
+    return len(labels) == 1
+
+
+def _baseline_scores(
+    runs: Mapping[str, Run], drawn: Sequence[str], metric: str
+) -> dict[str, float]:
+    """Validation scores of the baselines, by name, without the models that have curves."""
+    models = {next(iter(runs[name].metrics["models"])) for name in drawn}
+    models |= {f"{model}_trend" for model in models}  # a run's model without its kriging
+    validations = (run.metrics.get("validation") for run in runs.values())
+    validation: dict[str, dict] = next(filter(None, validations), {})
+    return {name: scores[metric] for name, scores in validation.items() if name not in models}

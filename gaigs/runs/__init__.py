@@ -19,7 +19,7 @@ from gaigs.kriging.links import check_known
 from gaigs.model import Model, checkpoint
 from gaigs.processes import is_first, limited_threads, only_run
 from gaigs.registry import check_type, name_of, only_recorded, registry
-from gaigs.report.table import metrics_table, verdict
+from gaigs.report.scores import metrics_table, verdict
 from gaigs.runs.folder import claim, is_configuration, store, stored_software, warn_of_changes
 
 log = logging.getLogger(__name__)
@@ -44,7 +44,7 @@ def run(config: dict, folder: Path, launcher: str | None = None) -> dict | None:
     from gaigs.training.budget import watched  # slow to import
 
     if launcher is not None:
-        from gaigs.runs.training import check_processes
+        from gaigs.runs.descent import check_processes
 
         check_processes(config["trainer"], launcher)
     with limited_threads(config["threads"]), watched(config) as watch:
@@ -57,7 +57,9 @@ def run(config: dict, folder: Path, launcher: str | None = None) -> dict | None:
             claim(folder, config)
             finished = folder / "metrics.json"
             if finished.is_file():
-                from gaigs.report.runs import read_metrics  # with Hydra, which loading does without
+                from gaigs.report.run_folders import (
+                    read_metrics,
+                )  # with Hydra, which loading does without
 
                 log.info("finished already: %s", finished)
                 metrics = read_metrics(finished)
@@ -65,9 +67,8 @@ def run(config: dict, folder: Path, launcher: str | None = None) -> dict | None:
                 metrics = train_and_test(config, folder)
                 if math.isfinite(watch.limit):
                     metrics |= {"max_time": watch.limit, "left_out": watch.left_out}
-                if not is_configuration(
-                    folder / "config.yaml"
-                ):  # loggers make a removed folder again
+                # Loggers make a removed folder again.
+                if not is_configuration(folder / "config.yaml"):
                     store(config, folder)
                 write_text(finished, json.dumps(metrics, indent=2) + "\n")
     console = Console(emoji=False)
@@ -111,8 +112,8 @@ def load(path: str | Path, trust: bool = False) -> Model:
     folder, config = Path(path), configuration_of(path)
     if not (folder / "best.ckpt").is_file():
         raise FileNotFoundError(
-            f"{folder} has no best.ckpt: the run is not finished, or one of a look-up by gaigs 0.3\n"
-            "start it again, a finished one in another folder"
+            f"{folder} has no best.ckpt: the run is not finished, or one of a look-up by "
+            "gaigs 0.3\nstart it again, a finished one in another folder"
         )
     model: Any = checkpoint.load(folder / "best.ckpt", trust, stored_software(folder))
     if config["kriging"] and name_of(model) != "kriging":
@@ -146,7 +147,10 @@ def links_of(folder: str | Path, trust: bool) -> Links:
 
 
 def train_and_test(config: dict, folder: Path) -> dict | None:
-    """Contents of ``metrics.json`` of a run in a claimed folder; None in all but the first process."""
+    """Contents of ``metrics.json`` of a run in a claimed folder.
+
+    The result is None in all but the first process.
+    """
     import lightning
 
     lightning.seed_everything(config["seed"], verbose=False)
@@ -157,38 +161,72 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         )
     # Slow to import: errors in data come first.
     from gaigs.runs import evaluation
-    from gaigs.runs.training import count_gaussians, fit
+    from gaigs.runs.training import fit
 
-    task, name = links.task, config["model"]["name"]
-    counts = {part_name: len(part) for part_name, part in links.split.parts().items()}
-    if unused := len(links) - sum(counts.values()):
-        counts["in no part"] = unused
-    sizes = ", ".join(f"{count} {part_name}" for part_name, count in counts.items())
-    log.info("data: %s; split %s: %s", config["data"]["name"], links.split.name, sizes)
-    scene = links.scene
-    box = " x ".join(f"{edge:.2f}" for edge in scene.upper - scene.lower)
-    log.info(
-        "data: training transmitters within %s m%s", box, links.remarks and f"; {links.remarks}"
-    )
-    loss = registry("loss").build(config["loss"], task=task)
-    baselines = evaluation.build_baselines(config["baselines"], name, scene)
+    name = config["model"]["name"]
+    _log_links(links, config["data"]["name"])
+    loss = registry("loss").build(config["loss"], task=links.task)
+    baselines = evaluation.build_baselines(config["baselines"], name, links.scene)
     if baselines:
         check_known(links)  # a training comes before
     fitted = fit(None, loss, links, config, folder)
     if fitted is None:
         return None
-    model, is_trained, best = fitted.models[name], bool(fitted.unseen), folder / "best.ckpt"
-    own = {} if is_trained else {name: registry("model").build(config["model"], scene=scene)}
+    look_ups = dict(baselines)
+    if not fitted.unseen:  # a model without a training is fitted for the validation, too
+        model = registry("model").build(config["model"], scene=links.scene)
+        look_ups = {name: model} | baselines
     # Shares of the run's limit; maps and figures have the rest.
     with stage(until=0.86):
-        validation = evaluation.validate(fitted.unseen, {**own, **baselines}, links)
+        validation = evaluation.validate(fitted.unseen, look_ups, links)
     with stage(until=0.92):
         scores = evaluation.score(fitted.models, baselines, links, folder)
-    metrics = {
-        "task": task.name,
+    model = fitted.models[name]
+    metrics = _facts(links, config["seed"], model, fitted, folder / "best.ckpt")
+    metrics |= {
+        "models": {key: evaluation.summary(links.task, values) for key, values in scores.items()},
+        "validation": {
+            key: evaluation.summary(links.task, values) for key, values in validation.items()
+        },
+        "validation_score": None,
+        "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
+    }
+    if validation:
+        metrics["validation_score"] = validation[name][links.task.monitor].mean().item()
+    metrics |= model.facts()
+    if config["kriging"]:
+        metrics["kriging"]["seconds"] = fitted.kriging_seconds
+    model.export(folder)
+    if links.task.is_scalar:
+        radio_map(model).save(folder / "radio_map.npz")
+    from gaigs.report.run_figures import write_figures  # matplotlib is slow to import
+
+    write_figures(folder, links, model)
+    return metrics
+
+
+def _log_links(links: Links, name: str) -> None:
+    """Logs the split of the links that were read by ``name``, and the extent of their places."""
+    counts = {part_name: len(part) for part_name, part in links.split.parts().items()}
+    if unused := len(links) - sum(counts.values()):
+        counts["in no part"] = unused
+    sizes = ", ".join(f"{count} {part_name}" for part_name, count in counts.items())
+    log.info("data: %s; split %s: %s", name, links.split.name, sizes)
+    box = " x ".join(f"{edge:.2f}" for edge in links.scene.upper - links.scene.lower)
+    remarks = f"; {links.remarks}" if links.remarks else ""
+    log.info("data: training transmitters within %s m%s", box, remarks)
+
+
+def _facts(links: Links, seed: int, model: Model, fitted: Any, best: Path) -> dict:
+    """What ``metrics.json`` has beside the scores; ``fitted`` is a result of ``training.fit``."""
+    from gaigs.runs import evaluation
+    from gaigs.runs.training import count_gaussians
+
+    return {
+        "task": links.task.name,
         "data": links.remarks,
         "split": links.split.name,
-        "seed": config["seed"],
+        "seed": seed,
         "device": evaluation.device_name(model.device),
         "rasterizer": None,
         "train_seconds": fitted.seconds,
@@ -198,19 +236,4 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "num_gaussians_start": fitted.start,
         "num_parameters": sum(parameter.numel() for parameter in model.parameters()),
         "checkpoint_bytes": best.stat().st_size if best.is_file() else None,
-        "models": {name: evaluation.summary(task, values) for name, values in scores.items()},
-        "validation": {
-            name: evaluation.summary(task, values) for name, values in validation.items()
-        },
-        "validation_score": validation[name][task.monitor].mean().item() if validation else None,
-        "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
-    } | model.facts()
-    if config["kriging"]:
-        metrics["kriging"]["seconds"] = fitted.kriging_seconds
-    model.export(folder)
-    if task.is_scalar:
-        radio_map(model).save(folder / "radio_map.npz")
-    from gaigs.report.run_figures import write_figures  # matplotlib is slow to import
-
-    write_figures(folder, links, model)
-    return metrics
+    }

@@ -32,7 +32,7 @@ from gaigs.model import Model
 from gaigs.model.answers import calibrated, predicted, spreads
 from gaigs.model.kriging import Kriging
 from gaigs.registry import name_of, registry
-from gaigs.report.table import metrics_table, verdict
+from gaigs.report.scores import metrics_table, verdict
 
 log = logging.getLogger(__name__)
 

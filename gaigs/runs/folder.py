@@ -31,20 +31,9 @@ def claim(folder: Path, config: dict) -> None:
             something else.
     """
     file = folder / "config.yaml"
-    names = (
-        "config.yaml",
-        "software.json",
-        "best.ckpt",
-        "log",
-        "predictions.npz",
-        "gaussians.ply",
-        "radio_map.npz",
-    )
-    there = [
-        name
-        for name in (*names, "figures", "last.ckpt", "metrics.json")
-        if (folder / name).exists()
-    ]
+    ours = "config.yaml software.json best.ckpt log predictions.npz gaussians.ply radio_map.npz"
+    names = [*ours.split(), "figures", "last.ckpt", "metrics.json"]
+    there = [name for name in names if (folder / name).exists()]
     if there and not is_configuration(file):
         raise ValueError(f"{folder} holds {', '.join(there)} of something else\n{ANOTHER}")
     for place in (folder, folder / "figures", *folder.glob("members/*")):
@@ -59,14 +48,14 @@ def claim(folder: Path, config: dict) -> None:
         raise ValueError(f"cannot parse {file}: {' '.join(str(error).split())}") from error
     from gaigs.configuration import differences  # with Hydra, which loading does without
 
-    differing = differences(there, config)
+    differing = []
+    values = differences(there, config)
+    for key, (was, value) in values.items():
+        # The configuration of a model repeats those of its parts.
+        if not (key.startswith("model.") and key.removeprefix("model.") in values):
+            differing.append(f"{key} was {was!r}, is {value!r}")
     if differing:
-        keys = [
-            key
-            for key in differing
-            if not (key.startswith("model.") and key.removeprefix("model.") in differing)
-        ]
-        listed = "; ".join("{} was {!r}, is {!r}".format(key, *differing[key]) for key in keys)
+        listed = "; ".join(differing)
         raise ValueError(f"{folder} holds a run of another configuration: {listed}\n{ANOTHER}")
 
 
@@ -105,22 +94,20 @@ def warn_of_changes(folder: Path, model: dict) -> None:
 
 
 def check_software(folder: Path, config: dict) -> None:
-    """Checks that a run is resumed by the software that began it; patch versions change no number."""
-    there, here = stored_software(folder), software(config)
-    series = lambda version: ".".join(version.split(".")[:2])
+    """Checks that a run is resumed by the software that began it; patch versions are alike."""
+    there = stored_software(folder)
+    here = software(config)
     began = str(there.get("gaigs", "0.1 or earlier"))
-    if series(began) != series(here["gaigs"]):
+    if began.split(".")[:2] != here["gaigs"].split(".")[:2]:
         raise ValueError(
             f"{folder} was begun by gaigs {began}, and this is {here['gaigs']}\n{ANOTHER}"
         )
-    changed = sorted(
-        key
-        for key in here.keys() | there.keys()
-        if key != "gaigs" and here.get(key) != there.get(key)
-    )
+    plugins = (here.keys() | there.keys()) - {"gaigs"}
+    changed = sorted(key for key in plugins if here.get(key) != there.get(key))
     if changed:
         raise ValueError(
-            f"the source of {', '.join(changed)} has changed since {folder} was begun\nrestore it, or {ANOTHER}"
+            f"the source of {', '.join(changed)} has changed since {folder} was begun\n"
+            f"restore it, or {ANOTHER}"
         )
 
 
@@ -138,12 +125,12 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
     on.
     """
     parts = ("train", "validation", "test")
-    same = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
-    same = same and are_alike(there.get("scene"), here.get("scene"))
-    if not same or there["links"] != here["links"]:
+    has_split = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
+    has_scene = are_alike(there.get("scene"), here.get("scene"))
+    if not (has_split and has_scene and there["links"] == here["links"]):
         raise ValueError(
-            f"the data have changed since {path} was written: another split, or other transmitters, receivers, "
-            f"frequencies or labels\n{ANOTHER}"
+            f"the data have changed since {path} was written: another split, or other "
+            f"transmitters, receivers, frequencies or labels\n{ANOTHER}"
         )
 
 

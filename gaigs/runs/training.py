@@ -3,21 +3,16 @@
 import contextlib
 import copy
 import logging
-import math
-import signal
 import tempfile
-import threading
 import time
-import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import lightning
 import torch
-from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
-from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from lightning.pytorch.utilities.seed import isolate_rng
-from torch import distributed
+from torch import Tensor
 
 from gaigs.configuration import composed, preset
 from gaigs.core import stages
@@ -28,16 +23,12 @@ from gaigs.model import Model, checkpoint
 from gaigs.model.answers import calibrated
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
-from gaigs.processes import STOPPING, Stopped, is_first, limited_threads, only_run
-from gaigs.registry import call, configuration_of, digests, registry
-from gaigs.runs.folder import ANOTHER, check_same_links, claim, fingerprint
+from gaigs.processes import is_first, limited_threads, only_run
+from gaigs.registry import configuration_of, registry
+from gaigs.runs.descent import descend
+from gaigs.runs.folder import claim
 from gaigs.splatting.loss import Loss
-from gaigs.training.batches import Batches, InOrder
-from gaigs.training.budget import ENDLESS, make_budget, watched
-from gaigs.training.checkpoints import Interrupted, KeepBest, KeepLast
-from gaigs.training.density_control import DensityControl
-from gaigs.training.progress import ProgressLine
-from gaigs.training.revision import Revision
+from gaigs.training.budget import watched
 
 log = logging.getLogger(__name__)
 
@@ -74,53 +65,23 @@ def train(
     Example:
         >>> links = gaigs.links("synthetic", transmitters=40, order=0)
         >>> model = gaigs.train("gaigs", links, max_steps=1, count=20, enable_progress_bar=False)
-        >>> model.predict([[1.0, 2.0, 1.5], [2.5, 1.0, 0.8]]).shape  # places, receivers, rows, columns
+        >>> model.predict([[1.0, 2.0, 1.5], [2.5, 1.0, 0.8]]).shape
         torch.Size([2, 1, 90, 360])
     """
     if not isinstance(model, str | Model) or not isinstance(links, Links):
         raise TypeError(
             f"train takes a model and links, got {type(model).__name__} and {type(links).__name__}"
         )
-    own = (
-        None
-        if isinstance(model, str)
-        else copy.deepcopy(model.trend)
-        if isinstance(model, Kriging)
-        else model
-    )
-    if isinstance(own, Ensemble):
-        members = "members" if own is model else "trend.members"
-        raise ValueError(
-            f"an ensemble cannot be trained further; train one of its models, {members}[0]"
-        )
-    check_fit(links, own and own.scene)
-    name = model if own is None else configuration_of(own)["name"]
-    if experiments := [word for word in overrides if word.startswith("+experiment=")]:
-        raise ValueError(
-            f"leave out {experiments[0]}: train takes the experiment of the model and the task"
-        )
-    words, parts = (
-        preset(name, links.task.name),
-        {k: v for k, v in options.items() if hasattr(v, "configuration")},
-    )
-    config = composed([*words, *overrides], options)
-    if overrides or options:
-        usual = composed(words, {})
-        if config["data"] != usual["data"] or config["split"] != usual["split"]:
-            raise ValueError("train takes no options of data and split; pass them to gaigs.links")
-        if own is not None and (config["model"] != usual["model"] or parts.keys() - {"loss"}):
-            raise ValueError(
-                "train takes no options of a model that is made already; pass them to its constructor"
-            )
-    config |= {"data": {"name": "arrays"}, "split": {"name": links.split.name}, **links.origin}
-    if own is not None:
-        config["model"] = configuration_of(own)
+    made = _made(model)
+    check_fit(links, None if made is None else made.scene)
+    parts = {key: option for key, option in options.items() if hasattr(option, "configuration")}
+    config = _configuration(model, made, links, overrides, options)
     with contextlib.ExitStack() as stack:
         stack.enter_context(limited_threads(config["threads"]))
         stack.enter_context(isolate_rng())
-        place = Path(
-            stack.enter_context(tempfile.TemporaryDirectory()) if folder is None else folder
-        )
+        if folder is None:
+            folder = stack.enter_context(tempfile.TemporaryDirectory())
+        place = Path(folder)
         place.mkdir(parents=True, exist_ok=True)
         stack.enter_context(only_run(place))
         claim(place, config)
@@ -128,8 +89,52 @@ def train(
         lightning.seed_everything(config["seed"], verbose=False)
         loss = registry("loss").build(parts.pop("loss", config["loss"]), task=links.task)
         if parts:
-            own = registry("model").build(config["model"] | parts, scene=links.scene)
-        return fit(own, loss, links, config, place).models[config["model"]["name"]].eval().cpu()
+            made = registry("model").build(config["model"] | parts, scene=links.scene)
+        return fit(made, loss, links, config, place).models[config["model"]["name"]].eval().cpu()
+
+
+def _made(model: str | Model) -> Model | None:
+    """The model that is to be trained further; None for a name."""
+    if isinstance(model, str):
+        return None
+    made = copy.deepcopy(model.trend) if isinstance(model, Kriging) else model
+    if isinstance(made, Ensemble):
+        members = "members" if made is model else "trend.members"
+        raise ValueError(
+            f"an ensemble cannot be trained further; train one of its models, {members}[0]"
+        )
+    return made
+
+
+def _configuration(
+    model: str | Model, made: Model | None, links: Links, overrides: Sequence[str], options: dict
+) -> dict:
+    """The configuration of a training on links that exist, of a model that may exist.
+
+    Raises:
+        ValueError: Overrides or options are of what exists.
+    """
+    name = model if made is None else configuration_of(made)["name"]
+    if experiments := [word for word in overrides if word.startswith("+experiment=")]:
+        raise ValueError(
+            f"leave out {experiments[0]}: train takes the experiment of the model and the task"
+        )
+    words = preset(name, links.task.name)
+    config = composed([*words, *overrides], options)
+    if overrides or options:
+        usual = composed(words, {})
+        if config["data"] != usual["data"] or config["split"] != usual["split"]:
+            raise ValueError("train takes no options of data and split; pass them to gaigs.links")
+        made_here = {key for key, option in options.items() if hasattr(option, "configuration")}
+        if made is not None and (config["model"] != usual["model"] or made_here - {"loss"}):
+            raise ValueError(
+                "train takes no options of a model that is made already; "
+                "pass them to its constructor"
+            )
+    config |= {"data": {"name": "arrays"}, "split": {"name": links.split.name}, **links.origin}
+    if made is not None:
+        config["model"] = configuration_of(made)
+    return config
 
 
 class Fitted(NamedTuple):
@@ -153,63 +158,36 @@ class Fitted(NamedTuple):
 
 
 def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
-    """Builds, fits, trains and kriges a model as configured; None in all but the first of several
-    processes.
+    """Builds, fits, trains and kriges a model as configured.
+
+    The result is None in all but the first of several processes.
     """
     name = config["model"]["name"]
-    if config["ensemble"] < 1:
-        raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
-    if model is None:
-        model = registry("model").build(config["model"], scene=links.scene)
-    if isinstance(model, Kriging):
-        raise ValueError(
-            "model=kriging has no training of its own; choose a trained model, and set kriging=true"
-        )
-    if config["kriging"]:
-        check_known(links)  # a training comes before
-    make_kriged = lambda trend: (
-        Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
-    )
-    kriged = make_kriged(model)
-    parts = {
-        key: part["name"]
-        for key, part in config["model"].items()
-        if isinstance(part, dict) and "name" in part
-    }
-    if "tokenizer" in parts and getattr(model, "tokenizer", model) is None:
-        if parts["tokenizer"] != registry("model").options(name).get(
-            "tokenizer", parts["tokenizer"]
-        ):
-            words = "tokenizer=%s is not read, as deformation=%s takes no tokens"
-            log.warning(words, parts["tokenizer"], parts["deformation"])
-        parts["tokenizer"] = "none"
-    log.info("model: %s", ", ".join([name, *(f"{key} {part}" for key, part in parts.items())]))
-    began, places = time.monotonic(), links.query[links.split.known].place_keys.unique()
+    model = _checked(model, links, config)
+    kriged = _untrained_kriging(model, links, config)
+    _log_parts(model, config["model"])
     # Shares of the run's limit at which parts end: the search 0.3, the training 0.5, kriging and
     # intervals 0.8.
-    with stages.stage(until=0.3 if model.is_trained else 0.8):
-        model.fit(links)
-        if stages.is_up():
-            stages.leave_out(f"the time for the fit of {name} was up")
-    if model.is_trained and model.known_places is not None:  # a training before this one
-        places = torch.cat((places, model.known_places)).unique()
-    model.known_places = places
-    searched, start = time.monotonic() - began, count_gaussians(model)
+    searched, places = _prepare(model, links, name, until=0.3 if model.is_trained else 0.8)
+    start = count_gaussians(model)
+    best = folder / "best.ckpt"
     if not model.is_trained:
         with stages.stage(until=0.8):
             model.calibration = calibrated(model, links)
         if is_first() and model.state_dict():
-            checkpoint.save(model, folder / "best.ckpt")
+            checkpoint.save(model, best)
         return Fitted({name: model}, {}, start)
     with stages.stage(until=0.5 / config["ensemble"]):
         model, seconds = descend(model, loss, links, config, folder, searched)
     if not is_first():
         return None
-    best, trained = folder / "best.ckpt", ""
+    trained = None
     if config["ensemble"] > 1:
-        model, more = with_others(model, loss, links, config, folder)
+        model, more = _add_members(model, loss, links, config, folder)
+        seconds += more
         model.known_places = places
-        kriged, seconds, trained = make_kriged(model), seconds + more, "members.0"
+        kriged = _untrained_kriging(model, links, config)
+        trained = "members.0"  # where the weights of the checkpoint belong
         checkpoint.update(best, model, trained)
     model.calibration = calibrated(model, links)
     if kriged is None:
@@ -221,220 +199,92 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         kriging_seconds = time.monotonic() - began
         if stages.is_up():
             stages.leave_out("the fit of kriging ended early")
-        kriged.calibration, kriged.known_places = calibrated(validation_model, links), places
-    checkpoint.update(best, kriged, ".".join(filter(None, ("trend", trained))))
-    models, unseen = ({name: own, f"{name}_trend": model} for own in (kriged, validation_model))
-    return Fitted(models, unseen, start, seconds, kriging_seconds)
+        kriged.calibration = calibrated(validation_model, links)
+        kriged.known_places = places
+    checkpoint.update(best, kriged, "trend" if trained is None else f"trend.{trained}")
+    trend = {f"{name}_trend": model}
+    models = {name: kriged} | trend
+    return Fitted(models, {name: validation_model} | trend, start, seconds, kriging_seconds)
 
 
-def with_others(
+def _checked(model: Model | None, links: Links, config: dict) -> Model:
+    """The model, built if there is none; a ``ValueError`` if the configuration cannot train it."""
+    if config["ensemble"] < 1:
+        raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
+    if model is None:
+        model = registry("model").build(config["model"], scene=links.scene)
+    if isinstance(model, Kriging):
+        raise ValueError(
+            "model=kriging has no training of its own; choose a trained model, and set kriging=true"
+        )
+    if config["kriging"]:
+        check_known(links)  # a training comes before
+    return model
+
+
+def _untrained_kriging(trend: Model, links: Links, config: dict) -> Kriging | None:
+    """Kriging of what a model leaves over, if it is configured."""
+    return Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
+
+
+def _log_parts(model: Model, config: dict) -> None:
+    """Logs the names of a model and its parts; warns of a tokenizer that no part reads."""
+    parts = {}
+    for key, part in config.items():
+        if isinstance(part, dict) and "name" in part:
+            parts[key] = part["name"]
+    tokenizer = parts.get("tokenizer")
+    if tokenizer is not None and getattr(model, "tokenizer", model) is None:
+        if tokenizer != registry("model").options(config["name"]).get("tokenizer", tokenizer):
+            words = "tokenizer=%s is not read, as deformation=%s takes no tokens"
+            log.warning(words, tokenizer, parts["deformation"])
+        parts["tokenizer"] = "none"
+    names = [f"{key} {part}" for key, part in parts.items()]
+    log.info("model: %s", ", ".join([config["name"], *names]))
+
+
+def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float, Tensor]:
+    """Fits what needs no gradient, as a search for planes does.
+
+    Returns:
+        The duration [s], and the keys of all places that the model has learnt from.
+    """
+    began = time.monotonic()
+    places = links.query[links.split.known].place_keys.unique()
+    with stages.stage(until=until):
+        model.fit(links)
+        if stages.is_up():
+            stages.leave_out(f"the time for the fit of {name} was up")
+    if model.is_trained and model.known_places is not None:  # a training before this one
+        places = torch.cat((places, model.known_places)).unique()
+    model.known_places = places
+    return time.monotonic() - began, places
+
+
+def _add_members(
     model: Model, loss: Loss, links: Links, config: dict, folder: Path
 ) -> tuple[Ensemble, float]:
     """An ensemble of a trained model and of others with the next seeds, each trained in a folder of
-    its own.
+    its own; and the time of the others [s].
     """
-    members, total = [model], 0.0
+    members = [model]
+    total = 0.0
     for number in range(1, config["ensemble"]):
-        place, seed = folder / "members" / str(number), config["seed"] + number
+        place = folder / "members" / str(number)
         place.mkdir(parents=True, exist_ok=True)
-        lightning.seed_everything(seed, verbose=False)
+        seeded = config | {"seed": config["seed"] + number}
+        lightning.seed_everything(seeded["seed"], verbose=False)
         other = registry("model").build(config["model"], scene=links.scene)
         with stages.stage(until=0.5 * (number + 1) / config["ensemble"]):
             began = time.monotonic()
             other.fit(links)
             searched = time.monotonic() - began
-            other, seconds = descend(other, loss, links, config | {"seed": seed}, place, searched)
+            other, seconds = descend(other, loss, links, seeded, place, searched)
         members.append(other)
         total += seconds
     ensemble = Ensemble(links.scene, members).eval().to(model.device)
     ensemble.fit(links)
     return ensemble, total
-
-
-def descend(
-    model: Model, loss: Loss, links: Links, config: dict, folder: Path, searched: float
-) -> tuple[Model, float]:
-    """Trains a model by gradient descent, which ``Model.fit`` has prepared in ``searched`` [s].
-
-    Returns:
-        The model at the step with the best validation score, or at the last step without validation
-        links; and the duration of both [s], summed over the parts of an interrupted run.
-    """
-    split = {"name": links.split.name, **links.split.parts()}
-    identity = {
-        "version": checkpoint.VERSION,
-        "model": config["model"],
-        "scene": links.scene.state(),
-        "split": split,
-    }
-    identity |= {
-        "config": config,
-        "links": fingerprint(links),
-        "plugins": digests(config, links.scene.state()["task"]),
-    }
-    context = {"model": model, "loss": loss, "identity": identity, "seed": config["seed"]}
-    module = registry("training").build(config["training"], **context)
-    last, best = folder / "last.ckpt", folder / "best.ckpt"
-    keep_last = KeepLast(last, config["save_every"])
-    options, budget = make_budget(config["trainer"], searched)
-    callbacks = [
-        budget,
-        KeepBest(best, module.patience),
-        keep_last,
-    ]  # Lightning calls the last two after all others
-    if module.density is not None:
-        callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))
-    if model.revisions:
-        callbacks.append(Revision(links, config["seed"]))
-    if config["trainer"].get("enable_progress_bar", True):
-        callbacks.append(ProgressLine())
-    loggers: list[Logger] = [CSVLogger(folder, "log")]
-    if config["tensorboard"]:
-        try:
-            loggers.append(TensorBoardLogger(folder, "tensorboard"))
-        except ModuleNotFoundError as error:
-            raise ImportError(
-                "tensorboard=true needs TensorBoard: pip install 'gaigs[tensorboard]'"
-            ) from error
-    context = {"callbacks": callbacks, "logger": loggers, "default_root_dir": folder}
-    trainer = make_trainer(options, **context)
-    if config["ensemble"] > 1 and trainer.world_size > 1:
-        raise ValueError(
-            "an ensemble trains in one process; set trainer.devices=1 and trainer.num_nodes=1"
-        )
-    if math.isfinite(stages.left()) and trainer.world_size > 1:
-        raise ValueError("max_time limits a run of one process; of several set trainer.max_time")
-    steps = ENDLESS if trainer.max_steps == -1 else trainer.max_steps
-    batches = Batches(links, links.split.train, module.batch_size, config["seed"], steps)
-    validation = (
-        InOrder(links, links.split.validation, module.batch_size)
-        if len(links.split.validation)
-        else None
-    )
-    resume = None
-    if last.is_file():
-        resume = last
-        content = resumable(last, best)
-        check_same_links(content[checkpoint.KEY], identity, last)
-        log.info("going on after step %d", content["global_step"])
-        stages.current().began -= content["callbacks"][budget.state_key]["seconds"]
-    # Lightning converts after it has loaded a checkpoint, which would round the weights: so convert
-    # first.
-    module = trainer.precision_plugin.convert_module(module)
-    handlers = {number: signal.getsignal(number) for number in STOPPING}
-    module.train()  # a model that has been trained or loaded is in evaluation mode
-    try:
-        with warnings.catch_warnings():
-            # Warnings about Lightning's use of torch, splits without validation links, and few
-            # steps.
-            for message in (
-                ".*LeafSpec",
-                "You defined a `validation_step` but",
-                "The number of training batches",
-            ):
-                warnings.filterwarnings("ignore", message)
-            trainer.fit(module, batches, validation, ckpt_path=resume, weights_only=True)
-    except Interrupted as stop:
-        raise Stopped(str(stop), stop.number) from None
-    except SystemExit as end:  # raised by Lightning at a signal before the first step
-        if isinstance(end.__context__, KeyboardInterrupt):
-            raise Stopped("stopped", getattr(end.__context__, "number", signal.SIGINT)) from None
-        raise
-    finally:
-        if threading.current_thread() is threading.main_thread():
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-        if distributed.is_available() and distributed.is_initialized():
-            distributed.destroy_process_group()
-    if keep_last.received is not None:  # after the last step
-        raise Stopped(f"stopped after step {trainer.global_step}", keep_last.received)
-    seconds, steps, size = budget.seconds - budget.searched, trainer.global_step, module.batch_size
-    log.info(
-        "trained %d steps of %d places in %.0f s: %.1f steps/s",
-        steps,
-        size,
-        seconds,
-        steps / seconds,
-    )
-    if budget.seconds >= budget.end and steps < trainer.max_steps:
-        stages.leave_out(f"the training ended after {steps} of {trainer.max_steps} steps")
-    module.load_state_dict(checkpoint.trained_weights(checkpoint.read(best)))
-    return model.eval().to(trainer.strategy.root_device), budget.seconds
-
-
-def resumable(last: Path, best: Path) -> dict:
-    """The checkpoint to resume from; a ValueError if it or the best one is damaged."""
-    needed = (
-        "optimizer_states",
-        "lr_schedulers",
-        "loops",
-        "callbacks",
-        "epoch",
-        "global_step",
-        "split",
-        "links",
-    )
-    try:
-        content = checkpoint.read(last)
-        if lacking := [key for key in needed if key not in content | content[checkpoint.KEY]]:
-            raise ValueError(f"{last} lacks {', '.join(lacking)} of a training")
-        if best.is_file():
-            checkpoint.read(best)
-    except ValueError as error:
-        raise ValueError(
-            f"cannot resume the training: {str(error).partition(chr(10))[0]}\n"
-            f"move {last} elsewhere to train again, which overwrites best.ckpt, or {ANOTHER}"
-        ) from error
-    return content
-
-
-def make_trainer(options: dict, **context: Any) -> lightning.Trainer:
-    """A trainer that can stop and resume at any step, in one process or several; a ``ValueError``
-    for other options.
-    """
-    for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
-        logging.getLogger(name).setLevel(logging.WARNING)
-    with warnings.catch_warnings():
-        warnings.filterwarnings(
-            "ignore", "GPU available but not used"
-        )  # advice against an option that was chosen
-        trainer = call("trainer", lightning.Trainer, options, **context)
-    # The first two set the limits of batches: 1 is one batch, 1.0 is all batches.
-    usual = {"fast_dev_run": False, "overfit_batches": 0.0, "accumulate_grad_batches": 1}
-    for name, value in (usual | {"limit_train_batches": 1.0, "limit_val_batches": 1.0}).items():
-        found = getattr(trainer, name)
-        if (type(found), found) != (type(value), value):
-            raise ValueError(
-                f"trainer.{name} must be left out\n"
-                "set trainer.max_steps to end a training early, training.batch_size for larger batches"
-            )
-    strategy = trainer.strategy
-    launcher = strategy.launcher
-    starts_scripts = launcher is None or "Subprocess" in type(launcher).__name__
-    if not isinstance(strategy, DDPStrategy | SingleDeviceStrategy) or not starts_scripts:
-        raise ValueError(
-            f"trainer.strategy must be auto for one process or ddp for several, got {type(strategy).__name__}"
-        )
-    return trainer
-
-
-def check_processes(options: dict, launcher: str) -> None:
-    """Raises a ``ValueError`` if a job of a multirun would train in several processes.
-
-    Args:
-        options: Of the trainer.
-        launcher: Class name of Hydra's launcher. That of SLURM starts the processes of each job;
-            with others they would start the next job at different times.
-    """
-    chosen = ("accelerator", "devices", "num_nodes", "strategy")
-    options = {key: options[key] for key in chosen if key in options}
-    trainer = make_trainer(options, logger=False, enable_checkpointing=False)
-    if trainer.strategy.launcher is not None and launcher != "SlurmLauncher":
-        raise ValueError(
-            "a job of a multirun must train in one process\n"
-            "run it alone, or use hydra/launcher=submitit_slurm, "
-            "which starts the processes of each job"
-        )
 
 
 def count_gaussians(model: Model) -> int:

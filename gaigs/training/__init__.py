@@ -1,4 +1,4 @@
-"""Training: gradient descent of a model on links, its batches, and its callbacks between the steps."""
+"""Gradient descent of a model on links: its steps, batches, and callbacks between the steps."""
 
 import torch
 
@@ -27,14 +27,12 @@ class MeanScores:
             self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
 
     def over_processes(self, strategy) -> dict[str, float]:
-        """The mean of each score, as of ``Task.logged``; every process has to call it with
-        Lightning's strategy.
+        """The mean of each score, as ``Task.logged`` gives it.
+
+        Every process has to call it with Lightning's strategy.
         """
-        names = list(self.sums)
-        totals = torch.tensor(
-            [self.count, *self.sums.values()], dtype=torch.float64, device=strategy.root_device
-        )
+        numbers = [self.count, *self.sums.values()]
+        totals = torch.tensor(numbers, dtype=torch.float64, device=strategy.root_device)
         count, *sums = strategy.reduce(totals, reduce_op="sum").tolist()
-        return self.task.logged(
-            {name: total / count for name, total in zip(names, sums, strict=True)}
-        )
+        pairs = zip(self.sums, sums, strict=True)
+        return self.task.logged({name: total / count for name, total in pairs})

@@ -39,9 +39,13 @@ class Batches:
         for option, value in (("training.batch_size", size), ("trainer.max_steps", steps)):
             if value < 1:
                 raise ValueError(f"{option} must be at least 1, got {value}")
-        self.links, self.size, self.seed, self.steps = links, size, seed, steps
-        _, place = links.query[index].unique(with_receivers=False)
-        self.places = index[place.argsort(stable=True)].split(place.bincount().tolist())
+        self.links = links
+        self.size = size
+        self.seed = seed
+        self.steps = steps
+        _, place = links.query[index].unique(with_receivers=False)  # (k,)
+        by_place = index[place.argsort(stable=True)]
+        self.places = by_place.split(place.bincount().tolist())
         self.position = 0
 
     def __len__(self) -> int:
@@ -50,25 +54,28 @@ class Batches:
     def __iter__(self) -> Iterator[Batch]:
         length = -(-len(self.places) // self.size)
         while self.position < self.steps:
+            # The order follows from seed and pass, so that a resumed training needs the step alone.
             passed, within = divmod(self.position, length)
-            parts = torch.randperm(len(self.places), generator=seeded(self.seed, passed)).split(
-                self.size
-            )
+            order = torch.randperm(len(self.places), generator=seeded(self.seed, passed))
+            parts = order.split(self.size)
             for chosen in parts[within : within + self.steps - self.position]:
                 self.position += 1
                 yield self._share([self.places[i] for i in chosen.tolist()])
 
     def _share(self, places: list[Tensor]) -> Batch:
+        """This process's part of a batch."""
         rank, processes = process()
         # A process without a place takes one with weight 0: every process has to take part in the
         # step.
-        own = places[rank::processes] or places[:1]
-        batch = self.links.batch(torch.cat(own))
+        shared = places[rank::processes]
+        taken = shared or places[:1]
+        batch = self.links.batch(torch.cat(taken))
         if processes == 1:
             return batch
-        held = len(places[rank::processes]) > 0
-        links = held * processes * len(batch) / sum(map(len, places))
-        return replace(batch, shares=(links, held * processes * len(own) / len(places)))
+        # The mean over processes of weighted means is the mean over the batch.
+        weight = processes if shared else 0
+        links = weight * len(batch) / sum(map(len, places))
+        return replace(batch, shares=(links, weight * len(taken) / len(places)))
 
     def state_dict(self) -> dict:
         return {"position": self.position}
@@ -92,8 +99,9 @@ class InOrder:
     def __iter__(self) -> Iterator[Batch]:
         rank, processes = process()
         for part in self.parts:
-            own = part[rank::processes]
+            shared = part[rank::processes]
             # A process without a link takes one with weight 0: all go through the same number of
             # batches.
-            share = float(len(own) > 0)
-            yield replace(self.links.batch(own if share else part[:1]), shares=(share, share))
+            share = float(len(shared) > 0)
+            batch = self.links.batch(shared if share else part[:1])
+            yield replace(batch, shares=(share, share))

@@ -1,9 +1,9 @@
 """The budget of a training: steps, wall time, or both; and how much of it is spent."""
 
+import contextlib
 import math
 import time
 from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
 
 from lightning.pytorch.callbacks import Callback, Timer
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -42,14 +42,16 @@ class Budget(Callback):
     def __init__(
         self, max_time: float | None = None, every: float | None = None, searched: float = 0.0
     ):
-        self.max_time, self.every, self.searched = max_time, every, searched
-        self.share, self.end = 0.0, math.inf
-        self.began = self.validated = searched  # the last validation, and its end [s]
+        self.max_time = max_time
+        self.every = every
+        self.searched = searched
+        self.share = 0.0
+        self.end = math.inf
+        self.began = searched  # time at which the last validation began [s]
+        self.validated = searched  # time at which it ended [s]
         self.is_due = False
-        self.spent, self.start = (
-            searched,
-            None,
-        )  # time before the training [s], and its clock at the start
+        self.spent = searched  # time before the training [s]
+        self.start: float | None = None  # clock at the start of the training [s]
 
     @property
     def seconds(self) -> float:
@@ -59,47 +61,40 @@ class Budget(Callback):
     @property
     def limit(self) -> float:
         """Time at which the training ends [s]; infinite if steps alone end it."""
-        own = (
-            math.inf
-            if self.max_time is None
-            else max(self.max_time, self.searched + self.max_time / 2)
-        )
-        return min(own, max(self.end, self.searched + 1.0))
+        limit = math.inf
+        if self.max_time is not None:
+            limit = max(self.max_time, self.searched + self.max_time / 2)
+        return min(limit, max(self.end, self.searched + 1.0))
 
     def state_dict(self) -> dict:
-        last = {
-            "share": self.share,
-            "began": self.began,
-            "validated": self.validated,
-            "is_due": self.is_due,
-        }
-        return {"seconds": self.seconds, "searched": self.searched, **last}
+        names = ("seconds", "searched", "share", "began", "validated", "is_due")
+        return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict) -> None:
-        self.spent, self.share, self.is_due = state["seconds"], state["share"], state["is_due"]
-        self.began, self.validated, self.searched = (
-            state["began"],
-            state["validated"],
-            state.get("searched", 0.0),
-        )
+        self.spent = state["seconds"]
+        self.searched = state.get("searched", 0.0)
+        for name in ("share", "began", "validated", "is_due"):
+            setattr(self, name, state[name])
 
     def on_fit_start(self, trainer, module) -> None:
-        own = self.searched, self.spent, self.began, self.validated
-        self.searched, self.spent, self.began, self.validated = trainer.strategy.broadcast(own)
+        names = ("searched", "spent", "began", "validated")
+        first = trainer.strategy.broadcast([getattr(self, name) for name in names])
+        for name, value in zip(names, first, strict=True):
+            setattr(self, name, value)
         self.end = self.spent + stages.left()
         self._stop_in_time(trainer)  # a run that was killed once its time was up
 
     def on_train_start(self, trainer, module) -> None:
         self.start = time.monotonic()
-        if (
-            self.is_due
-        ):  # the checkpoint was written after a validation, which is not to be repeated
+        # The checkpoint was written after a validation, which is not to be repeated.
+        if self.is_due:
             trainer.val_check_batch = trainer.global_step
 
     def on_train_batch_end(self, trainer, module, *_) -> None:
         if math.isinf(self.limit) and self.every is None:
             return
         elapsed = self._look(trainer)
+        # Validations take at most a fifth of the time.
         pause = 4 * (self.validated - self.began)
         is_time = self.every is not None and elapsed >= self.validated + max(self.every, pause)
         self.is_due = trainer.should_stop or is_time
@@ -118,7 +113,8 @@ class Budget(Callback):
                 logger.log_metrics({"seconds": self.validated}, step=trainer.global_step - 1)
 
     def on_train_end(self, trainer, module) -> None:
-        self.spent, self.start = self.seconds, None
+        self.spent = self.seconds
+        self.start = None
 
     def _look(self, trainer) -> float:
         """The first process's time [s]; stops the training when it is up."""
@@ -143,7 +139,8 @@ def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
             training; or an option counts in epochs.
     """
     options = dict(options)
-    max_time, every = options.pop("max_time", None), options.get("val_check_interval")
+    max_time = options.pop("max_time", None)
+    every = options.get("val_check_interval")
     if max_time is not None:
         max_time = seconds("trainer.max_time", max_time)
     elif options.get("max_steps", -1) == -1 and math.isinf(stages.left()):
@@ -151,7 +148,8 @@ def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
             "trainer.max_steps must be at least 1, got -1; time alone ends it with trainer.max_time"
         )
     if isinstance(every, str | dict):
-        every, options["val_check_interval"] = seconds("trainer.val_check_interval", every), ENDLESS
+        every = seconds("trainer.val_check_interval", every)
+        options["val_check_interval"] = ENDLESS
     else:
         every = None
     for option in ("val_check_interval", "log_every_n_steps"):
@@ -172,35 +170,38 @@ def seconds(option: str, duration: object) -> float:
     """A duration [s] as Lightning's ``Timer`` reads it: DD:HH:MM:SS, or a mapping such as
     ``{minutes: 3}``.
     """
-    try:
-        found = (
-            Timer(duration=duration).time_remaining() if isinstance(duration, str | dict) else None
-        )
-    except (MisconfigurationException, TypeError):
-        found = None
-    if not found or found < 1:
+    length = None
+    with contextlib.suppress(MisconfigurationException, TypeError):
+        if isinstance(duration, str | dict):
+            length = Timer(duration=duration).time_remaining()
+    if not length or length < 1:
         raise ValueError(
             f"{option} must be at least 1 s as 'DD:HH:MM:SS', in quotes in a file, got {duration!r}"
         )
-    return found
+    return length
 
 
-def watched(config: Mapping) -> AbstractContextManager[stages.Timekeeper]:
-    """The watch of a configured run: its limit ``max_time``, and bars unless the trainer has none."""
+def watched(config: Mapping) -> contextlib.AbstractContextManager[stages.Timekeeper]:
+    """The watch of a run: its limit ``max_time``, and bars unless the trainer has none."""
     limit = math.inf if config.get("max_time") is None else seconds("max_time", config["max_time"])
     return stages.watched(limit, is_first() and config["trainer"].get("enable_progress_bar", True))
 
 
 def time_share(trainer) -> float | None:
-    """The spent share of the time, the same in all processes; None if steps alone end the training."""
-    budgets = (callback for callback in trainer.callbacks if isinstance(callback, Budget))
-    return next((budget.share for budget in budgets if math.isfinite(budget.limit)), None)
+    """The spent share of the time, the same in all processes; None without a limit of time."""
+    shares = (one.share for one in _budgets(trainer) if math.isfinite(one.limit))
+    return next(shares, None)
 
 
 def is_time_up(trainer) -> bool:
     """True if the time of a training is up, by the clock of the first process."""
-    budgets = (callback for callback in trainer.callbacks if isinstance(callback, Budget))
-    return any(trainer.strategy.broadcast(budget.seconds) >= budget.limit for budget in budgets)
+    strategy = trainer.strategy
+    return any(strategy.broadcast(one.seconds) >= one.limit for one in _budgets(trainer))
+
+
+def _budgets(trainer) -> list[Budget]:
+    """The trainer's budget, if it has one."""
+    return [callback for callback in trainer.callbacks if isinstance(callback, Budget)]
 
 
 def share_done(trainer) -> Callable[[int], float]:

@@ -1,10 +1,10 @@
-"""Checkpoints of a training: the best one, and the last one, from which a stopped training goes on."""
+"""Checkpoints of a training: the best one, and the last one, from which it goes on."""
 
-import contextlib
 import math
 import signal
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -28,14 +28,17 @@ class KeepBest(Checkpoint):
             raise ValueError(
                 f"training.patience must be at least 1 validation or null, got {patience}"
             )
-        self.path, self.patience = path, patience
-        self.best, self.waited = -math.inf, 0  # an error counts as its negative
+        self.path = path
+        self.patience = patience
+        self.best = -math.inf  # an error counts as its negative
+        self.waited = 0
 
     def state_dict(self) -> dict:
         return {"best": self.best, "waited": self.waited}
 
     def load_state_dict(self, state: dict) -> None:
-        self.best, self.waited = state["best"], state["waited"]
+        self.best = state["best"]
+        self.waited = state["waited"]
 
     def on_train_start(self, trainer, module) -> None:
         """Scores the start of a model that predicts untrained, too."""
@@ -71,12 +74,13 @@ class KeepBest(Checkpoint):
             save(trainer, self.path)
 
     def _keep(self, trainer, module, score: float) -> bool:
+        """Writes a checkpoint if the score is better than before; returns whether it is."""
         score = score if module.task.higher_is_better else -score
-        better = score > self.best
-        if better:
+        is_better = score > self.best
+        if is_better:
             self.best = score
             save(trainer, self.path)
-        return better
+        return is_better
 
     def _stop_in_time(self, trainer) -> None:
         if self.patience is not None and self.waited >= self.patience:
@@ -95,7 +99,8 @@ class KeepLast(Checkpoint):
     """
 
     def __init__(self, path: Path, every: float | int):
-        self.path, self.every = path, every
+        self.path = path
+        self.every = every
         self.received: int | None = None
         self.random: dict | None = None
 
@@ -138,13 +143,14 @@ class KeepLast(Checkpoint):
         save(trainer, self.path)
 
     def _rest(self, trainer) -> None:
-        anyone = lambda holds: trainer.strategy.reduce_boolean_decision(holds, all=False)
+        """Writes a checkpoint between two steps if it is time; at a signal the training stops."""
+        any_of = partial(trainer.strategy.reduce_boolean_decision, all=False)
         is_due = trainer.is_global_zero and time.monotonic() >= self.saved + self.every
-        if not anyone(is_due or self.received is not None):
+        if not any_of(is_due or self.received is not None):
             return
         save(trainer, self.path)
         self.saved = time.monotonic()
-        if anyone(self.received is not None):
+        if any_of(self.received is not None):
             raise Interrupted(
                 f"stopped after step {trainer.global_step}", self.received or signal.SIGINT
             )
@@ -164,12 +170,10 @@ def save(trainer, path: Path) -> None:
     """
     for logger in trainer.loggers:
         logger.save()
-    with (
-        atomic_write(path)
-        if trainer.is_global_zero
-        else contextlib.nullcontext(path.with_suffix(".part")) as part
-    ):
-        trainer.save_checkpoint(part, weights_only=False)  # the first process alone writes
-        if trainer.is_global_zero:
+    if trainer.is_global_zero:
+        with atomic_write(path) as part:
+            trainer.save_checkpoint(part, weights_only=False)
             checkpoint.seal(part)
+    else:  # takes part, and writes nothing
+        trainer.save_checkpoint(path.with_suffix(".part"), weights_only=False)
     trainer.strategy.barrier()

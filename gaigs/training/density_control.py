@@ -37,18 +37,26 @@ class DensityControl(Callback):
         max_count: int,
         seed: int,
     ):
-        least: dict[str, tuple[float, int]] = {
-            "every": (every, 1), "start": (start, 0), "stop": (stop, start), "gradient": (gradient, 0),
-            "split_angle": (split_angle, 0), "max_count": (max_count, 1),
-        }  # fmt: skip
-        for option, (value, bound) in least.items():
-            if not value >= bound:
-                raise ValueError(f"density.{option} must be at least {bound}, got {value}")
+        for option, value, least in (
+            ("every", every, 1),
+            ("start", start, 0),
+            ("stop", stop, start),
+            ("gradient", gradient, 0),
+            ("split_angle", split_angle, 0),
+            ("max_count", max_count, 1),
+        ):
+            if not value >= least:
+                raise ValueError(f"density.{option} must be at least {least}, got {value}")
         if not 0 <= opacity < 1:
             raise ValueError(f"density.opacity must be in [0, 1), got {opacity}")
-        self.every, self.start, self.stop = every, start, stop
-        self.gradient, self.split_angle, self.opacity = gradient, split_angle, opacity
-        self.max_count, self.seed = max_count, seed
+        self.every = every
+        self.start = start
+        self.stop = stop
+        self.gradient = gradient
+        self.split_angle = split_angle
+        self.opacity = opacity
+        self.max_count = max_count
+        self.seed = seed
         self.pull = torch.zeros(0)
         self.steps = 0
 
@@ -56,7 +64,8 @@ class DensityControl(Callback):
         return {"pull": self.pull, "steps": self.steps}
 
     def load_state_dict(self, state: dict) -> None:
-        self.pull, self.steps = state["pull"], state["steps"]
+        self.pull = state["pull"]
+        self.steps = state["steps"]
 
     def on_fit_start(self, trainer, module) -> None:
         if module.model.primitives is None:
@@ -68,28 +77,29 @@ class DensityControl(Callback):
         gaussians = module.model.primitives
         if not gaussians.means.requires_grad:
             return
-        pull = gaussians.means.grad.norm(dim=-1) * self._distances(module)
+        pull = gaussians.means.grad.norm(dim=-1) * self._distances(module)  # (n,)
         self.pull = pull if self.steps == 0 else self.pull.to(pull) + pull
         self.steps += 1
 
     @torch.no_grad()
     def on_train_batch_end(self, trainer, module, *_) -> None:
-        gaussians, optimizer, step = (
-            module.model.primitives,
-            trainer.optimizers[0],
-            trainer.global_step,
-        )
+        gaussians = module.model.primitives
+        optimizer = trainer.optimizers[0]
+        step = trainer.global_step
         is_due = step % self.every == 0 and self.start <= step <= self.stop
         if not is_due or not gaussians.means.requires_grad:
             return
-        pulled = self.pull / self.steps > self.gradient
+        pulled = self.pull / self.steps > self.gradient  # (n,)
         room = max(0, self.max_count - len(gaussians))
         if int(pulled.sum()) > room:  # the hardest pulled alone
             chosen = torch.topk(torch.where(pulled, self.pull, -1), room).indices
             pulled = torch.zeros_like(pulled).index_fill(0, chosen, True)
-        wide = gaussians.scales.amax(-1) / self._distances(module) > self.split_angle
-        cloned, split = pulled & ~wide, pulled & wide
-        density.clone(gaussians, optimizer, cloned)
+        # A narrow Gaussian covers too little and is cloned, a wide one too much and is split (Kerbl
+        # et al., 2023).
+        wide = gaussians.scales.amax(-1) / self._distances(module) > self.split_angle  # (n,)
+        split = pulled & wide
+        density.clone(gaussians, optimizer, pulled & ~wide)
+        # Clones are last, and are not split.
         split = torch.cat((split, split.new_zeros(len(gaussians) - len(split))))
         density.split(gaussians, optimizer, split, seeded(self.seed, step))
         faint = gaussians.opacities < self.opacity
@@ -102,6 +112,7 @@ class DensityControl(Callback):
             trainer.strategy.model = trainer.strategy._setup_model(module)
 
     def _distances(self, module) -> torch.Tensor:
+        """Distances of Gaussians to the receivers' middle [m]."""
         gaussians = module.model.primitives
         middle = module.model.scene.positions(gaussians.means).mean(0)
         return (gaussians.means.detach() - middle).norm(dim=-1)

@@ -14,7 +14,7 @@ from gaigs.registry import call, register, suggest
 from gaigs.splatting.loss import Loss
 from gaigs.training import MeanScores, seeded
 from gaigs.training.budget import share_done
-from gaigs.training.finite import find_broken, is_finite
+from gaigs.training.divergence import find_broken, is_finite
 from gaigs.training.schedule import make_optimizer, make_schedule
 
 
@@ -78,12 +78,20 @@ class Descent(lightning.LightningModule):
         )
         if unset := model.parameter_groups().keys() - self.learning_rates.keys():
             raise ValueError(
-                f"the model has no learning rate for {', '.join(sorted(unset))}; add it to learning_rates"
+                f"the model has no learning rate for {', '.join(sorted(unset))}; "
+                "add it to learning_rates"
             )
-        self.model, self.loss, self.identity, self.seed = model, loss, identity, seed
-        self.links, self.batch_size, self.jitter = links, batch_size, jitter
-        self.patience, self.density = patience, density
-        self.optimizer, self.schedule = optimizer, schedule
+        self.model = model
+        self.loss = loss
+        self.identity = identity
+        self.seed = seed
+        self.links = links
+        self.batch_size = batch_size
+        self.jitter = jitter
+        self.patience = patience
+        self.density = density
+        self.optimizer = optimizer
+        self.schedule = schedule
         self.task = model.scene.task
         self.thin = call("training.thinning", self.task.thinning, thinning)
 
@@ -104,19 +112,16 @@ class Descent(lightning.LightningModule):
         """A batch as a step sees it: of some links, thinned, its places moved."""
         generator = seeded(self.seed, self.global_step)
         if self.links is not None and len(batch) > self.links:
-            some = (
-                torch.randperm(len(batch), generator=generator)[: self.links]
-                .sort()
-                .values.to(batch.labels.device)
-            )
-            batch = replace(batch, query=batch.query[some], labels=batch.labels[some])
+            order = torch.randperm(len(batch), generator=generator)
+            chosen = order[: self.links].sort().values.to(batch.labels.device)  # (links,)
+            batch = replace(batch, query=batch.query[chosen], labels=batch.labels[chosen])
         batch = self.thin(batch, generator)
         if self.jitter:
+            # One move a place, the same for all receivers.
             places, which = batch.query.unique(with_receivers=False)
-            moves = self.jitter * torch.randn(places.transmitters.shape, generator=generator).to(
-                places.transmitters
-            )
-            moved = (places.transmitters + moves)[which]
+            moves = torch.randn(places.transmitters.shape, generator=generator)
+            moves = self.jitter * moves.to(places.transmitters)
+            moved = (places.transmitters + moves)[which]  # (b, 3)
             batch = replace(batch, query=replace(batch.query, transmitters=moved))
         return batch
 
@@ -135,33 +140,35 @@ class Descent(lightning.LightningModule):
         if not torch.isfinite(total):
             raise self._diverged(total, terms, batch)
         if (self.global_step + 1) % self.trainer.log_every_n_steps == 0:  # type: ignore[attr-defined]
-            # Lightning would log after the step's callbacks, and a checkpoint written there would
-            # lack the row.
-            shared = {name: links * term for name, term in terms.items()}
-            names = [
-                "train/loss",
-                *(f"train/{name}" for name in shared),
-                *(f"penalty/{name}" for name in penalties),
-            ]
-            values = torch.stack(
-                [total, *shared.values(), *(places * penalty for penalty in penalties.values())]
-            )
-            values = self.trainer.strategy.reduce(values.detach(), reduce_op="mean").tolist()
-            values = dict(zip(names, values, strict=True))
-            for logger in self.loggers:
-                logger.log_metrics(values, step=self.global_step)
+            logged = {"train/loss": total}
+            logged |= {f"train/{name}": links * term for name, term in terms.items()}
+            logged |= {f"penalty/{name}": places * value for name, value in penalties.items()}
+            self._log_now(logged)
         return total
 
+    def _log_now(self, terms: dict[str, Tensor]) -> None:
+        """Logs means over processes.
+
+        Lightning would log after the step's callbacks, and a checkpoint written there would lack
+        the row.
+        """
+        values = torch.stack([*terms.values()]).detach()
+        values = self.trainer.strategy.reduce(values, reduce_op="mean").tolist()
+        row = dict(zip(terms, values, strict=True))
+        for logger in self.loggers:
+            logger.log_metrics(row, step=self.global_step)
+
     def _diverged(self, total: Tensor, terms: dict[str, Tensor], batch: Batch) -> ValueError:
-        """The error of a step whose loss is not finite: the first broken quantity, and the remedy."""
-        broken, remedy = "the data's labels", "check the files"
-        if is_finite(batch.labels):
-            broken, remedy = find_broken(self.model, batch, terms), "lower training.learning_rates"
+        """The error of a step without a finite loss: the first broken quantity, and the remedy."""
+        if not is_finite(batch.labels):
+            cause = "the data's labels; check the files"
+        else:
+            remedy = "lower training.learning_rates"
             if self.global_step == 0:
                 remedy = "no rate has acted yet, so check the options of that part"
-        return ValueError(
-            f"the loss must stay finite, got {total:g} at step {self.global_step}, first in {broken}; {remedy}"
-        )
+            cause = f"{find_broken(self.model, batch, terms)}; {remedy}"
+        place = f"{total:g} at step {self.global_step}"
+        return ValueError(f"the loss must stay finite, got {place}, first in {cause}")
 
     def on_validation_epoch_start(self) -> None:
         self.scores = MeanScores(self.task)

@@ -20,11 +20,9 @@ class ProgressLine(ProgressBar):
 
     def on_train_start(self, trainer, module) -> None:
         self.line = stages.make_bars(disable=not trainer.is_global_zero)
-        self.start, self.first, self.share_done = (
-            time.monotonic(),
-            trainer.global_step,
-            share_done(trainer),
-        )
+        self.start = time.monotonic()
+        self.first = trainer.global_step
+        self.share_done = share_done(trainer)
         self.task = self.line.add_task("training", total=1, **self._done(trainer), scores="")
         self.line.start()
         if trainer.is_global_zero:
@@ -38,7 +36,8 @@ class ProgressLine(ProgressBar):
         self.line.update(self.task, **self._done(trainer), scores=scores)
 
     def _done(self, trainer) -> dict:
-        step, last = trainer.global_step, trainer.max_steps
+        step = trainer.global_step
+        last = trainer.max_steps
         count = f"{step:{len(str(last))}d}/{last}" if last > 0 else f"{step} steps"
         rate = (step - self.first) / max(time.monotonic() - self.start, 1e-9)
         return {"completed": self.share_done(step), "count": f"{count} {rate:.1f} steps/s"}

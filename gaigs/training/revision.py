@@ -16,11 +16,6 @@ from gaigs.training.budget import is_time_up, time_share
 
 log = logging.getLogger(__name__)
 
-LINKS = 48
-"""Most training links, and validation links, of a revision: a search evaluates them hundreds of
-times.
-"""
-
 
 class _TimeUp(Exception):
     """The time of a training is up."""
@@ -50,10 +45,18 @@ class Revision(Callback):
     Shares are of the training's steps or of its time, whichever comes first. A revision that is not
     done when the time of the training is up leaves the model as it was. All processes choose the
     same links by the seed, so that they decide alike.
+
+    Args:
+        links: Links with a split.
+        seed: Of the choice of links.
+        max_links: Most training links, and validation links, of a revision: a search evaluates them
+            hundreds of times.
     """
 
-    def __init__(self, links: Links, seed: int):
-        self.links, self.seed = links, seed
+    def __init__(self, links: Links, seed: int, max_links: int = 48):
+        self.links = links
+        self.seed = seed
+        self.max_links = max_links
         self.made: list[int] = []
 
     def state_dict(self) -> dict:
@@ -71,39 +74,45 @@ class Revision(Callback):
 
     @torch.no_grad()
     def _revise(self, trainer, module) -> None:
-        time = time_share(trainer)
+        """Makes the revisions whose share of the training is over."""
         for number, share in enumerate(module.model.revisions):
-            by_steps = trainer.max_steps > 0 and trainer.global_step == round(
-                share * trainer.max_steps
-            )
-            if number in self.made or not (by_steps or (time is not None and time >= share)):
+            if number in self.made or not _is_due(trainer, share):
                 continue
             if is_time_up(trainer):
                 return
             self.made.append(number)
-            convert, split = trainer.precision_plugin.convert_input, self.links.split
-            parts = (self._batch(module, part, number) for part in (split.train, split.validation))
-            train, validation = (None if part is None else convert(part) for part in parts)
+            train = self._batch(trainer, module, self.links.split.train, number)
+            validation = self._batch(trainer, module, self.links.split.validation, number)
             module.eval()  # as for every prediction outside of a training step
             before = {name: value.clone() for name, value in module.model.state_dict().items()}
+
+            def loss(batch: Batch) -> float:
+                value, _ = module.loss(module.model(batch).value, batch)
+                return value.item()
+
             try:
                 with _ending(trainer, module.model):
-                    done = module.model.revise(
-                        number,
-                        train,
-                        validation,
-                        lambda batch: module.loss(module.model(batch).value, batch)[0].item(),
-                    )
+                    done = module.model.revise(number, train, validation, loss)
             except _TimeUp:
                 module.model.load_state_dict(before)
                 done = "the time is up within a revision, which is not made"
             module.train()
             log.info("step %d: %s", trainer.global_step, done)
 
-    def _batch(self, module, index: Int[Tensor, " k"], number: int) -> Batch | None:
-        """Some of the links, thinned as those of a step; None for an empty part."""
+    def _batch(self, trainer, module, index: Int[Tensor, " k"], number: int) -> Batch | None:
+        """Some of the links, thinned as in a step; None for an empty part."""
         if not len(index):
             return None
         generator = seeded(self.seed, number, len(index))
-        chosen = index[torch.randperm(len(index), generator=generator)[:LINKS].sort().values]
-        return module.thin(self.links.batch(chosen).to(module.device), generator)
+        order = torch.randperm(len(index), generator=generator)  # (k,)
+        chosen = index[order[: self.max_links].sort().values]
+        batch = module.thin(self.links.batch(chosen).to(module.device), generator)
+        return trainer.precision_plugin.convert_input(batch)
+
+
+def _is_due(trainer, share: float) -> bool:
+    """True once a share of the training is over: at its step, or from its time on."""
+    if trainer.max_steps > 0 and trainer.global_step == round(share * trainer.max_steps):
+        return True
+    spent = time_share(trainer)
+    return spent is not None and spent >= share

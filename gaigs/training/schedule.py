@@ -29,19 +29,17 @@ def make_optimizer(
         raise ValueError(
             "training.optimizer takes no lr, as each group has its own; set training.learning_rates"
         )
-    parts = [
-        {"params": list(parameters), "lr": rates[name], "name": name}
-        for name, parameters in groups.items()
-    ]
-    parameters = [parameter for group in groups.values() for parameter in group]
-    implementations = {"fused", "foreach", "differentiable"} & inspect.signature(
-        kind
-    ).parameters.keys()
+    parts = []
+    parameters: list[nn.Parameter] = []
+    for name, group in groups.items():
+        parts.append({"params": [*group], "lr": rates[name], "name": name})
+        parameters += group
+    known = inspect.signature(kind).parameters.keys()
+    implementations = {"fused", "foreach", "differentiable"} & known
     on_cpu = all(p.is_floating_point() and p.device.type == "cpu" for p in parameters)
+    # False would keep torch from the grouped steps that it takes by itself on a GPU.
     if "fused" in implementations and on_cpu and not implementations & options.keys():
-        options["fused"] = (
-            True  # False would keep torch from the grouped steps that it takes by itself on a GPU
-        )
+        options["fused"] = True
     optimizer = call("training.optimizer", kind, options, params=parts)
     for group in optimizer.param_groups:
         if group["name"] != "network" and "weight_decay" in group:
@@ -62,13 +60,8 @@ def make_schedule(
             steps alone.
     """
     if "_target_" not in config:
-        return call(
-            "training.schedule",
-            warmup_and_decay,
-            config,
-            optimizer=optimizer,
-            share_done=share_done,
-        )
+        given = {"optimizer": optimizer, "share_done": share_done}
+        return call("training.schedule", warmup_and_decay, config, **given)
     kind, options = _target("training.schedule", config, lr_scheduler, LRScheduler)
     return call("training.schedule", kind, options, optimizer=optimizer)
 
@@ -83,18 +76,21 @@ def warmup_and_decay(
         raise ValueError(f"training.schedule.final must be in (0, 1], got {final}")
     if warmup < 0:
         raise ValueError(f"training.schedule.warmup must be at least 0 steps, got {warmup}")
-    return LambdaLR(
-        optimizer, lambda step: min(1.0, (step + 1) / max(warmup, 1)) * final ** share_done(step)
-    )
+
+    def factor(step: int) -> float:
+        risen = min(1.0, (step + 1) / max(warmup, 1))
+        return risen * final ** share_done(step)
+
+    return LambdaLR(optimizer, factor)
 
 
 def _target(option: str, config: Mapping, module: ModuleType, base: type) -> tuple[type, dict]:
     """The class that a configuration names, and its options."""
     options = dict(config)
     target = str(options.pop("_target_", None))
-    found = getattr(module, target.removeprefix(f"{module.__name__}."), None)
-    if not target.startswith(f"{module.__name__}.") or not (
-        isinstance(found, type) and issubclass(found, base)
-    ):
-        raise ValueError(f"{option}._target_ must be a class of {module.__name__}, got {target!r}")
-    return found, options
+    start = f"{module.__name__}."
+    kind = getattr(module, target.removeprefix(start), None)
+    is_inside = target.startswith(start)
+    if is_inside and isinstance(kind, type) and issubclass(kind, base):
+        return kind, options
+    raise ValueError(f"{option}._target_ must be a class of {module.__name__}, got {target!r}")

@@ -23,7 +23,7 @@ from gaigs.core.query import Batch, Query
 from gaigs.core.task.scalar import Scalar
 from gaigs.model import Model, Prediction
 from gaigs.registry import registry
-from gaigs.report.curves import read_curves
+from gaigs.report.training_log import read_curves
 from gaigs.splatting.loss.absolute import Absolute
 from gaigs.testing import example_links
 from gaigs.training.batches import Batches, InOrder

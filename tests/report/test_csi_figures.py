@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gaigs.report.csi import impulse_responses, magnitudes_and_phases
-from gaigs.report.figures import Examples
+from gaigs.report.predictions import Examples
 
 EVEN = 2.4e9 + 1e6 * np.arange(64)
 GAP = np.delete(EVEN, [31, 32, 50])

@@ -10,8 +10,9 @@ import yaml
 from folders import FACTS, read, terminal, write_run
 
 from gaigs.report.__main__ import main
-from gaigs.report.multirun import ablation, read_runs, report
-from gaigs.report.runs import read_metrics
+from gaigs.report.ablation import ablation
+from gaigs.report.multirun import report
+from gaigs.report.run_folders import read_metrics, read_runs
 
 
 def scores(gaigs, mean=0.6, knn=0.95):
@@ -298,7 +299,7 @@ def test_the_configuration_counts_where_overrides_were_changed(tmp_path):
     write_configured(tmp_path / "0", [*words, "seed=0"], configured(0, **others), 0.9)
     write_configured(tmp_path / "1", [*words, "seed=0"], configured(1, "euclidean", **others), 0.7)
     first, second = read_runs(tmp_path)
-    assert first.doubts == ()
+    assert first.doubts == []
     assert (second.overrides["tokenizer"], second.overrides["seed"]) == ("euclidean", "1")
     named = ".hydra/overrides.yaml has tokenizer=ga, and config.yaml euclidean, which counts"
     assert second.doubts[0] == named
@@ -315,7 +316,7 @@ def test_runs_whose_overrides_were_cut_are_told_apart(tmp_path):
     ):
         write_configured(tmp_path / str(seed), words, configured(seed, tokenizer), 0.9)
     assert [run.overrides["tokenizer"] for run in read_runs(tmp_path)] == ["ga", "ga", "euclidean"]
-    assert [run.doubts for run in read_runs(tmp_path)][:2] == [(), ()]
+    assert [run.doubts for run in read_runs(tmp_path)][:2] == [[], []]
     report(tmp_path)
     assert (
         "2: .hydra/overrides.yaml has no tokenizer, and config.yaml euclidean"
@@ -325,12 +326,21 @@ def test_runs_whose_overrides_were_cut_are_told_apart(tmp_path):
     assert (group["tokenizer"], group["runs"]) == ("ga", "2")
 
 
+def test_runs_that_differ_in_two_things_are_told_apart(tmp_path):
+    write_configured(tmp_path / "0", ["seed=0"], configured(0), 0.9)
+    write_configured(tmp_path / "1", ["seed=1"], configured(1, "euclidean", rate=2), 0.9)
+    first, second = read_runs(tmp_path)
+    assert (first.overrides["tokenizer"], second.overrides["tokenizer"]) == ("ga", "euclidean")
+    assert (first.overrides["rate"], second.overrides["rate"]) == ("None", "2")
+    assert len(first.doubts + second.doubts) == 2
+
+
 def test_a_tokenizer_that_is_not_read_is_none_in_tables(tmp_path):
     for seed, tokenizer in enumerate(("ga", "euclidean")):
         words = [f"tokenizer={tokenizer}", "deformation=none", f"seed={seed}"]
         write_configured(tmp_path / str(seed), words, configured(seed, tokenizer, "none"), 0.9)
     runs = read_runs(tmp_path)
-    assert [(run.overrides["tokenizer"], run.doubts) for run in runs] == [("none", ())] * 2
+    assert [(run.overrides["tokenizer"], run.doubts) for run in runs] == [("none", [])] * 2
 
 
 def test_command_line(tmp_path, monkeypatch, capsys):

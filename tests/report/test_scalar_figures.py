@@ -12,7 +12,7 @@ from gaigs.core.radio_maps import RadioMap
 from gaigs.core.task.rssi import Rssi
 from gaigs.data import Split
 from gaigs.report import scalar
-from gaigs.report.scalar import PANELS, predicted_against_measured, radio_maps
+from gaigs.report.scalar import predicted_against_measured, radio_maps
 from gaigs.report.style import round_step
 from gaigs.testing import example_links
 
@@ -35,34 +35,31 @@ def counts(ax):
     return mesh.get_coordinates()[0, :, 0], mesh.get_array().filled(0)
 
 
-@pytest.fixture
-def counted(monkeypatch):
+def counted(*readings):
     """Readings are counted, however few they are."""
-    monkeypatch.setattr(scalar, "FEW", 0)
+    return predicted_against_measured(*readings, max_dots=0)
 
 
 def test_few_readings_are_dots_and_many_are_counted():
-    labels = np.linspace(-80, -50, 2 * scalar.FEW + 1)
+    labels = np.linspace(-80, -50, 2 * 400 + 1)
     draw = lambda count: predicted_against_measured(
         labels[:count], labels[:count] + 1, np.arange(count) % 2, ["west", "east"], Rssi()
     )
-    (few,), (many,) = draw(2 * scalar.FEW), draw(2 * scalar.FEW + 1)
+    (few,), (many,) = draw(2 * 400), draw(2 * 400 + 1)
     assert len(few.axes) == 2, "no bar of colours"
     np.testing.assert_array_equal(
         few.axes[1].lines[0].get_xydata(), np.stack((labels, labels + 1), 1)[1:-1:2]
     )
-    assert counts(many.axes[0])[1].sum() == scalar.FEW + 1
+    assert counts(many.axes[0])[1].sum() == 400 + 1
 
 
-def test_readings_are_counted_where_they_were_measured_and_predicted(counted):
+def test_readings_are_counted_where_they_were_measured_and_predicted():
     labels, predictions = (
         np.array([-61.0, -61, -70, -50, -43]),
         np.array([-55.0, -55.5, -70, -50.5, -44]),
     )
     receiver = np.array([1, 1, 1, 2, 2])
-    (figure,) = predicted_against_measured(
-        labels, predictions, receiver, ["silent", "hall", "[attic]"], Rssi()
-    )
+    (figure,) = counted(labels, predictions, receiver, ["silent", "hall", "[attic]"], Rssi())
     hall, attic = panels(figure)
     assert hall.get_title() == "hall, MAE 3.83 dB"  # (6 + 5.5 + 0) / 3
     assert attic.get_title() == "[attic], MAE 0.75 dB"
@@ -86,14 +83,12 @@ def test_many_receivers_take_several_figures():
 
 
 @pytest.mark.parametrize("scale", [1e-9, 0.03, 1.0, 4e6])
-def test_cells_and_margins_follow_from_the_data_in_other_units(counted, scale):
+def test_cells_and_margins_follow_from_the_data_in_other_units(scale):
     rng = np.random.default_rng(6)
     labels = scale * rng.gamma(2, 30, 3000)
     predictions = labels + scale * rng.normal(0, 10, 3000)
     predictions[0] = 1e9 * scale
-    (figure,) = predicted_against_measured(
-        labels, predictions, np.zeros(3000, int), ["hall"], NANOSECONDS
-    )
+    (figure,) = counted(labels, predictions, np.zeros(3000, int), ["hall"], NANOSECONDS)
     (ax,) = panels(figure)
     edges, count = counts(ax)
     assert count.sum() == 3000
@@ -116,8 +111,8 @@ def test_cells_and_margins_follow_from_the_data_in_other_units(counted, scale):
 @pytest.mark.parametrize(
     "labels", [np.full(4, 7.0), np.zeros(4), np.arange(11) / 10, -60 - 2.0 * np.arange(4)]
 )
-def test_every_reading_is_inside(counted, labels, task):
-    (figure,) = predicted_against_measured(labels, labels, np.zeros(len(labels), int), ["a"], task)
+def test_every_reading_is_inside(labels, task):
+    (figure,) = counted(labels, labels, np.zeros(len(labels), int), ["a"], task)
     (ax,) = panels(figure)
     assert counts(ax)[1].sum() == len(labels)
     assert ax.get_xlim() == ax.get_ylim()
@@ -257,7 +252,7 @@ def test_a_wild_map_has_no_endless_lines():
     assert len(contours.levels) < 40
 
 
-@pytest.mark.parametrize("count", [1, PANELS + 1])
+@pytest.mark.parametrize("count", [1, 7])
 def test_no_panel_is_lost_and_the_lowest_tell_their_metres(count):
     figures = draw(maps(count))
     for figure in figures:

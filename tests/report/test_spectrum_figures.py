@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gaigs.report.figures import Examples
+from gaigs.report.predictions import Examples
 from gaigs.report.spectrum import spectra
 
 ELEVATIONS, AZIMUTHS = np.arange(10.0, 91, 10), np.arange(0.0, 360, 15)

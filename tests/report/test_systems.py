@@ -13,12 +13,12 @@ from gaigs.core.task.spectrum import Spectrum
 from gaigs.registry import registry
 from gaigs.report import systems
 from gaigs.report.curves import learning_curves
-from gaigs.report.figures import scores_of_systems
 from gaigs.report.multirun import report
+from gaigs.report.predictions import scores_of_systems
+from gaigs.report.published import read_published
 from gaigs.report.run_figures import figures_of
-from gaigs.report.runs import read_runs
+from gaigs.report.run_folders import read_runs
 from gaigs.report.spectrum import SpectrumFigures, side_by_side
-from gaigs.report.systems import read_published
 
 SCORES = ("ssim_median", "ssim_mean", "ssim_p10", "ssim_p90", "mae")
 GRID = np.deg2rad(np.arange(1, 12)), np.deg2rad(np.arange(14))

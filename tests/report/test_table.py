@@ -7,7 +7,8 @@ from rich.console import Console
 
 from gaigs.core.task.csi import Csi
 from gaigs.registry import registry
-from gaigs.report.table import metrics_table, verdict, written
+from gaigs.report.scores import metrics_table, verdict
+from gaigs.report.table import written
 
 
 def run(task, **models):

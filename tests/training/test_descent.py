@@ -16,7 +16,7 @@ from gaigs.core.query import Query
 from gaigs.core.task.csi import Csi
 from gaigs.core.task.rssi import Rssi
 from gaigs.model import Model, Prediction
-from gaigs.report.curves import read_curves
+from gaigs.report.training_log import read_curves
 from gaigs.splatting.loss.absolute import Absolute
 from gaigs.splatting.loss.relative_error import RelativeError
 

@@ -9,7 +9,7 @@ from fitting import Plane, Watch, fit, make_module
 
 from gaigs.data import Split
 from gaigs.training.checkpoints import Interrupted, KeepLast
-from gaigs.training.revision import LINKS, Revision
+from gaigs.training.revision import Revision
 
 
 class Revised(Plane):
@@ -104,7 +104,7 @@ def test_a_revision_gets_links_of_both_parts_and_their_loss(links, tmp_path):
 
 
 def test_a_revision_gets_no_more_links_than_it_needs(links, tmp_path):
-    count = 2 * LINKS
+    count = 2 * 48
     copies = torch.arange(count) % len(links)
     parts = torch.arange(count - 1), torch.arange(0), torch.arange(count - 1, count)
     many = replace(
@@ -113,5 +113,5 @@ def test_a_revision_gets_no_more_links_than_it_needs(links, tmp_path):
     module = make(many)
     fit(module, many, tmp_path, 4, Revision(many, 0), limit_val_batches=0)
     for _, train, validation, _, _ in module.model.looks:
-        assert len(train) == LINKS
+        assert len(train) == 48
         assert validation is None

@@ -2,14 +2,13 @@
 
 import pytest
 import yaml
+from claims import compare, interval, main, read_claims, write_claims
 from folders import read, write_run
 from hydra import compose, initialize_config_dir
 
 from gaigs.configuration import conf_dir
 from gaigs.registry import registry
-from gaigs.report.claims import compare, interval, read_claims
-from gaigs.report.multirun import report
-from gaigs.report.runs import read_runs
+from gaigs.report.run_folders import read_runs
 
 
 def write_variant(folder, variant, score=None, seed=0, task="spectrum", log="", **overrides):
@@ -42,7 +41,7 @@ def test_an_interval_of_three_gains_by_hand():
 def test_one_seed_has_no_interval(tmp_path):
     write_variant(tmp_path, "paper", 0.9)
     write_variant(tmp_path, "ga", 0.6)
-    report(tmp_path)
+    main([str(tmp_path)])
     (row,) = read(tmp_path / "claims.csv")
     assert (row["low"], row["high"], row["seeds"], row["says"]) == ("", "", "1", "one seed")
 
@@ -89,7 +88,7 @@ def sweep(tmp_path):
 
 
 def test_the_table(sweep):
-    *_, table = report(sweep).renderables
+    table = write_claims(sweep, read_runs(sweep))
     first, *notes = (sweep / "claims.md").read_text().split("\n\n")
     lines = first.splitlines()
     assert (
@@ -136,13 +135,21 @@ def test_claims_of_several_tasks_are_one_table(tmp_path):
         for task in ("spectrum", "rssi"):
             write_variant(tmp_path / task, "paper", 3.0 + 0.01 * seed, seed, task, data=task)
             write_variant(tmp_path / task, "euclidean", 4.0, seed, task, data=task)
-    (table,) = report(tmp_path).renderables
+    table = write_claims(tmp_path, read_runs(tmp_path))
     assert table.row_count == 2
     assert {row["score"]: row["says"] for row in read(tmp_path / "claims.csv")} == {
         "MAE [dB]": "confirmed",
         "median SSIM": "contradicted",
     }
     assert "- published gain +0.014: 0.91 of GAI-GS" in (tmp_path / "claims.md").read_text()
+
+
+def test_a_folder_without_two_variants_is_refused(tmp_path, capsys):
+    for what in ("must hold runs, each with its", "must hold runs of two variants"):
+        with pytest.raises(SystemExit, match="2"):
+            main([str(tmp_path)])
+        assert what in " ".join(capsys.readouterr().err.split())
+        write_variant(tmp_path / what, "paper", 0.9)
 
 
 # --- the list of claims ---
@@ -155,14 +162,6 @@ def test_claims_name_the_variants_of_conf():
     for claim in claims:
         assert claim.published.keys() <= {*registry("task").names()}
         assert claim.source
-
-
-@pytest.mark.parametrize("broken", ["claims: 3", "claims: [{claim: a}]", "a: [", "3"])
-def test_a_broken_list_of_claims_is_refused(broken, tmp_path):
-    file = tmp_path / "claims.yaml"
-    file.write_text(broken)
-    with pytest.raises(ValueError, match=r"claims\.yaml must have the form of conf/claims\.yaml: "):
-        read_claims(file)
 
 
 PARTS = {"tokenizer", "deformation", "projection", "pooling"}

@@ -1,4 +1,4 @@
-"""The part of a training step that is not finite."""
+"""Divergence: the first quantity of a training step that is not finite."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -23,12 +23,12 @@ def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
     for name, parameter in model.named_parameters():
         if not is_finite(parameter):
             return f"the parameter {name}"
-    found: list[str] = []
+    broken: list[str] = []
 
     def look(name: str, part: nn.Module, arguments: tuple, output: object) -> None:
         values = output if isinstance(output, tuple) else (output,)
         if not all(is_finite(value) for value in values if isinstance(value, Tensor)):
-            found.append(f"the output of {name}")
+            broken.append(f"the output of {name}")
 
     hooks = [
         part.register_forward_hook(partial(look, name))
@@ -43,8 +43,8 @@ def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
     rest = {"the prediction": value}
     rest |= {f"the penalty {name}": penalty for name, penalty in penalties.items()}
     rest |= {f"the term {name}": term for name, term in terms.items()}
-    found += [name for name, tensor in rest.items() if not is_finite(tensor)]
-    return (found or ["their sum"])[0]
+    broken += [name for name, tensor in rest.items() if not is_finite(tensor)]
+    return broken[0] if broken else "their sum"
 
 
 def is_finite(values: Tensor) -> bool:

@@ -1,4 +1,6 @@
-"""The report at the end of a multirun, requested by an experiment under ``hydra.callbacks``."""
+"""A callback of Hydra that requests the tables of a multirun; an experiment names it under
+``hydra.callbacks``.
+"""
 
 import sys
 from pathlib import Path
@@ -9,25 +11,26 @@ from omegaconf import DictConfig, OmegaConf
 
 from gaigs.report.formats import figure_formats
 
-folders: list[tuple[Path, str | list[str]]] = []
-"""Multiruns of this process that need a report, and the formats of its figures."""
+requested: list[tuple[Path, str | list[str]]] = []
+"""Multiruns of this process whose tables are to be written, and the formats of their figures."""
 
 
-class AtEnd(Callback):
-    """Requests the report of a multirun. ``main`` writes it, as Hydra calls no callback after a
-    failed job.
+class MultirunReport(Callback):
+    """Requests the tables of a multirun.
+
+    ``main`` writes them, as Hydra calls no callback after a failed job.
     """
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         """Remembers the folder and the formats."""
         plain: Any = OmegaConf.to_container(config)
-        folders.append((Path(config.hydra.sweep.dir), plain["figures"]["format"]))
+        requested.append((Path(config.hydra.sweep.dir), plain["figures"]["format"]))
 
 
-def write() -> None:
-    """Writes the requested reports and prints their tables."""
-    while folders:
-        folder, formats = folders.pop()
+def write_requested() -> None:
+    """Writes the requested tables and prints them."""
+    while requested:
+        folder, formats = requested.pop()
         from rich.console import Console
 
         from gaigs.report.multirun import report  # slow to import
@@ -36,8 +39,7 @@ def write() -> None:
             with figure_formats(formats):
                 Console(emoji=False).print(report(folder))
         except Exception as error:  # a failed report must not look like a failed job
-            print(
-                f"gaigs: no report: {' '.join(str(error).split()) or repr(error)}", file=sys.stderr
-            )
+            message = " ".join(str(error).split()) or repr(error)
+            print(f"gaigs: no report: {message}", file=sys.stderr)
         else:
             print(f"report: {folder}; python -m gaigs.report {folder} writes it anew")

@@ -1,0 +1,216 @@
+"""The table of a multirun: its runs, their baselines, their spread over seeds, their speed."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from numpy import ndarray
+from rich.markup import escape
+from rich.table import Table
+
+from gaigs.core.task import Metric
+from gaigs.io.files import write_text
+from gaigs.report.curves import speed_against_error
+from gaigs.report.run_folders import Run, by_seed
+from gaigs.report.scores import COSTS, train_seconds
+from gaigs.report.style import save
+from gaigs.report.table import Spread, columns_of, markdown, terminal, write_csv, written
+
+
+def ablation(runs: Sequence[Run]) -> tuple[list[dict], dict]:
+    """Rows of runs, then of baselines, once for each split; and the settings that all share."""
+    overrides = [run.overrides for run in runs]
+    ended = [run.metrics for run in runs if run.metrics is not None]
+    names = columns_of(overrides)
+    typed = _common(names, overrides)
+    facts = ("split", "seed", "device")
+    known = _common(facts, ended)
+    varied = [name for name in names if name not in typed]
+    varied_facts = [fact for fact in facts if fact not in known]
+    rows = []
+    baselines = {}
+    for run in runs:
+        rows.append(_row(run, varied, varied_facts))
+        for row in _baselines(run.metrics, "split" in varied_facts):
+            # As text: two devices give scores that differ in the last bits.
+            baselines[tuple(written(value) for value in row.values())] = row
+    return [*rows, *baselines.values()], typed | known
+
+
+def _common(keys: Sequence[str], sources: Sequence[Mapping]) -> dict[str, object]:
+    """The values that all sources share, by key."""
+    values = {key: {source.get(key, "") for source in sources} for key in keys}
+    return {key: next(iter(found)) for key, found in values.items() if len(found) == 1}
+
+
+def _row(run: Run, varied: Sequence[str], facts: Sequence[str]) -> dict:
+    row = {"run": run.name, "status": "unfinished", "model": ""}
+    row |= {key: run.overrides.get(key, "") for key in varied}
+    if run.metrics is None:
+        return row
+    model, scores = next(iter(run.metrics["models"].items()))
+    row |= {"status": "done", "model": row["model"] or model}
+    row |= {fact: run.metrics[fact] for fact in facts}
+    row |= scores
+    row["train_seconds"] = train_seconds(run.metrics)
+    for cost in ("num_gaussians", "num_parameters", "inference_ms"):
+        row[cost] = run.metrics.get(cost)
+    return row
+
+
+def _baselines(metrics: Mapping | None, has_split: bool) -> list[dict]:
+    """Rows of the baselines of a run, without the run's model before its kriging."""
+    if metrics is None:
+        return []
+    first, *names = metrics["models"]
+    rows = []
+    for name in names:
+        if name != f"{first}_trend":
+            row = {"status": "baseline", "model": name} | metrics["models"][name]
+            if has_split:
+                row["split"] = metrics["split"]
+            rows.append(row)
+    return rows
+
+
+def over_seeds(runs: Sequence[Run], shared: Mapping) -> list[dict]:
+    """Rows of groups of runs that differ in ``seed`` alone, where two seeds or more have ended."""
+    ended = [run for run in runs if run.metrics is not None]
+    names = columns_of([run.overrides for run in ended])
+    varied = [name for name in names if name != "seed" and name not in shared]
+    rows = []
+    for group in by_seed(ended):
+        metrics = [run.metrics for run in group]
+        if len({one["seed"] for one in metrics}) < 2:
+            continue
+        scores = [next(iter(one["models"].values())) for one in metrics]
+        row = {"status": "seeds", "model": next(iter(metrics[0]["models"]))}
+        row |= {name: group[0].overrides.get(name, "") for name in varied}
+        if "split" not in shared:
+            splits = {one["split"] for one in metrics}
+            row["split"] = splits.pop() if len(splits) == 1 else f"{len(splits)} splits"
+        row["runs"] = len(group)
+        for name in scores[0]:
+            if all(name in score for score in scores):
+                row[name] = Spread.of([score[name] for score in scores])
+        rows.append(row)
+    return rows
+
+
+def write_ablation(
+    folder: Path,
+    runs: Sequence[Run],
+    rows: Sequence[dict],
+    shared: Mapping,
+    metrics: Mapping[str, Metric],
+) -> list[Table]:
+    """Writes ``ablation.csv``, ``ablation.md`` and, once a run has ended, the figure of speed.
+
+    ``rows`` and ``shared`` are results of ``ablation``, ``metrics`` of the task. The result are
+    tables for a terminal of 80 columns. Metrics that are not brief are in the files only.
+    """
+    intervals = {
+        "coverage_50": "within 50 %",
+        "coverage_50_error": "standard error of it",
+        "coverage_90": "within 90 %",
+        "coverage_90_error": "standard error of it",
+        "width_90": "width of 90 %",
+        "crps": "CRPS",
+        "nll": "NLL",
+        "calibration_links": "calibrating links",
+    }
+    titles = {name: metric.title for name, metric in metrics.items()} | intervals | COSTS
+    groups = over_seeds(runs, shared)
+    spread = "Runs that differ in the seed alone: mean ± standard deviation (n - 1), and the least"
+    settings = ", ".join(f"{key}={value}" for key, value in shared.items())
+    failures = [f"{run.name}: {run.failure}" for run in runs if run.failure is not None]
+    doubts = []
+    for run in runs:
+        doubts += [f"{run.name}: {doubt}" for doubt in run.doubts]
+
+    write_csv(folder / "ablation.csv", [*rows, *groups], ("_sd", "_least"))
+    page = f"{_markdown(rows, titles)}\n{settings}\n"
+    page += "".join(f"- without a result: {failure}\n" for failure in failures)
+    page += "".join(f"- {doubt}\n" for doubt in doubts)
+    if groups:
+        page += f"\n{spread}\n\n{_markdown(groups, titles)}"
+    write_text(folder / "ablation.md", page)
+    if metrics:
+        save(_speed(runs, rows, shared, titles), folder / "speed_against_error.png")
+
+    hidden = {name for name, metric in metrics.items() if not metric.is_brief}
+    hidden |= {"num_gaussians"} | intervals.keys() - {"coverage_90"}
+    if not any(row["status"] == "unfinished" for row in rows):
+        hidden.add("status")
+    varied = [_settings(run, shared) for run in runs]
+    if len({*varied}) == len(varied):
+        hidden.add("run")  # its name would repeat the varied overrides
+    caption = "\n".join([*failures, *doubts, f"{settings}; all columns in ablation.md"])
+    tables = [_terminal(f"Runs of {folder}", rows, titles, hidden, caption)]
+    if groups:
+        about = f"{spread}; all columns in ablation.md"
+        tables.append(_terminal("Over seeds", groups, titles, hidden | {"status"}, about))
+    return tables
+
+
+def _settings(run: Run, shared: Mapping) -> str:
+    """The overrides of a run that others do not share, as one text."""
+    pairs = run.overrides.items()
+    return " ".join(f"{key}={value}" for key, value in pairs if key not in shared)
+
+
+def _speed(
+    runs: Sequence[Run], rows: Sequence[dict], shared: Mapping, titles: Mapping[str, str]
+) -> Figure:
+    """The first metric of each run against its times."""
+    metric = next(iter(titles))
+    ended = [run for run in runs if run.metrics is not None]
+    done = [row for row in rows if row["status"] == "done"]
+    names = [_settings(run, shared) for run in ended]
+    if "" in names or len({*names}) < len(names):
+        names = [run.name for run in ended]
+    times = {
+        "inference [ms a transmitter]": _numbers(done, "inference_ms"),
+        "training [s]": _numbers(done, "train_seconds"),
+    }
+    baselines = {}
+    for row in rows[len(runs) :]:
+        baselines[f"{row['model']} {row.get('split', '')}".strip()] = row[metric]
+    models = [row["model"] for row in done]
+    scores = _numbers(done, metric)
+    return speed_against_error(names, scores, times, titles[metric], baselines, models)
+
+
+def _numbers(rows: Sequence[Mapping], key: str) -> Float[ndarray, " rows"]:
+    """A column as numbers; NaN where it is unknown."""
+    return np.array([np.nan if row.get(key) is None else row[key] for row in rows], float)
+
+
+def _text(value: float | int | str | Spread | None, separator: str) -> str:
+    if isinstance(value, Spread):
+        return f"{written(value)}{separator}least {written(value.least)}"
+    return written(value)
+
+
+def _markdown(rows: Sequence[Mapping], titles: Mapping[str, str]) -> str:
+    columns = columns_of(rows)
+    lines = [[titles.get(column, column) for column in columns]]
+    for row in rows:
+        lines.append([_text(row.get(column), ", ") for column in columns])
+    return markdown(lines)
+
+
+def _terminal(
+    title: str, rows: Sequence[Mapping], titles: Mapping[str, str], hidden: set[str], caption: str
+) -> Table:
+    columns = [column for column in columns_of(rows) if column not in hidden]
+    heads = {}
+    for column in columns:
+        heads[titles.get(column, column.replace(".", ".\n"))] = column in titles
+    lines = []
+    for row in rows:
+        lines.append([escape(_text(row.get(column), "\n")) for column in columns])
+    styles = [{"unfinished": "red", "baseline": "dim"}.get(row["status"]) for row in rows]
+    return terminal(title, heads, lines, caption, styles)

@@ -1,0 +1,71 @@
+"""Arrays of ``predictions.npz`` for the figures of a task."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+
+def as_baseline(name: str) -> str:
+    """The name of a baseline for a reader where a system has the same name."""
+    return f"{name} (baseline)"
+
+
+def own_scores(file: Path, kind: str) -> dict[str, ndarray]:
+    """The arrays ``<kind>_<model>`` by model, the run's own model first."""
+    start = f"{kind}_"
+    with np.load(file) as run:
+        return {key.removeprefix(start): run[key] for key in run.files if key.startswith(start)}
+
+
+def scores_of_systems(files: Mapping[str, Path], kind: str) -> dict[str, ndarray]:
+    """The arrays ``<kind>_<model>`` of each system's model, then of the first system's baselines.
+
+    A baseline with the scores of a system of its name is left out.
+    """
+    systems: dict[str, ndarray] = {}
+    baselines: dict[str, ndarray] = {}
+    for name, file in files.items():
+        by_model = own_scores(file, kind)
+        model = next(iter(by_model))
+        systems[name] = by_model.pop(model)
+        by_model.pop(f"{model}_trend", None)
+        baselines = baselines or by_model
+    others: dict[str, ndarray] = {}
+    for name, scores in baselines.items():
+        if not np.array_equal(systems.get(name), scores):
+            others[as_baseline(name) if name in systems else name] = scores
+    return systems | others
+
+
+class Examples(NamedTuple):
+    """Test samples for a figure.
+
+    Attributes:
+        labels: Labels (k, *shape).
+        predictions: Predictions, likewise.
+        scores: Score of each sample.
+        names: Rank of each sample among all.
+    """
+
+    labels: ndarray
+    predictions: ndarray
+    scores: Float[ndarray, " k"]
+    names: list[str]
+
+
+def read_examples(file: Path, kind: str) -> Examples:
+    """The samples at three ranks of the score ``<kind>_<model>`` of the run's model."""
+    scores = next(iter(own_scores(file, kind).values()))
+    order = np.argsort(scores)
+    names = {}
+    for name, rank in (("10th percentile", 0.1), ("median", 0.5), ("90th percentile", 0.9)):
+        names[int(order[round(rank * (len(order) - 1))])] = name
+    shown = [*names]
+    with np.load(file) as run:
+        labels = run["labels"][shown]
+        predictions = run["prediction"][shown]
+    return Examples(labels, predictions, scores[shown], [*names.values()])
