@@ -3,6 +3,7 @@
 import contextlib
 import csv
 import functools
+import importlib
 import json
 import os
 import pkgutil
@@ -147,14 +148,9 @@ def composed(place, files_read_once):
 
 
 page_by_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-of_today = pytest.mark.parametrize(
-    "page",
-    [page for page in PAGES if page.name != "renames.md"],
-    ids=lambda page: str(page.relative_to(ROOT)),
-)
 
 
-@of_today
+@page_by_page
 def test_files_and_links_exist(page, place):
     for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text()):
         assert "://" in target or (page.parent / target).exists(), target
@@ -174,7 +170,7 @@ def test_anchors_exist(page):
         ]
 
 
-@of_today
+@page_by_page
 def test_names_of_python_exist(page):
     for word in spoken(page):
         if re.fullmatch(r"gaigs(\.\w+)+", word) and Path(word).suffix not in FILES:
@@ -254,7 +250,7 @@ def test_each_block_of_the_readme_installs_the_processors_torch_first(command):
     )
 
 
-@of_today
+@page_by_page
 def test_configuration_keys_exist(page, composed, place):
     for word in spoken(page):
         match = re.fullmatch(r"\+?(?P<top>[a-z_]+)(\.[a-z_]+)*(=\S+)?", word)
@@ -469,6 +465,14 @@ def test_the_reference_has_every_public_name():
     assert {f"gaigs.{name}" for name in gaigs.__all__} - {"gaigs.__version__"} <= {*listed}
     for name in listed:
         pkgutil.resolve_name(name)
+
+
+@page_by_page
+def test_tables_of_options_have_a_description_of_each(page, monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    options = importlib.import_module("options")
+    filled = options.fill_in(page.read_text())  # an option without a description is an error
+    assert "::: options" not in filled
 
 
 def test_the_documented_file_of_channels_is_read(tmp_path):
