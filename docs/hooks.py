@@ -1,6 +1,4 @@
-"""Hooks of mkdocs: the repository's layout, a page for each notebook, and the viewer's file in its
-page.
-"""
+"""Hooks of mkdocs: the repository's layout, notebooks, tables of options, and the viewer."""
 
 import re
 from pathlib import Path
@@ -8,6 +6,7 @@ from pathlib import Path
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
+from options import fill_in
 
 import gaigs
 
@@ -52,9 +51,10 @@ def _notebook(config, name):
 
 
 def on_page_markdown(markdown, page, **_):
-    """Links to a notebook lead to its page; the page of the viewer shows its file."""
+    """Fills in tables of options, the pages of notebooks and the file of the viewer."""
     if page.file.generated_by:
         return markdown
+    markdown = fill_in(markdown)
     if page.file.src_uri == "docs/view.md":
         style = 'style="width: 100%; height: 40rem"'
         frame = f'<iframe src="room.html" title="The built-in room" {style}></iframe>'

@@ -1,3 +1,3 @@
 """The version of gaigs: a run folder is of one series, such as 0.2."""
 
-__version__ = "0.3.0"
+__version__ = "0.4.0"
