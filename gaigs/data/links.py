@@ -136,13 +136,11 @@ def from_arrays(
     if task.is_scalar and task.unit == "dBm":
         _doubt_levels(labels, received, remarks)
     row = rows[received]
-    _, sites = number_places(places.tolist())
+    sites = number_places(places.tolist())[1]
     parts: Any = None
     if test_rows is not None:
         parts = _parts(row, len(places), test_rows, train_rows)
-        shared = torch.isin(sites[row[parts[1]]], sites[row[parts[0]]])
-        if shared.any():
-            remarks.append(f"{int(shared.sum())} test links stand at places of training links")
+        remarks += _shared_places(sites[row], *parts)
     undivided = Links(
         query=Query(places[row], index[received].long(), _carriers(frequency, task, row, places)),
         receivers=receivers,
@@ -156,14 +154,19 @@ def from_arrays(
         remarks="; ".join(remarks),
     )
     links = _divided(undivided, config)
-    trained = {receiver.name for receiver in links.receivers}
-    untrained = [receiver.name for receiver in receivers if receiver.name not in trained]
+    _warn_of_untrained(receivers, links.receivers)
+    return links
+
+
+def _warn_of_untrained(receivers: Sequence[Receiver], trained: Sequence[Receiver]) -> None:
+    """Warns of receivers without training links."""
+    names = {receiver.name for receiver in trained}
+    untrained = [receiver.name for receiver in receivers if receiver.name not in names]
     if untrained:
         log.warning(
             "receivers without a training link are left out: %s\nname the others by name",
             shortened(untrained),
         )
-    return links
 
 
 def _divided(links: Links, split: Mapping) -> Links:
@@ -370,6 +373,16 @@ def _parts(
     if not len(training):
         raise ValueError(f"test_rows leave no row to train on, got all {count}")
     return torch.isin(row, training).nonzero()[:, 0], torch.isin(row, testing).nonzero()[:, 0]
+
+
+def _shared_places(
+    sites: Int[Tensor, " m"], train: Int[Tensor, " k"], test: Int[Tensor, " l"]
+) -> list[str]:
+    """A remark if test links stand at places of training links."""
+    shared = torch.isin(sites[test], sites[train])
+    if not shared.any():
+        return []
+    return [f"{int(shared.sum())} test links stand at places of training links"]
 
 
 def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:

@@ -74,10 +74,8 @@ def read(
         ImportError: Coordinates are to be converted, and pyproj is not installed.
         ValueError: A file has a defect; the message names file, line, column and value.
     """
-    table = tables.read_table(
-        tables.find_file(file, "a table of readings"),
-        "a heading x,y,ap1,ap2,... and one place a line",
-    )
+    file = tables.find_file(file, "a table of readings")
+    table = tables.read_table(file, "a heading x,y,ap1,ap2,... and one place a line")
     if {"tx_x", "rx_x"} <= {name.lower() for name in table.names}:
         raise ValueError(
             f"{table.file}, line 1: a table of a reading a line, with tx_x and rx_x; take "
@@ -88,17 +86,15 @@ def read(
     placed: dict[str, list[float]] = {}
     unused: list[str] = []
     if gateways is not None:
-        placed, unused = _read_gateways(
-            tables.find_file(gateways, "a table of gateways"), table, axes, height, storey, epsg
-        )
+        gateways = tables.find_file(gateways, "a table of gateways")
+        placed, unused = _read_gateways(gateways, table, axes, height, storey, epsg)
     columns = find_gateways(table, axes, placed, ignore or [], not_heard)
     is_placed = ~np.isnan(points).any(1)
-    if not is_placed.any():
-        raise ValueError(f"{table.file}: expected rows with coordinates, got none")
     count = int(is_placed.sum())
-    world = _to_world(
-        table, axes, np.array([*points[is_placed], *placed.values()]), count, epsg, gateways
-    )
+    if not count:
+        raise ValueError(f"{table.file}: expected rows with coordinates, got none")
+    everything = np.array([*points[is_placed], *placed.values()])
+    world = _to_world(table, axes, everything, count, epsg, gateways)
     stands = dict(zip(placed, world.points[count:].tolist(), strict=True))
 
     levels = table.numbers[is_placed][:, columns.gateways]  # (rows, gateways)
@@ -115,10 +111,7 @@ def read(
     names = [table.names[columns.gateways[k]] for k in present]
     unit = ""
     if placed and not world.remark:
-        known = [k for k, name in enumerate(names) if name in stands]
-        means = np.where(survey.counts > 0, survey.means, np.nan)[:, present[known]]
-        positions = np.array([stands[names[k]] for k in known])
-        unit = _unit_of_gateways(survey.places, means, positions)
+        unit = _unit_of_gateways(survey, dict(zip(names, present, strict=True)), stands)
 
     silent = [table.names[k] for k in columns.gateways if table.names[k] not in names]
     remarks = [
@@ -129,9 +122,7 @@ def read(
         remarks += _remarks_on_gateways(Path(gateways).name, names, stands, unit, unused)
     if count < len(points):
         remarks.append(f"{len(points) - count} rows without coordinates are left out")
-    remarks += _remarks_on_heights(axes, placed, height, storey)
-    if world.remark:
-        remarks.append(world.remark)
+    remarks += [*_remarks_on_heights(axes, placed, height, storey), world.remark]
     if columns.ignored:
         remarks.append(f"columns ignored: {tables.shortened(columns.ignored)}")
 
@@ -146,7 +137,7 @@ def read(
         frame=world.frame,
         uncertainties=torch.tensor([0.0 if name in stands else math.inf for name in names]),
         noises=survey.noises,
-        remarks="; ".join(remarks) + loud_remark(labels.tolist()),
+        remarks="; ".join(filter(None, remarks)) + loud_remark(labels.tolist()),
     )
 
 
@@ -311,17 +302,24 @@ def _read_gateways(
 
 
 def _unit_of_gateways(
-    places: Float[ndarray, "n 3"], levels: Float[ndarray, "n k"], stands: Float[ndarray, "k 3"]
+    survey: "Survey", columns: Mapping[str, int], stands: Mapping[str, Sequence[float]]
 ) -> str:
     """The unit, cm or mm, in which far gateways explain the levels by distance; or ""."""
+    known = [name for name in columns if name in stands]
+    means = np.where(survey.counts > 0, survey.means, np.nan)
+    levels = means[:, [columns[name] for name in known]]  # (n, k)
+    positions = np.array([stands[name] for name in known])  # (k, 3)
+    places = survey.places
     extent = np.ptp(places[:, :2], axis=0).max()
-    if np.ptp(stands[:, :2], axis=0).max() <= 30 * extent:
+    if np.ptp(positions[:, :2], axis=0).max() <= 30 * extent:
         return ""
     # Correlations of levels with log distances within gateways. A false unit puts gateways so far
     # away that distances hardly differ.
     falls = {"": 0.5}
     for unit in ("cm", "mm"):
-        apart = np.linalg.norm(places[:, None] - UNITS[unit] * stands, axis=2).clip(0.1)  # (n, k)
+        apart = np.linalg.norm(places[:, None] - UNITS[unit] * positions, axis=2).clip(
+            0.1
+        )  # (n, k)
         x = np.where(np.isnan(levels), np.nan, np.log10(apart))
         x = x - np.nanmean(x, 0)
         y = levels - np.nanmean(levels, 0)

@@ -157,16 +157,8 @@ def find_gateways(
 ) -> Columns:
     """The columns of gateways, and the marks of "not heard" in them."""
     reserved = {axes.x, axes.y, axes.z, *(table.column(name) for name in ignore)}
-    coordinate = HEIGHTS.union(*PAIRS[0], *PAIRS[1], *PAIRS[2])
     free = [k for k in range(len(table.names)) if k not in reserved]
-    likely = []
-    for k in free:
-        name = table.names[k]
-        numbers = table.numbers[:, k]
-        distinct = np.unique(numbers[np.isfinite(numbers)])
-        weak = ((distinct >= QUIETEST) & (distinct <= WEAK)).sum() >= max(1, len(distinct) / 2)
-        if name in placed or (weak and plain_name(name)[0] not in coordinate):
-            likely.append(k)
+    likely = [k for k in free if table.names[k] in placed or _is_weak(table, k)]
     marks = marks_of(table.numbers[:, likely]) if not_heard is None else marks_given(not_heard)
     gateways: list[int] = []
     silent: list[str] = []
@@ -211,6 +203,16 @@ def find_gateways(
         name = table.names[k]
         ignored.append(f"{name} (powers in W or mW?)" if name in powers else name)
     return Columns(gateways, marks, [*filter(None, silent)], [*filter(None, ignored)])
+
+
+def _is_weak(table: tables.Table, column: int) -> bool:
+    """True if a column has no coordinate's name, and half of its numbers are low levels."""
+    if plain_name(table.names[column])[0] in HEIGHTS.union(*PAIRS[0], *PAIRS[1], *PAIRS[2]):
+        return False
+    numbers = table.numbers[:, column]
+    distinct = np.unique(numbers[np.isfinite(numbers)])
+    weak = (distinct >= QUIETEST) & (distinct <= WEAK)
+    return bool(weak.sum() >= max(1, len(distinct) / 2))
 
 
 def _refuse_lists(table: tables.Table, columns: Sequence[int]) -> None:
