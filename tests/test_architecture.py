@@ -22,9 +22,9 @@ FILES = {
     for file in (ROOT / "gaigs").rglob("*.py")
 }
 LONGEST_CHAIN = 10
-LIMITS = {"lines of gaigs/": 38_000, "lines of a file": 1_200}
+LIMITS = {"lines of gaigs/": 39_400, "lines of a file": 1_200}
 """Raised only with a reason. The checks of data against geometry (``data/checks``) took 1,700
-lines.
+lines, the searches for planes in plain words (``planes``) 1,200.
 """
 
 
