@@ -107,7 +107,7 @@ def test_the_number_of_gaussians_is_the_checkpoints(folder, content):
 
 
 def test_many_spectra_go_to_a_file_as_the_page_shows(folder, tmp_path, monkeypatch):
-    page = (Path(__file__).parents[1] / "docs/start.md").read_text()
+    page = (Path(__file__).parents[2] / "docs/start.md").read_text()
     (code,) = [
         block
         for block in re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
