@@ -88,7 +88,7 @@ class GaussianProcess(LookUp):
         self.trends = tuple(build_trend(one, scene) for one in given)
         if any(built.is_trained for built in self.trends):
             raise ValueError(
-                f"model.trend cannot be trained, got {name_of(self.trends[0])}; "
+                f"model.trend cannot be trained, got {given[0]['name']}; "
                 "take mean, path_loss or friis"
             )
         self.chosen = 0
