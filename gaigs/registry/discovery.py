@@ -89,9 +89,13 @@ class Holder:
     def registration(self) -> Registration | None:
         """The decorator of the component; None without one, as entry points may be."""
         file = self.file or self._module_file(self.target.partition(":")[0])
-        for one in registrations(file) if file else ():
-            if (one.kind, one.name) == (self.kind, self.name):
-                return one
+        try:
+            components = registrations(file) if file else []
+        except (SyntaxError, ValueError):  # the import names the file
+            components = []
+        for component in components:
+            if (component.kind, component.name) == (self.kind, self.name):
+                return component
         return None
 
     def read_options(self, given: tuple[str, ...]) -> dict[str, Any]:
