@@ -25,6 +25,7 @@ from gaigs.data import load, nerf2_spectrum
 from gaigs.io import deepmimo
 from gaigs.model.gaigs import GaussianSplatting
 from gaigs.registry import registry
+from gaigs.splatting.pooling.paths import PathPooling
 from gaigs.splatting.pooling.softmax_attention import SoftmaxAttention
 from gaigs.testing import (
     check_data,
@@ -34,6 +35,7 @@ from gaigs.testing import (
     check_task,
     example_links,
 )
+from gaigs.testing.pooling import example_paths
 
 DEVICES = [
     "cpu",
@@ -60,11 +62,8 @@ MADE_FOR = {
     | dict.fromkeys(("absolute", "squared", "huber"), ("spectrum", "rssi")),
     # The last two are made from trained models.
     "model": {"path_loss": ["rssi"], "friis": ["csi"], "kriging": [], "ensemble": []},
-    "pooling": dict.fromkeys(("array_response", "path_spectrum", "spectrum"), ("spectrum",))
-    | dict.fromkeys(("path_rssi", "mean_power", "softmax_attention"), ("rssi",))
-    | dict.fromkeys(("path_csi", "element_sum"), ("csi",)),
 }
-"""The tasks of a component that does not take all of them."""
+"""The tasks of a loss or model that refuses others."""
 
 MIRRORED = ["placement=mirrored", "deformation=none", "~projection", "~rasterizer"]
 
@@ -119,6 +118,33 @@ def on_its_tasks(kind):
         (name, task) for name in built_in(kind) for task in MADE_FOR[kind].get(name, SIMULATED)
     ]
     return pytest.mark.parametrize(("name", "task"), pairs)
+
+
+def poolings_with_tasks():
+    """Poolings, each with the tasks whose labels it gives for maps or paths of the right shape."""
+    pairs = []
+    for name in built_in("pooling"):
+        tasks = [task for task in SIMULATED if gives(name, task)]
+        assert tasks, f"pooling {name!r} must give labels of a task"
+        pairs += [(name, task) for task in tasks]
+    return pairs
+
+
+def gives(name, task):
+    """True if a pooling gives labels of a task's shape."""
+    links = example_links(task, CARRIER)
+    try:
+        pooling = registry("pooling").build(configured("pooling", name), scene=links.scene)
+    except ValueError:
+        return False
+    query, grid = links.query[:1], pooling.grid or links.task.directions
+    if isinstance(pooling, PathPooling):
+        received = example_paths(links.receivers[0], query, torch.float32)
+    elif grid is None:
+        return False
+    else:
+        received = torch.ones(1, pooling.channels, *grid.shape)
+    return pooling(received, query).shape[1:] == links.task.shape
 
 
 def unsuitable(kind):
@@ -288,12 +314,20 @@ def test_rasterizer(name, device):
     check_rasterizer(rasterizer, device)
 
 
-@on_its_tasks("pooling")
+@pytest.mark.parametrize(("name", "task"), poolings_with_tasks())
 @on_every_device
 def test_pooling(name, task, device):
-    config, needs_carrier = configured("pooling", name), name in ("array_response", "path_spectrum")
-    links = example_links(task, CARRIER if needs_carrier else None)
+    config, links = configured("pooling", name), example_links(task, CARRIER)
     check_pooling(lambda scene: registry("pooling").build(config, scene=scene), links, device)
+
+
+def test_each_task_has_poolings_of_maps_and_of_paths():
+    expected = {"spectrum": ("array_response", "path_spectrum", "spectrum")}
+    expected["rssi"] = ("path_rssi", "mean_power", "softmax_attention")
+    expected["csi"] = ("path_csi", "element_sum")
+    pairs = poolings_with_tasks()
+    for task, names in expected.items():
+        assert {name for name, of_task in pairs if of_task == task} >= {*names}
 
 
 @on_every_device
@@ -346,7 +380,7 @@ def test_a_task_that_a_component_is_not_made_for_is_refused(kind, name, task):
 @pytest.mark.parametrize("task", SIMULATED)
 def test_a_task_brings_a_pooling_a_loss_and_baselines_that_suit_it(task):
     config, scene = composed(f"data={SIMULATED[task]}"), example_links(task).scene
-    assert MADE_FOR["pooling"][config["pooling"]["name"]] == (task,)
+    assert gives(config["pooling"]["name"], task)
     registry("loss").build(config["loss"], task=scene.task)
     assert {"mean", "knn"} <= {model["name"] for model in config["baselines"]}
     for model in config["baselines"]:

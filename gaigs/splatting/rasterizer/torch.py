@@ -187,19 +187,20 @@ def _nearest(a: Tensor, b: Tensor, period: _Period | None) -> Tensor:
     return (offset - turns * period.rounded) + (rest - turns * period.rest)
 
 
-class _FilledSplats(NamedTuple):
-    """Splats front to back, and behind them one that does nothing and fills the tiles' lists up."""
+class _SplatParts(NamedTuple):
+    """Tensors of n splats front to back, or their gradients."""
 
-    means: Tensor  # (n + 1, 2)
-    factors: Tensor  # (1 or b, n + 1, 3)
-    signal: Tensor  # (b, n + 1, c)
-    opacities: Tensor  # (b, n + 1)
-    logs: Tensor | None  # (b, n + 1), logarithms of the attenuations
+    means: Tensor  # (n, 2)
+    factors: Tensor  # (1 or b, n, 3)
+    signal: Tensor  # (b, n, c)
+    opacities: Tensor  # (b, n)
+    logs: Tensor | None  # (b, n), logarithms of the attenuations
 
     @classmethod
     def filled(
         cls, means: Tensor, factors: Tensor, signal: Tensor, opacities: Tensor, logs: Tensor | None
-    ) -> "_FilledSplats":
+    ) -> "_SplatParts":
+        """Adds behind them a splat that does nothing, which fills the tiles' lists up."""
         pad = torch.nn.functional.pad
         row = (0, 0, 0, 1)
         return cls(
@@ -232,7 +233,7 @@ class _Weights(NamedTuple):
     left: Tensor
 
 
-def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _FilledSplats) -> _Weights:
+def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _SplatParts) -> _Weights:
     """Footprints, opacities and transmittances of a chunk.
 
     Args:
@@ -283,7 +284,7 @@ class _Composite(torch.autograd.Function):
         count, pixels = tiles.down * tiles.across, tiles.edge**2
         image = signal.new_zeros(b, c, count, pixels)
         left = signal.new_ones(b, count, pixels)
-        inputs = _FilledSplats.filled(means, factors, signal, opacities, logs)
+        inputs = _SplatParts.filled(means, factors, signal, opacities, logs)
         for chosen, k in tiles.chunks:
             w = _weigh(tiles, chosen, k, inputs)
             # eq. (14): the sum of signal_i A_i T_i over the splats.
@@ -296,7 +297,7 @@ class _Composite(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx, image_gradient, left_gradient):
         tiles = ctx.tiles
-        inputs = _FilledSplats.filled(*ctx.saved_tensors)
+        inputs = _SplatParts.filled(*ctx.saved_tensors)
         gradients = [None if tensor is None else torch.zeros_like(tensor) for tensor in inputs]
         image_gradient = tiles.split(image_gradient)  # (b, c, t, y x)
         left_gradient = tiles.split(left_gradient)  # (b, t, y x)
@@ -318,9 +319,9 @@ class _Composite(torch.autograd.Function):
 
 
 def _differentiate(
-    w: _Weights, k: Tensor, inputs: _FilledSplats, towards: Tensor, left_gradient: Tensor, edge: int
-) -> tuple[Tensor | None, ...]:
-    """Gradients of a chunk's splats, in the order of ``_FilledSplats``.
+    w: _Weights, k: Tensor, inputs: _SplatParts, towards: Tensor, left_gradient: Tensor, edge: int
+) -> _SplatParts:
+    """Gradients of a chunk's splats (t, k).
 
     Args:
         w: The chunk composited; used up.
@@ -349,7 +350,8 @@ def _differentiate(
     factors = inputs.factors[:, k]
     d_exponent = d_exponent.unflatten(-1, (edge, edge))  # (b, t, k, y, x)
     d_means, d_factors = _moments(d_exponent, w.s, w.y, factors)
-    return d_means.sum(0), d_factors.sum_to_size(factors.shape), d_signal, d_opacity, d_logs
+    d_factors = d_factors.sum_to_size(factors.shape)
+    return _SplatParts(d_means.sum(0), d_factors, d_signal, d_opacity, d_logs)
 
 
 def _moments(d_exponent: Tensor, s: Tensor, y: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
