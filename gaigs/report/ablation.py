@@ -41,8 +41,12 @@ def ablation(runs: Sequence[Run]) -> tuple[list[dict], dict]:
 
 def _common(keys: Sequence[str], sources: Sequence[Mapping]) -> dict[str, object]:
     """The values that all sources share, by key."""
-    values = {key: {source.get(key, "") for source in sources} for key in keys}
-    return {key: next(iter(found)) for key, found in values.items() if len(found) == 1}
+    common = {}
+    for key in keys:
+        values = {source.get(key, "") for source in sources}
+        if len(values) == 1:
+            common[key] = values.pop()
+    return common
 
 
 def _row(run: Run, varied: Sequence[str], facts: Sequence[str]) -> dict:

@@ -323,10 +323,9 @@ def _scale(
     high = quantiles.max()
     # A flat map has no range: the scale's width then suits its size, or is 1.
     span = float(high - low) or float(abs(high)) or 1.0
-    if error_unit == "dB" and span > 10:
-        rounded, step = 5, 10
-    else:
-        rounded, step = round_step(span, 20), round_step(span, 8)
+    is_wide = error_unit == "dB" and span > 10
+    rounded = 5 if is_wide else round_step(span, 20)
+    step = 10 if is_wide else round_step(span, 8)
     lower = rounded * np.floor(low / rounded)
     return _Scale(lower, rounded * (np.floor(high / rounded) + 1), step)
 

@@ -2,6 +2,7 @@
 
 import math
 import zipfile
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -127,8 +128,11 @@ def _cells(
             values = system.values.get(key, ())
             row[title] = Spread.of(values) if len(values) > 1 else next(iter(values), None)
         rows.append(row)
-    known = [title for title in rows[0] if any(row[title] is not None for row in rows)]
-    return [{title: row[title] for title in known} for row in rows]
+    for title in [*rows[0]]:
+        if all(row[title] is None for row in rows):
+            for row in rows:
+                del row[title]
+    return rows
 
 
 def _lines(
@@ -194,7 +198,9 @@ def write_systems(
     for name, figure in _figures(done, task, metrics).items():
         save(figure, folder / f"systems_{name}.png")
     brief = _brief(scores[0], costs[0], metrics)
-    shown = [{title: row[title] for title in brief} for row in rows]
+    shown = []
+    for row in rows:
+        shown.append({title: row[title] for title in brief})
     cells = _lines([escape(name) for name in names], shown, metrics)
     caption = "".join(f"{failure}\n" for failure in failed) + "all columns in systems.md"
     styles = [None if system.runs else "dim" for system in systems]
@@ -245,8 +251,10 @@ def _figures(
 
 def _first_seeds(systems: Sequence[System]) -> dict[str, Run]:
     """The run of each system with the first common seed, or else its first run, by name."""
-    seeds = [{run.metrics["seed"] for run in system.runs} for system in systems]
-    seed = min(set.intersection(*seeds), default=None)
+    counts: Counter[int] = Counter()
+    for system in systems:
+        counts.update({run.metrics["seed"] for run in system.runs})
+    seed = min((seed for seed in counts if counts[seed] == len(systems)), default=None)
     runs = {}
     for system in systems:
         same = (run for run in system.runs if run.metrics["seed"] == seed)

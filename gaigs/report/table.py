@@ -65,7 +65,9 @@ def write_csv(file: Path, rows: Sequence[Mapping], endings: Sequence[str] = ()) 
     Columns of a ``Spread`` follow its mean: deviation and least value, or the first alone. Their
     names have the ``endings``.
     """
-    spread = {key for row in rows for key, value in row.items() if isinstance(value, Spread)}
+    spread = set()
+    for row in rows:
+        spread |= {column for column, value in row.items() if isinstance(value, Spread)}
     columns = []
     for column in columns_of(rows):
         columns.append(column)

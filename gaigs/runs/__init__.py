@@ -109,7 +109,8 @@ def load(path: str | Path, trust: bool = False) -> Model:
     if not os.path.isdir(path):
         loaded: Any = checkpoint.load(path, trust, {})
         return loaded
-    folder, config = Path(path), configuration_of(path)
+    folder = Path(path)
+    config = configuration_of(path)
     if not (folder / "best.ckpt").is_file():
         raise FileNotFoundError(
             f"{folder} has no best.ckpt: the run is not finished, or one of a look-up by "
