@@ -452,7 +452,7 @@ FAULTS = {
 """
 
 
-def shared_files(seconds: float, top: Path) -> int:
+def shared_files(seconds: float, top: Path) -> int:  # noqa: C901, two processes in one story
     """Two processes export, save and load the same files of two models; the number of those that
     were mixed or failed.
 

@@ -80,7 +80,10 @@ def test_the_names_are_those_of_the_package():
 
 def test_the_package_is_quick_to_import():
     """The command line's help and errors wait for this import."""
-    code = "import sys, gaigs, gaigs.__main__; print(*{'torch', 'lightning', 'scipy', 'matplotlib'} & {*sys.modules})"
+    code = (
+        "import sys, gaigs, gaigs.__main__; print(*{'torch', 'lightning', 'scipy', 'matplotlib'} & "
+        "{*sys.modules})"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == []
 
@@ -175,7 +178,8 @@ def test_threads_hold_while_it_trains_and_no_longer(spectra, tmp_path, monkeypat
         ),
         (
             {"width": 3},
-            "width is an option of several parts; say which: deformation.width, tokenizer.euclidean.width",
+            "width is an option of several parts; say which: deformation.width, "
+            "tokenizer.euclidean.width",
         ),
         ({"tokenizer": "gaa"}, r"there is no tokenizer 'gaa' \(did you mean 'ga'\?\)"),
         (

@@ -66,7 +66,10 @@ def drawn():
     """
     (diagram,) = re.findall(r"^```mermaid\n(.*?)^```$", PAGE, re.M | re.S)
     labels = dict(re.findall(r'^ +(\w+)\["(\w+)"\]$', diagram, re.M))
-    label = lambda word: labels.get(word, word)
+
+    def label(word):
+        return labels.get(word, word)
+
     layers = {}
     for height, parts in re.findall(
         r'^  subgraph L(\d+)\[" "\]\n(.*?)^  end$', diagram, re.M | re.S

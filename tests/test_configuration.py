@@ -148,9 +148,12 @@ def test_models_that_are_not_installed_are_left_out_with_a_warning(caplog):
 
 def test_two_jobs_run_at_a_time_if_joblib_is_installed(configure, monkeypatch):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="needs gaigs[parallel]")
-    settings = lambda *more: (
-        configure.__wrapped__("+experiment=systems_rssi", *more, with_hydra=True).hydra.launcher
-    )
+
+    def settings(*more):
+        return configure.__wrapped__(
+            "+experiment=systems_rssi", *more, with_hydra=True
+        ).hydra.launcher
+
     assert settings()["n_jobs"] == 2
     assert settings()["_target_"].endswith("JoblibLauncher")
 

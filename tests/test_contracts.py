@@ -83,7 +83,10 @@ def built_in(kind):
     ]
 
 
-every = lambda kind: pytest.mark.parametrize("name", built_in(kind))
+def every(kind):
+    return pytest.mark.parametrize("name", built_in(kind))
+
+
 on_every_device = pytest.mark.parametrize("device", DEVICES)
 
 
@@ -248,7 +251,10 @@ def test_data(name, tmp_path, request):
 def test_split(name, task):
     """The links of the RSSI share rows; the spectra's do not."""
     links, config = example_links(task), configured("split", name, "split.validation=0.25")
-    build = lambda seed: registry("split").build(config | {"seed": seed}, links=links)
+
+    def build(seed):
+        return registry("split").build(config | {"seed": seed}, links=links)
+
     check_split(build, links, parts_rows=name == "official")
 
 
@@ -332,7 +338,9 @@ def test_each_task_has_poolings_of_maps_and_of_paths():
 
 @on_every_device
 def test_learnt_pooling(device):
-    build = lambda scene: SoftmaxAttention([4, 8], temperature=0.5, prior=0.1, learn=True)
+    def build(scene):
+        return SoftmaxAttention([4, 8], temperature=0.5, prior=0.1, learn=True)
+
     check_pooling(build, example_links("rssi"), device)
 
 

@@ -89,7 +89,8 @@ def test_a_run_prints_what_it_does_and_nothing_else(uninterrupted):
         r"data: training transmitters within \d\.\d\d x \d\.\d\d x \d\.\d\d m$", lines[1]
     )
     assert lines[2].startswith(
-        "model: gaigs, placement free, tokenizer euclidean, deformation two_branch, projection mercator"
+        "model: gaigs, placement free, tokenizer euclidean, deformation two_branch, projection "
+        "mercator"
     )
     assert re.match(
         r"training .* 40/40 [\d.]+ steps/s 0:00:00 loss \d\.\d{3} ssim \d\.\d{3}$", lines[3]
@@ -227,7 +228,8 @@ def test_a_wrong_word_gives_one_message(overrides, message, run):
         ),
         (
             ("--batch-size=8",),
-            "there is no flag --batch-size; options have no dashes, such as training.batch_size=...",
+            "there is no flag --batch-size; options have no dashes, such as "
+            "training.batch_size=...",
         ),
         (
             ("seed=1", "--model", "knn"),
@@ -384,7 +386,10 @@ def test_an_unknown_error_has_a_traceback(run, monkeypatch):
     assert "Traceback" in err
 
 
-TORCH = "[enforce fail at alloc_cpu.cpp:124] DefaultCPUAllocator: can't allocate memory: you tried to allocate 8 bytes."
+TORCH = (
+    "[enforce fail at alloc_cpu.cpp:124] DefaultCPUAllocator: can't allocate memory: you tried to "
+    "allocate 8 bytes."
+)
 
 
 @pytest.mark.parametrize(

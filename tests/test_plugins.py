@@ -73,7 +73,10 @@ def composed(*overrides):
         return OmegaConf.to_container(compose("config", list(overrides)))
 """
 
-YAGI = "class Yagi:\n    def __init__(self, scene, elements: int):\n        self.gain = scene * elements\n"
+YAGI = (
+    "class Yagi:\n    def __init__(self, scene, elements: int):\n        self.gain = scene * "
+    "elements\n"
+)
 ENTRY = "[gaigs.pooling]\nyagi = yagi_antenna.pooling:Yagi\n"
 
 

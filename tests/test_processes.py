@@ -115,7 +115,10 @@ def test_sigterm_stops_all_jobs_of_a_launcher(tmp_path):
         f"hydra.sweep.dir={tmp_path / 's'}",
     )
     process = start(tmp_path / "s", *jobs, "save_every=0.2", "trainer.max_steps=100000")
-    saved = lambda: sorted((tmp_path / "s").glob("*/last.ckpt"))
+
+    def saved():
+        return sorted((tmp_path / "s").glob("*/last.ckpt"))
+
     wait_for(process, lambda: len(saved()) == 2)
     process.send_signal(signal.SIGTERM)
     process.communicate(timeout=120)
@@ -193,9 +196,10 @@ def test_nohup_is_heeded():
     environment = os.environ | {"PYTHONPATH": str(Path(gaigs.__path__[0]).parent)}
     for words, expected in ((["nohup"], "False"), ([], "True")):
         command = [*words, sys.executable, "-c", code]
-        usual = lambda: signal.signal(
-            signal.SIGHUP, signal.SIG_DFL
-        )  # the tests may run by nohup themselves
+
+        def usual():
+            return signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
         done = subprocess.run(
             command, env=environment, capture_output=True, text=True, preexec_fn=usual
         )
@@ -259,7 +263,8 @@ def test_jobs_of_a_launcher_share_the_processors(monkeypatch):
 def test_a_fault_of_a_plug_in_has_its_file_and_line(tmp_path):
     file = tmp_path / "plug_in.py"
     file.write_text(
-        "def fault():\n    return len(3)\n\n\ndef refusal():\n    raise ValueError('width is too small')\n"
+        "def fault():\n    return len(3)\n\n\ndef refusal():\n    raise ValueError('width is too "
+        "small')\n"
     )
     functions: dict = {}
     exec(compile(file.read_text(), str(file), "exec"), functions)

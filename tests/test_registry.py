@@ -75,7 +75,10 @@ def plugins(tmp_path, monkeypatch):
 
 
 def component(kind, name, body="value = 1"):
-    return f"from gaigs.registry import register\n\n\n@register({kind!r}, {name!r})\nclass Component:\n    {body}\n"
+    return (
+        f"from gaigs.registry import register\n\n\n@register({kind!r}, {name!r})\nclass "
+        f"Component:\n    {body}\n"
+    )
 
 
 def test_registry_of_an_unknown_kind_suggests_the_nearest():
@@ -102,7 +105,10 @@ def test_a_taken_name_tells_who_holds_it_and_who_asks(models):
 def test_a_built_in_name_is_taken_before_its_file_is_imported():
     with pytest.raises(
         ValueError,
-        match=r"'mercator' is held by gaigs.splatting.projection.mercator\.py, and \w+.Waveguide asks",
+        match=(
+            r"'mercator' is held by gaigs.splatting.projection.mercator\.py, and \w+.Waveguide "
+            r"asks"
+        ),
     ):
         Registry("projection").register("mercator")(Waveguide)
 

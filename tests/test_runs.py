@@ -350,7 +350,10 @@ def test_another_configuration_in_the_same_folder_is_refused(left, finished, tmp
     before = digest(folder)
     other = config | {"seed": 1, "gaussians": config["gaussians"] | {"count": 31}}
     other["model"] = config["model"] | {"gaussians": other["gaussians"]}
-    message = r"a run of another configuration: gaussians\.count was 30, is 31; seed was 0, is 1\nchoose another"
+    message = (
+        r"a run of another configuration: gaussians\.count was 30, is 31; seed was 0, is 1\nchoose "
+        r"another"
+    )
     with pytest.raises(ValueError, match=message):
         runs.run(other, folder)
     assert digest(folder) == before
@@ -736,7 +739,8 @@ def test_a_reader_of_a_run_is_imported_if_it_is_the_recorded_one_or_trusted(tmp_
     source = tmp_path / "plugins/own_data.py"
     source.write_text(
         "import gaigs\nfrom gaigs.data.synthetic import furnished_room\n\n"
-        "@gaigs.register('data', 'own_data')\ndef own_data():\n    return furnished_room(transmitters=30, order=0)\n"
+        "@gaigs.register('data', 'own_data')\ndef own_data():\n    return "
+        "furnished_room(transmitters=30, order=0)\n"
     )
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", sys.path[:])
@@ -819,7 +823,10 @@ def test_a_changed_component_of_a_notebook_is_no_finished_run(body, monkeypatch)
     monkeypatch.setitem(registry("split")._registered, "cell", None)
     digests = []
     for number, value in enumerate((2, 3, 2)):
-        cell = f"# {number}\n@gaigs.register('split', 'cell')\n{body.format(value)}\nother = {number}\n"
+        cell = (
+            f"# {number}\n@gaigs.register('split', 'cell')\n{body.format(value)}\nother = "
+            f"{number}\n"
+        )
         monkeypatch.setitem(
             linecache.cache, f"cell {number}", (len(cell), None, cell.splitlines(True), "")
         )

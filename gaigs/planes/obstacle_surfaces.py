@@ -50,10 +50,9 @@ class SurfaceOptions:
 class Sheet(NamedTuple):
     """A closed surface of even density of matter, as a thin material that absorbs.
 
-    It is far thinner than the wavelength. ``conductance`` is the sheet's over the admittance of free
-    space.
-    With c the cosine of the angle of incidence, the field falls to 1 / (1 + conductance / (2 c))
-    for TE and to 1 / (1 + c conductance / 2) for TM. Its phase does not turn.
+    It is far thinner than the wavelength. ``conductance`` is the sheet's over the admittance of
+    free space. With c the cosine of the angle of incidence, the field falls to 1 / (1 + conductance
+    / (2 c)) for TE and to 1 / (1 + c conductance / 2) for TM. Its phase does not turn.
 
     Source: the limit of ITU-R P.2040-3, equation 43b, for a thin slab.
     """

@@ -27,6 +27,7 @@ def not_installed(kind: str, name: str) -> str | None:
             package = f"gaigs-{folder.replace('_', '-')}"
             return (
                 f"{kind} {name!r} is in the package {package}, which is not installed\n"
-                f"pip install {package}, or in a copy of the repository pip install ./plugins/{folder}"
+                f"pip install {package}, or in a copy of the repository pip install "
+                f"./plugins/{folder}"
             )
     return None

@@ -1,8 +1,7 @@
-"""Splits of links into training, validation and test; only official parts may separate links of one
-row.
+"""Splits of links into training, validation and test.
 
-Fractions count places, not readings: all links of one place, receiver and carrier together count as
-one.
+Only official parts may separate links of one row. Fractions count places, not readings: all links
+of one place, receiver and carrier count as one.
 """
 
 from typing import NamedTuple
@@ -22,11 +21,11 @@ def rows_of(links: Links) -> Int[Tensor, " n"]:
 def places_of(links: Links) -> Int[Tensor, " n"]:
     """First row at each link's place: a place that is measured in several rows is one group."""
     rows = rows_of(links)
-    found = rows.new_full((len(rows),), int(rows.max()))
+    last = rows.new_full((len(rows),), int(rows.max()))
     # Links of one row stay together, even at several places.
     for numbers in (links.query.place_keys, rows):
         _, which = numbers.unique(return_inverse=True)
-        first = found.scatter_reduce(0, which, rows, "amin")
+        first = last.scatter_reduce(0, which, rows, "amin")
         rows = first[which]
     return rows
 
@@ -59,23 +58,23 @@ def part(
     """
     check("test", test, 0 <= test < 1, "in [0, 1)")
     check_validation(validation)
-    generator, votes = generator_of(seed), links.query.votes
+    generator = generator_of(seed)
+    votes = links.query.votes
     training, testing, _ = hold_out(
         "test", torch.arange(len(links)), groups, votes, test, generator, rows=rows
     )
     if train is not None:
         order = drawn(groups, training, generator, rows)
-        check(
-            "train",
-            train,
-            1 <= train <= len(order),
-            f"in 1..{len(order)}, the places that do not test",
-        )
+        bounds = f"in 1..{len(order)}, the places that do not test"
+        check("train", train, 1 <= train <= len(order), bounds)
         training = training[torch.isin(groups[training], order[:train])]
     training, validating, share = hold_out(
         "validation", training, groups, votes, validation, generator, rows=rows
     )
-    words = [name, f"test {test:g}", *([f"validation {share:g}"] if share else []), f"seed {seed}"]
+    words = [name, f"test {test:g}"]
+    if share:
+        words.append(f"validation {share:g}")
+    words.append(f"seed {seed}")
     return Split(", ".join(words), training, validating, testing, groups)
 
 
@@ -128,20 +127,25 @@ def hold_out(
     if len(order) < 2:
         without = ", or set split.validation=0" if name == "validation" else ""
         raise ValueError(
-            f"split.{name}={usual:g} holds out whole places, runs or cubes, so there must be two of them or more, got "
-            f"{len(order)} with {len(links)} links; choose smaller runs or cubes, add measurements{without}"
+            f"split.{name}={usual:g} holds out whole places, runs or cubes, so there must be two "
+            f"of them or more, got {len(order)} with {len(links)} links; choose smaller runs or "
+            f"cubes, add measurements{without}"
         )
     _, numbers = torch.cat((order, groups[links])).unique(return_inverse=True)
     sizes = votes.new_zeros(len(order)).index_add(0, numbers[len(order) :], votes[links])
     # Single precision: sums of thirds are whole numbers but for rounding.
     filled = sizes[numbers[: len(order)]].cumsum(0).float()
-    total, filled = filled[-1].item(), filled[:-1]
+    total = filled[-1].item()
+    filled = filled[:-1]  # one group at least is kept
     surplus = filled - usual * total
-    count = max(1, int((surplus <= 0).sum())) if at_most else int(surplus.abs().argmin()) + 1
+    count = int(surplus.abs().argmin()) + 1
+    if at_most:
+        count = max(1, int((surplus <= 0).sum()))
     if fraction is None and filled[count - 1] < 9:
         enough = int((filled < 9).sum())
         if enough < len(filled) and filled[enough] <= 0.3 * total:
-            count, usual = enough + 1, round(filled[enough].item() / total, 2)
+            count = enough + 1
+            usual = round(filled[enough].item() / total, 2)
     held = torch.isin(groups[links], order[:count])
     return Parted(links[~held], links[held], usual)
 

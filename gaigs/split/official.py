@@ -28,7 +28,8 @@ def official(
     check_validation(validation)
     generator = generator_of(seed)
     train, test = (part.sort().values for part in links.official())
-    rows, usual = rows_of(links), 0.1 if validation is None else validation
+    rows = rows_of(links)
+    usual = 0.1 if validation is None else validation
     length = min(length, max(1, int(usual * len(rows[train].unique()) / 4)))
     has_runs = length > 1
     groups = runs_of(links, length) if has_runs else places_of(links)
@@ -38,8 +39,6 @@ def official(
     )
     words = ["official"]
     if share:
-        words += [
-            f"validation {share:g}{f' in runs of {length}' if has_runs else ''}",
-            f"seed {seed}",
-        ]
+        runs = f" in runs of {length}" if has_runs else ""
+        words += [f"validation {share:g}{runs}", f"seed {seed}"]
     return Split(", ".join(words), train, validating, test, groups)

@@ -4,7 +4,9 @@ import torch
 from gaigs.algebra import PROJECTIVE, SPACETIME
 from gaigs.algebra.embedding import embed_event, embed_plane, embed_point, extract_point
 
-close = lambda a, b: torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+
+def close(a, b):
+    return torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
 
 
 @pytest.fixture

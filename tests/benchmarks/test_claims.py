@@ -96,9 +96,11 @@ def test_the_table(sweep):
         == "| claim | compared | score | published gain | with | without | ours | seeds | says |"
     )
     assert lines[2:] == [
-        "| both tokenizers beat geometric algebra alone | paper, ga | median SSIM | none | 0.910 | 0.610 | "
+        "| both tokenizers beat geometric algebra alone | paper, ga | median SSIM | none | 0.910 | "
+        "0.610 | "
         "+0.300 (+0.275, +0.325) | 3 | confirmed |",
-        "| 16 anchors beat 4 | paper, anchors_4 | median SSIM | none | 0.905 | 0.900 | +0.005 (-0.071, +0.081) | 2 | "
+        "| 16 anchors beat 4 | paper, anchors_4 | median SSIM | none | 0.905 | 0.900 | +0.005 "
+        "(-0.071, +0.081) | 2 | "
         "not seen |",
     ]
     assert "95%" in notes[0]

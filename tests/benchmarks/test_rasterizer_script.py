@@ -57,7 +57,10 @@ def test_wrong_maps_and_gradients_are_seen(name):
 
     assert truth.errors(drawn, "cpu", torch.float64)["error"] < 1e-12
     assert truth.errors(wrong, "cpu", torch.float64)["error"] == pytest.approx(0.1, rel=0.2)
-    halved = lambda signal: signal.detach() + 0.5 * (signal - signal.detach())
+
+    def halved(signal):
+        return signal.detach() + 0.5 * (signal - signal.detach())
+
     found = truth.errors(
         lambda splats, signal, *rest: drawn(splats, halved(signal), *rest), "cpu", torch.float64
     )

@@ -220,8 +220,8 @@ def test_times_to_levels_and_the_best_rows(options, monkeypatch):
     monkeypatch.setattr(Accuracy, "levels", {"ssim": [0.6, 0.95], "mae_db": [3]})
     text = Accuracy(options).tables(rows)
     assert (
-        "| validation | inference [ms] | rendering [ms] | training [s] | s to 0.6 | s to `knn` 0.700 | s to 0.95 |"
-        in text
+        "| validation | inference [ms] | rendering [ms] | training [s] | s to 0.6 | s to `knn` "
+        "0.700 | s to 0.95 |" in text
     )
     lines = [line for line in text.splitlines() if line.startswith("| ")]
     assert lines[2:5] == [
@@ -259,12 +259,12 @@ def test_budgets_show_scatter_and_the_smallest_value(options):
         in text
     )
     assert (
-        "| part | key | mean SSIM of the validation links by value | smallest within 0.005 | default now |"
-        in text
+        "| part | key | mean SSIM of the validation links by value | smallest within 0.005 | "
+        "default now |" in text
     )
     assert (
-        "| Gaussians | `gaussians.count` | 75: 0.890, 300: 0.900, 600: 0.903 | **300** | 300 | 3, 3 | 20, 20 |"
-        in text
+        "| Gaussians | `gaussians.count` | 75: 0.890, 300: 0.900, 600: 0.903 | **300** | 300 | 3, "
+        "3 | 20, 20 |" in text
     )
 
 
@@ -291,7 +291,7 @@ def test_values_of_axes_are_trained_and_axes_without_a_key_left_out(tmp_path, fa
     assert len(trained) == 3
     text = (tmp_path / "budgets.md").read_text()
     assert (
-        "| Gaussians | `gaussians.count` | 5: 0.0500, 10: 0.100, 20: 0.200 | **20**, the largest tried | 10 |"
-        in text
+        "| Gaussians | `gaussians.count` | 5: 0.0500, 10: 0.100, 20: 0.200 | **20**, the largest "
+        "tried | 10 |" in text
     )
     assert "pooling.grid" not in text

@@ -202,7 +202,10 @@ def test_scores_are_those_of_the_normal_distribution():
     assert found["width_90"].tolist() == [12, 12]
     for i in range(2):
         normal = stats.norm(value[i].item(), std[i].item())
-        steps = lambda x, i=i, normal=normal: (normal.cdf(x) - (x >= labels[i].item())) ** 2
+
+        def steps(x, i=i, normal=normal):
+            return (normal.cdf(x) - (x >= labels[i].item())) ** 2
+
         expected, _ = quad(steps, -30, 30, points=[labels[i].item(), value[i].item()], limit=200)
         assert found["crps"][i].item() == pytest.approx(expected, rel=1e-5)
         assert found["nll"][i].item() == pytest.approx(-normal.logpdf(labels[i].item()), rel=1e-6)
@@ -515,7 +518,10 @@ def test_kriging_does_not_know_a_single_group_of_validation_links():
 def test_elements_that_an_array_lacks_have_no_intervals_and_count_in_none(tmp_path):
     frequencies, rng = np.linspace(2.4e9, 2.48e9, 5), np.random.default_rng(0)
     places = rng.uniform([0.5, 0.5, 0.5], [6, 4, 2], (150, 3))
-    pose = lambda x: Pose(torch.tensor([x, 2.0, 1.5]), torch.eye(3))
+
+    def pose(x):
+        return Pose(torch.tensor([x, 2.0, 1.5]), torch.eye(3))
+
     receivers = [
         Receiver("four", pose(6.4), Array.planar(2, 2, 0.06)),
         Receiver("one", pose(0.2), Array.single()),

@@ -38,9 +38,10 @@ def check_deformation(
             for n, b in ((7, 3), (1, 1)):
                 if b < sets:
                     continue
-                random = lambda *shape, to=dtype: torch.randn(*shape, generator=generator).to(
-                    device, to
-                )
+
+                def random(*shape, to=dtype):
+                    return torch.randn(*shape, generator=generator).to(device, to)
+
                 gaussians = random(n, widths[1]) if sets == 1 else random(b, n, widths[1])
                 tokens = Tokens(random(b, widths[0]), gaussians, random(b, widths[2]))
                 places = checks.random_places(scene, sets * n, generator).to(device, dtype)

@@ -58,7 +58,10 @@ def _check_batch(loss: Loss, batch: Batch, dtype: torch.dtype) -> None:
             total > least,
             f"the loss must be least at the labels, got {least:g} there and {total:g} {case}",
         )
-        single = lambda i: replace(batch, query=batch.query[i : i + 1], labels=labels[i : i + 1])
+
+        def single(i):
+            return replace(batch, query=batch.query[i : i + 1], labels=labels[i : i + 1])
+
         each = torch.stack([loss(values[i : i + 1], single(i))[0] for i in range(len(batch))])
         require_close(
             each.mean(), total, PRECISION[dtype], "the loss must be the mean over its links"

@@ -21,7 +21,10 @@ def check_projection(projection: Projection, device: torch.device | str = "cpu")
 
     The contract is that of ``gaigs.splatting.projection.Projection``.
     """
-    degrees = lambda *range_: torch.arange(*range_, dtype=torch.float64, device=device).deg2rad()
+
+    def degrees(*range_):
+        return torch.arange(*range_, dtype=torch.float64, device=device).deg2rad()
+
     azimuths, elevations = torch.cartesian_prod(
         degrees(-175, 180, 25), degrees(-55, 60, 10)
     ).unbind(1)

@@ -139,9 +139,9 @@ def _scenes() -> Iterator[tuple[str, tuple]]:
         spread=(0.05, 0.6),
         opacity=(0, 0.99),
     ):
-        random = lambda low, high, *shape: (
-            low + (high - low) * torch.rand(*shape, generator=generator)
-        )
+        def random(low, high, *shape):
+            return low + (high - low) * torch.rand(*shape, generator=generator)
+
         low, high = (
             torch.stack([getattr(axis, end)() for axis in (plane.u, plane.v)])
             for end in ("min", "max")
@@ -226,7 +226,10 @@ def render_with_gradients(
 def cast_scene(arguments: tuple, device: torch.device | str, dtype: torch.dtype) -> tuple:
     """Arguments of a rasterizer on another device and in another precision."""
     splats, signal, opacities, attenuations, plane = arguments
-    to = lambda tensor: None if tensor is None else tensor.to(device, dtype)
+
+    def to(tensor):
+        return None if tensor is None else tensor.to(device, dtype)
+
     splats = Splats(
         to(splats.means2d), to(splats.factors), to(splats.depths), splats.visible.to(device)
     )

@@ -35,10 +35,13 @@ def check_split(build: Callable[[int], Split], links: Links, parts_rows: bool = 
                 sum(map(len, parts)) == len(set().union(*parts)),
                 "links of one row must be in one part",
             )
-    content = lambda split: (
-        split.name,
-        tuple(tuple(part.tolist()) for part in split.parts().values()),
-    )
+
+    def content(split):
+        return (
+            split.name,
+            tuple(tuple(part.tolist()) for part in split.parts().values()),
+        )
+
     drawn = [content(split) for split in splits]
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(12345)

@@ -100,9 +100,10 @@ def test_a_faulty_deformation_is_found(change, message):
         {"attenuation_layers": 1, "signal_layers": 1},
     )
     kind = broken(TwoBranch, change)
-    build = lambda tokenizer_widths, channels, scene: kind(
-        tokenizer_widths, channels, width=8, heads=heads, **sizes
-    )
+
+    def build(tokenizer_widths, channels, scene):
+        return kind(tokenizer_widths, channels, width=8, heads=heads, **sizes)
+
     with pytest.raises(AssertionError, match=message):
         check_deformation(build, SCENE)
 

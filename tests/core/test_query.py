@@ -102,7 +102,8 @@ def test_impossible_frequencies_are_refused(frequency, message, known):
     [
         (
             {"frequency": 1e9},
-            "the training links have no known carrier, so no other can be predicted; leave frequency",
+            "the training links have no known carrier, so no other can be predicted; leave "
+            "frequency",
         ),
         (
             {"frequency": 60e9, "known": ONE},
@@ -226,7 +227,10 @@ both = pytest.mark.parametrize("with_receivers", [False, True])
 def make(n=60, dtype=torch.float32, frequencies=True, seed=0):
     """Links between few places, receivers and carriers, so that many are equal."""
     generator = torch.Generator().manual_seed(seed)
-    draw = lambda count: torch.randint(count, (n,), generator=generator)
+
+    def draw(count):
+        return torch.randint(count, (n,), generator=generator)
+
     places = torch.tensor([[0.1, 2, 3], [0.1, 2, -3], [-1, 7, 1], [0.1, -2, 3]], dtype=dtype)
     carriers = torch.tensor([2.4e9, 5.2e9, 5.200001e9], dtype=dtype)
     return Query(places[draw(4)], draw(3), carriers[draw(3)] if frequencies else None)

@@ -112,7 +112,8 @@ def test_height_and_receivers_may_be_chosen():
         drawn = radio_map(Slope(scene()), pitch=0.5, height=2, receivers=receivers)
         assert (drawn.height, drawn.receivers) == (2.0, ("window",))
     assert repr(drawn) == (
-        "<radio map of RSSI [dBm]: window; 9 x 14 points, x -0.50 to 6.00 and y -1.00 to 3.00, z 2.00 m>"
+        "<radio map of RSSI [dBm]: window; 9 x 14 points, x -0.50 to 6.00 and y -1.00 to 3.00, z "
+        "2.00 m>"
     )
     assert drawn.values[0, 0, 0] == pytest.approx(
         drawn.x[0] + 10 * drawn.y[0] + 200 - 1000, abs=1e-3

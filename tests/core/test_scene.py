@@ -33,7 +33,10 @@ def test_separate_floors_have_their_heights():
     """Places of a floor scatter by hand-held heights; among heights of a drone there is no floor."""
     rng = np.random.default_rng(0)
     heights = [floor + rng.uniform(0.9, 1.5, count) for floor, count in ((0, 20), (4, 50), (8, 30))]
-    places = lambda z: torch.from_numpy(np.column_stack((rng.uniform(size=(len(z), 2)), z))).float()
+
+    def places(z):
+        return torch.from_numpy(np.column_stack((rng.uniform(size=(len(z), 2)), z))).float()
+
     several = places(np.concatenate(heights))
     np.testing.assert_allclose(floors_of(several), [5.2, 9.2, 1.2], atol=0.2)
     links = example_links("rssi")

@@ -138,7 +138,10 @@ def put(name, index, value):
     return {name: array}
 
 
-NEAR = "expected positions within 1e5 m of the origin on each axis (subtract a common origin from all), got"
+NEAR = (
+    "expected positions within 1e5 m of the origin on each axis (subtract a common origin from "
+    "all), got"
+)
 CARRIER = "expected a frequency from 10000 to 3e+11 Hz, got"
 LEVEL = "expected magnitudes below 1e+18, the largest of a link 1e-18 or more unless all are 0, got"
 
@@ -362,7 +365,10 @@ def test_amplitude_and_phase_as_parts_are_refused(file, unit, phases, word):
     amplitude = np.abs(h) if unit == "linear" else 20 * np.log10(np.abs(h)) - 60
     factor = "a" if unit == "linear" else r"10 \*\* \(a / 20\)"
     frequencies = np.linspace(2.4e9, 2.46e9, 40)
-    mend = rf"as amplitude a and phase p\ngive {factor} \* np.exp\(1j \* {'p' if word == 'jp' else 'np.deg2rad'}"
+    mend = (
+        rf"as amplitude a and phase p\ngive {factor} \* np.exp\(1j \* "
+        rf"{'p' if word == 'jp' else 'np.deg2rad'}"
+    )
     for wrong in mistaken(amplitude, phase):
         changed(file, h=None, re=wrong.real, im=wrong.imag, frequencies=frequencies)
         with pytest.raises(ValueError, match=rf"h: (real|imaginary) parts are .*{mend}"):
@@ -408,7 +414,8 @@ def test_wrong_names_of_arrays_are_refused(file):
         ),
         (
             {"h": "CSI"},
-            "h: expected one array of complex numbers of (n, e, s), got 0 called 'CSI' among ['tx',",
+            "h: expected one array of complex numbers of (n, e, s), got 0 called 'CSI' among "
+            "['tx',",
         ),
         ({"tx": ["x", "y"]}, "tx: data.arrays has 2 names"),
     ):

@@ -109,7 +109,9 @@ def test_marks_of_long_tables_are_named_and_may_be_several(tmp_path):
     [(";", ","), (";", "."), ("\t", ","), ("|", "."), (" ", "."), (" ", ",")],
 )
 def test_every_reader_takes_the_same_separators(tmp_path, wide, rssi_folder, separator, point):
-    other = lambda text: text.replace(",", separator).replace(".", point)
+    def other(text):
+        return text.replace(",", separator).replace(".", point)
+
     (tmp_path / "a.csv").write_text(LONG)
     (tmp_path / "b.csv").write_text(other(LONG))
     pairs = [(rssi_csv.read(tmp_path / "a.csv"), rssi_csv.read(tmp_path / "b.csv"))]
@@ -206,7 +208,10 @@ def test_powers_are_no_levels(wide, unit):
 )
 def test_degrees_among_metres_are_named(wide, heading, columns, options):
     names = heading.replace(",", " and ")
-    message = rf"columns {names}: expected metres, got .*, which look like degrees\nset data.epsg=4326 and data.coord"
+    message = (
+        rf"columns {names}: expected metres, got .*, which look like degrees\nset data.epsg=4326 "
+        r"and data.coord"
+    )
     with pytest.raises(ValueError, match=message):
         wide(survey(heading, columns), **options)
 

@@ -48,11 +48,17 @@ def files(request, tmp_path, reader):
         case "nerf2_spectrum":
             root = request.getfixturevalue("spectrum_folder")
             (root / "freq.txt").write_text("2.4\n2.45\n" * 3)
-            read = lambda: nerf2_spectrum.read(str(root))
+
+            def read():
+                return nerf2_spectrum.read(str(root))
+
         case "nerf2_rssi":
             root = request.getfixturevalue("rssi_folder")
             (root / "layout.csv").write_text("0,0\n4,0\n4,3.5\n0,0\n")
-            read = lambda: nerf2_rssi.read(str(root))
+
+            def read():
+                return nerf2_rssi.read(str(root))
+
         case "rssi_csv":
             # The last column is no reader's, and its cells have quotes.
             rows = [
@@ -91,7 +97,10 @@ def files(request, tmp_path, reader):
                 root / "vertices.npz",
             ):
                 unread.unlink()
-            read = lambda: read_channels(root, subcarriers=4)
+
+            def read():
+                return read_channels(root, subcarriers=4)
+
     return read, sorted(file for file in root.rglob("*") if file.is_file())
 
 

@@ -234,11 +234,14 @@ def test_measured_sample_scores_as_published(measured):
     ).topk(3, largest=False)
     weights = 1 / distances
     guesses = torch.einsum("bk,bkij->bij", weights / weights.sum(1, keepdim=True), known[nearest])
-    score = lambda predictions: np.median(
-        [
-            structural_similarity(a.numpy(), b.numpy(), data_range=1)
-            for a, b in zip(labels, predictions, strict=True)
-        ]
-    )
+
+    def score(predictions):
+        return np.median(
+            [
+                structural_similarity(a.numpy(), b.numpy(), data_range=1)
+                for a, b in zip(labels, predictions, strict=True)
+            ]
+        )
+
     assert score(known.mean(0).expand(40, -1, -1)) == pytest.approx(0.67, abs=0.01)
     assert score(guesses) == pytest.approx(0.974, abs=0.002)

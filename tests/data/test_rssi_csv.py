@@ -77,7 +77,8 @@ def test_the_end_with_fewer_places_is_the_fixed_one(file, text, end, moving):
     assert links.rows.tolist() == [0, 0, 1, 2, 1, 3]
     fixed = {"rx": "receiver", "tx": "transmitter"}[end]
     assert links.remarks == (
-        f"6 readings of a moving {moving} at 2 places of a fixed {fixed}; 2 of -100 dBm were not heard and are left out"
+        f"6 readings of a moving {moving} at 2 places of a fixed {fixed}; 2 of -100 dBm were not "
+        "heard and are left out"
     )
     check_data(links)
 
@@ -115,7 +116,10 @@ def test_only_the_mark_is_not_heard(file):
     file.write_text(FORTH.replace("-53", "-120.5").replace("-43", "-200"))
     links = read(file)
     assert links.labels.tolist() == [-40, -50.25, -41, -42, -200, -120.5]
-    counts = "2 of -100 dBm were not heard and are left out; 2 readings below -100 dBm are taken for levels"
+    counts = (
+        "2 of -100 dBm were not heard and are left out; 2 readings below -100 dBm are taken for "
+        "levels"
+    )
     assert counts in links.remarks
     links = read(file, not_heard=-200)
     assert links.labels.tolist() == [-40, -50.25, -41, -100, -42, -100, -120.5]

@@ -64,7 +64,8 @@ def test_weak_readings_are_left_out_and_counted(clear):
     assert torch.equal(links.query.transmitters, clear.query.transmitters[heard])
     assert torch.equal(links.query.receivers, clear.query.receivers[heard])
     assert links.remarks == (
-        f"{int(heard.sum())} readings of 200 places at 4 gateways; {int((~heard).sum())} below -60 dBm were not heard "
+        f"{int(heard.sum())} readings of 200 places at 4 gateways; {int((~heard).sum())} below -60 "
+        "dBm were not heard "
         "and are left out"
     )
 

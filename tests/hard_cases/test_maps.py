@@ -54,9 +54,10 @@ class Gaussians:
 def random_gaussians(n=12, seed=0):
     """In all directions above the horizon, at 1 to 5 m."""
     generator = torch.Generator().manual_seed(seed)
-    uniform = lambda low, high, *shape: (
-        low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
-    )
+
+    def uniform(low, high, *shape):
+        return low + (high - low) * torch.rand(*shape, generator=generator, dtype=torch.float64)
+
     directions = from_spherical(uniform(0, 2 * math.pi, n), uniform(0.05, 1.5, n))
     means = ON.position + directions * uniform(1, 5, n, 1)
     quats = torch.randn(n, 4, generator=generator, dtype=torch.float64)

@@ -18,7 +18,11 @@ from gaigs.testing.placement import example_gaussians
 from gaigs.testing.pooling import example_paths
 
 SCENE = example_links("rssi").scene
-every = lambda kind: pytest.mark.parametrize("name", registry(kind).names())
+
+
+def every(kind):
+    return pytest.mark.parametrize("name", registry(kind).names())
+
 
 receiver = SCENE.receivers[0].pose.position
 means = example_gaussians(SCENE, 20).means.detach()
@@ -178,7 +182,10 @@ def test_values_of_maps(name, image):
     for pooling, links, grid in poolings_of(name):
         if grid is not None:
             query = links.query[:2]
-            ask = lambda module, own, query=query: module(own, widen(query, own.dtype))
+
+            def ask(module, own, query=query):
+                return module(own, widen(query, own.dtype))
+
             require_same(ask, pooling, MAPS[image]((2, pooling.channels, *grid.shape)))
 
 
@@ -201,9 +208,10 @@ def test_values_of_paths(name, size, alike):
                 torch.ones(shape), torch.zeros(shape) if alike else torch.arange(40.0).view(shape)
             )
         query = links.query[:2]
-        ask = lambda module, received, query=query: module.read(
-            received, widen(query, received.real.dtype)
-        )
+
+        def ask(module, received, query=query):
+            return module.read(received, widen(query, received.real.dtype))
+
         require_same(ask, pooling, size * waves)
 
 

@@ -6,7 +6,10 @@ from plyfile import PlyData, PlyElement
 
 from gaigs.io.meshes import parse_obj, read_obj, read_ply
 
-OBJ = "# a room\no floor\nv 0 0 1\nv 4 0 1\nv 4.5 2e0 1\nv 0 2 1\nusemtl glass\nf 1/1 2/2 3/3 4/4\no roof\nf -4 -3 -2\n"
+OBJ = (
+    "# a room\no floor\nv 0 0 1\nv 4 0 1\nv 4.5 2e0 1\nv 0 2 1\nusemtl glass\nf 1/1 2/2 3/3 4/4\no "
+    "roof\nf -4 -3 -2\n"
+)
 
 
 def ply(text):

@@ -27,7 +27,10 @@ def draw(*shape, seed=0):
 def solved(places, fields, labels, residuals):
     channels = [torch.from_numpy(part)[..., None] for part in (fields, labels, residuals)]
     found = PathField()
-    margins = lambda part: channels[0][part]
+
+    def margins(part):
+        return channels[0][part]
+
     found.solve(Equations.of(torch.from_numpy(places), margins, *channels[1:]), PROCESS)
     return found
 
@@ -38,9 +41,10 @@ def dense(places, asked, fields, labels, residuals):
         fields.shape[1],
         (np.abs(residuals) ** 2).mean(1) + 1e-4 * (np.abs(labels) ** 2).mean(1),
     )
-    each = lambda a, b: np.kron(
-        PROCESS.deviation**2 * np.exp(-cdist(a, b) / PROCESS.length), np.eye(n)
-    )
+
+    def each(a, b):
+        return np.kron(PROCESS.deviation**2 * np.exp(-cdist(a, b) / PROCESS.length), np.eye(n))
+
     matrix = block_diag(*(part.T for part in fields))
     noise = np.diag(np.repeat(PROCESS.nugget * powers, labels.shape[1]))
     return each(asked, places) @ matrix.conj().T, matrix @ each(
@@ -83,7 +87,10 @@ def test_variances_of_resolved_paths_are_the_dense_ones():
 def test_conjugate_gradients_stop_at_their_tolerance():
     root, right, calls = torch.from_numpy(draw(30, 30)), torch.from_numpy(draw(30, seed=1)), []
     matrix = root @ root.mH + 5 * torch.eye(30)
-    times = lambda x: calls.append(0) or matrix @ x
+
+    def times(x):
+        return calls.append(0) or matrix @ x
+
     x = conjugate_gradients(times, lambda rest: rest, right)
     assert 1e-9 < (matrix @ x - right).norm() / right.norm() <= 1.1e-6
     assert len(calls) < 100
@@ -137,9 +144,10 @@ def test_margins_are_largest_where_obstacles_block_a_part(passing, monkeypatch):
     links, model = made()
     clear = model.predict(links.query)
     model.placement.obstacles = torch.nn.Identity()
-    depths = lambda obstacles, folded, strengths: torch.full_like(
-        strengths.real, -math.log(passing)
-    )
+
+    def depths(obstacles, folded, strengths):
+        return torch.full_like(strengths.real, -math.log(passing))
+
     monkeypatch.setattr(model.placement, "_depths", depths)
     torch.testing.assert_close(
         model.margins(links.query).sum(1), (passing * (1 - passing) + 0.1) * clear

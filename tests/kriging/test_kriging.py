@@ -63,7 +63,10 @@ def make(task="rssi", count=100, carriers=(), smooth=0.0, trained=0.0, noise=0.0
     places = BOX * torch.rand(count, 3, generator=generator)
     frequencies = torch.tensor(carriers)[torch.arange(count) % len(carriers)] if carriers else None
     shape, dtype = links.task.shape, links.task.dtype
-    draw = lambda: torch.randn(count, *shape, dtype=dtype, generator=generator)
+
+    def draw():
+        return torch.randn(count, *shape, dtype=dtype, generator=generator)
+
     covariances = torch.from_numpy(np.exp(-cdist(places.double(), places.double()) / 4))
     factor = torch.linalg.cholesky(covariances + 1e-9 * torch.eye(count)).to(dtype)
     order = torch.randperm(count, generator=generator)
@@ -311,10 +314,13 @@ def test_a_trend_that_scores_worse_than_its_fallback_is_reported(task, trained, 
 
 def test_a_trend_that_was_not_learnt_is_left_out_where_scores_are_higher_without_it(monkeypatch):
     links, numbers = make("spectrum", smooth=1.0, noise=0.1), itertools.count()
-    likely = lambda *parts, **options: (
-        fit.fit_hyperparameters(*parts, **options)[0],
-        next(numbers),
-    )  # first the trend
+
+    def likely(*parts, **options):
+        return (
+            fit.fit_hyperparameters(*parts, **options)[0],
+            next(numbers),
+        )
+
     monkeypatch.setattr(field, "fit_hyperparameters", likely)
     model = Kriging(links.scene, Trained(links.scene))
     model.fit(links)
@@ -384,14 +390,20 @@ def test_surveys_see_the_process_of_the_predictions(kind, carriers):
 def test_components_are_the_fewest_that_leave_little_out(dtype, exact):
     options = {"share": 0.02, "most": 100, "exact": 512 if exact else 10}
     generator = torch.Generator().manual_seed(0)
-    draw = lambda *shape: torch.randn(*shape, dtype=dtype, generator=generator)
+
+    def draw(*shape):
+        return torch.randn(*shape, dtype=dtype, generator=generator)
+
     residuals = draw(150, 60) @ (2.0 ** -torch.arange(60))[:, None].to(dtype).mul(draw(60, 200))
     state = torch.random.get_rng_state()
     components = principal_components(residuals, **options)
     assert torch.equal(torch.random.get_rng_state(), state)
     assert components.abs().amax(1) == pytest.approx(1)
     values = np.linalg.svd(residuals.numpy(), compute_uv=False).astype(float)
-    left = lambda count: (values[count:] ** 2).sum() / (values**2).sum()
+
+    def left(count):
+        return (values[count:] ** 2).sum() / (values**2).sum()
+
     assert left(len(components)) <= 0.02 < left(len(components) - 1)
     basis, _ = np.linalg.qr(components.numpy().T.astype(complex).conj())
     over = residuals.numpy() - residuals.numpy() @ basis @ basis.conj().T
@@ -404,7 +416,10 @@ def test_components_are_the_fewest_that_leave_little_out(dtype, exact):
 def test_components_of_millions_of_numbers_leave_as_little_out():
     """A single sum in single precision would be wrong by more than ``LEFT``."""
     generator = torch.Generator().manual_seed(0)
-    draw = lambda *shape: torch.randn(*shape, generator=generator)
+
+    def draw(*shape):
+        return torch.randn(*shape, generator=generator)
+
     residuals = draw(500, 150) * torch.logspace(0, -2.5, 150) @ draw(150, 32400)
     basis, _ = torch.linalg.qr(principal_components(residuals).T)
     over = residuals - residuals @ basis @ basis.T

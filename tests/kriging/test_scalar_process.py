@@ -93,7 +93,10 @@ def first(readings, count):
 def test_the_density_is_that_of_a_normal_variable_plus_noise(degrees, variance, noise):
     errors = np.array([0.0, 0.7, 5.0, 12.0 if math.isinf(degrees) else 40.0])
     scatter = stats.norm if math.isinf(degrees) else stats.t(degrees)
-    both = lambda u, e: stats.norm.pdf(u) * scatter.pdf((e - u * variance**0.5) / noise) / noise
+
+    def both(u, e):
+        return stats.norm.pdf(u) * scatter.pdf((e - u * variance**0.5) / noise) / noise
+
     expected = [
         np.log(quad(both, -20, 20, args=(e,), points=[0, e / variance**0.5], limit=400)[0])
         for e in errors
@@ -114,10 +117,13 @@ def test_means_and_deviations_are_the_formula(smoothness, carriers):
     process.solve(places, receivers, values)
     query = replace(links.query[links.split.test], receivers=torch.ones(36, dtype=torch.long))
     asked, own = coordinates(links.scene, query, 1.0), receivers == 1
-    stretch = lambda points: np.hstack((points[:, :3], 3.0 * points[:, 3:]))
-    kernel = lambda a, b: (
-        9 * MATERN[smoothness](cdist(stretch(a.numpy()), stretch(b.numpy())) / 0.7)
-    )
+
+    def stretch(points):
+        return np.hstack((points[:, :3], 3.0 * points[:, 3:]))
+
+    def kernel(a, b):
+        return 9 * MATERN[smoothness](cdist(stretch(a.numpy()), stretch(b.numpy())) / 0.7)
+
     noises = process.variances[own].numpy()
     solve = np.linalg.inv(kernel(places[own], places[own]) + np.diag(noises))
     towards = kernel(asked, places[own])
@@ -195,9 +201,12 @@ def test_kernel_tails_and_hyperparameters_are_those_of_the_draw(smoothness, degr
     assert facts["smoothness"] == smoothness
     assert facts["degrees_of_freedom"] == (0 if math.isinf(degrees) else 4)
     length, signal, noise = model.scalar.logarithms.exp().unbind(1)
+
     # Within a box of few lengths, length and variance are hardly known apart, but well as this
     # power of both.
-    slope = lambda length, signal: signal**2 / length ** (2 * smoothness)
+    def slope(length, signal):
+        return signal**2 / length ** (2 * smoothness)
+
     np.testing.assert_allclose(
         slope(length, signal), slope(2.0 if smoothness == 0.5 else 0.7, 5.0), rtol=0.6
     )

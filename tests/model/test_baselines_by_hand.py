@@ -35,7 +35,12 @@ PAIRS.remove(
     ("rssi", {"name": "gaussian_process", "trend": None})
 )  # see tests/kriging/test_scalar_process.py
 PROCESSES = [pair for pair in PAIRS if pair[1]["name"] == "gaussian_process"]
-named = lambda value: value["name"] if isinstance(value, dict) else str(value)
+
+
+def named(value):
+    return value["name"] if isinstance(value, dict) else str(value)
+
+
 VALIDATING = pytest.mark.parametrize("validating", [0, 14])
 
 WAVELENGTHS = 299792458.0 / (2.4e9 + np.array([-3e7, -1e7, 1e7, 3e7]))
@@ -146,9 +151,10 @@ def knn(config, known, places):
 
 def path_loss(config, known, places):
     own = known.receiver.pose.position.double().numpy()
-    decades = lambda points: np.log10([max(math.dist(point, own), 0.1) for point in points])[
-        :, None
-    ]
+
+    def decades(points):
+        return np.log10([max(math.dist(point, own), 0.1) for point in points])[:, None]
+
     steps = decades(places) - decades(known.places).mean()
     return known.labels.mean() - 10 * config["exponents"][known.receiver.name] * steps
 

@@ -139,9 +139,20 @@ class Foreign:
 
 
 MEANS = "model.gaussians.means"
-MODEL = lambda content: content[checkpoint.KEY]["model"]
-SCENE = lambda content: content[checkpoint.KEY]["scene"]
-WEIGHTS = lambda content: content["state_dict"]
+
+
+def MODEL(content):
+    return content[checkpoint.KEY]["model"]
+
+
+def SCENE(content):
+    return content[checkpoint.KEY]["scene"]
+
+
+def WEIGHTS(content):
+    return content["state_dict"]
+
+
 DEFECTS = {
     "no weights": (lambda content: content.pop("state_dict"), "it lacks state_dict"),
     "no model": (lambda content: content[checkpoint.KEY].pop("model"), "it lacks model"),
@@ -161,7 +172,8 @@ DEFECTS = {
     ),
     "a plug-in that is not recorded": (
         lambda content: content[checkpoint.KEY].update(model={"name": "broken"}, plugins={}),
-        r"plugins/broken.py is not the source of model 'broken' that was recorded .*\n.* trust=True in gaigs.load",
+        r"plugins/broken.py is not the source of model 'broken' that was recorded .*\n.* "
+        r"trust=True in gaigs.load",
     ),
     "other weights": (lambda content: MODEL(content)["deformation"].update(width=32), "size mismatch for deformation"),
     "a weight too few": (lambda content: WEIGHTS(content).pop(MEANS), "Missing key.*gaussians.means"),

@@ -186,7 +186,9 @@ def several_carriers(label, seed=0, places=60, carriers=(1e9, 1.5e9, 2.2e9, 3.3e
 
 
 def test_a_carrier_that_matters_is_kept_apart_from_others():
-    waves = lambda places, phase: 10 * torch.sin(places[:, 0] + phase)
+    def waves(places, phase):
+        return 10 * torch.sin(places[:, 0] + phase)
+
     alike = several_carriers(lambda places, logs: waves(places, 0))
     apart = several_carriers(
         lambda places, logs: waves(places, 3 * (logs * 1e3).round())

@@ -312,7 +312,10 @@ def test_phases_come_with_planes_that_move():
     pooling = {"name": "path_rssi", "floor_db": -100.0}
     model = walled(build(links, placement=MIRRORED | {"order": 1}, pooling=pooling))
     placement, batch = model.placement, links.batch(torch.arange(12))
-    loss = lambda batch: (model(batch).value - batch.labels).abs().mean().item()
+
+    def loss(batch):
+        return (model(batch).value - batch.labels).abs().mean().item()
+
     assert model.revise(2, batch, None, loss).startswith("phases count; planes moved by ")
     assert placement.coherent
     placement.log_bandwidth.fill_(math.log(BANDWIDTH))

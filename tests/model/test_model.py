@@ -133,7 +133,10 @@ def test_gaussians_that_become_nan_are_not_hidden(build, links):
 
 @pytest.mark.parametrize("method", ["predict", "predict_batches"])
 def test_far_positions_are_predicted_with_a_warning(build, method):
-    message = r"^2 of 3 positions are up to 1\.71e\+05 m outside .* is 7\.04 m across: nothing was measured near there$"
+    message = (
+        r"^2 of 3 positions are up to 1\.71e\+05 m outside .* is 7\.04 m across: nothing was "
+        r"measured near there$"
+    )
     ask, places = (
         getattr(build(), method),
         [[9.9e4, -9.9e4, 9.9e4], [1.0, 2.0, 1.0], [-9.9e4, 0.0, 0.0]],
@@ -183,7 +186,10 @@ def test_a_single_known_carrier_is_the_default(build, band):
 
 def test_a_band_is_left_with_a_warning(build, band):
     model, place = build(scene=band.scene), band.query.transmitters[:1]
-    message = r"^2 of 3 positions are asked at 9e\+08 to 6e\+10 Hz, outside .* band of 1e\+09 to 4e\+09 Hz: nothing was"
+    message = (
+        r"^2 of 3 positions are asked at 9e\+08 to 6e\+10 Hz, outside .* band of 1e\+09 to 4e\+09 "
+        r"Hz: nothing was"
+    )
     for method in (model.predict, model.predict_batches):
         with pytest.warns(ExtrapolationWarning, match=message):
             values = method(place.expand(3, 3), frequency=torch.tensor([6e10, 2e9, 9e8]))

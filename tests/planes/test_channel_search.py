@@ -49,8 +49,13 @@ def reflection(permittivity, thickness, cosines, level):
 
 def channels(places, elements, planes):
     """Direct waves and images of the first order (b, e, s)."""
-    waves = lambda points: np.exp(-2j * np.pi * FREQUENCIES / speed_of_light * points) / points
-    apart = lambda points: np.linalg.norm(points[:, None] - elements, axis=-1)[..., None]
+
+    def waves(points):
+        return np.exp(-2j * np.pi * FREQUENCIES / speed_of_light * points) / points
+
+    def apart(points):
+        return np.linalg.norm(points[:, None] - elements, axis=-1)[..., None]
+
     found = waves(apart(places))
     for (*normal, offset), slab in zip(planes, MATERIALS, strict=False):
         images = places - 2 * (places @ normal - offset)[:, None] * normal
@@ -365,9 +370,10 @@ def test_walls_are_tried_beside_planes_amid_the_places(monkeypatch):
     own, normal = search(links), torch.tensor([[1.0, 0, 0]]).double()
     wall = float(own.frame.points[:, 0].max()) + 0.3
     peaks = torch.tensor([[-1.5, 1.0], [0.0, 0.9], [1.5, 0.8], [wall, 0.5]]).double()
-    share = lambda _, grid: (
-        peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()
-    ).sum(-1)
+
+    def share(_, grid):
+        return (peaks[:, 1] * (-((grid[..., 3:] - peaks[:, 0]) / 0.1).square()).exp()).sum(-1)
+
     monkeypatch.setattr(own.score, "added_shares", share)
     walls, amid = own.along_axes.propose_along(half_spaces(torch.zeros(0, 4).double()), normal, 0.1)
     assert [plane[3].item() for plane in walls] == pytest.approx([wall], abs=0.03)
@@ -389,9 +395,15 @@ def test_an_image_counts_by_what_it_adds_to_known_paths(few):
     tried = torch.cat((planes[1:], others, planes.repeat(32, 1)))
     known_room = half_spaces(planes[:1])
     shares, expected = own.score.added_shares(known_room, tried), []
-    stacked = lambda x: x if few == 0 else np.concatenate((x.real, x.imag), -1)
+
+    def stacked(x):
+        return x if few == 0 else np.concatenate((x.real, x.imag), -1)
+
     for part, turn in zip(*own.data.sample(planes[:1]), strict=True):
-        waves = lambda images, part=part: part.waves(images.float()).to(torch.complex128).numpy()
+
+        def waves(images, part=part):
+            return part.waves(images.float()).to(torch.complex128).numpy()
+
         places, normals = part.places.double(), tried[:, :3]
         heights = places @ normals.mT - tried[:, 3]
         outside = heights * (normals @ part.position.double() - tried[:, 3]) > 0
@@ -406,10 +418,13 @@ def test_an_image_counts_by_what_it_adds_to_known_paths(few):
         for row, channel in enumerate(
             stacked((part.flat * turn.conj()).to(torch.complex128).numpy())
         ):
-            fitted = lambda columns, channel=channel: (
-                columns.T @ np.linalg.lstsq(columns.T, channel, rcond=1e-4)[0]
-            )
-            left = lambda columns, channel=channel: np.linalg.norm(channel - fitted(columns)) ** 2  # noqa: B023
+
+            def fitted(columns, channel=channel):
+                return columns.T @ np.linalg.lstsq(columns.T, channel, rcond=1e-4)[0]
+
+            def left(columns, channel=channel):
+                return np.linalg.norm(channel - fitted(columns)) ** 2
+
             after = [left(np.concatenate((known[row], wave))) for wave in images[row]]
             expected.append((1 - np.array(after) / left(known[row])) * outside[row].numpy())
     np.testing.assert_allclose(shares, np.mean(expected, 0), rtol=0, atol=0.005)

@@ -44,10 +44,13 @@ def search():
         links, query=query, receivers=(receiver,), labels=torch.ones(150, 2), rows=None, split=split
     )
     count = len(receiver.array.lags[0])
-    ones = lambda labels, query: (
-        torch.ones(len(labels), count, dtype=torch.complex128),
-        torch.zeros(len(labels)),
-    )
+
+    def ones(labels, query):
+        return (
+            torch.ones(len(labels), count, dtype=torch.complex128),
+            torch.zeros(len(labels)),
+        )
+
     made = LagSearch(links, query.frequencies, ones, 2)
     own = made.receivers[0]
     walls = seen_from(WALLS, made.frame.middle)

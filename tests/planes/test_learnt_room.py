@@ -99,7 +99,10 @@ def test_shares_are_those_of_image_sources(links, build):
         placement.kept.copy_((placement.sequences[:, 0] == 0) | (placement.sequences[:, 0] == -1))
     found = summarize(placement, training(links))
     direct, mirrored = [], []
-    root = lambda cosine: np.sqrt(PERMITTIVITY - (1 - cosine**2))
+
+    def root(cosine):
+        return np.sqrt(PERMITTIVITY - (1 - cosine**2))
+
     for place, receiver in zip(
         *(part.numpy() for part in (training(links).transmitters, training(links).receivers)),
         strict=True,
@@ -282,7 +285,10 @@ def test_obstacles_are_written_as_splats(links, build, tmp_path):
     write_room(placement, training(links), tmp_path)
     file = PlyData.read(str(tmp_path / "obstacles.ply"))
     vertices = file["vertex"]
-    columns = lambda *names: torch.from_numpy(np.stack([vertices[name] for name in names], -1))
+
+    def columns(*names):
+        return torch.from_numpy(np.stack([vertices[name] for name in names], -1))
+
     torch.testing.assert_close(columns("x", "y", "z"), blobs.centres.data + placement.middle)
     axes = semi_axes(
         columns("rot_0", "rot_1", "rot_2", "rot_3"), columns("scale_0", "scale_1", "scale_2").exp()

@@ -48,7 +48,10 @@ def test_gains_of_planes_and_paths_count_as_material(placement):
     plasterboard.
     """
     paint(placement, 0, complex(2.73, -0.1))
-    reflected = lambda value: abs((1 - value**0.5) / (1 + value**0.5))
+
+    def reflected(value):
+        return abs((1 - value**0.5) / (1 + value**0.5))
+
     gain = math.log(reflected(permittivity("glass", FREQUENCY)) / reflected(complex(2.73, -0.1)))
     alone = (placement.sequences == 0).any(1) & ((placement.sequences >= 0).sum(1) == 1)
     placement.kept.copy_((placement.sequences < 0).all(1) | alone)

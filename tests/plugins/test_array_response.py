@@ -117,9 +117,10 @@ def test_any_directions_get_the_arrays_answer(build):
     (between,) = model(Batch(query, Rays(elevations, azimuths))).value
     steps = torch.cartesian_prod(torch.arange(4) - 1.5, torch.arange(4) - 1.5)
     cosines = torch.stack((azimuths.cos() * elevations.cos(), azimuths.sin() * elevations.cos()))
-    amplitudes = lambda cosines: (
-        (fields[:, None] * torch.exp(-1j * math.pi * (steps @ cosines))).sum(0).abs()
-    )
+
+    def amplitudes(cosines):
+        return (fields[:, None] * torch.exp(-1j * math.pi * (steps @ cosines))).sum(0).abs()
+
     pixels = GRID.flatten().vectors()[:, :2].T
     low, high = amplitudes(pixels).aminmax()
     torch.testing.assert_close(

@@ -129,7 +129,10 @@ def write_example(folder, seed=0):
 
 def test_written_paths_have_their_geometry(tmp_path):
     users, station, fields, points = write_example(tmp_path)
-    matrix = lambda name: np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name]
+
+    def matrix(name):
+        return np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name]
+
     ways = {"aod": (station, users, points), "aoa": (users, station, points)}
     for end, (start, direct, bounce) in ways.items():
         expected = np.stack((direct - start, bounce - start), 1)

@@ -94,7 +94,9 @@ def test_the_series_is_of_normalised_legendre_functions():
 
 
 def test_the_series_has_finite_gradients_at_the_poles():
-    series = lambda vectors: torch.view_as_real(fourier_legendre(vectors, 3))
+    def series(vectors):
+        return torch.view_as_real(fourier_legendre(vectors, 3))
+
     assert torch.autograd.gradcheck(series, directions(4).requires_grad_())
 
 

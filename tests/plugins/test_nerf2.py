@@ -61,7 +61,10 @@ def given(package, scene, links, rays, seed=0, **changes):
     arguments = {"samples": 7, "far": 3.5, "rays": [2, 4], "frequency": 2.4e9} | changes
     model = Given(scene, **arguments)
     generator = torch.Generator().manual_seed(seed)
-    random = lambda *shape: torch.rand(*shape, generator=generator)
+
+    def random(*shape):
+        return torch.rand(*shape, generator=generator)
+
     along, sent = (rays, 7), (links, rays, 7, model.reading.channels)
     # Up to opaque within a step, and many turns.
     model.samples = package.Samples(
@@ -106,7 +109,10 @@ def test_levels_are_the_published_sum(package, seed, carrier):
     batch = Batch(links.query[torch.tensor([0, 2, 4])])
     model, _ = given(package, links.scene, 3, 8, seed)
     length = LIGHT / (carrier or 2.4e9)
-    factor = lambda t: cmath.exp(2j * math.pi * t / length)
+
+    def factor(t):
+        return cmath.exp(2j * math.pi * t / length)
+
     sums = [sum(along(model.samples, b, r, 0, factor) for r in range(8)) for b in range(3)]
     expected = torch.tensor([100 * (abs(total) - 1) for total in sums])
     torch.testing.assert_close(model(batch).value, expected, rtol=1e-4, atol=1e-3)
@@ -223,7 +229,10 @@ def test_the_networks_are_the_published_ones(package):
 
 def test_published_sizes():
     model = make(example_links().scene, octaves=10, width=256, layers=8)
-    count = lambda *sizes: sum(a * b + b for a, b in pairwise(sizes))
+
+    def count(*sizes):
+        return sum(a * b + b for a, b in pairwise(sizes))
+
     first = (
         count(63, 256, 256, 256, 256)
         + count(63 + 256, 256, 256, 256, 256)
@@ -244,7 +253,10 @@ def test_it_starts_at_the_mean_amplitude(task):
     model = make(links.scene)
     model.fit(links)
     batch = links.batch(links.split.train)  # 16 of them, as many as it looks at
-    amplitudes = lambda values: model.reading.amplitudes(values, batch.query).mean()
+
+    def amplitudes(values):
+        return model.reading.amplitudes(values, batch.query).mean()
+
     with torch.no_grad():
         torch.testing.assert_close(
             amplitudes(model(batch).value), amplitudes(batch.labels), rtol=0.1, atol=0

@@ -117,9 +117,16 @@ def test_inputs_alike_all_over_an_image_shift_the_first_convolution(package):
 
 def test_published_sizes():
     model = make(octaves=10, widths=[64, 128, 256])
-    double = lambda inputs, width: 9 * inputs * width + width + 9 * width**2 + width + 4 * width
-    gate = lambda c: 2 * (c * (c // 2) + c // 2 + 2 * (c // 2)) + c // 2 + 1 + 2
-    up = lambda inputs, outputs: 4 * inputs * outputs + outputs
+
+    def double(inputs, width):
+        return 9 * inputs * width + width + 9 * width**2 + width + 4 * width
+
+    def gate(c):
+        return 2 * (c * (c // 2) + c // 2 + 2 * (c // 2)) + c // 2 + 1 + 2
+
+    def up(inputs, outputs):
+        return 4 * inputs * outputs + outputs
+
     pyramid = 2 * (256 * 128 + 128) + 512 * 256 + 256
 
     def count(inputs, outputs):
@@ -170,9 +177,12 @@ def test_spectra_are_interpolated_from_the_grid(package):
 
 def test_directions_beyond_the_labels_get_the_nearest_ones():
     model = make().eval()
-    values = lambda degrees: model.predict(
-        LINKS.query.transmitters[:1], directions=Grid.degrees([degrees], [10, 100])
-    )
+
+    def values(degrees):
+        return model.predict(
+            LINKS.query.transmitters[:1], directions=Grid.degrees([degrees], [10, 100])
+        )
+
     torch.testing.assert_close(values(-20), values(4))
     torch.testing.assert_close(values(90), values(89))
 

@@ -124,9 +124,12 @@ def moved(scene, by=0.0, factor=1.0):
 
 def test_places_are_relative_to_the_box():
     scene, places = LINKS["rssi"].scene, LINKS["rssi"].query.transmitters
-    ask = lambda scene, places: build("mlp", scene).question(
-        Query(places, torch.zeros(len(places), dtype=torch.long))
-    )
+
+    def ask(scene, places):
+        return build("mlp", scene).question(
+            Query(places, torch.zeros(len(places), dtype=torch.long))
+        )
+
     answer = ask(scene, places)
     torch.testing.assert_close(ask(moved(scene, by=7.0), places + 7), answer, rtol=0, atol=1e-4)
     # The coordinates themselves keep their meaning in a larger box, their waves stay those of the
@@ -391,9 +394,10 @@ def test_the_generator_is_four_transposed_convolutions(task):
 def test_the_discriminator_looks_at_label_and_link(task):
     model = fitted("dcgan", task).eval()
     batch = LINKS[task].batch(torch.arange(6))
-    judge = lambda labels, query=batch.query: model.discriminate(
-        replace(batch, query=query), labels
-    )
+
+    def judge(labels, query=batch.query):
+        return model.discriminate(replace(batch, query=query), labels)
+
     own = judge(batch.labels)
     assert own.shape == (6,)
     assert (own - judge(batch.labels.flip(0))).abs().max() > 1e-6

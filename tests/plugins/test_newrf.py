@@ -55,7 +55,10 @@ def package():
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_channels_are_the_published_sum(package, sign):
     generator = torch.Generator().manual_seed(sign + 1)
-    random = lambda *shape: torch.rand(*shape, generator=generator)
+
+    def random(*shape):
+        return torch.rand(*shape, generator=generator)
+
     fields = torch.complex(2 * random(2, 3, 6, 4) - 1, 2 * random(2, 3, 6, 4) - 1)
     depths, frequencies = (
         3 * random(2, 3, 6) ** 3,
@@ -119,7 +122,10 @@ def test_the_field_is_the_published_network(package):
     field = package.Field((9, 5), width=8, layers=6, elements=2).double()
     places, views = torch.randn(3, 9).double(), torch.randn(3, 5).double()
     weights = {name: values.numpy() for name, values in field.state_dict().items()}
-    apply = lambda name, x: weights[f"{name}.weight"] @ x + weights[f"{name}.bias"]
+
+    def apply(name, x):
+        return weights[f"{name}.weight"] @ x + weights[f"{name}.bias"]
+
     densities, sent = field(places, views)
     for i in range(3):
         place, view = places[i].numpy(), views[i].numpy()

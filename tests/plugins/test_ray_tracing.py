@@ -366,9 +366,10 @@ def test_descent_finds_what_the_walls_are_made_of(tracer, hall, task):
 def test_the_built_in_room_is_the_simulated_one():
     rooms = module("rooms")
     meshes = rooms.find_meshes("synthetic_rssi", None)
-    lines = lambda segments: {
-        tuple(sorted(tuple(round(x, 4) for x in end) for end in line)) for line in segments
-    }
+
+    def lines(segments):
+        return {tuple(sorted(tuple(round(x, 4) for x in end) for end in line)) for line in segments}
+
     shell = [mesh for mesh in meshes if mesh.name == "room"]
     furniture = [mesh for mesh in meshes if mesh.name != "room"]
     assert lines(edges(furniture).tolist()) < lines(synthetic.edges(synthetic.ROOM).tolist())
@@ -482,9 +483,10 @@ def test_files_of_all_kinds_hold_the_same_room(tracer, hall, tmp_path):
     (tmp_path / "hall.xml").write_text(f'<scene version="2.1.0">{"".join(shapes)}</scene>')
     found = rooms.find_meshes("none", str(tmp_path / "hall.xml"))
     assert len(found) == len(expected)
-    lines = lambda meshes: sorted(
-        sorted(map(tuple, line)) for line in edges(meshes).round(decimals=4).tolist()
-    )
+
+    def lines(meshes):
+        return sorted(sorted(map(tuple, line)) for line in edges(meshes).round(decimals=4).tolist())
+
     assert lines(found) == lines(expected)
     chosen = {f"mat{k}": "wood" for k in range(len(expected))}
     assert rooms.known_materials(found, {name: chosen[name] for name in chosen}) == chosen
@@ -492,7 +494,10 @@ def test_files_of_all_kinds_hold_the_same_room(tracer, hall, tmp_path):
 
 def test_an_obj_has_faces_of_many_corners_counted_from_either_end():
     rooms = module("rooms")
-    text = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0  # a comment\nf 1/1 2/2 3/3 4/4\nusemtl glass\nf -4 -3 -2\n"
+    text = (
+        "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0  # a comment\nf 1/1 2/2 3/3 4/4\nusemtl glass\nf -4 -3 "
+        "-2\n"
+    )
     first, second = rooms.read_obj(text, "file")
     assert (first.material, first.faces) == ("unnamed", ((0, 1, 2, 3),))
     assert (second.material, second.faces, second.vertices[2]) == ("glass", ((0, 1, 2),), (1, 1, 0))

@@ -104,7 +104,10 @@ def test_the_network_moves_stretches_and_weighs_each_receivers_own_gaussians(mod
     values = {
         name: parameter.detach().double().numpy() for name, parameter in model.named_parameters()
     }
-    linear = lambda name, x: values[f"{name}.weight"] @ x + values[f"{name}.bias"]
+
+    def linear(name, x):
+        return values[f"{name}.weight"] @ x + values[f"{name}.bias"]
+
     middle = ((SCENE.lower + SCENE.upper) / 2).double().numpy()
     for k, (place, receiver) in enumerate(
         zip(query.transmitters.double().numpy(), query.receivers, strict=True)

@@ -43,9 +43,10 @@ def test_its_parts_keep_theirs():
     check_deformation(functools.partial(build, "deformation", config["deformation"]), LINKS.scene)
     check_tokenizer(build("tokenizer", config["tokenizer"], scene=LINKS.scene), LINKS.scene)
     for channels in (1, 2):
-        make = lambda scene, channels=channels: build(
-            "pooling", config["pooling"] | {"channels": channels}
-        )
+
+        def make(scene, channels=channels):
+            return build("pooling", config["pooling"] | {"channels": channels})
+
         check_pooling(make, LINKS)
 
 
@@ -63,8 +64,13 @@ def transcribed(network, tokens, placed, query):
     values = {
         name: parameter.detach().double().numpy() for name, parameter in network.named_parameters()
     }
-    linear = lambda name, x: values[f"{name}.weight"] @ x + values[f"{name}.bias"]
-    relu = lambda x: np.maximum(x, 0)
+
+    def linear(name, x):
+        return values[f"{name}.weight"] @ x + values[f"{name}.bias"]
+
+    def relu(x):
+        return np.maximum(x, 0)
+
     positions = [receiver.pose.position.double().numpy() for receiver in network.scene.receivers]
     signal, attenuations = [], []
     for q in range(len(query)):

@@ -57,13 +57,20 @@ def transcribed(network, tokens, channels):
     values = {
         name: parameter.detach().double().numpy() for name, parameter in network.named_parameters()
     }
-    linear = lambda name, x: values[f"{name}.weight"] @ x + values[f"{name}.bias"]
-    relu = lambda x: np.maximum(x, 0)
-    mixed = lambda name, transmitter, gaussian: (
-        values[f"{name}.links.weight"] @ transmitter
-        + values[f"{name}.gaussians.weight"] @ gaussian
-        + values[f"{name}.bias"]
-    )
+
+    def linear(name, x):
+        return values[f"{name}.weight"] @ x + values[f"{name}.bias"]
+
+    def relu(x):
+        return np.maximum(x, 0)
+
+    def mixed(name, transmitter, gaussian):
+        return (
+            values[f"{name}.links.weight"] @ transmitter
+            + values[f"{name}.gaussians.weight"] @ gaussian
+            + values[f"{name}.bias"]
+        )
+
     rows = []
     for transmitter in tokens.transmitters.detach().double().numpy():
         for gaussian in tokens.gaussians.double().numpy():

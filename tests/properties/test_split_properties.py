@@ -50,7 +50,10 @@ def test_parts_are_disjoint_cover_and_repeat(name, shape, data, test, validation
     options |= {"validation": validation, "seed": seed} | (
         {} if name == "official" else {"test": test}
     )
-    build = lambda: registry("split").build({"name": name} | options, links=links)
+
+    def build():
+        return registry("split").build({"name": name} | options, links=links)
+
     try:
         split = build()
     except ValueError:

@@ -239,12 +239,14 @@ def test_paths_are_drawn_from_end_to_end_the_strongest_on_top(walls):
 
 
 def test_walls_have_a_place_in_the_legend_if_there_are_any():
-    words = lambda edges: [
-        text.get_text()
-        for text in room(links(POINT, receivers=np.array([5.0, 4, 2]), edges=edges))
-        .legends[0]
-        .get_texts()
-    ]
+    def words(edges):
+        return [
+            text.get_text()
+            for text in room(links(POINT, receivers=np.array([5.0, 4, 2]), edges=edges))
+            .legends[0]
+            .get_texts()
+        ]
+
     assert "walls and furniture" in words([[[0.0, 0, 0], [1, 0, 0]]])
     assert "walls and furniture" not in words(np.zeros((0, 2, 3)))
 

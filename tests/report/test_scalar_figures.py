@@ -42,9 +42,12 @@ def counted(*readings):
 
 def test_few_readings_are_dots_and_many_are_counted():
     labels = np.linspace(-80, -50, 2 * 400 + 1)
-    draw = lambda count: predicted_against_measured(
-        labels[:count], labels[:count] + 1, np.arange(count) % 2, ["west", "east"], Rssi()
-    )
+
+    def draw(count):
+        return predicted_against_measured(
+            labels[:count], labels[:count] + 1, np.arange(count) % 2, ["west", "east"], Rssi()
+        )
+
     (few,), (many,) = draw(2 * 400), draw(2 * 400 + 1)
     assert len(few.axes) == 2, "no bar of colours"
     np.testing.assert_array_equal(
@@ -65,7 +68,10 @@ def test_readings_are_counted_where_they_were_measured_and_predicted():
     assert attic.get_title() == "[attic], MAE 0.75 dB"
     edges, count = counts(hall)
     np.testing.assert_allclose(np.diff(edges), 2)
-    cell = lambda value: np.searchsorted(edges, value, side="right") - 1
+
+    def cell(value):
+        return np.searchsorted(edges, value, side="right") - 1
+
     assert count[cell(-55.2), cell(-61)] == 2  # predictions upwards, labels to the right
     assert count[cell(-70), cell(-70)] == 1
     assert count.sum() == 3
@@ -229,7 +235,8 @@ def test_lines_and_colours_follow_from_the_data_in_other_units(scale):
     assert -48 * scale < low <= 51 * -scale
     assert -79 * scale <= high < -83 * scale
     assert figure.get_suptitle() == (
-        f"Predicted delay spread of a transmitter at z = 1.25 m at 2.45 GHz, a line every {step:g} ns"
+        f"Predicted delay spread of a transmitter at z = 1.25 m at 2.45 GHz, a line every {step:g} "
+        "ns"
     )
     assert figure.axes[-1].get_ylabel() == "delay spread [ns]"
 

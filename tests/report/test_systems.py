@@ -116,7 +116,10 @@ def sweep(tmp_path_factory):
 def test_published_figures_and_costs_stand_beside_ours(sweep):
     rows = rows_of(sweep[0])
     assert [*rows] == ["NeRF²", "GAI-GS", "yagi", "mean", "knn"]
-    column = lambda title: [row[title] for row in rows.values()]
+
+    def column(title):
+        return [row[title] for row in rows.values()]
+
     assert column("published median SSIM, RFID") == ["0.78", "0.91", "", "", ""]
     assert column("published training [min], A100") == ["", "203.0", "", "", ""]
     assert column("model") == ["nerf2", "gaigs", "yagi", "mean", "knn"]
@@ -144,9 +147,11 @@ def test_the_page_of_systems(sweep):
     assert {line.count("|") for line in cost.splitlines()} == {cost.splitlines()[0].count("|")}
     assert notes.splitlines() == [
         "data=room, split=official, device=cpu",
-        "- published median SSIM, RFID: GAI-GS, table 1, on the 6,123 spectra of NeRF²; WRF-GS+ after its repository, "
+        "- published median SSIM, RFID: GAI-GS, table 1, on the 6,123 spectra of NeRF²; WRF-GS+ "
+        "after its repository, "
         "issue 4",
-        "- published training [min], A100: GAI-GS, table 2, on a part of the same spectra and one NVIDIA A100",
+        "- published training [min], A100: GAI-GS, table 2, on a part of the same spectra and one "
+        "NVIDIA A100",
         "- published inference [ms], A100: likewise",
         "- published rendering [ms], A100: likewise",
         "- without a result: MLP: unfinished",

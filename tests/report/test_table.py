@@ -125,7 +125,9 @@ def test_channels_of_unknown_phase_are_led_by_the_score_that_they_have():
 
 
 def test_receivers_stand_below_with_the_first_metric_of_each_model():
-    at = lambda gaigs, mean: {"gaigs": rssi(gaigs, 77.0), "mean": rssi(mean, 66.0)}
+    def at(gaigs, mean):
+        return {"gaigs": rssi(gaigs, 77.0), "mean": rssi(mean, 66.0)}
+
     metrics = RSSI | {"receivers": {"[attic]": at(2.125, 7.5), "cellar": at(4.5, 3.875)}}
     bold = printed(metrics_table(metrics), styles=True)
     assert "\x1b[1m2.125\x1b[0m" in bold
@@ -145,7 +147,8 @@ def test_receivers_stand_below_with_the_first_metric_of_each_model():
     [
         (
             SPECTRA,
-            "gaigs is 0.245 above mean and 0.050 below knn in median SSIM on split runs of 20 [hard].",
+            "gaigs is 0.245 above mean and 0.050 below knn in median SSIM on split runs of 20 "
+            "[hard].",
         ),
         (RSSI, "gaigs is 3.00 dB below mean in MAE (lower is better) on split runs of 20 [hard]."),
         (
@@ -155,11 +158,13 @@ def test_receivers_stand_below_with_the_first_metric_of_each_model():
                 knn=spectrum(0.9004, 0),
                 mean=spectrum(0.8996, 0),
             ),
-            "gaigs is level with knn and level with mean in median SSIM on split runs of 20 [hard].",
+            "gaigs is level with knn and level with mean in median SSIM on split runs of 20 "
+            "[hard].",
         ),
         (
             run("rssi", gaigs=rssi(3.961), mean=rssi(6.28), knn=rssi(3.76), path_loss=rssi(3.964)),
-            "gaigs is 2.32 dB below mean, 0.20 dB above knn and level with path_loss in MAE (lower is better) on split "
+            "gaigs is 2.32 dB below mean, 0.20 dB above knn and level with path_loss in MAE (lower "
+            "is better) on split "
             "runs of 20 [hard].",
         ),
         (

@@ -179,7 +179,10 @@ def heard():
     heard[7] = False
     rows = heard.nonzero()[:, 0]
     early = rows < 90
-    official = lambda: (early.nonzero()[:, 0], (~early).nonzero()[:, 0])
+
+    def official():
+        return (early.nonzero()[:, 0], (~early).nonzero()[:, 0])
+
     return links_at(3 * torch.rand(120, 3, generator=generator)[rows], rows, official)
 
 

@@ -47,9 +47,10 @@ class Mirror(Placement):
         images = query.transmitters[:, None] * query.transmitters.new_tensor([1, 1, -1])
         ones, own = images.new_ones(b, 1 + count), images.new_ones(1)
         free = gaussians if count else None
-        beside = lambda mine, theirs, axis: (
-            mine if free is None else torch.cat((mine, theirs()), axis)
-        )
+
+        def beside(mine, theirs, axis):
+            return mine if free is None else torch.cat((mine, theirs()), axis)
+
         return Placed(
             means=beside(images, lambda: free.means.expand(b, -1, -1), 1),
             lengths=beside(images.norm(dim=-1), lambda: ones[:, 1:], 1),

@@ -162,7 +162,10 @@ def test_processes_share_each_batch_and_their_mean_is_that_of_the_batch(
     of_place = torch.randn(
         PLACES + 4, generator=torch.Generator().manual_seed(2), dtype=torch.float64
     )
-    of_places = lambda batch: of_place[batch.query.transmitters[:, 0].unique().long()].mean()
+
+    def of_places(batch):
+        return of_place[batch.query.transmitters[:, 0].unique().long()].mean()
+
     assert {len(batches) for batches in shared} == {steps}
     for batch, *parts in zip(whole, *shared, strict=True):
         held = [part for part in parts if part.shares != (0, 0)]

@@ -200,9 +200,12 @@ def test_a_training_that_goes_on_has_the_time_that_was_spent(train, links, tmp_p
     """Stopped between validations and at one, it sees what an uninterrupted one sees, whatever the
     clock shows now.
     """
-    make = lambda: make_module(
-        links, Turned(links.scene), learning_rates={"slope": 0.05, "network": 0.02}
-    )
+
+    def make():
+        return make_module(
+            links, Turned(links.scene), learning_rates={"slope": 0.05, "network": 0.02}
+        )
+
     whole, part, rest = Clock(), Clock(at=at), Clock(start=5000.0)
     torch.manual_seed(0)
     uninterrupted, stopped, resumed = make(), make(), make()

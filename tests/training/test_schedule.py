@@ -11,7 +11,9 @@ CONSTANT = {"_target_": "torch.optim.lr_scheduler.ConstantLR", "factor": 0.25, "
 
 @pytest.fixture
 def groups():
-    make = lambda size: nn.Parameter(torch.ones(size))
+    def make(size):
+        return nn.Parameter(torch.ones(size))
+
     return {"means": [make(2)], "network": [make(3), make(1)]}
 
 

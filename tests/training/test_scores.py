@@ -44,7 +44,9 @@ def test_links_count_alike_in_any_process(monkeypatch, processes, size):
 
 
 def test_random_numbers_follow_from_the_given_numbers():
-    draw = lambda *numbers: torch.rand(3, generator=seeded(*numbers)).tolist()
+    def draw(*numbers):
+        return torch.rand(3, generator=seeded(*numbers)).tolist()
+
     torch.manual_seed(5)
     first = draw(0, 7)
     torch.manual_seed(6)

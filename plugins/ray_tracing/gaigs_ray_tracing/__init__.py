@@ -98,21 +98,11 @@ class RayTracing(Model):
             raise ValueError(f"model.rays must be at least 1, got {rays}")
         self.room, self.mesh, self.materials = room, mesh, materials
         self.frequency, self.depth, self.rays = frequency, depth, rays
-        self.beamformer = None
-        if scene.task.dtype.is_complex:
-            check_elements("model 'ray_tracing'", scene)
-        elif scene.task.directions is not None:
-            self.beamformer = Beamformer("model 'ray_tracing'", scene)
-        elif scene.task.unit != "dBm":
-            raise ValueError(
-                f"model 'ray_tracing' predicts spectra, RSSI and channels, not labels of task "
-                f"{scene.task.name!r}; use another model"
-            )
+        self.beamformer = _beamformer(scene)
         learnt = {"log_permittivities": torch.zeros(0), "log_conductivities": torch.zeros(0)}
         if self.beamformer is None:
-            learnt["log_gains"] = torch.zeros(
-                len(scene.receivers), 2
-            )  # ln of amplitude, phase [rad]
+            # ln of amplitude, phase [rad]
+            learnt["log_gains"] = torch.zeros(len(scene.receivers), 2)
         for name, start in learnt.items():
             if calibrate:
                 self.register_parameter(name, nn.Parameter(start))
@@ -301,3 +291,22 @@ class RayTracing(Model):
         ):
             return torch.full((len(query),), float(self.frequency))
         return carriers(self.scene, query)
+
+
+def _beamformer(scene: Scene) -> Beamformer | None:
+    """The beamformer of spectra; None for channels and levels.
+
+    Raises:
+        ValueError: Labels are of another kind.
+    """
+    if scene.task.dtype.is_complex:
+        check_elements("model 'ray_tracing'", scene)
+        return None
+    if scene.task.directions is not None:
+        return Beamformer("model 'ray_tracing'", scene)
+    if scene.task.unit != "dBm":
+        raise ValueError(
+            "model 'ray_tracing' predicts spectra, RSSI and channels, not labels of task "
+            f"{scene.task.name!r}; use another model"
+        )
+    return None

@@ -157,7 +157,7 @@ class MeshRoom:
 
 
 def facing(position: Sequence[float], target: Sequence[float], turn: float = 0.0) -> Pose:
-    """Pose at a position [m] whose normal points at a target [m], rotated about the normal [deg]."""
+    """Pose at a position [m] with its normal towards a target [m], turned about it [deg]."""
     normal = torch.tensor(target, dtype=torch.float64) - torch.tensor(position, dtype=torch.float64)
     azimuth = torch.atan2(normal[1], normal[0])
     depression = torch.atan2(-normal[2], normal[:2].norm())

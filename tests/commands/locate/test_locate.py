@@ -254,7 +254,10 @@ def test_regions_of_tracks_hold_more_than_the_posterior_says(rssi):
 def test_prior_follows_the_known_places_and_a_region_replaces_it(rssi):
     links, model, prints = rssi
     known = links.query.transmitters[links.split.train]
-    apart = lambda places: torch.cdist(places, known).amin(1).median()
+
+    def apart(places):
+        return torch.cdist(places, known).amin(1).median()
+
     box = torch.stack((known.amin(0), known.amax(0)))
     even = gaigs.fingerprints(model, region=box, points=1000)
     assert apart(prints.candidates.places) < 0.95 * apart(even.candidates.places)
@@ -344,7 +347,10 @@ def test_neighbours_are_those_of_numpy():
         return weights @ places.numpy()[rows][near] / weights.sum()
 
     for count in (1, 2, 3, 5, 8, 12, 20, 30, 50):
-        rows = lambda i: [j for j in range(40) if j != i]
+
+        def rows(i):
+            return [j for j in range(40) if j != i]
+
         errors[count] = np.mean(
             [
                 np.linalg.norm(guess(filled[i], rows(i), count) - places[i].numpy())
@@ -363,7 +369,10 @@ def test_median_place_has_the_least_expected_distance():
     places, weights = rng.normal(size=(30, 3)), rng.dirichlet(np.full(30, 0.3), 2)
     found = geometric_median(torch.tensor(places).float(), torch.tensor(weights))
     for own, median in zip(weights, found.numpy(), strict=True):
-        expected = lambda place, own=own: own @ np.linalg.norm(places - place, axis=1)
+
+        def expected(place, own=own):
+            return own @ np.linalg.norm(places - place, axis=1)
+
         best = minimize(
             expected, own @ places, method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-9}
         )

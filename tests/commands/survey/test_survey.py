@@ -35,7 +35,10 @@ def fitted(links):
 def process(seed=0, known=12, noise=0.3):
     rng = np.random.default_rng(seed)
     places = torch.from_numpy(rng.uniform(0, 4, (known, 3)))
-    covariances = lambda a, b: 4 * torch.from_numpy(np.exp(-cdist(a, b) / 1.5))
+
+    def covariances(a, b):
+        return 4 * torch.from_numpy(np.exp(-cdist(a, b) / 1.5))
+
     return Process(covariances, places, torch.full((known,), noise, dtype=torch.float64), noise)
 
 
@@ -63,7 +66,10 @@ def test_covariances_are_those_given_the_readings():
 def test_losses_are_those_of_leaving_a_place_out():
     own, asked = process(noise=1.0), asked_places()
     known, _, losses, superfluous = measured_places([own], asked, MEAN)
-    error = lambda rows: MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
+
+    def error(rows):
+        return MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
+
     every = error(range(12))
     for place, loss in zip(known, losses, strict=True):
         kept = (own.places.float() != place).any(1).nonzero()[:, 0]
@@ -168,7 +174,10 @@ def test_first_places_lie_nearer_to_the_region_than_random_ones():
     candidates = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor(
         [8.0, 5.0, 0.5]
     )
-    apart = lambda places: torch.cdist(candidates, places).amin(1).mean()
+
+    def apart(places):
+        return torch.cdist(candidates, places).amin(1).mean()
+
     plan = gaigs.survey(candidates=candidates, count=20)
     assert apart(plan.places) < 0.9 * min(
         apart(candidates[20 * k : 20 * k + 20]) for k in range(20)
@@ -263,7 +272,10 @@ def test_losses_are_those_of_leaving_all_readings_of_a_place_out():
     often = torch.tensor([0] * 8 + [1] * 3 + list(range(2, 12)))
     own = replace(own, places=own.places[often], noises=own.noises[often])
     known, _, losses, _ = measured_places([own], asked, MEAN)
-    error = lambda rows: MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
+
+    def error(rows):
+        return MEAN * np.sqrt(variances(own, rows, asked) + own.noise).mean()
+
     for place, loss in zip(known, losses, strict=True):
         rows = [
             row

@@ -96,9 +96,10 @@ def test_one_thread_at_a_time_uses_the_model(mirrored, monkeypatch):
     shown = Contents(mirrored, links)
     for name in ("learnt_room", "learnt_paths", "evaluate"):
         own = getattr(type(mirrored), name)
-        watched = lambda *given, own=own, name=name: (
-            uses.append((name, shown.lock.locked())) or own(*given)
-        )
+
+        def watched(*given, own=own, name=name):
+            return uses.append((name, shown.lock.locked())) or own(*given)
+
         monkeypatch.setattr(type(mirrored), name, watched)
     shown.answer([1.0, 1.2, 1.1], 0)
     shown.facts()
@@ -247,7 +248,8 @@ def test_a_drag_changes_the_picture(is_served, browser, links, levels, tmp_path)
             url = (tmp_path / "room.html").as_uri()
         browser.open(url)
         browser.wait(
-            "window.viewer && viewer.ready && viewer.runs[0].drawing.layers.get('map').numbers.length"
+            "window.viewer && viewer.ready && "
+            "viewer.runs[0].drawing.layers.get('map').numbers.length"
         )
         pictures, before = (
             browser.run("return viewer.pictures"),

@@ -174,7 +174,10 @@ def test_the_fft_order_is_named(count, phase):
 def test_channels_without_their_parts_are_named(change):
     own = room(1, 16, 3)
     remarks = replace(own, h=change(own.h)).links().remarks
-    words = "(real parts are 0 or more|imaginary parts are 0) at all links, .* of amplitudes a and phases p"
+    words = (
+        "(real parts are 0 or more|imaginary parts are 0) at all links, .* of amplitudes a and "
+        "phases p"
+    )
     assert re.search(words, remarks)
 
 
@@ -190,7 +193,10 @@ def test_noise_in_guard_subcarriers_is_named(factor):
     own.h[..., :2] *= factor * np.exp(
         2j * np.pi * np.random.default_rng(0).random(own.h[..., :2].shape)
     )
-    words = "2 of 16 subcarriers are 30 dB or more from the usual one in power: 3.46, 3.465 GHz; leave them out if"
+    words = (
+        "2 of 16 subcarriers are 30 dB or more from the usual one in power: 3.46, 3.465 GHz; leave "
+        "them out if"
+    )
     assert words in own.links().remarks
 
 
@@ -206,7 +212,10 @@ def test_guard_and_null_subcarriers_are_left_out(value, caplog):
     assert links.labels.shape == (220, 4, 12)
     kept = np.delete(np.arange(16), nulls)
     torch.testing.assert_close(links.task.frequencies, torch.from_numpy(own.frequencies[kept]))
-    words = "4 of 16 subcarriers have one value in every link, and are left out: 3.46, 3.465, 3.5, 3.535 GHz"
+    words = (
+        "4 of 16 subcarriers have one value in every link, and are left out: 3.46, 3.465, 3.5, "
+        "3.535 GHz"
+    )
     assert links.remarks == words
     assert words in caplog.text
     assert gaigs.describe(links).findings == ()

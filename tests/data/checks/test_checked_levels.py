@@ -75,7 +75,8 @@ UNITS = {
     ),
     "sign": (
         -LEVELS,
-        "480 levels are above 0 dBm, .* to 8.*; was a sign lost, or are they path losses. levels = -l",
+        "480 levels are above 0 dBm, .* to 8.*; was a sign lost, or are they path losses. levels = "
+        "-l",
     ),
     "dBuV": (
         LEVELS + 107,

@@ -79,7 +79,10 @@ def test_a_head_left_out_does_not_exist_and_costs_nothing(heads):
 
 def test_the_number_of_parameters_is_that_of_the_papers_layers():
     scene, gaussian, transmitter = WIDTHS
-    linear = lambda fan_in, fan_out: (fan_in + 1) * fan_out
+
+    def linear(fan_in, fan_out):
+        return (fan_in + 1) * fan_out
+
     attenuation = linear(scene + gaussian + transmitter, WIDTH) + 2 * linear(WIDTH, WIDTH)
     signal = linear(scene + gaussian + transmitter + WIDTH, WIDTH) + linear(WIDTH, WIDTH)
     heads = {name: linear(WIDTH, 1) for name in ("opacity", "attenuation")}

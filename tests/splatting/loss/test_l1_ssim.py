@@ -82,7 +82,10 @@ def test_the_window_is_at_most_the_thinned_grid(rows, stride, window):
 def test_gradients_are_those_of_finite_differences(pair):
     grid = GRID.thin(slice(9), slice(8))
     values, labels = (part[:1, :9, :8] for part in pair)
-    ssim = lambda values: loss_of(values, labels, grid)[1]["ssim"]
+
+    def ssim(values):
+        return loss_of(values, labels, grid)[1]["ssim"]
+
     assert torch.autograd.gradcheck(ssim, values.requires_grad_())
 
 

@@ -203,7 +203,10 @@ def test_gradients_are_the_derivatives(scene):
     rays = Rays(torch.tensor([0.5, 0.9]), torch.tensor([0.3, 2.0]))
     heard = torch.view_as_real(lags).requires_grad_()
     pooling = PathSpectrum(scene)
-    small = lambda heard: pooling.read(torch.view_as_complex(heard), ask(1), rays)
+
+    def small(heard):
+        return pooling.read(torch.view_as_complex(heard), ask(1), rays)
+
     assert torch.autograd.gradcheck(small, heard, atol=1e-5)
 
 

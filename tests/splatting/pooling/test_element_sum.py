@@ -86,7 +86,10 @@ def test_a_bright_direction_is_a_plane_wave_from_there(pattern, conjugated, rece
     ray = pooling.grid.vectors()[row, column].double()
     places = array.elements.double() @ pose.rotation.double().T
     source = 1e6 * pose.rotation.double() @ ray
-    at = lambda distances: free_space(distances[:, None], FREQUENCIES, sign)
+
+    def at(distances):
+        return free_space(distances[:, None], FREQUENCIES, sign)
+
     arriving = at((source - places).norm(dim=1)) / at(source.norm()[None])
     middle = at((query.transmitters[0].double() - pose.position.double()).norm()[None])
     share = 1 / (ROWS * COLUMNS)  # of the sphere

@@ -115,9 +115,10 @@ def scene(
 ):
     """Paths in float64; some of them sit on the array's middle."""
     generator = torch.Generator().manual_seed(0)
-    random = lambda low, high, *shape: (
-        low + (high - low) * torch.rand(*shape, generator=generator).double()
-    )
+
+    def random(low, high, *shape):
+        return low + (high - low) * torch.rand(*shape, generator=generator).double()
+
     sets = b if own else 1
     points = torch.randn(b, n, 3, generator=generator).double()
     points = points + 0.5 * torch.nn.functional.normalize(
@@ -163,7 +164,10 @@ SUMS = {"fields": (fields_of, sum_fields), "lags": (lags_of, sum_lags)}
 
 def graded(function, leaves, constants):
     """A value, and the gradients of a fixed sum of it, each times the largest value of its leaf."""
-    made = lambda leaf: leaf is not None and leaf.dtype != torch.bool
+
+    def made(leaf):
+        return leaf is not None and leaf.dtype != torch.bool
+
     leaves = [leaf.detach().clone().requires_grad_() if made(leaf) else leaf for leaf in leaves]
     value, inputs = function(*leaves, *constants), [leaf for leaf in leaves if made(leaf)]
     gradients = torch.autograd.grad(fixed_sum(value), inputs, allow_unused=True)
@@ -180,11 +184,14 @@ def graded(function, leaves, constants):
 def test_sums_and_gradients_are_those_of_plain_sums(title, dtype):
     for what, (leaves, constants) in SCENES[title].items():
         function, plain = SUMS[what]
-        to = lambda part: (
-            part.to(dtype.to_complex() if part.is_complex() else dtype)
-            if isinstance(part, torch.Tensor) and part.dtype != torch.bool
-            else part
-        )
+
+        def to(part):
+            return (
+                part.to(dtype.to_complex() if part.is_complex() else dtype)
+                if isinstance(part, torch.Tensor) and part.dtype != torch.bool
+                else part
+            )
+
         found = graded(function, map(to, leaves), [*map(to, constants)])
         expected = graded(
             plain, (leaf if leaf is None else leaf.clone() for leaf in leaves), constants
@@ -207,7 +214,10 @@ def test_nan_shows(what, broken):
 def draw(n=6, b=2, spread=0.0, far=10.0, seed=0):
     """Points and semi-axes, amplitudes and path lengths, float64."""
     generator = torch.Generator().manual_seed(seed)
-    random = lambda *shape: torch.rand(*shape, generator=generator, dtype=torch.float64)
+
+    def random(*shape):
+        return torch.rand(*shape, generator=generator, dtype=torch.float64)
+
     centres = random(b, n, 2) - 0.5
     ahead = (1 - centres.square().sum(-1, keepdim=True)).sqrt()
     seen = far * torch.cat((centres, ahead), -1), far * spread * (random(b, n, 3, 3) - 0.5)
@@ -335,7 +345,10 @@ def test_coherence_is_the_share_of_interference(monkeypatch):
     monkeypatch.setattr(
         "gaigs.splatting.pooling.paths.LagPooling.least_spread", 0.0
     )  # the spread of a path weakens its own coherent part
-    lags = lambda *shares: lags_of(*seen, torch.tensor(shares).double(), None, ARRAY, carriers())
+
+    def lags(*shares):
+        return lags_of(*seen, torch.tensor(shares).double(), None, ARRAY, carriers())
+
     powers, whole = lags(0, 0), lags(1, 1)
     torch.testing.assert_close(lags(0.5, 0.4) - powers, 0.2 * (whole - powers))
     torch.testing.assert_close(lags(1, 0), powers)

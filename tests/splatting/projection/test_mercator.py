@@ -16,7 +16,10 @@ def test_it_is_the_papers_logarithm_scaled_to_the_limit(limit):
     azimuths = torch.linspace(-3, 3, 39, dtype=torch.float64)
     points = 2 * from_spherical(azimuths, torch.from_numpy(degrees).deg2rad())
     u, v = Mercator(0.01, limit).coordinates(points).unbind(-1)
-    paper = lambda elevation: np.log(np.tan(np.pi / 4 + np.radians(elevation) / 2))
+
+    def paper(elevation):
+        return np.log(np.tan(np.pi / 4 + np.radians(elevation) / 2))
+
     torch.testing.assert_close(u, azimuths)
     np.testing.assert_allclose(v, np.pi * paper(degrees) / paper(limit), rtol=1e-9, atol=1e-12)
 

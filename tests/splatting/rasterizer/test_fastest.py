@@ -15,7 +15,10 @@ pytestmark = pytest.mark.usefixtures("opencl_works")
 
 def scene(n=12, dtype=torch.float32, channels=2, attenuations=None):
     generator = torch.Generator().manual_seed(0)
-    random = lambda *shape: torch.rand(*shape, generator=generator).to(dtype)
+
+    def random(*shape):
+        return torch.rand(*shape, generator=generator).to(dtype)
+
     splats = Splats(
         random(n, 2),
         0.1 * torch.tensor([1, 0, 1]).to(dtype).expand(1, n, 3),

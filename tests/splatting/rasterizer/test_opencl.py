@@ -62,7 +62,10 @@ def random_scene(
     random axes.
     """
     generator = torch.Generator().manual_seed(seed)
-    uniform = lambda low, high, *shape: low + (high - low) * torch.rand(*shape, generator=generator)
+
+    def uniform(low, high, *shape):
+        return low + (high - low) * torch.rand(*shape, generator=generator)
+
     plane = plane or grid(Mercator(0.1))
     u = uniform(plane.u.min(), plane.u.max(), n)
     if plane.period is not None:
@@ -238,7 +241,10 @@ def test_channels_beyond_those_of_a_chunk_change_no_other(c, own):
 def test_tensors_may_have_any_layout():
     splats, signal, opacities, _, plane = random_scene(plane=grid(DirectionCosine(0.1)))
     pixels = torch.ones(3, *plane.shape, dtype=torch.bool)
-    strided = lambda tensor: tensor.mT.contiguous().mT
+
+    def strided(tensor):
+        return tensor.mT.contiguous().mT
+
     depths = splats.depths.repeat_interleave(2)[::2]
     other = (
         replace(splats, means2d=strided(splats.means2d), depths=depths),

@@ -115,7 +115,10 @@ def test_a_device_that_cannot_be_opened_is_an_error_that_names_it(function, monk
 def test_a_driver_that_does_not_know_the_processor_is_an_error_and_is_probed_once(monkeypatch):
     builds = []
     found_devices.find_fault.cache_clear()
-    program = lambda context, source: builds.append(source) or SimpleNamespace(build=broken(LOG))
+
+    def program(context, source):
+        return builds.append(source) or SimpleNamespace(build=broken(LOG))
+
     monkeypatch.setattr(found_devices.cl, "Program", program)
     for _ in range(2):
         with pytest.raises(

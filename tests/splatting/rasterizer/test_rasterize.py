@@ -9,9 +9,10 @@ from gaigs.core.propagation import bartlett
 
 def cloud(n=5, b=None, dtype=torch.float64):
     generator = torch.Generator().manual_seed(1)
-    draw = lambda *shape: torch.rand(
-        *([b] if b else []), n, *shape, generator=generator, dtype=dtype
-    )
+
+    def draw(*shape):
+        return torch.rand(*([b] if b else []), n, *shape, generator=generator, dtype=dtype)
+
     return {
         "means": draw(3) * 2 + 1, "quats": draw(4) - 0.5, "scales": draw(3) * 0.3 + 0.1, "opacities": draw() * 0.8,
         "signal": draw(2) - 0.5, "attenuations": draw() * 0.5 + 0.5,

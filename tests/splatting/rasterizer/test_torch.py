@@ -29,7 +29,10 @@ PROJECTIONS = {"mercator": Mercator, "direction_cosine": DirectionCosine}
 def scene(projection="mercator", n=40, own=False, attenuations=True, size=0.3):
     """Arguments of a rasterizer: Gaussians about a receiver, on its plane."""
     generator = torch.Generator().manual_seed(n)
-    uniform = lambda low, high, *shape: low + (high - low) * torch.rand(*shape, generator=generator)
+
+    def uniform(low, high, *shape):
+        return low + (high - low) * torch.rand(*shape, generator=generator)
+
     projection = PROJECTIONS[projection](GRID.pitch)
     means = from_spherical(uniform(0, math.tau, n), uniform(-0.5, 1.57, n)) * uniform(0.5, 4, n, 1)
     half = size * torch.randn(2 if own else 1, n, 3, 3, generator=generator)

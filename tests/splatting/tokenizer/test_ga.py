@@ -18,7 +18,9 @@ both = pytest.mark.parametrize("algebra", ["projective", "spacetime"])
 
 
 def make_scene(shift=0.0, scale=1.0):
-    place = lambda *coordinates: scale * torch.tensor(coordinates) + shift
+    def place(*coordinates):
+        return scale * torch.tensor(coordinates) + shift
+
     receiver = Receiver("gateway", Pose(place(5.0, 0.3, 1.0), torch.eye(3)))
     return Scene((receiver,), place(0.0, 0.0, 0.0), place(4.0, 3.0, 2.0), 0.1, Rssi())
 

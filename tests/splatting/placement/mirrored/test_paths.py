@@ -265,8 +265,11 @@ def test_obstacles_attenuate_paths_along_their_legs():
     clear, dimmed = bare(None, query), placement(None, query)
     losses = -(dimmed.gains / clear.gains).abs().log()
     heard = clear.gains.abs() > 0
+
     # The direct path has one leg, a reflected one two, which meet on the wall.
-    depth = lambda *ends: placement.obstacles(*(end - placement.middle for end in ends))
+    def depth(*ends):
+        return placement.obstacles(*(end - placement.middle for end in ends))
+
     direct = depth(query.transmitters, POSE.position.expand_as(query.transmitters))
     torch.testing.assert_close(losses[heard[:, 0], 0], direct[heard[:, 0]], rtol=1e-3, atol=1e-5)
     wall = 1 + 2  # y = 0
@@ -369,7 +372,8 @@ def test_the_initial_band_is_that_of_the_data_or_of_the_rooms_size():
         ({"order": -1}, "placement.order must be at least 0, got -1"),
         (
             {"order": 9},
-            r"order=9 gives more than 100,000 sequences of 6 planes, .*\n.*placement.order=6 or less",
+            r"order=9 gives more than 100,000 sequences of 6 planes, .*\n.*placement.order=6 or "
+            r"less",
         ),
         ({"planes": 10, "order": 10**9}, "set placement.order=5 or less"),
         ({"obstacles": -2}, "placement.obstacles must be at least 0, got -2"),
