@@ -19,7 +19,7 @@ import torch
 import gaigs
 from gaigs import processes
 from gaigs.io.files import write_text
-from gaigs.io.tables import original, write_csv
+from gaigs.io.tables import original, write_table
 from gaigs.report.table import markdown
 from gaigs.runs.evaluation import device_name
 
@@ -126,7 +126,7 @@ class Benchmark:
                 texts = {column: text_of(row.get(column)) for column in columns}
                 rows[identity(texts)] = texts | {"status": texts["status"] or MEASURED}
             lines = [[row[column] for column in columns] for row in rows.values()]
-            write_csv(file, [columns, *lines])
+            write_table(file, [columns, *lines])
             seconds = time.monotonic() - begin
             longest = max(longest, seconds)
             log.info("%s %d/%d: %.1f s", self.name, number_of_cell + 1, len(left), seconds)

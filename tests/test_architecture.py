@@ -22,7 +22,7 @@ FILES = {
     for file in (ROOT / "gaigs").rglob("*.py")
 }
 LONGEST_CHAIN = 10
-LIMITS = {"lines of gaigs/": 38_200, "lines of a file": 1_200}
+LIMITS = {"lines of gaigs/": 41_000, "lines of a file": 500}
 """Raised only with a reason. The checks of data against geometry (``data/checks``) took 1,700
 lines. Dense lines of reports and trainings, opened up, took 240.
 """

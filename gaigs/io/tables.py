@@ -251,9 +251,6 @@ def write_table(file: Path, rows: Iterable[Sequence]) -> None:
             writer.writerow([inert(cell) if isinstance(cell, str) else cell for cell in row])
 
 
-write_csv = write_table  # the name in commands and reports
-
-
 def inert(text: str) -> str:
     """A text that no spreadsheet takes for a formula.
 

@@ -83,7 +83,7 @@ def write_csv(file: Path, rows: Sequence[Mapping], endings: Sequence[str] = ()) 
                 for ending, number in zip(endings, others, strict=False):
                     cells[f"{column}{ending}"] = number
         lines.append([cells.get(column, "") for column in columns])
-    tables.write_csv(file, lines)
+    tables.write_table(file, lines)
 
 
 def terminal(

@@ -17,7 +17,7 @@ from gaigs.io.tables import (
     read_parts,
     read_points,
     to_index,
-    write_csv,
+    write_table,
 )
 
 
@@ -115,7 +115,7 @@ def test_a_folder_to_write_is_empty_or_missing(tmp_path):
 def test_no_text_of_a_written_table_is_a_formula_and_numbers_stay(tmp_path):
     texts = ['=HYPERLINK("http://example.com")', "+1-2", "-a", "@sum", "\tx", "'=1+1", "''-x"]
     plain = ["hall", "", "'hall", "a=b", "-70.5", "+3e-2", "-inf"]
-    write_csv(tmp_path / "names.csv", [["name", *texts], [-1.5, *plain]])
+    write_table(tmp_path / "names.csv", [["name", *texts], [-1.5, *plain]])
     with open(tmp_path / "names.csv", newline="") as file:
         (_, *written), (number, *others) = csv.reader(file)
     assert written == [f"'{text}" for text in texts]

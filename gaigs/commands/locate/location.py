@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gaigs.core.geometry import Frame
-from gaigs.io.tables import write_csv
+from gaigs.io.tables import write_table
 from gaigs.kriging.links import distances
 
 
@@ -97,4 +97,4 @@ def write_columns(path: str | Path, columns: Mapping[str, Tensor]) -> None:
     rows: list[list[str]] = [[*columns]]
     for numbers in zip(*(column.tolist() for column in columns.values()), strict=True):
         rows.append([f"{round(number, 6):.12g}" for number in numbers])
-    write_csv(Path(path), rows)
+    write_table(Path(path), rows)

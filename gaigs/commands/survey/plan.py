@@ -22,7 +22,7 @@ from gaigs.commands.survey.processes import (
 from gaigs.core.geometry import Frame, even_places
 from gaigs.core.query import Query, as_positions
 from gaigs.core.stages import track
-from gaigs.io.tables import write_csv
+from gaigs.io.tables import write_table
 from gaigs.kriging.kernel import Process
 from gaigs.kriging.links import coordinates
 from gaigs.model import Model
@@ -94,7 +94,7 @@ class SurveyPlan:
         losses = self.losses[self.superfluous].tolist()
         for place, loss in zip(self.known[self.superfluous].tolist(), losses, strict=True):
             rows.append(self._row("leave out", place, f"{self.known_error + loss:.6g}"))
-        write_csv(Path(path), rows)
+        write_table(Path(path), rows)
 
     def _row(self, use: str, place: Sequence[float], error: str) -> list[str]:
         numbers = [*place]
