@@ -171,7 +171,7 @@ class Kriging(Wrapper):
             )
         return self._krige_labels(links, values, is_final)
 
-    def _most(self, links: Links, most: int) -> int:
+    def _most(self, links: Links, most: int = LIMIT) -> int:
         """Most known links of a receiver: ``most``, or as many as three predictions of them take a
         third of the time left.
 
