@@ -285,7 +285,8 @@ def test_a_damaged_checkpoint_to_resume_from_destroys_nothing(finished, tmp_path
     (copy / name).write_bytes((copy / name).read_bytes()[:-999])
     before = digest(copy)
     with pytest.raises(
-        ValueError, match=rf"cannot resume the training: .*{name} is damaged.*\nmove .*last\.ckpt"
+        ValueError,
+        match=rf"cannot resume the training: .*{name} cannot be read: it is damaged.*\nmove .*last\.ckpt",
     ):
         runs.run(config, copy)
     assert digest(copy) == before

@@ -155,6 +155,8 @@ def radio_map(
     if height is None:
         height = _usual_height(scene)
     lower, upper = _rectangle(scene, float(height), float(margin))
+    for message in _doubts(scene, float(height), float(margin)):
+        warnings.warn(message, ExtrapolationWarning, stacklevel=3)  # a decorator lies between
     if frequency is None:
         frequency = scene.middle_frequency
     predict = _Predictions(model, chosen, frequency)
@@ -216,25 +218,27 @@ def _rectangle(scene: Scene, height: float, margin: float) -> tuple[ndarray, nda
             f"height must be finite and margin at least 0 [m], got height {height} and margin "
             f"{margin}"
         )
-    beyond = max(scene.lower[2].item() - height, height - scene.upper[2].item())
-    _warn_if_far("height", beyond, scene.extent, scene)
-    _warn_if_far("margin", margin, 20 * scene.extent, scene)
     receivers = [receiver.pose.position.numpy() for receiver in scene.receivers]
     ends = scene.lower.double().numpy(), scene.upper.double().numpy()
     corners = np.stack((*ends, *receivers))[:, :2]
     return corners.min(0) - margin, corners.max(0) + margin
 
 
-def _warn_if_far(name: str, distance: float, most: float, scene: Scene) -> None:
-    """Warns if an option puts transmitters more than ``most`` [m] outside the training box."""
-    if distance <= most:
-        return
-    message = (
-        f"{name} puts transmitters {distance:.4g} m outside the box of the training transmitters, "
-        f"which with the receivers is {scene.extent:.3g} m across; is it in m?"
-    )
-    # The caller of the public function, which a decorator wraps, is five frames up.
-    warnings.warn(message, ExtrapolationWarning, stacklevel=5)
+def _doubts(scene: Scene, height: float, margin: float) -> list[str]:
+    """Warnings about options that put transmitters far outside the training box."""
+    beyond = max(scene.lower[2].item() - height, height - scene.upper[2].item())
+    messages = []
+    for name, distance, most in (
+        ("height", beyond, scene.extent),
+        ("margin", margin, 20 * scene.extent),
+    ):
+        if distance > most:
+            messages.append(
+                f"{name} puts transmitters {distance:.4g} m outside the box of the training "
+                f"transmitters, which with the receivers is {scene.extent:.3g} m across; is it in "
+                "m?"
+            )
+    return messages
 
 
 def _check_pitch(pitch: float, lower: ndarray, upper: ndarray) -> None:

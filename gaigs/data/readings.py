@@ -123,7 +123,7 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     loud = values >= -1
     if 0 < loud.sum() <= min(3, len(values) - 1) and values[loud][0] > values[~loud][-1] + 10:
         marks += values[loud & ((counts > 1) | (values == 0))].tolist()
-    lowest = values.min(initial=0)
+    lowest = float(values.min(initial=0))
     inside = np.where((levels >= QUIETEST) & (levels <= LOUDEST), levels, np.nan)
     has_several = [len(np.unique(column[~np.isnan(column)])) > 1 for column in inside.T]
     inside = inside[:, has_several]

@@ -249,7 +249,9 @@ SPOILT = {
 def test_a_damaged_or_foreign_file_is_refused(spoil, folder, tmp_path):
     path = Path(shutil.copy(folder / "best.ckpt", tmp_path))
     SPOILT[spoil](path)
-    with pytest.raises(ValueError, match=r"best\.ckpt is (damaged, or )?no checkpoint of") as error:
+    with pytest.raises(
+        ValueError, match=r"best\.ckpt (cannot be read: it is damaged|is no checkpoint of)"
+    ) as error:
         gaigs.load(path)
     assert "weights_only" not in "".join(traceback.format_exception(error.value))
 
@@ -266,7 +268,7 @@ def test_any_change_of_a_file_is_found(change, folder, tmp_path):
     data, draw = (folder / "best.ckpt").read_bytes(), random.Random(0)
     for _ in range(8):
         (tmp_path / "best.ckpt").write_bytes(change(data, draw))
-        with pytest.raises(ValueError, match="is damaged"):
+        with pytest.raises(ValueError, match="it is damaged"):
             checkpoint.read(tmp_path / "best.ckpt")
 
 

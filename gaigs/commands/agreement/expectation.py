@@ -67,7 +67,7 @@ def on_split(
     return rows, remarks
 
 
-class Nearest(NamedTuple):
+class NearestLinks(NamedTuple):
     """The nearest known link of each test link.
 
     Attributes:
@@ -81,7 +81,7 @@ class Nearest(NamedTuple):
     missing: int
 
 
-def nearest_known(links: Links) -> Nearest:
+def nearest_known(links: Links) -> NearestLinks:
     """The nearest known link of each test link of the same receiver and carrier."""
     places = links.query.transmitters.double().numpy()
     order = visits(links)
@@ -98,7 +98,7 @@ def nearest_known(links: Links) -> Nearest:
             separations.append(np.abs(order[asked] - order[there[nearest]]))
     all_distances = np.concatenate(distances)
     missing = len(test) - len(all_distances)
-    return Nearest(all_distances, np.concatenate(separations), missing)
+    return NearestLinks(all_distances, np.concatenate(separations), missing)
 
 
 def drawn_scores(

@@ -144,7 +144,7 @@ def log_likelihood(difference: Mismatch, degrees: float, temper: float) -> Float
     return (difference.reception - temper * together).double()
 
 
-class Trial(NamedTuple):
+class UnseenPrints(NamedTuple):
     """Held-out fingerprints, compared with the map of a model that does not know them.
 
     Attributes:
@@ -176,7 +176,7 @@ class Trial(NamedTuple):
 
 def fitted(
     prints: Fingerprints,
-    trials: Sequence[Trial],
+    trials: Sequence[UnseenPrints],
     degrees: Sequence[float] = (0.25, 1.0, 4.0, 30.0),
     half_octaves: Iterable[int] = range(-8, 17),
     fewest: int = 20,

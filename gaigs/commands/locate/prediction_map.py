@@ -17,7 +17,7 @@ from gaigs.commands.locate.fingerprints import (
     receptions,
     transmissions,
 )
-from gaigs.commands.locate.likelihood import Trial, fitted, independent, mismatch
+from gaigs.commands.locate.likelihood import UnseenPrints, fitted, independent, mismatch
 from gaigs.core import stages
 from gaigs.core.geometry import ExtrapolationWarning, even_places
 from gaigs.core.query import as_positions, evenly
@@ -216,7 +216,7 @@ class MapMaker:
         return ((places >= self.box.amin(0)) & (places <= self.box.amax(0))).all(1)
 
 
-class Fold(NamedTuple):
+class PrintFold(NamedTuple):
     """Held-out fingerprints of one fold.
 
     Attributes:
@@ -231,9 +231,9 @@ class Fold(NamedTuple):
     truth: Float[Tensor, "n 3"]
     errors: Float[Tensor, "k r m"]
 
-    def half(self, number: int) -> "Fold":
+    def half(self, number: int) -> "PrintFold":
         """Every second fingerprint."""
-        return Fold(self.prints, *(part[number::2] for part in self[1:]))
+        return PrintFold(self.prints, *(part[number::2] for part in self[1:]))
 
 
 def held_out_folds(
@@ -243,7 +243,7 @@ def held_out_folds(
     most: int = 500,
     located: int = 200,
     enough: int = 300,
-) -> list[Fold]:
+) -> list[PrintFold]:
     """Folds of known links with the maps of models that do not know them.
 
     Args:
@@ -255,7 +255,7 @@ def held_out_folds(
         enough: Number of located fingerprints after which no fold is added.
     """
     links = maker.links
-    folds: list[Fold] = []
+    folds: list[PrintFold] = []
     for one, part, others in stages.track(model.unseen(links), "folds", model.fold_count):
         one.calibration = model.calibration
         # Known links of a transmission that has a link in the part are held out with it.
@@ -267,7 +267,7 @@ def held_out_folds(
             errors = values[chosen] - predicted(one, truth[chosen], maker.frequency).values
             if maker.is_region:  # a value from elsewhere is not like those that will be asked
                 chosen = chosen[maker.contains(truth[chosen])]
-            folds.append(Fold(maker.make(one, others), values[chosen], truth[chosen], errors))
+            folds.append(PrintFold(maker.make(one, others), values[chosen], truth[chosen], errors))
         if sum(min(len(fold.truth), located) for fold in folds) >= enough:
             break
     if len(folds) == 1 and len(folds[0].values) > 1:
@@ -275,7 +275,7 @@ def held_out_folds(
     return folds
 
 
-def trials_of(folds: Sequence[Fold], most: int = 200) -> list[Trial]:
+def trials_of(folds: Sequence[PrintFold], most: int = 200) -> list[UnseenPrints]:
     """Held-out fingerprints compared with the maps of their folds, at most so many of each."""
     trials = []
     for number, fold in enumerate(folds):
@@ -286,7 +286,7 @@ def trials_of(folds: Sequence[Fold], most: int = 200) -> list[Trial]:
         if len(chosen):
             asked = fold.values[chosen] @ prints.axes
             differences = [mismatch(prints, asked, unknown) for unknown in (False, True)]
-            trials.append(Trial(prints, differences, fold.truth[chosen]))
+            trials.append(UnseenPrints(prints, differences, fold.truth[chosen]))
     return trials
 
 

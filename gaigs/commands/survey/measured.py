@@ -30,8 +30,8 @@ class Measured(NamedTuple):
     superfluous: Bool[Tensor, " k"]
 
 
-class Readings(NamedTuple):
-    """Readings of one receiver, and its process at the asked places.
+class ReceiverReadings(NamedTuple):
+    """ReceiverReadings of one receiver, and its process at the asked places.
 
     Attributes:
         process: The process.
@@ -96,7 +96,7 @@ def measured_places(
     for process, index, measured, chance in zip(processes, rows, places, chances, strict=True):
         which = distances(measured, known).argmin(1)
         parts = [process.covariances(part, part).diagonal() for part in asked.split(16)]
-        readings.append(Readings(process, index, which, torch.cat(parts), chance))
+        readings.append(ReceiverReadings(process, index, which, torch.cat(parts), chance))
 
     def error(is_kept: Bool[Tensor, " k"]) -> float:
         deviations = []

@@ -139,7 +139,7 @@ class Scored(NamedTuple):
     score: float
 
 
-class Trial(NamedTuple):
+class Trials(NamedTuple):
     """Conventions to compare.
 
     Attributes:
@@ -155,7 +155,7 @@ class Trial(NamedTuple):
 
 def trials(
     links: Any, sample: Sample, directions: "Directions", is_known: bool, limits: Limits
-) -> Iterator[Trial]:
+) -> Iterator[Trials]:
     """All conventions: single ones, those of axes, and unless the read one is known, pairs."""
     axes = [*of_axes(sample, [("tx",), ("rx",), ("tx", "rx")])]
     units = [*of_units([("tx",), ("rx",)])]  # in any unit of both, directions are the same
@@ -165,15 +165,15 @@ def trials(
     single = [*of_frames(), *units, *orientations, *pixels, *columns]
     single += [*scaling_changes(sample, directions.grid), *order_changes(links)]
     single += of_receivers(sample, lambda links: directions.scores(links).mean().item())
-    yield Trial(single, limits.of_others, 1)
-    yield Trial(axes, limits.of_axes, 1)
+    yield Trials(single, limits.of_others, 1)
+    yield Trials(axes, limits.of_axes, 1)
     if is_known:
         return
     pairs = []
     for first, second in itertools.combinations([axes, units, orientations, pixels, columns], 2):
         for a, b in itertools.product(first, second):
             pairs.append(both(a, b))
-    yield Trial(pairs, limits.of_pairs, 2)  # there are hundreds
+    yield Trials(pairs, limits.of_pairs, 2)  # there are hundreds
 
 
 def best_directions(

@@ -111,7 +111,7 @@ def read(
     names = [table.names[columns.gateways[k]] for k in present]
     unit = ""
     if placed and not world.remark:
-        unit = _unit_of_gateways(survey, dict(zip(names, present, strict=True)), stands)
+        unit = _unit_of_gateways(survey, dict(zip(names, present.tolist(), strict=True)), stands)
 
     silent = [table.names[k] for k in columns.gateways if table.names[k] not in names]
     remarks = [
