@@ -59,9 +59,6 @@ RESPONSES = {
 }
 """Arrays of files with impulse responses ``a`` and ``tau`` in place of ``h``."""
 
-STRENGTHS = 1e-18, 1e18
-"""Range of the strongest entry of a channel, whose square float32 can hold."""
-
 
 @register("data", "csi_npz", task="csi", split="random")
 def read(
@@ -340,7 +337,7 @@ def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
 def _rule(name: str, array: np.ndarray, receivers: int) -> tuple[str, np.ndarray]:
     """The range of an array in words, and True for numbers within it."""
     if name == "h":
-        low, high = STRENGTHS
+        low, high = 1e-18, 1e18  # float32 can hold their squares
         sizes = np.abs(array)
         strongest = sizes.max((1, 2), keepdims=True)  # (n, 1, 1)
         is_faint = (strongest > 0) & (strongest < low)

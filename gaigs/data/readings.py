@@ -20,9 +20,6 @@ from gaigs.registry import suggest
 QUIETEST, LOUDEST = -150.0, 30.0
 """Bounds of readings [dBm]; others have another unit, a lost sign, or mean "not heard"."""
 
-MARKS = (100.0, 127.0, -200.0, -999.0)
-"""Usual marks of "not heard" out of these bounds."""
-
 ROUND = (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)
 """Usual marks of "not heard" within these bounds."""
 
@@ -118,7 +115,8 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     """
     values, counts = np.unique(levels[np.isfinite(levels)], return_counts=True)
     outside = (values < QUIETEST) | (values > LOUDEST)
-    marks = values[outside & ((counts > 1) | np.isin(values, MARKS))].tolist()
+    usual = (100.0, 127.0, -200.0, -999.0)
+    marks = values[outside & ((counts > 1) | np.isin(values, usual))].tolist()
     values, counts = values[~outside], counts[~outside]
     loud = values >= -1
     if 0 < loud.sum() <= min(3, len(values) - 1) and values[loud][0] > values[~loud][-1] + 10:

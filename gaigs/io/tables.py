@@ -213,10 +213,6 @@ def described(cell: str) -> str:
     return quote(cell)
 
 
-EMPTY = {"", "nan", "na", "n/a", "null", "none", "-inf", "-"}
-"""Cells that mean "not heard" in any table."""
-
-
 class Table(NamedTuple):
     """A table in numbers, a column a name: NaN for an empty cell, infinity for another text."""
 
@@ -299,7 +295,8 @@ def _level(cell: str, has_commas: bool) -> float:
     """
     text = re.sub(r"(?i)\s*dbm$", "", cell)
     value = to_number(text.replace(",", ".") if has_commas else text)
-    is_text = math.isnan(value) and text.strip().lower() not in EMPTY
+    empty = ("", "nan", "na", "n/a", "null", "none", "-inf", "-")
+    is_text = math.isnan(value) and text.strip().lower() not in empty
     return math.inf if is_text else value
 
 

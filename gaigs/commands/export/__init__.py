@@ -9,7 +9,7 @@ from gaigs.model import Model
 from gaigs.registry import call, check_instance, check_type
 from gaigs.runs import links_of, load
 
-MAPS = {
+MAP_FILES = {
     ".tif": maps.write_geotiff,
     ".tiff": maps.write_geotiff,
     ".geojson": maps.write_geojson,
@@ -18,9 +18,9 @@ MAPS = {
     ".pdf": maps.write_figures,
 }
 PREDICTIONS = ".csv", ".nc"
-ROOMS = ".glb", ".gltf", ".obj", ".xml"
+ROOM_FILES = ".glb", ".gltf", ".obj", ".xml"
 SCENARIO = ".deepmimo"
-SUFFIXES = (*dict.fromkeys((*MAPS, *PREDICTIONS, *ROOMS, SCENARIO)),)
+SUFFIXES = (*dict.fromkeys((*MAP_FILES, *PREDICTIONS, *ROOM_FILES, SCENARIO)),)
 
 
 def export(
@@ -70,13 +70,15 @@ def export(
     check_type("file", file, str | Path)
     file = Path(file)
     suffix = check_suffix(file)
-    if suffix in ROOMS:
+    if suffix in ROOM_FILES:
         return rooms.write_room(model, file, frequency)
     if suffix == SCENARIO:
         return scenarios.write_scenario(model, file, places, frequency)
-    if suffix in PREDICTIONS and (places is not None or suffix not in MAPS):
+    if suffix in PREDICTIONS and (places is not None or suffix not in MAP_FILES):
         return predictions.write_predictions(model, file, places, frequency, interval)
-    return MAPS[suffix](file, radio_map(model, pitch, height, frequency=frequency), model.scene)
+    return MAP_FILES[suffix](
+        file, radio_map(model, pitch, height, frequency=frequency), model.scene
+    )
 
 
 def check_suffix(file: Path) -> str:
@@ -101,12 +103,16 @@ def run(config: dict, folder: Path) -> None:
     suffix = check_suffix(Path(f"export.{form}"))
     model = load(config["folder"], config["trust"])
     takes_places = suffix in (*PREDICTIONS, SCENARIO)
-    if places is None and takes_places and (suffix not in MAPS or not model.scene.task.is_scalar):
+    if (
+        places is None
+        and takes_places
+        and (suffix not in MAP_FILES or not model.scene.task.is_scalar)
+    ):
         places = "test"
     if suffix in PREDICTIONS and places:
         name = "predictions"
     else:
-        name = "radio_map" if suffix in MAPS else "room"
+        name = "radio_map" if suffix in MAP_FILES else "room"
     if places == "test":
         places = links_of(config["folder"], config["trust"])
     elif isinstance(places, str):

@@ -47,13 +47,13 @@ class Measure(NamedTuple):
     meaning: str
 
 
-COHERENT = Measure(
+OVER_LINKS = Measure(
     coherence, 0.1, 0.8, "the direct wave explains {} of the channels", "in the mean over links"
 )
-WITHIN = Measure(
+WITHIN_LINKS = Measure(
     likeness, 0.3, 0.8, "the direct wave explains {} of each channel", "of the power within a link"
 )
-LEVEL = Measure(
+BY_LEVEL = Measure(
     level_share, 0.22, 0.3, "distance explains {} of the levels' spread", "of the spread of levels"
 )
 
@@ -97,9 +97,9 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
     waves = direct_waves(everywhere, links.query[train], task.frequencies)
     sign = phase_sign(labels, waves, receivers) if is_known else 0
-    finding = best_convention(few, COHERENT) if is_known else None
+    finding = best_convention(few, OVER_LINKS) if is_known else None
     if finding is None and not sign:
-        measure = WITHIN if has_gain else WITHIN._replace(measure=aligned_likeness)
+        measure = WITHIN_LINKS if has_gain else WITHIN_LINKS._replace(measure=aligned_likeness)
         finding = best_convention(few, measure)
     if finding is not None:
         yield finding
@@ -108,7 +108,7 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     strange = strange_parts(labels, waves, receivers, task.frequencies, sign) if sign else {}
     if strange:
         # Another convention may explain as much with a calibrated array.
-        calibrated = COHERENT._replace(measure=partial(coherence, is_calibrated=True))
+        calibrated = OVER_LINKS._replace(measure=partial(coherence, is_calibrated=True))
         finding = best_convention(few, calibrated)
         if finding is not None and finding.fits > 0.7 * coherence(few):
             yield finding
@@ -134,7 +134,7 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
 
 def _without_sign(few: Sample, is_enough: bool) -> Iterator[Finding]:
     """A finding about channels whose phases follow the distance with neither sign."""
-    finding = best_convention(few, LEVEL)
+    finding = best_convention(few, BY_LEVEL)
     if finding is not None:
         yield finding
     elif is_enough:

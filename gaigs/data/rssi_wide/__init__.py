@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from torch import Tensor
 
@@ -74,20 +74,10 @@ def read(
         ImportError: Coordinates are to be converted, and pyproj is not installed.
         ValueError: A file has a defect; the message names file, line, column and value.
     """
-    file = tables.find_file(file, "a table of readings")
-    table = tables.read_table(file, "a heading x,y,ap1,ap2,... and one place a line")
-    if {"tx_x", "rx_x"} <= {name.lower() for name in table.names}:
-        raise ValueError(
-            f"{table.file}, line 1: a table of a reading a line, with tx_x and rx_x; take "
-            "data=rssi_csv"
-        )
+    table = _read_table(file)
     axes = find_axes(table, coordinates)
     points = _read_points(table, axes, height, storey, epsg)
-    placed: dict[str, list[float]] = {}
-    unused: list[str] = []
-    if gateways is not None:
-        gateways = tables.find_file(gateways, "a table of gateways")
-        placed, unused = _read_gateways(gateways, table, axes, height, storey, epsg)
+    placed, unused = _read_gateways(gateways, table, axes, height, storey, epsg)
     columns = find_gateways(table, axes, placed, ignore or [], not_heard)
     is_placed = ~np.isnan(points).any(1)
     count = int(is_placed.sum())
@@ -101,12 +91,7 @@ def read(
     received = ~(np.isnan(levels) | np.isin(levels, columns.marks))
     survey = _averaged(world.points[:count], levels, received)
     rows, receivers = survey.counts.nonzero()
-    measured = len(np.unique(rows))
-    if measured < 2:
-        raise ValueError(
-            f"{table.file}: expected levels at two places or more, got {measured}; see "
-            "data.not_heard"
-        )
+    measured = _count_places(rows, table.file)
     present, receivers = np.unique(receivers, return_inverse=True)
     names = [table.names[columns.gateways[k]] for k in present]
     unit = ""
@@ -139,6 +124,28 @@ def read(
         noises=survey.noises,
         remarks="; ".join(filter(None, remarks)) + loud_remark(labels.tolist()),
     )
+
+
+def _read_table(file: str | Path) -> tables.Table:
+    """The table of readings; a ``ValueError`` for a table with a reading a line."""
+    path = tables.find_file(file, "a table of readings")
+    table = tables.read_table(path, "a heading x,y,ap1,ap2,... and one place a line")
+    if {"tx_x", "rx_x"} <= {name.lower() for name in table.names}:
+        raise ValueError(
+            f"{table.file}, line 1: a table of a reading a line, with tx_x and rx_x; take "
+            "data=rssi_csv"
+        )
+    return table
+
+
+def _count_places(rows: Int[ndarray, " n"], file: Path) -> int:
+    """Number of places with a reading; a ``ValueError`` if it is below two."""
+    count = len(np.unique(rows))
+    if count < 2:
+        raise ValueError(
+            f"{file}: expected levels at two places or more, got {count}; see data.not_heard"
+        )
+    return count
 
 
 def _remarks_on_readings(
@@ -252,9 +259,17 @@ def _read_points(
 
 
 def _read_gateways(
-    file: Path, table: tables.Table, axes: Axes, height: float, storey: float, epsg: int | None
+    given: str | Path | None,
+    table: tables.Table,
+    axes: Axes,
+    height: float,
+    storey: float,
+    epsg: int | None,
 ) -> tuple[dict[str, list[float]], list[str]]:
     """Coordinates of a file's gateways by the table's names, and its gateways without a column."""
+    if given is None:
+        return {}, []
+    file = tables.find_file(given, "a table of gateways")
     if file.suffix.lower() in (".yml", ".yaml"):
         places = {}
         units = units_of(table, axes, epsg)

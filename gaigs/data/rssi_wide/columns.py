@@ -12,10 +12,13 @@ from gaigs.data.maps import metres_of
 from gaigs.data.readings import LOUDEST, QUIETEST, and_list, marks_given, marks_of
 from gaigs.io import tables
 
-FORMS = ("{}", "{}pos", "pos{}", "{}coord", "coord{}", "position{}", "tx{}", "loc{}")
-PLAIN = {axis: {form.format(axis) for form in FORMS} for axis in "xyz"}
+AXIS_NAMES = {
+    axis: {axis, f"{axis}pos", f"pos{axis}", f"{axis}coord", f"coord{axis}", f"position{axis}",
+           f"tx{axis}", f"loc{axis}"}
+    for axis in "xyz"
+}  # fmt: skip
 PAIRS = (
-    (PLAIN["x"], PLAIN["y"]),
+    (AXIS_NAMES["x"], AXIS_NAMES["y"]),
     (
         {"easting", "east", "utmx", "utme", "utmeasting"},
         {"northing", "north", "utmy", "utmn", "utmnorthing"},
@@ -24,7 +27,7 @@ PAIRS = (
 )
 """Names of columns of x and y, easting and northing, longitude and latitude, in small letters."""
 
-HEIGHTS = PLAIN["z"] | {"alt", "altitude", "elevation", "height"}
+HEIGHTS = AXIS_NAMES["z"] | {"alt", "altitude", "elevation", "height"}
 FLOORS = {"floor", "storey", "floorid"}
 NAMES = {"name", "gateway", "ap", "id", "mac", "bssid", "ssid", "station", "anchor", "beacon"}
 
