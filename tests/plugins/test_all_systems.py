@@ -280,10 +280,10 @@ def seen_in(elevations):
 @pytest.mark.parametrize(
     ("name", "scene", "message"),
     [
-        *((name, links_of("spectrum", CARRIERS[:2]).scene, "of one carrier, and these links have 2")
+        *((name, links_of("spectrum", CARRIERS[:2]).scene, "learns one carrier, and the training links have 2")
           for name in ("array_response", "nerf2", "nerf_apt", "gsrf")),
-        ("newrf", links_of("csi", CARRIERS[:2]).scene, "of one carrier, and these links have 2"),
-        ("ngrf", links_of("csi", CARRIERS[:2]).scene, "of one carrier, and these links have 2"),
+        ("newrf", links_of("csi", CARRIERS[:2]).scene, "learns one carrier, and the training links have 2"),
+        ("ngrf", links_of("csi", CARRIERS[:2]).scene, "learns one carrier, and the training links have 2"),
         ("ngrf", of_task("rssi"), "gives complex channels, not labels of task 'rssi'"),
         ("newrf", of_task("rssi"), "gives complex channels, not labels of task 'rssi'"),
         ("newrf", replace(of_task("csi"), task=Csi(4, torch.tensor([2.4e9]))), "a single subcarrier"),

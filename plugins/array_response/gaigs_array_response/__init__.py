@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from gaigs.core import geometry
 from gaigs.core.geometry import Directions
 from gaigs.core.query import Batch
-from gaigs.core.scene import Scene
+from gaigs.core.scene import Scene, check_one_carrier
 from gaigs.model import Model, Prediction
 from gaigs.splatting.tokenizer.euclidean import fourier_features, learnable_octaves
 from gaigs.splatting.tokenizer.euclidean import octaves as angular_frequencies
@@ -62,12 +62,7 @@ class ArrayResponse(Model):
                 f"model 'array_response' predicts spectra, not labels of task {scene.task.name!r}; "
                 "use another model"
             )
-        if scene.has_band:
-            raise ValueError(
-                "model 'array_response' measures its array in wavelengths, of one carrier, and "
-                "these links have "
-                f"{len(scene.frequencies)}; use another model"
-            )
+        check_one_carrier("model 'array_response'", scene)
         if rows < 1 or columns < 1 or rows * columns < 2:
             raise ValueError(
                 f"an array must have at least 2 elements, got model.rows={rows}, "

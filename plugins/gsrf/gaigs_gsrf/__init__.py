@@ -11,7 +11,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor, nn
 
 from gaigs.core.query import Batch, Query
-from gaigs.core.scene import Scene
+from gaigs.core.scene import Scene, check_one_carrier
 from gaigs.data import Links
 from gaigs.model import Model, Prediction
 from gaigs.registry import registry
@@ -65,11 +65,7 @@ class Gsrf(Model):
         signal: float,
     ):
         super().__init__(scene)
-        if scene.has_band:
-            raise ValueError(
-                f"model 'gsrf' is of one carrier, and these links have {len(scene.frequencies)}; "
-                "use another model"
-            )
+        check_one_carrier("model 'gsrf'", scene)
         if not 0 < radius < math.inf:
             raise ValueError(f"model.radius must be positive [m], got {radius}")
         if pooling is None:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from gaigs.core.geometry import Directions, Grid, magnitudes
 from gaigs.core.phases import array_sign
 from gaigs.core.query import Query, check_carrier
-from gaigs.core.scene import Scene, check_elements, direct_waves
+from gaigs.core.scene import Scene, check_elements, check_one_carrier, direct_waves
 from gaigs.data import Links
 
 REACH = 0.025
@@ -176,11 +176,7 @@ def make_reading(scene: Scene, rays: list[int], frequency: float) -> Reading:
             is out of range.
     """
     task = scene.task
-    if scene.has_band:
-        raise ValueError(
-            f"a radiance field is of one carrier, and these links have {len(scene.frequencies)}; "
-            "take another model"
-        )
+    check_one_carrier("a radiance field", scene)
     if len(rays) != 2:
         raise ValueError(f"model.rays must be [rows, columns], got {rays}")
     check_carrier("model.frequency", frequency)

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize, pad, softplus
 from gaigs.core.phases import array_sign
 from gaigs.core.propagation import free_space
 from gaigs.core.query import Batch
-from gaigs.core.scene import Scene, check_elements, direct_waves
+from gaigs.core.scene import Scene, check_elements, check_one_carrier, direct_waves
 from gaigs.data import Links
 from gaigs.model import Model, Prediction
 from gaigs.splatting.tokenizer.euclidean import MAX_OCTAVE, fourier_features
@@ -149,12 +149,7 @@ class NeWrf(Model):
                 "tell; take another "
                 "model"
             )
-        if scene.has_band:
-            raise ValueError(
-                "the field of model 'newrf' is of one carrier, and these links have "
-                f"{len(scene.frequencies)}; take "
-                "another model"
-            )
+        check_one_carrier("model 'newrf'", scene)
         least = {
             "arrivals": 1,
             "samples": 2,

@@ -13,7 +13,7 @@ from gaigs.core.geometry import polar, quaternions_to_rotations
 from gaigs.core.phases import array_sign
 from gaigs.core.propagation import fit_gain, free_space
 from gaigs.core.query import Batch
-from gaigs.core.scene import Scene, check_elements, direct_waves
+from gaigs.core.scene import Scene, check_elements, check_one_carrier, direct_waves
 from gaigs.data import Links
 from gaigs.model import Model, Prediction
 from gaigs.splatting.tokenizer.euclidean import fourier_features, learnable_octaves, octaves
@@ -72,11 +72,7 @@ class NGrf(Model):
     ):
         super().__init__(scene)
         check_elements("model 'ngrf'", scene)
-        if scene.has_band:
-            raise ValueError(
-                f"model 'ngrf' is of one carrier, and these links have {len(scene.frequencies)}; "
-                "use another model"
-            )
+        check_one_carrier("model 'ngrf'", scene)
         for option, number in (("count", count), ("width", width), ("layers", layers)):
             if number < 1:
                 raise ValueError(f"model.{option} must be at least 1, got {number}")
