@@ -49,7 +49,7 @@ FILES = {".csv", ".json", ".png", ".ply", ".log"}
 PLUGINS = ROOT / "docs/plugins.md"
 BRIEF = [
     "trainer.max_steps=2", "trainer.val_check_interval=2", "trainer.accelerator=cpu", "gaussians.count=20",
-    "trainer.enable_progress_bar=false", "split.validation=0.2",
+    "trainer.enable_progress_bar=false", "split.validation=0.2", "baselines=[mean,knn]",
 ]  # fmt: skip
 FEW = {
     "data=delay_spread": ["data.places=20"],

@@ -7,7 +7,7 @@ import os
 import re
 import sys
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
@@ -196,7 +196,8 @@ def _dropped_holders(kind: str | None = None) -> tuple[list[Holder], list[str]]:
         try:
             if file.name == "pyproject.toml":
                 (source,) = sources(root / "plugins", file.parent.name)
-                points = _project_entry_points(tomllib.loads(file.read_text(encoding="utf-8")))
+                state = file.stat()
+                points = _project_entry_points(file, state.st_mtime_ns, state.st_size)
                 for group, name, target in points:
                     holders.append(Holder(group, name, where, target, root=source))
             else:
@@ -207,13 +208,16 @@ def _dropped_holders(kind: str | None = None) -> tuple[list[Holder], list[str]]:
     return [holder for holder in holders if kind in (None, holder.kind)], unreadable
 
 
-def _project_entry_points(project: Mapping) -> Iterator[tuple[str, str, str]]:
+@functools.cache  # a composition asks for each kind
+def _project_entry_points(file: Path, *_state: int) -> list[tuple[str, str, str]]:
     """Kind, name and target of each entry point of gaigs in a pyproject.toml."""
-    groups = project.get("project", {}).get("entry-points", {})
-    for group, points in groups.items():
+    project = tomllib.loads(file.read_text(encoding="utf-8")).get("project", {})
+    entries = []
+    for group, points in project.get("entry-points", {}).items():
         if group.startswith("gaigs."):
             for name, target in points.items():
-                yield group.removeprefix("gaigs."), name, str(target)
+                entries.append((group.removeprefix("gaigs."), name, str(target)))
+    return entries
 
 
 def _plugin_files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
