@@ -23,7 +23,7 @@ from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Parts
 from gaigs.registry import check_type
 
-PART = 64
+TRANSMITTERS_AT_ONCE = 64
 """Transmitters simulated at a time: the waves of their paths take 100 times the labels' memory."""
 
 
@@ -39,7 +39,8 @@ class SimulatedRoom:
         frequency_offsets: From a bandwidth, frequencies that sample the band, relative to its
             middle [Hz].
         respond: From places (n, 3), a receiver, a frequency and offsets (f,), the response of each
-            element to unit-power transmitters, ``PART`` of them at a time (part, elements, f).
+            element to unit-power transmitters, ``TRANSMITTERS_AT_ONCE`` of them at a time
+            (part, elements, f).
     """
 
     pose: Pose

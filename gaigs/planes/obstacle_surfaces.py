@@ -95,9 +95,9 @@ class Crossings(NamedTuple):
     """Points where paths cross surfaces.
 
     Attributes:
-        cosines: Of the angles of incidence.
-        tm_shares: Shares of TM in vertical polarisation.
-        paths, surfaces: Numbers.
+        cosines: Cosines of the angles of incidence (c,).
+        tm_shares: Shares of the TM field in vertical polarisation (c,).
+        paths, surfaces: Numbers of the path and of the surface (c,).
     """
 
     cosines: Float[Tensor, " c"]

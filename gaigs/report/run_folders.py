@@ -97,7 +97,7 @@ def read_runs(folder: Path) -> list[Run]:
             "pass the folder that Hydra made for 'python -m gaigs --multirun ...'"
         )
     runs = [_read_run(place, place.relative_to(folder).as_posix()) for place in places]
-    _tell_apart(runs)
+    _add_differing_options(runs)
     return sorted(runs, key=_by_number)
 
 
@@ -188,8 +188,13 @@ def _has_unread_tokenizer(config: Mapping) -> bool:
     return (config.get("deformation") or {}).get("name") == "none"
 
 
-def _tell_apart(runs: list[Run]) -> None:
-    """Adds values of configurations to equal overrides of runs that differ in other options."""
+def _add_differing_options(runs: list[Run]) -> None:
+    """Adds options to ``overrides`` where runs of one group differ in them.
+
+    Runs of a group have the same overrides but for the seed, so the options come from
+    ``config.yaml`` alone.
+    Runs with another value than most of the group get a doubt.
+    """
     for group in by_seed(runs):
         configs = {run.folder: _compared(run.config) for run in group}
         first, *others = configs.values()

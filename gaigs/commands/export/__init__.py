@@ -18,9 +18,9 @@ MAPS = {
     ".pdf": maps.write_figures,
 }
 PREDICTIONS = ".csv", ".nc"
-ROOMS = ".glb", ".gltf", ".obj", ".xml"
+ROOM_FORMATS = ".glb", ".gltf", ".obj", ".xml"
 SCENARIO = ".deepmimo"
-SUFFIXES = (*dict.fromkeys((*MAPS, *PREDICTIONS, *ROOMS, SCENARIO)),)
+SUFFIXES = (*dict.fromkeys((*MAPS, *PREDICTIONS, *ROOM_FORMATS, SCENARIO)),)
 
 
 def export(
@@ -70,7 +70,7 @@ def export(
     check_type("file", file, str | Path)
     file = Path(file)
     suffix = check_suffix(file)
-    if suffix in ROOMS:
+    if suffix in ROOM_FORMATS:
         return rooms.write_room(model, file, frequency)
     if suffix == SCENARIO:
         return scenarios.write_scenario(model, file, places, frequency)

@@ -98,11 +98,11 @@ class PlaceDensity:
             most: Largest number of places whose density counts.
             tried: Number of widths, from a quarter of the spacing to the diagonal of the box.
         """
-        some = evenly(torch.arange(len(self.places)), most)
+        rows = evenly(torch.arange(len(self.places)), most)
         ends = math.log10(spacing / 4), math.log10(self.edges.norm())
 
         def mean_logarithm(width: float) -> float:
-            return self.logarithm(self.places[some], width, self.folds[some]).mean().item()
+            return self.logarithm(self.places[rows], width, self.folds[rows]).mean().item()
 
         return max(torch.logspace(*ends, tried).tolist(), key=mean_logarithm)
 

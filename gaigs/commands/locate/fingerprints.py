@@ -48,8 +48,8 @@ class Fingerprints:
             (m, k).
         values: Predictions at the candidates along these axes (g, r, k).
         deviations: Standard deviations of labels of one number (g, r); else 1.
-        hearing: Probability that each receiver receives a transmitter there (g, r); without links a
-            half.
+        reception_probabilities: Probability that each receiver receives a transmitter there (g, r);
+            without links a half.
         degrees, temper: Arguments of ``log_likelihood``.
         held: Held-out fingerprints of each fold, which calibrate regions; empty without links.
         frame: Place of x and y on a map; None if unknown.
@@ -68,7 +68,7 @@ class Fingerprints:
     axes: Float[Tensor, "m k"]
     values: Float[Tensor, "g r k"]
     deviations: Float[Tensor, "g r"]
-    hearing: Float[Tensor, "g r"]
+    reception_probabilities: Float[Tensor, "g r"]
     degrees: float = 4.0
     temper: float = 1.0
     held: tuple[LocatedFold, ...] = ()

@@ -50,7 +50,7 @@ class Measure(NamedTuple):
 COHERENT = Measure(
     coherence, 0.1, 0.8, "the direct wave explains {} of the channels", "in the mean over links"
 )
-WITHIN = Measure(
+WITHIN_LINK = Measure(
     likeness, 0.3, 0.8, "the direct wave explains {} of each channel", "of the power within a link"
 )
 LEVEL = Measure(
@@ -99,7 +99,7 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     sign = phase_sign(labels, waves, receivers) if is_known else 0
     finding = best_convention(few, COHERENT) if is_known else None
     if finding is None and not sign:
-        measure = WITHIN if has_gain else WITHIN._replace(measure=aligned_likeness)
+        measure = WITHIN_LINK if has_gain else WITHIN_LINK._replace(measure=aligned_likeness)
         finding = best_convention(few, measure)
     if finding is not None:
         yield finding

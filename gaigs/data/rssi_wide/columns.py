@@ -13,9 +13,9 @@ from gaigs.data.readings import LOUDEST, QUIETEST, and_list, marks_given, marks_
 from gaigs.io import tables
 
 FORMS = ("{}", "{}pos", "pos{}", "{}coord", "coord{}", "position{}", "tx{}", "loc{}")
-PLAIN = {axis: {form.format(axis) for form in FORMS} for axis in "xyz"}
+PLAIN_HEADINGS = {axis: {form.format(axis) for form in FORMS} for axis in "xyz"}
 PAIRS = (
-    (PLAIN["x"], PLAIN["y"]),
+    (PLAIN_HEADINGS["x"], PLAIN_HEADINGS["y"]),
     (
         {"easting", "east", "utmx", "utme", "utmeasting"},
         {"northing", "north", "utmy", "utmn", "utmnorthing"},
@@ -24,7 +24,7 @@ PAIRS = (
 )
 """Names of columns of x and y, easting and northing, longitude and latitude, in small letters."""
 
-HEIGHTS = PLAIN["z"] | {"alt", "altitude", "elevation", "height"}
+HEIGHTS = PLAIN_HEADINGS["z"] | {"alt", "altitude", "elevation", "height"}
 FLOORS = {"floor", "storey", "floorid"}
 NAMES = {"name", "gateway", "ap", "id", "mac", "bssid", "ssid", "station", "anchor", "beacon"}
 
@@ -40,7 +40,7 @@ class Columns(NamedTuple):
     Attributes:
         gateways: Numbers of the gateways' columns.
         marks: Values that mean "not heard".
-        silent: Names of gateways that heard nothing.
+        silent: Names of gateways that received nothing.
         ignored: Names of other columns.
     """
 

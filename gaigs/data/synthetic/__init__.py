@@ -13,7 +13,7 @@ from gaigs.core.geometry import Grid, Pose
 from gaigs.data import Links
 from gaigs.data.readings import gateway
 from gaigs.data.simulation import (
-    PART,
+    TRANSMITTERS_AT_ONCE,
     SimulatedRoom,
     draw_places,
     simulate_spectra,
@@ -111,9 +111,9 @@ def respond_in_parts(
 ) -> Iterator[Complex[Tensor, "part elements f"]]:
     """``respond`` for the paths of at most ``order`` reflections in any room.
 
-    ``PART`` transmitters [m] are taken at a time.
+    ``TRANSMITTERS_AT_ONCE`` transmitters [m] are taken at a time.
     """
-    for part in transmitters.split(PART):
+    for part in transmitters.split(TRANSMITTERS_AT_ONCE):
         paths = trace(room, part, receiver.pose.position, frequency, order)
         yield respond(paths, receiver, frequency, offsets)
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gaigs.core.antenna import Receiver
 from gaigs.data.readings import gateway
-from gaigs.data.simulation import PART, SimulatedRoom, draw_places
+from gaigs.data.simulation import TRANSMITTERS_AT_ONCE, SimulatedRoom, draw_places
 from gaigs.data.synthetic.image_source import respond
 
 from .cache import find_paths
@@ -99,9 +99,9 @@ def _respond_in_parts(
     frequency: float,
     offsets: Tensor,
 ) -> Sequence[Tensor]:
-    """``respond`` for the traced paths, ``PART`` places at a time."""
+    """``respond`` for the traced paths, ``TRANSMITTERS_AT_ONCE`` places at a time."""
     paths = find_paths(room, receiver.pose.position, places, frequency, diffraction)
-    return respond(paths, receiver, frequency, offsets).split(PART)
+    return respond(paths, receiver, frequency, offsets).split(TRANSMITTERS_AT_ONCE)
 
 
 def place(room: MeshRoom, count: int, seed: int) -> Float[Tensor, "count 3"]:
