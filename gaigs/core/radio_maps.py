@@ -29,7 +29,7 @@ class RadioMap:
         values: One map a receiver (receivers, rows, columns) [unit]; rows along y, columns along x.
         x: One a column, world frame [m].
         y: One a row, world frame [m].
-        height: Of the transmitters, world frame [m].
+        height: Height of the transmitters, world frame [m].
         receivers: Names of the receivers.
         quantity: Name of the predicted quantity.
         unit: Unit of a value; empty for a ratio.

@@ -90,7 +90,7 @@ def read(
             responses, see ``gaigs.data.impulse_responses.from_sionna``.
         arrays: Names of these arrays in the file where they differ, such as ``{"h": "CSI"}``; two
             names are those of real and imaginary part.
-        phase: Of ``gaigs.core.task.csi.Csi``.
+        phase: See ``gaigs.core.task.csi.Csi``.
         band_train, band_test: Subcarriers to train and to test on, as for
             ``gaigs.data.bands.hold_out_band`` [Hz].
         parts: Axis of 2, ``first`` or ``last``, along which a real ``h`` has real and imaginary

@@ -68,7 +68,8 @@ class Responses(NamedTuple):
     """Impulse responses between places.
 
     Attributes:
-        gains: Of k receivers with e antennas, n transmitters with m, and p paths (k, e, n, m, p).
+        gains: Complex gains (k, e, n, m, p) of p paths; k receivers have e antennas, n
+            transmitters m.
         delays: The same, or with a 1 for the antennas [s].
         tx, rx: Places of both ends (n, 3), (k, 3) [m].
     """

@@ -90,8 +90,8 @@ def from_arrays(
         receivers: ``Receiver`` or several, or positions (3,) or (k, 3) [m] of antennas that look
             along the axes; all elements of a channel then stand there.
         labels: One a link, (n, ...) of the task's shape; or one for each transmitter and receiver,
-            (n, k, ...). Readings of NaN or None and channels of zeros were not received: they are left
-            out, and so are receivers without training links.
+            (n, k, ...). Readings of NaN or None and channels of zeros were not received: they are
+            left out, and so are receivers without training links.
         index: Receiver of each link (n,), or of all, from 0; not needed with one receiver, n
             positions, or labels (n, k, ...).
         frequency: Carrier, one or one a link [Hz]; None if unknown, for channels the middle of the

@@ -26,9 +26,9 @@ NOT_HEARD = -100.0
 def read(root: str | Path, frequency: float | None = None) -> Links:
     """A data set from its folder: one link for each reading that a gateway received.
 
-    Readings of -100 dBm were not received. They, and gateways that received nothing, are left out
-    and counted in the remarks. Gateways look along the world's axes. The readings of one measurement
-    share a row.
+    Readings of -100 dBm were not received. They, and gateways that received nothing, are
+    left out and counted in the remarks. Gateways look along the world's axes. The readings of one
+    measurement share a row.
 
     Args:
         root: Folder with ``tx_pos.csv``, ``gateway_rssi.csv``, ``gateway_position.yml``, for the

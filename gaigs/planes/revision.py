@@ -44,7 +44,7 @@ def move_planes(
     Args:
         model: With a placement ``mirrored``.
         batch: Links whose errors count.
-        wavelength: Of the carrier [m].
+        wavelength: Wavelength of the carrier [m].
         least: Least distance searched on either side [m].
         widest: Largest distance [wavelengths].
 

@@ -46,7 +46,7 @@ class Revision(Callback):
 
     Args:
         links: Links with a split.
-        seed: Of the choice of links.
+        seed: Seed of the choice of links.
         max_links: Most training links, and validation links, of a revision: a search evaluates them
             hundreds of times.
     """

@@ -218,7 +218,7 @@ class Directions:
 
     Attributes:
         grid: Directions of the pixels that are compared.
-        ranks: Of each pixel, 0 for the darkest and 1 for the brightest (n, rows, columns).
+        ranks: Rank of each pixel, 0 for the darkest and 1 for the brightest (n, rows, columns).
         places: Number of places that count: within a sixth of the room spectra are alike.
     """
 

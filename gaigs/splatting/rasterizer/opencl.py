@@ -442,7 +442,7 @@ def _tiling(
     """A plane in whole tiles, as the kernels read it.
 
     Args:
-        queue: Of the device.
+        queue: Command queue of the device.
         u_content, v_content: Bytes and shapes of u and v.
         period: As in ``Plane``.
 

@@ -27,8 +27,8 @@ class MovablePlanes(Placement):
     Neither rounding nor a turn of a plane depends on the world's origin.
 
     Attributes:
-        middle: Of the room [m].
-        diagonal: Of the box that holds transmitters and receivers [m].
+        middle: Middle of the room [m].
+        diagonal: Diagonal of the box that holds transmitters and receivers [m].
         turn: Rotation from the world's axes to the first planes' axes.
         origin: Normals and offsets at the start, or at the last change of ``step`` (w, 4); the
             offsets are in metres from ``middle``.
