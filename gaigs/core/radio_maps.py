@@ -129,7 +129,7 @@ def radio_map(
             training, and of several floors that with most training places.
         margin: Widening of the box on each side [m].
         receivers: Names or indices, or one of them; None: all receivers.
-        frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
+        frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
 
     Warns:
         ExtrapolationWarning: The frequency is outside the training links' band, or height or margin

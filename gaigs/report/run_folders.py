@@ -29,7 +29,7 @@ class Run(NamedTuple):
         config: The run's configuration; empty if it is unknown.
         metrics: Contents of ``metrics.json``; None where the job failed, was stopped or still runs.
         failure: The error of a failed job; else None.
-        doubts: Sentences on overrides that are not those of the run's configuration.
+        doubts: Sentences on overrides that differ from the run's configuration.
     """
 
     name: str
@@ -224,7 +224,7 @@ def _compared(config: Mapping) -> dict:
     parts = {**config}
     if _has_unread_tokenizer(config):
         parts.pop("tokenizer", None)
-    # A model's configuration repeats those of its parts.
+    # A model's configuration repeats the configurations of its parts.
     model = config.get("model") or {}
     return parts | {"model": {key: value for key, value in model.items() if key not in config}}
 

@@ -123,7 +123,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
     Args:
         model: A trained, fitted or loaded model, of the same receivers and task.
         links: Links with a split.
-        baselines: Names or configurations of models without a training; None: those of the task.
+        baselines: Names or configurations of models without a training; None: the task's own.
 
     Raises:
         TypeError: The model is not a ``gaigs.Model``, or the links are not ``gaigs.Links``.
@@ -179,7 +179,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
 
 
 def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:
-    """The numbers of a table, and those of intervals where a model has them."""
+    """The numbers of a table, with numbers of intervals where a model has them."""
     of_task = task_scores(scores)
     of_intervals = {
         name.removeprefix(INTERVALS): score for name, score in scores.items() if name not in of_task
@@ -188,7 +188,7 @@ def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:
 
 
 def task_scores(scores: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The scores of the task, without those of intervals."""
+    """The scores of the task, without scores of intervals."""
     return {name: score for name, score in scores.items() if not name.startswith(INTERVALS)}
 
 

@@ -104,7 +104,7 @@ def measure(
     The later label of a pair is scored with the earlier as its prediction.
 
     Args:
-        links: All links in the order of the files, which counts as that of measurement.
+        links: All links in the order of the files, which counts as the order of measurement.
         random: Draws the pairs.
         counted: Largest number of computed distances; of more pairs, those of random links with all
             others count.
@@ -229,7 +229,7 @@ def draw(
     """Number of pairs in each cell, and random pairs of each cell: earlier and later link.
 
     Args:
-        agreement: Its edges are those of the cells.
+        agreement: Edges of the cells.
         places: Transmitters of the links [m].
         order: Measurement of each link, see ``visits``.
         groups: Links of one receiver and carrier, see ``groups_of``.

@@ -114,7 +114,7 @@ def traced_gains(model: MirroredSplatting, rest: float) -> Complex[Tensor, " rec
 
 
 def _gain_comments(model: MirroredSplatting, rest: float) -> list[str]:
-    """The steps from traced channels to those of each receiver."""
+    """The steps from traced channels to the channels of each receiver."""
     conjugated = ", then conjugated" if model.pooling.array_sign > 0 else ""
     gains = traced_gains(model, rest).tolist()
     comments = []

@@ -91,7 +91,7 @@ class PlaceDensity:
         return torch.logaddexp(near, (self.elsewhere / volume).log())
 
     def likeliest_width(self, spacing: float, most: int = 1000, tried: int = 24) -> float:
-        """The width under which known places are most likely by those of other folds [m].
+        """The width under which known places are most likely, given the other folds' places [m].
 
         Args:
             spacing: Median distance from a known place to the next [m].
@@ -117,7 +117,7 @@ def near_candidates(
     links: Links,
     known: Int[Tensor, " k"],
 ) -> Candidates:
-    """A grid with a quarter of the places, and random places about those of known links."""
+    """A grid with a quarter of the places, and random places about known links' places."""
     places, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)
     folds = torch.zeros(len(places), dtype=torch.long)
     folds = folds.index_copy(0, which, folds_of(links, known))

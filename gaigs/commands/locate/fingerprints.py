@@ -88,7 +88,7 @@ class Fingerprints:
     def drops(self, unknown_power: bool = False, step: float | None = None) -> Float[Tensor, " h"]:
         """Logarithms of the best candidate's density over the density at the true place, ascending.
 
-        One for each held-out fingerprint. Options are those of ``locate``; with ``step``
+        One for each held-out fingerprint. Options as for ``locate``; with ``step``
         fingerprints are values of a ``walk``.
         """
         if (unknown_power, step) not in self._drops:

@@ -291,7 +291,7 @@ def trials_of(folds: Sequence[PrintFold], most: int = 200) -> list[UnseenPrints]
 
 
 def along(prints: Fingerprints, errors: Sequence[Float[Tensor, "_ r m"]]) -> Fingerprints:
-    """A map along the axes of some errors; without any along those of its own differences."""
+    """A map along the axes of some errors; without any, along the axes of its own differences."""
     if not prints.task.shape:
         return replace(prints, axes=torch.eye(1))
     if not errors:

@@ -360,7 +360,7 @@ def _differentiate(
 
 
 def _moments(d_exponent: Tensor, s: Tensor, y: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from those of the exponents.
+    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from exponents' gradients.
 
     Sums run over s and y themselves: those over du and dv would cancel where a splat is long and
     thin.
