@@ -215,9 +215,9 @@ def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
 
 
 def hang_up(number: int) -> None:
-    """At SIGHUP drops the output to the closed terminal, and ignores further ones.
+    """At SIGHUP drops the output to the closed terminal, and ignores any further SIGHUP.
 
-    The shell sends one, too.
+    The terminal and then the shell each send one, so two are usual.
     """
     if number != getattr(signal, "SIGHUP", None):
         return

@@ -6,18 +6,22 @@ from torch.autograd.function import once_differentiable
 
 
 class Mix(torch.autograd.Function):
-    """Mixes components and channels of multivectors, and scalars.
+    """Equivariant linear layer on multivectors and scalars, with its gradient in closed form.
 
-    The tensors are small: autograd's own calls would take most of a training step.
+        result_k = sum_w (e_w ^ x)_k W[maps[w, k]]
+
+    is component k, with x the multivectors, e_w each blade of the algebra's null vectors (the first
+    is 1), and W a matrix over channels for each equivariant map. Component 1 mixes with scalars,
+    too. The tensors are small: autograd's own calls would take most of a training step.
 
     Args:
-        multivectors: (*tokens, c, k).
+        multivectors: (*tokens, c, k), c channels of k components.
         scalars: (*tokens, s).
         weight: A matrix for each equivariant map (maps, c, c_out).
         from_weight, from_bias: Linear map from scalars to components 1.
         to_weight, to_bias: Linear map from components 1 and scalars to scalars.
-        maps: Number of the map that leads from each wedge to each component (2**r, k).
-        null_wedges: Matrix of the wedge with each blade of null vectors, first with 1 (2**r, k, k).
+        maps: Row of ``weight`` for each blade w and component (2**r, k), with r null vectors.
+        null_wedges: Matrix that maps x to e_w ^ x, for each w, the identity first (2**r, k, k).
     """
 
     @staticmethod

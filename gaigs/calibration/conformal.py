@@ -58,12 +58,13 @@ class Calibration:
     of about p.
 
     Attributes:
-        edges: Of the distances (r or 1, g - 1) [m].
+        edges: Edges of the distances (r or 1, g - 1) [m].
         amplitudes: Edges of the predicted amplitudes (bins - 1,).
         counts: Links of each group (groups,).
-        quantiles: Of the errors, for intervals of levels 0 to 1 (groups, bins, steps + 1).
+        quantiles: Quantiles of the errors for intervals of levels 0 to 1 (groups, bins,
+            steps + 1).
         sizes: Root mean square of the errors (groups, bins).
-        places, receivers: Of the known links, for the distance; empty with one group of distances.
+        places, receivers: Known links, for the distance; empty with one group of distances.
         lowest: Least possible label.
 
     Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; by groups of

@@ -163,7 +163,7 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
     searched = sections or plain.keys() - {*READ_BY_LINKS} - commands
     names = {key: key.rpartition(".")[2] for key in option_keys(plain, searched)}
     keys = sorted(key for key, last in names.items() if last == name)
-    # A model's option of its own wins over those of its parts.
+    # A model's own option wins over its parts' options.
     if not sections and f"model.{name}" in keys:
         return f"model.{name}"
     if len(keys) > 1:

@@ -23,7 +23,7 @@ CONSTRUCTED = tuple(kind for kind in KINDS if kind not in ("task", "training"))
 
 
 class PluginConfigurations(SearchPathPlugin):
-    """Hydra's search path: gaigs's own files, those of plug-ins, then the constructors."""
+    """Hydra's search path: gaigs's own files, plug-ins' files, then the constructors."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         for folder in plugin_conf_dirs():

@@ -321,7 +321,7 @@ class Grid:
 
     @classmethod
     def degrees(cls, elevations=range(1, 91), azimuths=range(360)) -> "Grid":
-        """A grid of whole degrees; the default is that of the NeRF² spectra, 90 x 360."""
+        """A grid of whole degrees; the default, 90 x 360, is the grid of NeRF² spectra."""
 
         def as_radians(values):
             return torch.tensor([float(v) for v in values], dtype=torch.float32).deg2rad()

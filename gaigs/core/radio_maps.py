@@ -29,7 +29,7 @@ class RadioMap:
         values: One map a receiver (receivers, rows, columns) [unit]; rows along y, columns along x.
         x: One a column, world frame [m].
         y: One a row, world frame [m].
-        height: Of the transmitters, world frame [m].
+        height: Height of the transmitters, world frame [m].
         receivers: Names of the receivers.
         quantity: Name of the predicted quantity.
         unit: Unit of a value; empty for a ratio.
@@ -129,7 +129,7 @@ def radio_map(
             training, and of several floors that with most training places.
         margin: Widening of the box on each side [m].
         receivers: Names or indices, or one of them; None: all receivers.
-        frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
+        frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
 
     Warns:
         ExtrapolationWarning: The frequency is outside the training links' band, or height or margin

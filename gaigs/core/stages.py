@@ -33,7 +33,7 @@ class Timekeeper:
 
 
 class Stage:
-    """A part of a run; arguments are those of ``stage``."""
+    """A part of a run; arguments as for ``stage``."""
 
     def __init__(self, keeper: Timekeeper, name: str, total: int, until: float, is_fixed: bool):
         self.keeper = keeper
@@ -59,7 +59,7 @@ class Stage:
             log.warning(words, self.name, more, max(0.0, self.keeper.left()))
 
     def show(self) -> None:
-        """Adds the bar to those of the run."""
+        """Adds the bar to the run's bars."""
         with self.keeper.lock:
             if self not in self.keeper.stages:  # it has ended
                 return

@@ -86,8 +86,8 @@ def read(
             name other arrays. In place of ``h`` and ``rx_index`` the file may have impulse
             responses, see ``gaigs.data.impulse_responses.from_sionna``.
         arrays: Names of these arrays in the file where they differ, such as ``{"h": "CSI"}``; two
-            names are those of real and imaginary part.
-        phase: Of ``gaigs.core.task.csi.Csi``.
+            names are for real and imaginary part.
+        phase: See ``gaigs.core.task.csi.Csi``.
         band_train, band_test: Subcarriers to train and to test on, as for
             ``gaigs.data.bands.hold_out_band`` [Hz].
         parts: Axis of 2, ``first`` or ``last``, along which a real ``h`` has real and imaginary

@@ -23,7 +23,7 @@ def to_channels(
 
     Args:
         gains: Baseband-equivalent gain of each path at each element; 0 for no path.
-        delays: Of each path, for all elements or for each [s].
+        delays: Delay of each path, shared by all elements (d = 1) or for each (d = e) [s].
         offsets: Subcarriers relative to the carrier [Hz].
 
     Example:
@@ -68,7 +68,8 @@ class Responses(NamedTuple):
     """Impulse responses between places.
 
     Attributes:
-        gains: Of k receivers with e antennas, n transmitters with m, and p paths (k, e, n, m, p).
+        gains: Complex gains (k, e, n, m, p) of p paths; k receivers have e antennas, n
+            transmitters m.
         delays: The same, or with a 1 for the antennas [s].
         tx, rx: Places of both ends (n, 3), (k, 3) [m].
     """
@@ -84,10 +85,10 @@ def from_sionna(
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Arrays of ``gaigs.data.csi_npz`` from impulse responses of Sionna RT, and remarks.
 
-    ``sionna.rt.Paths.cir`` gives them. Gains without the phase of the delay at the carrier, as of
-    ``sionna.rt.Paths.a``, get it. Lines of sight show it: first paths whose delay is the distance
-    over the speed of light. The end with fewer places, the receivers in a tie, becomes the fixed
-    one; a channel is the same both ways.
+    ``sionna.rt.Paths.cir`` gives them. Gains of ``sionna.rt.Paths.a`` lack the carrier's phase over
+    the delay, and get it: first paths whose delay is the distance over the speed of light (lines of
+    sight) show which gains these are. A channel is the same both ways, so the end with fewer places
+    becomes the fixed one, in a tie the receivers.
 
     Args:
         arrays: ``a`` (k, e, n, m, p, 1) and ``tau`` (k, n, p) or (k, e, n, m, p), of k receivers
@@ -96,7 +97,7 @@ def from_sionna(
         needs_delays: True if delays must count from the transmission.
 
     Raises:
-        ValueError: Shapes do not fit, or a delay is none.
+        ValueError: Shapes do not fit, or a delay is not from 0 to 1 ms.
     """
     carrier = _read_carrier(arrays)
     responses = _with_fixed_end(_without_missing_delays(_to_responses(arrays), needs_delays))
@@ -149,7 +150,7 @@ def _read_carrier(arrays: Mapping[str, np.ndarray]) -> float:
 
 
 def _to_responses(arrays: Mapping[str, np.ndarray]) -> Responses:
-    """Impulse responses whose shapes fit."""
+    """Impulse responses of arrays, once their shapes are checked; gains become complex."""
     a, tau, tx, rx = (arrays[name] for name in ("a", "tau", "tx", "rx"))
     if a.dtype.kind == "f" and a.ndim == 7 and len(a) == 2:
         a = a[0] + 1j * a[1]

@@ -90,8 +90,8 @@ def from_arrays(
         receivers: ``Receiver`` or several, or positions (3,) or (k, 3) [m] of antennas that look
             along the axes; all elements of a channel then stand there.
         labels: One a link, (n, ...) of the task's shape; or one for each transmitter and receiver,
-            (n, k, ...). Readings of NaN or None and channels of zeros were not heard, and are left
-            out; so are receivers without training links.
+            (n, k, ...). Readings of NaN or None and channels of zeros were not received: they are
+            left out, and so are receivers without training links.
         index: Receiver of each link (n,), or of all, from 0; not needed with one receiver, n
             positions, or labels (n, k, ...).
         frequency: Carrier, one or one a link [Hz]; None if unknown, for channels the middle of the
@@ -232,7 +232,8 @@ def _make_receivers(
 ) -> tuple[list[Receiver], Any]:
     """Receivers at positions, named rx0, rx1, ..., and the receiver of each link.
 
-    As many positions as places, with one label each, are the receivers of the links one by one.
+    With ``is_one_a_place`` (one label for each place) and as many positions as places, position i
+    is the receiver of link i; equal positions are one receiver.
     """
     stands = as_positions("receivers", positions).reshape(-1, 3)
     if is_one_a_place and len(stands) == len(places) > 1:

@@ -19,16 +19,16 @@ from gaigs.io.yaml import read_mapping, to_position
 from gaigs.registry import register
 
 NOT_HEARD = -100.0
-"""Value of readings that were not heard [dBm]."""
+"""Value of readings that were not received [dBm]."""
 
 
 @register("data", "nerf2_rssi", task="rssi", split="official_runs")
 def read(root: str | Path, frequency: float | None = None) -> Links:
-    """A data set from its folder: one link for each reading that a gateway heard.
+    """A data set from its folder: one link for each reading that a gateway received.
 
-    Readings of -100 dBm were not heard. They, and gateways that heard nothing, are left out and
-    counted in the remarks. Gateways look along the world's axes. The readings of one measurement
-    share a row.
+    Readings of -100 dBm were not received. They, and gateways that received nothing, are
+    left out and counted in the remarks. Gateways look along the world's axes. The readings of one
+    measurement share a row.
 
     Args:
         root: Folder with ``tx_pos.csv``, ``gateway_rssi.csv``, ``gateway_position.yml``, for the

@@ -158,8 +158,9 @@ def _lowest_marks(levels: Float[ndarray, "n k"], marks: Sequence[float]) -> list
     last = gaps[-1]
     lowest = []
     for value in values[: last + 1].tolist():
-        # A weak receiver has its floor alone.
-        mixed = (levels == value).any(0) & (levels > values[last]).any(0)
+        # A mark stands beside true levels in several columns. A column of low values alone is a
+        # weak receiver's.
+        mixed = (levels == value).any(0) & (levels > values[last]).any(0)  # (k,)
         if value not in marks and (levels == value).sum() >= 3 and mixed.sum() >= 2:
             lowest.append(value)
     return lowest

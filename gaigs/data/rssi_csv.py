@@ -31,7 +31,7 @@ def read(
     frequency: float | None = None,
 ) -> Links:
     """A data set from a table with a heading, one reading a line: one link for each reading that
-    was heard.
+    was received.
 
     The places of the fixed end become the receivers, ``rx1`` ... or ``tx1`` ... in the order of
     their first appearance, and look along the world's axes. The places of the moving end become the
@@ -46,8 +46,8 @@ def read(
             walls.
         fixed: End that stands still, ``tx`` or ``rx``; None for the end with fewer places, the
             receiver in a tie.
-        not_heard: Value, or values, of readings that were not heard [dBm]; all others lie in [-200,
-            30].
+        not_heard: Value, or values, of readings that were not received [dBm]; all others lie in
+            [-200, 30].
         frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
 
     Raises:

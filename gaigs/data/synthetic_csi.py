@@ -30,7 +30,7 @@ def furnished_room_csi(
     Args:
         bandwidth: From the lowest subcarrier to the highest, about the carrier [Hz].
         subcarriers: Evenly over the band; a single one is the carrier.
-        phase: Of ``gaigs.core.task.csi.Csi``; other than ``known``, links get random phases.
+        phase: See ``gaigs.core.task.csi.Csi``; other than ``known``, links get random phases.
         band_train, band_test: Subcarriers to train and to test on, as for
             ``gaigs.data.bands.hold_out_band`` [Hz].
 

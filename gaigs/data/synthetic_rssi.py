@@ -21,7 +21,7 @@ def furnished_room_rssi(
 
     Args:
         noise: Standard deviation of the Gaussian error of each reading [dB].
-        sensitivity: Readings below it are not heard, and left out [dBm].
+        sensitivity: Readings below it are not received, and left out [dBm].
 
     Raises:
         ValueError: An option is out of range, or a gateway hears nothing.

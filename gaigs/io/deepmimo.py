@@ -16,7 +16,7 @@ class Station(NamedTuple):
     """A base station and its paths to users.
 
     Attributes:
-        position: Of the station [m].
+        position: Place of the station [m].
         fields: Gain of each path at the carrier, with the phase of its length; 0 for no path.
         bounces: Points of its reflections from the station on [m]; NaN for missing ones.
     """

@@ -32,7 +32,7 @@ class Hyperparameters(NamedTuple):
     """Hyperparameters of a Gaussian process over links."""
 
     length: float = math.nan  # correlation length of the kernel [m]
-    nugget: float = math.nan  # variance of the noise over that of the signal
+    nugget: float = math.nan  # variance of the noise over the signal's
     scale: float = math.nan  # of frequencies, see ``coordinates`` [m]; NaN without a band
 
     def facts(self) -> dict[str, float]:

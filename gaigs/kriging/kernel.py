@@ -108,7 +108,7 @@ def kriging_weights(
     Args:
         asked, around: Places, see ``coordinates`` [m].
         length: Correlation length of the kernel [m].
-        nugget: Variance of the noise over that of the signal.
+        nugget: Variance of the noise over the signal's.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 2.2.
     """

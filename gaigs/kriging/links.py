@@ -89,7 +89,7 @@ def coordinates(scene: Scene, query: Query, scale: float | Tensor) -> Float[Tens
 
 
 def scaled(places: Float[Tensor, "k d"], scale: float) -> Float[Tensor, "k d"]:
-    """The ``coordinates`` of a scale, from those of scale 1."""
+    """The ``coordinates`` of a scale, from coordinates of scale 1."""
     return torch.cat((places[:, :3], scale * places[:, 3:]), 1)
 
 

@@ -68,10 +68,14 @@ class Equations:
         residuals: Complex[Tensor, "k e s"],
         least: float = 1e-4,
     ) -> "Equations":
-        """From the fields m_i of each ``slice`` of the links, one after the other: all together may
-        take gigabytes.
+        """Equations of links, in parts: all fields together may take gigabytes.
 
-        ``least`` is the power of a link's noise over the link's, where the fit leaves nothing.
+        Args:
+            places: Places of the links [m].
+            margins: Fields m_i of a slice of the links.
+            labels: Channels of the links.
+            residuals: Labels minus predictions.
+            least: Least noise power of a link as a share of its power.
         """
         grams, sides = [], []
         size = max(1, min(64, 300_000 // labels[0].numel()))

@@ -86,7 +86,7 @@ class ScalarProcess(nn.Module):
     def deviations(
         self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
-        """Standard deviations of readings at some places: of z given the readings, and of the
+        """Standard deviations of new readings at some places: z given the known readings, plus
         noise.
         """
         deviations = places.new_zeros(len(places))
@@ -167,7 +167,7 @@ class ScalarProcess(nn.Module):
         for choice in self._choices()[1:]:  # the fits above have the first
             choice = choice._replace(scale=best.choice.scale)
             tried = self._maximise(values, few, choice, best.logarithms)
-            best = min(best, tried, key=lambda one: one.cost)
+            best = min(best, tried, key=lambda fit: fit.cost)
         held = self._readings.held_out(every, folds, most)
         self._take(self._maximise(values, held, best.choice, best.logarithms, has_deviations=True))
         return index
@@ -180,7 +180,7 @@ class ScalarProcess(nn.Module):
         return choices
 
     def fit_count(self, candidates: int) -> int:
-        """Maximisations of a ``fit`` to some candidates of residuals."""
+        """Number of maximisations of a ``fit`` to this many candidates of residuals."""
         return candidates + len(self._choices())
 
     def refit(
@@ -192,14 +192,21 @@ class ScalarProcess(nn.Module):
         held: Int[Tensor, " h"] | None = None,
         most: int = 300,
     ) -> float:
-        """Fits the hyperparameters to other readings, from those that it has; kernel and noise
-        stay.
+        """Fits lengths and deviations anew, from their present values; kernel and noise stay.
 
-        With ``held``, to readings of these rows given all others too. The fit before is their
-        prior, since few readings alone would overfit.
+        The first fit holds out readings of all folds. With ``held`` a second fit follows, of these
+        readings given all others. Few readings alone would overfit, so the mean of the first fit
+        over the receivers is the second fit's prior.
+
+        Args:
+            places, receivers, values: Known readings, as for ``fit``.
+            folds: Readings are held out with all of their fold.
+            held: Rows of the readings that the second fit holds out, such as the validation links;
+                None for one fit.
+            most: Largest number of held-out readings of a fit.
 
         Returns:
-            Least negative log posterior of the last of these fits.
+            Negative log posterior of the last fit.
         """
         self.places, self.receivers = places, receivers
         every = torch.arange(len(values))
@@ -222,7 +229,10 @@ class ScalarProcess(nn.Module):
         receivers: Int[Tensor, " k"],
         values: Float[Tensor, " k"],
     ) -> None:
-        """Takes known residuals, whose process ``fit`` has found."""
+        """Takes residuals of known readings and weights them for predictions.
+
+        ``fit`` has chosen the hyperparameters before.
+        """
         self.places, self.receivers, self.values = places, receivers, values.clone()
         noises = (2 * self.logarithms[receivers, 2]).exp()
         self.variances = noises * self._factors(values)
@@ -235,8 +245,9 @@ class ScalarProcess(nn.Module):
             self.weights[known] = torch.cholesky_solve(values[known, None], factor)[:, 0]
 
     def take(self, other: "ScalarProcess") -> None:
-        """Takes the hyperparameters of another process for ``deviations``; means need ``solve``
-        again.
+        """Takes the hyperparameters of another process.
+
+        ``deviations`` follow at once; for means call ``solve`` again.
         """
         ratios = (2 * (other.logarithms - self.logarithms)[self.receivers, 2]).exp()
         is_alike = torch.equal(self.choice[:2], other.choice[:2])
@@ -271,10 +282,10 @@ class ScalarProcess(nn.Module):
         return maximise(cost, start)
 
     def _factors(self, values: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-        """Variances of the noise of all known readings over those of their receivers; 1 if it is
-        normal.
+        """Ratios of each known reading's noise variance to its receiver's (k,); 1 for normal noise.
 
-        Each reading has the expected square of its noise given those around it.
+        With Student's t of nu degrees of freedom, a ratio is (nu + E e² / variance) / (nu + 1).
+        Here e is the reading's noise given the readings around it. The two are updated in turn.
         """
         choice = self._choice
         factors = torch.ones_like(values)
@@ -297,8 +308,8 @@ class ScalarProcess(nn.Module):
                     between, values[around.rows], variances[around.rows]
                 )
                 # The reading's deviation from its neighbours is shared between process and noise.
-                own = variances[part]
-                shares = own / (of_process + own)
+                noise = variances[part]
+                shares = noise / (of_process + noise)
                 squares = (shares * (values[part] - means)).square() + of_process * shares
                 expected.append(squares / noises[part])
             factors = (choice.degrees + torch.cat(expected)) / (choice.degrees + 1)
@@ -320,8 +331,9 @@ class ScalarProcess(nn.Module):
 class ScalarPosterior(Posterior):
     """Kriged residuals of labels of one number, with a ``ScalarProcess``.
 
-    The trend weight is the mean of its candidates, each as likely as it makes the validation links,
-    with all readings of a place as one: without such links a half.
+    The trend weight is the mean of its candidates, weighted by the likelihood that each gives to
+    the validation links, where all readings of a place count as one. Without validation links all
+    candidates count alike.
     """
 
     def __init__(self, scene: Scene):

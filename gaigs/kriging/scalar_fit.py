@@ -88,7 +88,7 @@ class HeldOutCost:
         held: Held-out readings, and those around them.
         choice: Kernel and noise, which stay.
         has_deviations: True if receivers have hyperparameters of their own.
-        prior: Logarithms about which those of all receivers scatter; None: no prior.
+        prior: Logarithms about which the receivers' logarithms scatter; None: no prior.
         options: Options of the process.
     """
 

@@ -48,7 +48,7 @@ class Ensemble(Wrapper):
 
     @property
     def underlying(self) -> Model:
-        """The first member, whose room and Gaussians stand for those of all."""
+        """The first member, whose room and Gaussians stand for all."""
         return self.members[0]  # type: ignore[return-value]
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:

@@ -172,11 +172,11 @@ class Kriging(Wrapper):
         return self._krige_labels(links, values, is_final)
 
     def _most(self, links: Links, most: int = LIMIT) -> int:
-        """Most known links of a receiver: ``most``, or as many as three predictions of them take a
-        third of the time left.
+        """Largest number of known links of a receiver: at most ``most``.
 
-        The trained model predicts the links once, and once more for each half of the validation
-        links.
+        It is lower if three predictions of all these links would exceed a third of the remaining
+        time. The trained model predicts the links once, and once more for each half of the
+        validation links.
         """
         if math.isinf(stages.left()):
             return most
@@ -198,8 +198,7 @@ class Kriging(Wrapper):
             fallback = validation_scores(links, predicted(model.fallback, links, held))
             is_unlearnt = is_surely_better(fallback, trend)
         if is_unlearnt and self.posterior.chooses_weight:
-            # The likelihood may still mix it in: where the score is higher without it, it is left
-            # out.
+            # The likelihood may still give the trend weight: without it if the score is higher so.
             without = self._validation_model(links, values, (0.0,))
             score = validation_scores(links, predicted(model, links, held)).mean()
             if validation_scores(links, predicted(without, links, held)).mean() > score:
@@ -221,8 +220,9 @@ class Kriging(Wrapper):
     def _validation_model(
         self, links: Links, values: Tensor, weights: Sequence[float] = weights
     ) -> "Kriging":
-        """Fits weights and hyperparameters, the trend weight one of ``weights``; a model of the
-        training links.
+        """Fits weights and hyperparameters; returns a model that knows the training links alone.
+
+        The trend weight is chosen among ``weights``.
         """
         split = links.split
         candidates = self._candidates(links, values, weights)
@@ -292,24 +292,35 @@ class Kriging(Wrapper):
     def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` for a trend of paths.
 
-        The weight is 1 if ``FEWEST`` validation links or more have a mean score that rises by more
-        than 1.5 standard errors, else 0.
+        The weight of kriging is 1 if it raises the mean score of the validation links by more than
+        1.5 standard errors, and these are ``FEWEST`` or more; else 0.
+
+        Args:
+            links: Links with a split.
+            values: The trend's predictions of the known links, training links first.
+            is_final: True if this model, too, is to predict; it then knows the validation links.
+
+        Returns:
+            A model that knows the training links alone.
         """
         self._make_posterior(True)
-        split, index = links.split, links.split.known
-        query, device, count = links.query[index], self.weight.device, len(links.split.train)
+        split = links.split
+        index = split.known
+        count = len(split.train)
+        query = links.query[index]
+        device = self.weight.device
         aligned = links.task.align(links.labels[index], values)
         equations = self.posterior.equations(query, aligned, aligned - values, device)
         self.posterior.fit_process()
         model = Kriging(self.scene, self.trend, self.fallback_options)
         model._make_posterior(True)
         model.posterior.load_state_dict(self.posterior.state_dict())
-        # Training links come first among the known ones, of a receiver too.
-        training = [
-            known[: int((query.receivers[:count] == receiver).sum())]
-            for receiver, known in enumerate(equations)
-        ]
+        # Equations of each receiver's training links: they come first among its known links.
+        training = []
+        for receiver, known in enumerate(equations):
+            training.append(known[: int((query.receivers[:count] == receiver).sum())])
         model.posterior.solve_equations(training)
+        # Validation links as kriging from the training links predicts them.
         kriged = values[count:].clone()
         # A link at a time: the margins of all of them may take gigabytes.
         for row in stages.track(range(count, len(index)), "kriging"):
@@ -318,9 +329,9 @@ class Kriging(Wrapper):
         if len(single_readings(links, split.validation)) >= FEWEST:
             plain = validation_scores(links, values[count:])
             helps = is_surely_better(validation_scores(links, kriged), plain, errors=1.5)
-        for one in (self, model) if is_final else (model,):
-            one.trend_weight.fill_(1)
-            one.weight.fill_(helps)
+        for kriging in (self, model) if is_final else (model,):
+            kriging.trend_weight.fill_(1)
+            kriging.weight.fill_(helps)
         if is_final:
             self.posterior.solve_equations(equations)
             self._log()

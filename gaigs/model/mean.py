@@ -14,7 +14,7 @@ from gaigs.registry import register
 class Mean(Model):
     """Predicts each receiver's mean label for any transmitter; NaN before ``fit``.
 
-    Channels of unknown phase are aligned to that of the first known link.
+    Channels of unknown phase are aligned to the phase of the first known link.
     """
 
     def __init__(self, scene: Scene):

@@ -86,7 +86,7 @@ def shrunk(
     """Exponents drawn towards their mean as far as chance explains their scatter.
 
     Args:
-        exponents: Of least squares.
+        exponents: Exponents fitted by least squares.
         weights: Inverse variances of their errors, for noise of variance 1; 0 without an exponent.
         noise: Variance of the labels about the law; NaN if too few of them say it, and the mean
             counts alone.

@@ -270,7 +270,7 @@ class ChannelData:
         has_common_phase: True if all channels have one phase in common.
         order: Largest number of reflections of a path; more than 2 count as 2, as longer paths
             hardly locate a plane.
-        options: Of the search.
+        options: Options of the search.
     """
 
     def __init__(

@@ -43,7 +43,7 @@ class ChannelSearch:
         order: Largest number of reflections of a path.
         most: Largest number of planes.
         start: Planes known before (w, 4).
-        options: Of the search.
+        options: Options of the search.
 
     Source: ours.
     """

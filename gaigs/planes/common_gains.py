@@ -39,41 +39,51 @@ class CommonGains:
         self.most = most
 
     def find_axis_walls(self) -> SlabRoom:
-        """The walls of the start, moved where phases agree, and others.
+        """Half-spaces of the known walls and of further planes square to the axes.
 
-        A wall of the start is moved along its normal if that explains more than by chance.
+        Known walls move along their normals where that explains more than by chance. No planes
+        result if the room is too large for its wavelength: a grid of offsets then leaves room for
+        fewer than 50 places.
         """
         options = self.data.options
         frame = self.data.frame
+        # Offsets on each axis, a tenth of a wavelength apart, over the box and its margin.
         extent = frame.points.amax(0) - frame.points.amin(0) + 2 * options.margin * frame.diagonal
-        steps = 10 * extent / self.data.wavelength  # of each axis, a tenth of a wavelength apart
+        steps = 10 * extent / self.data.wavelength  # (3,)
+        # Waves are offsets x places x elements x subcarriers; ``most_waves`` limits the places.
         elements = max(len(receiver.elements) for receiver in self.data.receivers)
         subcarriers = max(4, 32 // elements)
-        most = min(200, options.most_waves // (int(steps.sum()) * elements * subcarriers))
-        unique = [part.of_unique_places() for part in self.data.draw(most, subcarriers, 1)]
+        max_places = min(200, options.most_waves // (int(steps.sum()) * elements * subcarriers))
+        unique = [part.of_unique_places() for part in self.data.draw(max_places, subcarriers, 1)]
         parts = [part for part in unique if len(part.places)]
-        if most < 50 or not parts:  # too few places for the many wavelengths of a large hall
+        if max_places < 50 or not parts:
             return half_spaces(self.start[:0])
         axes = torch.eye(3).to(frame.points).split(1)
-        lines = torch.cat(
-            [
-                frame.grid(axis, int(count), options.margin)[0]
-                for axis, count in zip(axes, steps, strict=True)
-            ]
-        )
+        lines = []
+        for axis, count in zip(axes, steps, strict=True):
+            lines.append(frame.grid(axis, int(count), options.margin)[0])
+        # Share of the rest that the best of all these planes explains by chance.
         by_chance = options.chance / sum(len(part.places) for part in parts)
         planes = self._place_start(parts, by_chance)
-        planes = self._pursue(parts, planes, lines, by_chance)
-        for number in range(len(planes)):  # once more, as the others are known now
+        planes = self._pursue(parts, planes, torch.cat(lines), by_chance)
+        # Each plane moves once more, as the others are known now. A known wall stays unless the
+        # move explains more than by chance.
+        for number in range(len(planes)):
             bonus = by_chance if number < len(self.start) else 0.0
             planes[number] = self.move(parts, _without(planes, number), planes[number], bonus)[1]
         planes = self.choose_lobes(parts, planes, by_chance)
+        return half_spaces(self._without_chance_planes(parts, planes, by_chance))
+
+    def _without_chance_planes(
+        self, parts: list[ReceiverChannels], planes: Float[Tensor, "w 4"], by_chance: float
+    ) -> Float[Tensor, "v 4"]:
+        """Known walls, and the found planes without which the rest rises by more than chance."""
         for number in reversed(range(len(self.start), len(planes))):
             others = _without(planes, number)
             share = self.fit(parts, half_spaces(planes)).share
             if self.fit(parts, half_spaces(others)).share < (1 + by_chance) * share:
                 planes = others
-        return half_spaces(planes)
+        return planes
 
     def _place_start(self, parts: list[ReceiverChannels], by_chance: float) -> Float[Tensor, "w 4"]:
         """Walls of a drawing where phases agree; those that explain most go first."""
@@ -110,10 +120,11 @@ class CommonGains:
     def choose_lobes(
         self, parts: list[ReceiverChannels], planes: Float[Tensor, "w 4"], by_chance: float
     ) -> Float[Tensor, "w 4"]:
-        """The planes, each in the lobe of its phases where paths of all orders leave least.
+        """The planes, each at the offset where paths of all orders leave least.
 
-        Walls of the start move at most ``drawing_error`` in all, and only if that lowers the rest
-        by more than chance.
+        The fit over an offset has a maximum (a lobe) every half wavelength: a reflected path then
+        changes by a whole wavelength, and phases agree again. Known walls move at most
+        ``drawing_error`` in all, and only if that lowers the rest by more than chance.
         """
         options = self.data.options
         order = self.data.order
@@ -143,9 +154,15 @@ class CommonGains:
         plane: Float[Tensor, "4"],
         bonus: float,
     ) -> tuple[float, Float[Tensor, "4"]]:
-        """Largest share that a plane explains near its place, beside others; the plane there.
+        """Largest share of power that a plane explains nearby, and the plane there.
 
-        The place itself has a bonus, as a share of the rest.
+        It moves along its normal by at most ``drawing_error``.
+
+        Args:
+            parts: Channels.
+            others: Planes whose images the fit has already.
+            plane: The plane, at its present offset.
+            bonus: Advantage of the present offset, as a share of the power that the others leave.
         """
         known = self.fit(parts, half_spaces(others))
         error = self.data.options.drawing_error

@@ -14,7 +14,13 @@ from gaigs.planes.strengths import fit_free, log_share
 
 
 class FreeRoom(NamedTuple):
-    """Planes, the mean log of what free strengths leave, and the share of power of the last."""
+    """Planes with what free strengths at each place leave of the channels.
+
+    Attributes:
+        planes: Planes in the frame (w, 4).
+        error: Mean over links of the log of the share of power that remains.
+        share: Share of power that the last added plane explains, its rating.
+    """
 
     planes: Float[Tensor, "w 4"]
     error: float
@@ -72,16 +78,21 @@ class FreeScore(Score[FreeRoom]):
         return GridRatings(rough, rate)
 
     def add(self, room: FreeRoom, candidate: Candidate) -> FreeRoom | None:
+        """The room with the candidate; None if it explains too little.
+
+        A plane of ``certain_share`` is taken, one of ``faint_share`` if the error then falls by
+        ``certain_fall``. The candidate must explain more than a plane of no meaning does by chance.
+        """
         options = self.data.options
-        # A wave explains one part of noise in as many as a channel has numbers; the best of a grid
-        # somewhat more.
+        # The room leaves a share exp(error) of the power. If that is noise, one wave explains
+        # 1 / numbers of it, and the best of a grid up to 5 standard errors more.
         places = sum(len(receiver.places) for receiver in self.links)
         numbers = min(receiver.flat.shape[1] for receiver in self.links)
         by_chance = math.exp(room.error) * (1 + 5 / math.sqrt(places)) / numbers
         if candidate.rating < max(options.faint_share, by_chance):
             return None
         planes = torch.cat((room.planes, candidate.plane[None]))
-        larger = self.evaluate(self.descend(planes, 30, 1e-2), candidate.rating)
+        larger = self.evaluate(self.descend(planes, steps=30, rate=1e-2), candidate.rating)
         is_certain = candidate.rating >= options.certain_share
         if is_certain or room.error - larger.error >= options.certain_fall:
             return larger
@@ -91,7 +102,7 @@ class FreeScore(Score[FreeRoom]):
         return self.evaluate(torch.cat((room.planes[:number], room.planes[number + 1 :])))
 
     def refine(self, room: FreeRoom) -> FreeRoom:
-        return self.evaluate(self.descend(room.planes, 60, 1e-2), room.share)
+        return self.evaluate(self.descend(room.planes, steps=60, rate=1e-2), room.share)
 
     def descend(
         self, planes: Float[Tensor, "w 4"], steps: int, rate: float
@@ -101,7 +112,7 @@ class FreeScore(Score[FreeRoom]):
 
         def loss(planes: Float[Tensor, "w 4"]) -> Float[Tensor, ""]:
             shares = []
-            for receiver in self.data.draw(24, 8):
+            for receiver in self.data.draw(24, 8):  # places, subcarriers
                 receiver = receiver.single()
                 points = receiver.images(planes.to(receiver.places), sequences)
                 waves = receiver.waves(points)
@@ -125,7 +136,7 @@ class FreeScore(Score[FreeRoom]):
         turns = 2 * math.pi * torch.outer(receiver.frequencies - centre, delays)  # (s, t)
         rest = rest.unflatten(1, (len(receiver.elements), -1))  # (b, e, s)
         profile = rest @ torch.polar(torch.ones_like(turns), turns)  # (b, e, t)
-        # Single precision: of a path of 30 m it leaves a hundredth of a radian at 10 GHz.
+        # Single precision suffices: a hundredth of a radian at 10 GHz, after a path of 30 m.
         return torch.view_as_real(profile.to(torch.complex64))
 
     def _count_delays(self, receiver: ReceiverChannels) -> int:
@@ -141,7 +152,10 @@ class FreeScore(Score[FreeRoom]):
     ) -> Float[Tensor, "n k"]:
         """Mean share of power that one more image explains; 0 for a plane between the ends.
 
-        The planes of a line have one normal.
+        Args:
+            receivers: Places and elements of each receiver.
+            profiles: Delay profiles of its residuals, see ``compute_profile``.
+            lines: Planes to rate: n normals, each with k offsets.
         """
         total = lines.new_zeros(lines.shape[:2])
         for receiver, profile in zip(receivers, profiles, strict=True):
@@ -149,6 +163,7 @@ class FreeScore(Score[FreeRoom]):
             for number, line in enumerate(lines):
                 normal, offsets = line[0, :3], line[:, 3]
                 heights = (receiver.places @ normal)[:, None] - offsets  # (b, k)
+                # Only a plane with both ends of the link on one side reflects.
                 is_beside = heights * (receiver.position @ normal - offsets) > 0
                 total[number] += (table.image_powers(normal, heights) * is_beside).sum(0)
         return total / sum(len(receiver.places) for receiver in receivers)

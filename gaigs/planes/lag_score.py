@@ -51,8 +51,8 @@ class LagRoom(NamedTuple):
     Attributes:
         planes: Normals and offsets (w, 4) [m].
         open: For each link the direct path, then all paths at each plane (b, w + 1).
-        errors: Of each link; ``LagOptions.blocked`` more than without the last plane that was moved
-            where this is not open (b,).
+        errors: Error of each link (b,). Where the last moved plane is not open, it is the error
+            without this plane plus ``LagOptions.blocked``.
     """
 
     planes: Float[Tensor, "w 4"]

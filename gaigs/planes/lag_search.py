@@ -74,7 +74,7 @@ class LagSearch:
             share of each label that they do not explain.
         order: Largest number of reflections of a path; more than 2 count as 2.
         most: Links that count, of all receivers and carriers together; of each at least 20.
-        options: Of the search.
+        options: Options of the search.
 
     Attributes:
         doubts: Sentences on what speaks against the data's geometry.
@@ -147,7 +147,7 @@ class LagSearch:
         """The planes, each moved twice by up to 8 % of the diagonal and 18 degrees, and others.
 
         Args:
-            planes: Of the start, in the world's frame.
+            planes: Planes at the start, in the world's frame.
             bandwidth: Band over which powers are averaged [Hz]. None: the one with which moving the
                 strongest plane leaves least, or a carrier if moving all planes leaves less with it:
                 one plane among others in the wrong places hardly interferes.

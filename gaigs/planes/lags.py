@@ -31,9 +31,9 @@ class ArrayPaths(NamedTuple):
     """Paths as an array receives them.
 
     Attributes:
-        fields: At the middle of the array (b, n).
-        steering: Phases at the elements (b, n, e).
-        lengths: (b, n) [m].
+        fields: Fields at the middle of the array (b, n).
+        steering: Phase factors at the elements (b, n, e).
+        lengths: Lengths of the paths (b, n) [m].
     """
 
     fields: Complex[Tensor, "b n"]
@@ -42,11 +42,15 @@ class ArrayPaths(NamedTuple):
 
 
 class FurtherWave(NamedTuple):
-    """Weights of one more path beside known ones (b, n, e), and the lengths of these (b, n) [m].
+    """How a further path would lower the error of the known paths' covariances.
 
-    The sum of the further wave's conjugate times the weights, over known paths and elements, has
-    half the fall of the error as its real part. Without a bandwidth the sum over known paths is
-    taken: n is 1.
+    For a weak further path with conjugate wave w* at the elements, the error falls by 2 Re sum(w*
+    times the weights), summed over known paths and elements.
+
+    Attributes:
+        weights: Weights for each known path and element (b, n, e). Without a bandwidth they are
+            summed over the known paths, and n is 1.
+        lengths: Lengths of the known paths (b, n) [m].
     """
 
     weights: Complex[Tensor, "b n e"]
@@ -57,10 +61,10 @@ class SingleReflections(NamedTuple):
     """Paths of one reflection at planes (b, c).
 
     Attributes:
-        directions: In the array's frame.
-        lengths: [m].
+        directions: Unit vectors in the array's frame.
+        lengths: Lengths of the paths [m].
         gains: Fields without a phase; 0 for places behind a plane.
-        cosines: Of the angles of incidence, negative behind a plane.
+        cosines: Cosines of the angles of incidence, negative behind a plane.
     """
 
     directions: Float[Tensor, "b c 3"]
@@ -75,9 +79,9 @@ class ReceiverLags:
 
     Attributes:
         places: Transmitters (b, 3) [m].
-        lags: At each of ``array.lags``, over the power (b, l).
-        frequency: Of the carrier [Hz].
-        pose, array: Of the receiver.
+        lags: Covariances at each of ``array.lags``, over the power (b, l).
+        frequency: Carrier [Hz].
+        pose, array: Pose and array of the receiver.
         directions: Directions in which spectra are compared: 4 x 4 elements resolve no more (k, 3).
     """
 
@@ -91,7 +95,7 @@ class ReceiverLags:
     )
 
     def at(self, index: object) -> "ReceiverLags":
-        """The same of some links."""
+        """The covariances of some of the links."""
         return replace(self, places=self.places[index], lags=self.lags[index])
 
     @property
@@ -100,7 +104,7 @@ class ReceiverLags:
 
     @property
     def wavenumber(self) -> float:
-        """[rad/m]."""
+        """Wavenumber of the carrier [rad/m]."""
         return 2 * math.pi / speed_of_light * self.frequency
 
     @cached_property

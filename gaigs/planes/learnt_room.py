@@ -65,7 +65,7 @@ class Matter(NamedTuple):
     Attributes:
         centres: [m].
         widths: Standard deviations along the world's axes [m].
-        densities: At the centres [dB/m].
+        densities: Densities at the centres [dB/m].
     """
 
     centres: Float[ndarray, "k 3"]

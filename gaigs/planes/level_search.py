@@ -70,7 +70,7 @@ class LevelRoom(NamedTuple):
         passing: Share of the direct path's field, and of the field at each plane, that obstacles
             let through at each link (b, w + 1).
         gain: Fall of the errors by the plane located last [standard errors].
-        number: Of this plane.
+        number: Number of this plane.
         bandwidth: Over which powers were averaged [Hz].
     """
 
@@ -196,10 +196,10 @@ class LevelSearch:
         frequencies: Carrier of each link [Hz].
         trend: Levels on which the paths' powers stand [dB].
         planes: Normals and offsets at the start (w, 4) [m]. Each is searched near its start.
-        numbers: Of these planes in the placement.
+        numbers: Numbers of these planes in the placement.
         order: Largest number of reflections of a path; more than 2 count as 2.
         most: Links that count, of all receivers together.
-        options: Of the search.
+        options: Options of the search.
 
     Source: ours.
     """

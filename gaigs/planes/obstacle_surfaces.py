@@ -74,7 +74,7 @@ class Legs(NamedTuple):
         start: First ends [m].
         along: From first to last ends [m].
         paths: Number of each leg's path.
-        densities: Of matter, at points evenly spread over a leg [Np/m].
+        densities: Densities of matter, at points evenly spread over a leg [Np/m].
     """
 
     start: Float[Tensor, "s 3"]
@@ -95,9 +95,9 @@ class Crossings(NamedTuple):
     """Points where paths cross surfaces.
 
     Attributes:
-        cosines: Of the angles of incidence.
-        tm_shares: Shares of TM in vertical polarisation.
-        paths, surfaces: Numbers.
+        cosines: Cosines of the angles of incidence (c,).
+        tm_shares: Shares of the TM field in vertical polarisation (c,).
+        paths, surfaces: Numbers of the path and of the surface (c,).
     """
 
     cosines: Float[Tensor, " c"]
@@ -261,7 +261,7 @@ class SheetFit:
 
     Args:
         paths: With obstacles.
-        crossings: Of each density.
+        crossings: Crossings for each density.
     """
 
     def __init__(self, paths: AttenuatedPaths, crossings: list[Crossings]):
@@ -335,7 +335,7 @@ def fit_sheets(
         placement: With obstacles, or without any, which have no sheets.
         query: Links.
         lower, upper: Corners of the room [m].
-        options: Of the fit.
+        options: Options of the fit.
 
     Returns:
         The sheets, and the gain of all paths beside them [Np].

@@ -29,7 +29,7 @@ class Likeness(NamedTuple):
 
 
 class TilePeak(NamedTuple):
-    """Maximum of a periodogram: its height, a plane, and the pivot of its turn [m]."""
+    """Maximum of a periodogram: its height, its plane, and the point about which that turns [m]."""
 
     height: float
     plane: Float[Tensor, "4"]
@@ -39,8 +39,8 @@ class TilePeak(NamedTuple):
 class PlanePeriodogram:
     """Search for the plane whose reflections are a further wave: its maxima near a known plane.
 
-    The slope of the error by the covariances, times the waves of known paths, is the wave of one
-    more path, and its phase follows from its length. Lengths are linear within a tile of offsets
+    The gradient of the error by the covariances, times the waves of known paths, is the wave of one
+    more path. Its phase follows from the path's length. Lengths are linear within a tile of offsets
     and tilts, so the sum over links is a Fourier sum on each tile.
 
     Args:
@@ -79,7 +79,8 @@ class PlanePeriodogram:
     ) -> list[TilePeak]:
         """At most six maxima with planes near a normal, in place of a known plane."""
         (bounce,) = mean_bounces(self.receivers, plane[None])
-        half = min(self.wavelength, self.reach)  # of a tile [m]
+        # Tiles lie in a row along the normal; each reaches this far on either side [m].
+        half = min(self.wavelength, self.reach)
         moves = torch.linspace(-half, half, 19)
         turns = self._turns(bounce)
         every = torch.cat((-turns.flip(0)[:-1], turns))
@@ -140,22 +141,33 @@ def compare_with_wave(
     pivots: Float[Tensor, "c 3"],
     axes: Float[Tensor, "2 3"],
 ) -> Likeness:
-    """Likeness of the reflection at each plane to a further wave over a bandwidth [Hz]."""
+    """Likeness of the reflection at each plane to a further wave.
+
+    Args:
+        receiver: Links of one receiver.
+        wave: The further wave; its weights are on each known path and element.
+        bandwidth: Bandwidth of the covariances [Hz].
+        planes: Planes (normal, offset [m]).
+        pivots: Points about which the planes turn [m].
+        axes: Unit vectors towards which the normals turn.
+    """
     single = receiver.reflect_once(planes)
     directions = single.directions.transpose(0, 1)  # (c, b, 3)
     lengths = single.lengths.transpose(0, 1)  # (c, b)
     gains = single.gains.transpose(0, 1)
     cosines = single.cosines.transpose(0, 1)
+    # Over the band, paths with a difference of length d are coherent by sinc(bandwidth d / c).
     alike = sinc(bandwidth / speed_of_light * (wave.lengths - lengths[..., None]))  # (c, b, n)
     weights = torch.einsum("cbn,bne->cbe", alike.to(wave.weights), wave.weights)
-    values = (receiver.steer(directions).conj() * weights).sum(2) * gains.conj()
+    # The product with the reflection's field: steering vector, gain, and phase of its length.
+    values = (receiver.steer(directions).conj() * weights).sum(2) * gains.conj()  # (c, b)
     values = values * torch.polar(torch.ones_like(lengths), receiver.wavenumber * lengths)
     # Saturation at the median, so that no link rules.
     sizes = values.abs()
     medians = torch.where(sizes > 0, sizes, math.nan).nanmedian(1, keepdim=True).values
     values = values / (sizes + medians.nan_to_num(1.0))
-    # A path of length L changes by 2 cos(theta) a move of its plane along the normal, and by the
-    # bounce's distance from the pivot a turn.
+    # A path's length changes by 2 cos(theta) per metre that the plane moves along its normal. Per
+    # radian that it turns, it changes by this times the bounce's distance from the pivot.
     normals, offsets = planes[:, None, :3], planes[:, None, 3]
     heights = (receiver.places * normals).sum(-1) - offsets  # (c, b)
     ways = reflect(receiver.places, normals, offsets) - receiver.pose.position

@@ -37,13 +37,14 @@ def move_planes(
 ) -> list[float]:
     """Moves each used plane to the least error, the strongest first.
 
-    It moves along its normal, or along one that is square to the others. If a map is drawn, which
-    takes long, planes keep their normals.
+    It moves along its normal, or along one that is perpendicular to the other planes' normals, see
+    ``square_normals``. A model that draws maps takes long for each trial, so its planes keep their
+    normals.
 
     Args:
         model: With a placement ``mirrored``.
         batch: Links whose errors count.
-        wavelength: Of the carrier [m].
+        wavelength: Wavelength of the carrier [m].
         least: Least distance searched on either side [m].
         widest: Largest distance [wavelengths].
 

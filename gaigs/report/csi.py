@@ -109,7 +109,7 @@ def impulse_responses(shown: Examples, frequencies: Float[ndarray, " s"]) -> Fig
 
     Args:
         shown: Channels (k, elements, subcarriers) and their SNR [dB].
-        frequencies: Of the subcarriers, in any order, evenly spaced or not, at least two [Hz].
+        frequencies: Two subcarriers or more, in any order, evenly spaced or not [Hz].
     """
     delays, responses = impulse_response(_pairs(shown), frequencies)
     levels = decibels(responses)  # (k, 2, delays)

@@ -29,7 +29,7 @@ class Run(NamedTuple):
         config: The run's configuration; empty if it is unknown.
         metrics: Contents of ``metrics.json``; None where the job failed, was stopped or still runs.
         failure: The error of a failed job; else None.
-        doubts: Sentences on overrides that are not those of the run's configuration.
+        doubts: Sentences on overrides that differ from the run's configuration.
     """
 
     name: str
@@ -97,7 +97,7 @@ def read_runs(folder: Path) -> list[Run]:
             "pass the folder that Hydra made for 'python -m gaigs --multirun ...'"
         )
     runs = [_read_run(place, place.relative_to(folder).as_posix()) for place in places]
-    _tell_apart(runs)
+    _add_differing_options(runs)
     return sorted(runs, key=_by_number)
 
 
@@ -188,8 +188,13 @@ def _has_unread_tokenizer(config: Mapping) -> bool:
     return (config.get("deformation") or {}).get("name") == "none"
 
 
-def _tell_apart(runs: list[Run]) -> None:
-    """Adds values of configurations to equal overrides of runs that differ in other options."""
+def _add_differing_options(runs: list[Run]) -> None:
+    """Adds options to ``overrides`` where runs of one group differ in them.
+
+    Runs of a group have the same overrides but for the seed, so the options come from
+    ``config.yaml`` alone.
+    Runs with another value than most of the group get a doubt.
+    """
     for group in by_seed(runs):
         configs = {run.folder: _compared(run.config) for run in group}
         first, *others = configs.values()
@@ -219,7 +224,7 @@ def _compared(config: Mapping) -> dict:
     parts = {**config}
     if _has_unread_tokenizer(config):
         parts.pop("tokenizer", None)
-    # A model's configuration repeats those of its parts.
+    # A model's configuration repeats the configurations of its parts.
     model = config.get("model") or {}
     return parts | {"model": {key: value for key, value in model.items() if key not in config}}
 

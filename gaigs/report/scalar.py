@@ -105,10 +105,10 @@ def predicted_against_measured(
             page = received[first : first + max_panels]
             figure, axes = _panels(len(page), 1, 1, f"measured {axis}", f"predicted {axis}")
             for ax, index in zip(axes, page, strict=True):
-                own = receiver == index
+                of_receiver = receiver == index
                 if has_few:
                     dots = {"color": BLUE, "markersize": 3, "alpha": 0.5, "markeredgewidth": 0}
-                    ax.plot(labels[own], predictions[own], "o", **dots)
+                    ax.plot(labels[of_receiver], predictions[of_receiver], "o", **dots)
                 else:
                     count = np.ma.masked_equal(cells.counts[index], 0)
                     look = {"cmap": "viridis_r", "norm": colours, "rasterized": True}
@@ -117,7 +117,7 @@ def predicted_against_measured(
                 ax.axline((start, start), slope=1, color="0.3", linewidth=0.7)
                 limits = (start, cells.edges[-1])
                 ax.set(xlim=limits, ylim=limits, aspect="equal")
-                error = _with_digits(errors[own].mean(), task.error_unit)
+                error = _with_digits(errors[of_receiver].mean(), task.error_unit)
                 ax.set_title(f"{names[index]}, MAE {error}")
                 ax.grid()
                 ax.set_axisbelow(True)
@@ -147,7 +147,7 @@ def _cells(
 ) -> _Cells:
     """Cells of a round width, which hold all labels.
 
-    A prediction more than 20 cells outside the labels counts there.
+    A prediction more than 20 cells outside the range of the labels counts as at that limit.
     """
     # Equal labels have no range: the cell's width then suits their size, or is 1.
     span = float(np.ptp(labels)) or float(np.abs(labels).max()) or 1.0
@@ -161,8 +161,8 @@ def _cells(
     edges = np.arange(lower, upper + 1)
     counts = {}
     for index in np.unique(receiver):
-        own = receiver == index
-        count, *_ = np.histogram2d(across[own], up[own], (edges, edges))
+        of_receiver = receiver == index
+        count, *_ = np.histogram2d(across[of_receiver], up[of_receiver], (edges, edges))
         counts[int(index)] = count.T
     return _Cells(width, width * edges, limits, counts)
 

@@ -1,4 +1,4 @@
-"""Scores of one run beside those of its baselines: which ones count, a table, a sentence."""
+"""Scores of one run beside its baselines' scores: which ones count, a table, a sentence."""
 
 import itertools
 from collections.abc import Mapping

@@ -120,7 +120,7 @@ def looks(systems: Iterable[str]) -> dict[str, tuple]:
     places = {**_places()}
     known = {*places.values()}
     taken = {places[model] for model in models.values() if model in places}
-    found = {}
+    looks_by_name = {}
     for name, model in models.items():
         if model not in places:
             # A place that follows from the name; the next one where a known system has it.
@@ -129,8 +129,8 @@ def looks(systems: Iterable[str]) -> dict[str, tuple]:
             places[model] = min(order, key=lambda place: (place in taken, place in known))
             taken.add(places[model])
         colour, dash = LINES[places[model]]
-        found[name] = colour, ":" if name.endswith("_trend") else dash
-    return found
+        looks_by_name[name] = colour, ":" if name.endswith("_trend") else dash
+    return looks_by_name
 
 
 def _models(systems: Iterable[str]) -> dict[str, str]:

@@ -48,9 +48,8 @@ Scores = dict[str, dict[str, Tensor]]
 """Scores of every link, by the names of model and score."""
 
 
-def build_baselines(configurations: Sequence, own: str, scene: Scene) -> dict[str, Model]:
-    """The baselines of a run by name, not fitted; the one with the name ``own`` of the run's model
-    is left out.
+def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> dict[str, Model]:
+    """The baselines of a run by name, not fitted, without the one named as the run's model.
 
     Raises:
         ValueError: A baseline has no name, an unknown one or options that do not fit, has to be
@@ -66,7 +65,7 @@ def build_baselines(configurations: Sequence, own: str, scene: Scene) -> dict[st
         name = config["name"]
         if name in models:
             raise ValueError(f"baselines must have different names, got {name!r} twice")
-        built = None if name == own else registry("model").build(config, scene=scene)
+        built = None if name == model_name else registry("model").build(config, scene=scene)
         if built is not None and built.is_trained:
             raise ValueError(f"baseline {name!r} has to be trained; run it by model={name}")
         models[name] = built
@@ -124,7 +123,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
     Args:
         model: A trained, fitted or loaded model, of the same receivers and task.
         links: Links with a split.
-        baselines: Names or configurations of models without a training; None: those of the task.
+        baselines: Names or configurations of models without a training; None: the task's own.
 
     Raises:
         TypeError: The model is not a ``gaigs.Model``, or the links are not ``gaigs.Links``.
@@ -166,19 +165,21 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
                 len(test),
             )
     task = (links.held_out or links).task
-    own = name_of(model.trend if isinstance(model, Kriging) else model)
-    models = {own: model} | ({f"{own}_trend": model.trend} if isinstance(model, Kriging) else {})
+    model_name = name_of(model.trend if isinstance(model, Kriging) else model)
+    models = {model_name: model} | (
+        {f"{model_name}_trend": model.trend} if isinstance(model, Kriging) else {}
+    )
     if baselines is None:
         baselines = (
             composed([f"task={task.name}"], {})["baselines"] if files_of("task", task.name) else ()
         )
     baselines = [baselines] if isinstance(baselines, str) else baselines
-    scores = score(models, build_baselines(baselines, own, links.scene), links)
+    scores = score(models, build_baselines(baselines, model_name, links.scene), links)
     return Evaluation(task, links.split.name, scores, device_name(model.device))
 
 
 def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:
-    """The numbers of a table, and those of intervals where a model has them."""
+    """The numbers of a table, with numbers of intervals where a model has them."""
     of_task = task_scores(scores)
     of_intervals = {
         name.removeprefix(INTERVALS): score for name, score in scores.items() if name not in of_task
@@ -187,7 +188,7 @@ def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:
 
 
 def task_scores(scores: dict[str, Tensor]) -> dict[str, Tensor]:
-    """The scores of the task, without those of intervals."""
+    """The scores of the task, without scores of intervals."""
     return {name: score for name, score in scores.items() if not name.startswith(INTERVALS)}
 
 

@@ -51,7 +51,7 @@ def claim(folder: Path, config: dict) -> None:
     differing = []
     values = differences(there, config)
     for key, (was, value) in values.items():
-        # The configuration of a model repeats those of its parts.
+        # The configuration of a model repeats the configurations of its parts.
         if not (key.startswith("model.") and key.removeprefix("model.") in values):
             differing.append(f"{key} was {was!r}, is {value!r}")
     if differing:

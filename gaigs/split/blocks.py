@@ -15,7 +15,7 @@ def blocks(
 
     Args:
         edge: Edge of a cube [m]; the first cube starts at the lower corner of all transmitters.
-            Other options and errors are those of ``gaigs.split.part``.
+            Other options and errors: see ``gaigs.split.part``.
     """
     low, high = 1e-6, 1e6  # float32 has no finer resolution, and data no larger extent
     check("edge", edge, low <= edge <= high, f"from {low:g} to {high:g} m")

@@ -11,6 +11,6 @@ def random(
 ) -> Split:
     """Random places test: interpolation, since a neighbour on a dense trajectory is always near.
 
-    Options and errors are those of ``gaigs.split.part``.
+    Options and errors: see ``gaigs.split.part``.
     """
     return part("random", links, places_of(links), test, validation, seed, rows=rows_of(links))

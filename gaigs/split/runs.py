@@ -12,6 +12,6 @@ def runs(
     """Random runs test: a trajectory with gaps.
 
     Args:
-        length: Rows in a run. Other options and errors are those of ``gaigs.split.part``.
+        length: Rows in a run. Other options and errors: see ``gaigs.split.part``.
     """
     return part(f"runs of {length}", links, runs_of(links, length), test, validation, seed)

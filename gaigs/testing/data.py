@@ -88,7 +88,7 @@ def _direct_waves(places: Tensor, elements: Tensor, frequencies: Tensor) -> Tens
 def check_data(links: Links) -> None:
     """Checks links: shapes, ranges, repeatable labels, disjoint parts, a scene that can be stored.
 
-    The contract is that of ``gaigs.data.Links``.
+    The contract is in ``gaigs.data.Links``.
     """
     _check_query(links)
     _check_receivers(links)

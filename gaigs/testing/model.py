@@ -25,7 +25,7 @@ def check_model(
 ) -> None:
     """Checks a model: it fits, predicts, evaluates any directions, trains and can be stored.
 
-    The contract is that of ``gaigs.model.Model``.
+    The contract is in ``gaigs.model.Model``.
 
     Args:
         build: Makes the model for a scene.

@@ -18,7 +18,7 @@ def check_placement(placement: nn.Module, scene: Scene, device: torch.device | s
     """Checks a placement: shapes, dtype, gradients, independence of the batch.
 
     It is built for the scene and 2 channels. A placement with Gaussians of its own is also called
-    without free ones. The contract is that of ``gaigs.splatting.placement.Placement``.
+    without free ones. The contract is in ``gaigs.splatting.placement.Placement``.
     """
     generator = torch.Generator().manual_seed(0)
     cases = [(40, 3, torch.float32), (40, 3, torch.float64)]

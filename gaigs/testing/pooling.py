@@ -37,7 +37,7 @@ def check_pooling(
     among the inputs. A pooling of maps without a grid is given maps over the label's directions and
     over a list of some of them; any other is called with such a list. A pooling of maps to one real
     number must also take maps that are constant, span 12 decades or are of half precision.
-    The contract is that of ``gaigs.splatting.pooling.Pooling``.
+    The contract is in ``gaigs.splatting.pooling.Pooling``.
 
     Args:
         build: Makes the pooling for a scene.

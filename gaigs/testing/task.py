@@ -18,7 +18,7 @@ from gaigs.testing.checks import flat, require, require_close, require_refusal
 def check_task(task: Task, *thinnings: Mapping) -> None:
     """Checks a task: its state, its scores, what it refuses, its thinning.
 
-    True values must score best. The contract is that of ``gaigs.core.task.Task``.
+    True values must score best. The contract is in ``gaigs.core.task.Task``.
 
     Args:
         task: The task.

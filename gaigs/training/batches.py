@@ -31,7 +31,7 @@ class Batches:
     Args:
         index: Links to draw from.
         size: Places a batch, of all processes together; the last batch of a pass may hold fewer.
-        seed: Of the order.
+        seed: Seed of the order.
         steps: Number of batches.
     """
 

@@ -93,8 +93,8 @@ class Budget(Callback):
     def on_train_batch_end(self, trainer, module, *_) -> None:
         if math.isinf(self.limit) and self.every is None:
             return
-        elapsed = self._look(trainer)
-        # Validations take at most a fifth of the time.
+        elapsed = self._measure_time(trainer)
+        # Validations take at most a fifth of the time: 4 d of training follow one of duration d.
         pause = 4 * (self.validated - self.began)
         is_time = self.every is not None and elapsed >= self.validated + max(self.every, pause)
         self.is_due = trainer.should_stop or is_time
@@ -107,7 +107,7 @@ class Budget(Callback):
     def on_validation_end(self, trainer, module) -> None:
         if math.isinf(self.limit) and self.every is None:
             return
-        self.validated = self._look(trainer)
+        self.validated = self._measure_time(trainer)
         if not trainer.sanity_checking:
             for logger in trainer.loggers:  # beside the scores of this validation
                 logger.log_metrics({"seconds": self.validated}, step=trainer.global_step - 1)
@@ -116,7 +116,7 @@ class Budget(Callback):
         self.spent = self.seconds
         self.start = None
 
-    def _look(self, trainer) -> float:
+    def _measure_time(self, trainer) -> float:
         """The first process's time [s]; stops the training when it is up."""
         elapsed = trainer.strategy.broadcast(self.seconds)
         self.share = (elapsed - self.searched) / (self.limit - self.searched)

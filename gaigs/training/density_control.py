@@ -21,7 +21,7 @@ class DensityControl(Callback):
         split_angle: Largest standard deviation over distance beyond which a Gaussian is wide [rad].
         opacity: Opacity below which Gaussians are pruned.
         max_count: Largest number of Gaussians to grow to.
-        seed: Of the halves' random positions.
+        seed: Seed of the halves' random positions.
 
     Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2; thresholds in docs/methods.md.
     """

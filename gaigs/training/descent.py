@@ -24,12 +24,12 @@ class Descent(lightning.LightningModule):
 
     Args:
         identity: Entry of a checkpoint beside the weights: scene, configuration and split.
-        seed: Of the training's random numbers.
+        seed: Seed of the training's random numbers.
         batch_size: Places a step.
         thinning: Options of the task's thinning: the part of each label in a step.
         jitter: Standard deviation of each place's random shift along each axis in every step [m].
         penalties: Weights of penalties by name, in place of ``Model.penalty_weights``.
-        learning_rates: At the start, by parameter group, in place of ``Model.learning_rates``.
+        learning_rates: Initial rates by parameter group, in place of ``Model.learning_rates``.
         optimizer, schedule: As ``gaigs.training.schedule`` takes them.
         patience: Validations without a better score until the training stops; None: it goes on to
             the last step.

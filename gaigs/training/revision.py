@@ -22,10 +22,8 @@ class _TimeUp(Exception):
 
 
 @contextlib.contextmanager
-def _ending(trainer, model: nn.Module) -> Iterator[None]:
-    """Looks at the clock whenever a part of the model is called, and raises ``_TimeUp`` when the
-    time is up.
-    """
+def _stopping_when_time_is_up(trainer, model: nn.Module) -> Iterator[None]:
+    """Raises ``_TimeUp`` at the first call of a submodule after the training's time is up."""
 
     def look(*_) -> None:
         if is_time_up(trainer):
@@ -48,7 +46,7 @@ class Revision(Callback):
 
     Args:
         links: Links with a split.
-        seed: Of the choice of links.
+        seed: Seed of the choice of links.
         max_links: Most training links, and validation links, of a revision: a search evaluates them
             hundreds of times.
     """
@@ -91,7 +89,7 @@ class Revision(Callback):
                 return value.item()
 
             try:
-                with _ending(trainer, module.model):
+                with _stopping_when_time_is_up(trainer, module.model):
                     done = module.model.revise(number, train, validation, loss)
             except _TimeUp:
                 module.model.load_state_dict(before)

@@ -23,7 +23,7 @@ def on_split(
     baselines: list[Mapping],
     looked_up: int = 30_000_000,
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
-    """Expected metrics on the split's test links and those of the baselines, by row; and remarks.
+    """Expected metrics on the split's test links and the baselines' metrics, by row; and remarks.
 
     Each test link is looked up in the cell of its nearest known link of the same receiver and
     carrier, and stands for the pairs compared there. The rows are empty if no test link can be

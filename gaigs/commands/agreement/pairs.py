@@ -104,7 +104,7 @@ def measure(
     The later label of a pair is scored with the earlier as its prediction.
 
     Args:
-        links: All links in the order of the files, which counts as that of measurement.
+        links: All links in the order of the files, which counts as the order of measurement.
         random: Draws the pairs.
         counted: Largest number of computed distances; of more pairs, those of random links with all
             others count.
@@ -165,9 +165,10 @@ def distance_edges(links: Links, places: Float[ndarray, "n 3"]) -> Float[ndarray
 
 
 def visits(links: Links) -> Int[ndarray, " n"]:
-    """Number of each link's measurement.
+    """Number of the measurement to which each link belongs, ascending from 0.
 
-    It is one more at each change of the row, so a place measured again counts anew.
+    Links follow in the order of the files. Consecutive links of one row (one transmission to all
+    receivers) are one measurement; a row that comes back later starts another one.
     """
     return np.concatenate(([0], (rows_of(links).diff() != 0).numpy().cumsum()))
 
@@ -184,7 +185,9 @@ def groups_of(links: Links) -> list[Int[ndarray, " k"]]:
 
 
 class Reservoir:
-    """The pairs of each cell with the smallest random keys.
+    """A random sample of the pairs of each cell: those with the smallest random keys.
+
+    Pairs arrive in parts, so the number of all pairs need not be known in advance.
 
     Args:
         cells: Number of cells. Pairs of a further cell are never kept.
@@ -223,9 +226,16 @@ def draw(
     block: int,
     random: np.random.Generator,
 ) -> tuple[Int[ndarray, " cells"], dict[int, Int[ndarray, "k 2"]]]:
-    """Number of pairs of each cell, and at most so many of them, earlier and later link.
+    """Number of pairs in each cell, and random pairs of each cell: earlier and later link.
 
-    Arguments are those of ``measure``.
+    Args:
+        agreement: Edges of the cells.
+        places: Transmitters of the links [m].
+        order: Measurement of each link, see ``visits``.
+        groups: Links of one receiver and carrier, see ``groups_of``.
+        most: Largest number of drawn pairs of a cell.
+        block: Number of distances in memory at a time.
+        random: Draws the pairs.
     """
     size = agreement.pairs.size
     counts = np.zeros(size + 1, int)  # the last cell holds links that are not a pair
@@ -249,7 +259,7 @@ def draw(
 
 
 def compare(links: Links, earlier: ndarray, later: ndarray) -> dict[str, Tensor]:
-    """Scores of labels with others as their predictions."""
+    """Scores of the later links' labels, with the earlier links' labels as the predictions."""
     labels = torch.from_numpy(later).split(evaluation.BATCH)
     others = torch.from_numpy(earlier).split(evaluation.BATCH)
     parts = []

@@ -43,7 +43,7 @@ def export(
             of DeepMIMO v4.
         places: Of predictions and scenarios: positions (n, 3) [m], from which each receiver hears;
             a query; or links, whose test is predicted and written beside its labels.
-        pitch, height: Of a radio map [m], as for ``gaigs.radio_map``.
+        pitch, height: Grid of a radio map [m], as for ``gaigs.radio_map``.
         frequency: Carrier of radio map, places and materials of the room [Hz]; None: that of the
             training links.
         interval: Probability with which the intervals of predictions hold the label.

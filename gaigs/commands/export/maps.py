@@ -55,7 +55,7 @@ def title(floor: RadioMap) -> str:
 def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     """Bands of value and deviation, one receiver after the other, north up.
 
-    Coordinates are those of the frame's projected system.
+    Coordinates are in the frame's projected system.
 
     Source: OGC GeoTIFF Standard 1.1; names of bands as GDAL stores them.
     """

@@ -200,7 +200,7 @@ def _rows(
 ) -> Iterator[Sequence[str]]:
     """A heading, and a row for each number of each link that is not absent.
 
-    Columns are those of the link, then of the axes, then of the values.
+    Columns describe the link, then the axes, then the values.
     """
     of_link = ("x", "y", "z", "easting", "northing", "receiver", "frequency")
     axes: dict[str, list] = {}

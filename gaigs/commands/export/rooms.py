@@ -114,7 +114,7 @@ def traced_gains(model: MirroredSplatting, rest: float) -> Complex[Tensor, " rec
 
 
 def _gain_comments(model: MirroredSplatting, rest: float) -> list[str]:
-    """The steps from traced channels to those of each receiver."""
+    """The steps from traced channels to the channels of each receiver."""
     conjugated = ", then conjugated" if model.pooling.array_sign > 0 else ""
     gains = traced_gains(model, rest).tolist()
     comments = []
@@ -134,9 +134,14 @@ class Bsdf(NamedTuple):
 
 
 def itu_bsdf(material: Material, frequency: float) -> Bsdf:
-    """A material of ITU-R P.2040 by its name, which follows the carrier that is set in Sionna RT.
+    """A material of ITU-R P.2040 in Sionna RT.
 
-    For a carrier [Hz] outside the tables it is the extrapolated numbers of this carrier.
+    It is given by name, so that Sionna RT computes it for the carrier that is set there. Outside
+    1 to 40 GHz, where Sionna RT has no table, it is given by extrapolated constants.
+
+    Args:
+        material: Name and thickness.
+        frequency: Carrier [Hz].
     """
     name = f"{material.name}-{1e3 * material.thickness:.4g}mm"
     thickness = ("thickness", material.thickness)

@@ -91,18 +91,18 @@ class PlaceDensity:
         return torch.logaddexp(near, (self.elsewhere / volume).log())
 
     def likeliest_width(self, spacing: float, most: int = 1000, tried: int = 24) -> float:
-        """The width under which known places are most likely by those of other folds [m].
+        """The width under which known places are most likely, given the other folds' places [m].
 
         Args:
             spacing: Median distance from a known place to the next [m].
             most: Largest number of places whose density counts.
             tried: Number of widths, from a quarter of the spacing to the diagonal of the box.
         """
-        some = evenly(torch.arange(len(self.places)), most)
+        rows = evenly(torch.arange(len(self.places)), most)
         ends = math.log10(spacing / 4), math.log10(self.edges.norm())
 
         def mean_logarithm(width: float) -> float:
-            return self.logarithm(self.places[some], width, self.folds[some]).mean().item()
+            return self.logarithm(self.places[rows], width, self.folds[rows]).mean().item()
 
         return max(torch.logspace(*ends, tried).tolist(), key=mean_logarithm)
 
@@ -117,7 +117,7 @@ def near_candidates(
     links: Links,
     known: Int[Tensor, " k"],
 ) -> Candidates:
-    """A grid with a quarter of the places, and random places about those of known links."""
+    """A grid with a quarter of the places, and random places about known links' places."""
     places, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)
     folds = torch.zeros(len(places), dtype=torch.long)
     folds = folds.index_copy(0, which, folds_of(links, known))

@@ -48,8 +48,8 @@ class Fingerprints:
             (m, k).
         values: Predictions at the candidates along these axes (g, r, k).
         deviations: Standard deviations of labels of one number (g, r); else 1.
-        hearing: Probability that each receiver receives a transmitter there (g, r); without links a
-            half.
+        reception_probabilities: Probability that each receiver receives a transmitter there (g, r);
+            without links a half.
         degrees, temper: Arguments of ``log_likelihood``.
         held: Held-out fingerprints of each fold, which calibrate regions; empty without links.
         frame: Place of x and y on a map; None if unknown.
@@ -68,7 +68,7 @@ class Fingerprints:
     axes: Float[Tensor, "m k"]
     values: Float[Tensor, "g r k"]
     deviations: Float[Tensor, "g r"]
-    hearing: Float[Tensor, "g r"]
+    reception_probabilities: Float[Tensor, "g r"]
     degrees: float = 4.0
     temper: float = 1.0
     held: tuple[LocatedFold, ...] = ()
@@ -88,7 +88,7 @@ class Fingerprints:
     def drops(self, unknown_power: bool = False, step: float | None = None) -> Float[Tensor, " h"]:
         """Logarithms of the best candidate's density over the density at the true place, ascending.
 
-        One for each held-out fingerprint. Options are those of ``locate``; with ``step``
+        One for each held-out fingerprint. Options as for ``locate``; with ``step``
         fingerprints are values of a ``walk``.
         """
         if (unknown_power, step) not in self._drops:

@@ -55,10 +55,14 @@ class Mismatch(NamedTuple):
 def mismatch(
     prints: Fingerprints, asked: Float[Tensor, "n r k"], unknown_power: bool = False
 ) -> Mismatch:
-    """Differences of values, along the axes of a map, from its predictions.
+    """Differences of values from a map's predictions, and the probability of their reception.
 
-    With ``unknown_power`` squares are the least over all offsets of a value's levels, or all
-    factors of a prediction's spectra or channels.
+    Args:
+        prints: The map, g candidates.
+        asked: Values along ``prints.axes``, NaN where a receiver has received none.
+        unknown_power: True if the transmission's power is unknown. Squared errors are then the
+            least over all offsets of a value's levels, or all factors of predicted spectra or
+            channels, and reception tells nothing.
     """
     is_received = ~asked[..., 0].isnan()  # (n, r)
     if prints.task.shape:
@@ -69,12 +73,12 @@ def mismatch(
     counts = is_received.float().sum(1)
     reception = torch.zeros_like(squares)
     if not unknown_power:
-        likely = is_received.float() @ prints.hearing.log().mT
-        unlikely = (~is_received).float() @ (-prints.hearing).log1p().mT
+        likely = is_received.float() @ prints.reception_probabilities.log().mT
+        unlikely = (~is_received).float() @ (-prints.reception_probabilities).log1p().mT
         # In a track, a value that no receiver has received may not have been sent.
         reception = (likely + unlikely) * (counts > 0)[:, None]
     elif not prints.task.shape:
-        counts = counts - 1  # one number less tells of the place
+        counts = counts - 1  # the fitted offset takes one degree of freedom
     return Mismatch(squares.clamp_min(0), log_deviations, counts, reception)
 
 
@@ -136,8 +140,8 @@ def log_likelihood(difference: Mismatch, degrees: float, temper: float) -> Float
     Args:
         difference: Values and predictions compared.
         degrees: Degrees of freedom. The fewer, the less one unlike place or receiver counts.
-        temper: The power. It stands for what the errors of receivers have in common, and for what
-            the axes miss.
+        temper: The power, below 1 where receivers' errors are correlated: their evidence counts
+            less than independent errors would.
     """
     exponent = (degrees + difference.counts[:, None]) / 2
     together = exponent * torch.log1p(difference.squares / degrees) + difference.log_deviations
@@ -174,22 +178,23 @@ class UnseenPrints(NamedTuple):
         return (errors - apart / 2).sum().item()
 
 
-def fitted(
+def choose_likelihood(
     prints: Fingerprints,
     trials: Sequence[UnseenPrints],
     degrees: Sequence[float] = (0.25, 1.0, 4.0, 30.0),
     half_octaves: Iterable[int] = range(-8, 17),
     fewest: int = 20,
 ) -> Fingerprints:
-    """A map with the likelihood of the least energy score of held-out fingerprints.
+    """The map with the ``degrees`` and ``temper`` of the least energy score of held-out values.
 
-    The likelihood of each fold is chosen by the other folds.
+    Regions are calibrated by held-out fingerprints whose own fold has no part in the choice: for
+    each fold the other folds choose.
 
     Args:
         prints: The map.
         trials: Held-out fingerprints of each fold.
         degrees: Degrees of freedom to choose from, the heaviest tails first.
-        half_octaves: Exponents to choose from, in powers of the root of 2.
+        half_octaves: Integers i; the tempers to choose from are 2^(i / 2).
         fewest: Number of fingerprints below which the degrees are not chosen: so few hardly show
             whether one of twenty is an outlier. Levels then keep the likelihood of ``prints``, and
             other labels take the heaviest tails.

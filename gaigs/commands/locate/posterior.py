@@ -41,8 +41,8 @@ def locate(
         value: A label of each receiver (r, *shape), or of each transmission and receiver (n, r,
             *shape), scaled as the training labels; with one receiver also (*shape) or (n, *shape);
             or a mapping of the receivers' names to their labels, (*shape) or (n, *shape). NaN, of
-            channels also zeros, where a receiver has not heard it, as if a mapping lacks it; of a
-            track, a value may be unheard by all.
+            channels also zeros, where a receiver has not received it, as if a mapping lacks it; of
+            a track, a value may be received by none.
         links, region: As for ``fingerprints``.
         unknown_power: True if all labels of a transmission share an unknown offset [dB], or factor
             of amplitudes. Channels are always compared without their power and phase.
@@ -53,8 +53,8 @@ def locate(
             without links the posterior counts, whose regions are often too small.
 
     Raises:
-        ValueError: A value has another shape than the labels, or was heard by no receiver and is no
-            part of a track; or an option is impossible.
+        ValueError: A value has another shape than the labels, or was received by no receiver and is
+            no part of a track; or an option is impossible.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -91,7 +91,7 @@ def locate(
 def excess_of(
     asked: Float[Tensor, "n r 1"], prints: Fingerprints, deviations: float = 5.0
 ) -> float | None:
-    """How far readings are beyond all predictions; None if that is plausible.
+    """Largest excess of readings over the range of all predictions; None if it is plausible.
 
     Args:
         asked: Readings.
@@ -120,7 +120,7 @@ def posterior(
     if step is not None and not 0 < step < math.inf:
         raise ValueError(f"step must be above 0 m, got {step!r}")
     step = step if len(asked) > 1 else None  # one value is no track
-    drop = drop_of(prints, unknown_power, step, level)
+    drop = conformal_drop(prints, unknown_power, step, level)
     is_calibrated = prints.held_out_count >= fewest(level)
     parts = []
     # In parts: a value takes 60 bytes a candidate, and its posterior 9. A track is one part.
@@ -135,11 +135,13 @@ def posterior(
     return replace(joined(parts), frame=prints.frame)
 
 
-def drop_of(
+def conformal_drop(
     prints: Fingerprints, unknown_power: bool, step: float | None, level: float
 ) -> Float[Tensor, ""] | None:
-    """Largest drop below the highest density within a region of a level; None if nothing is held
-    out.
+    """Log density below the maximum at which a region ends, from held-out fingerprints.
+
+    A region of all candidates above this holds the transmitter with probability ``level``. None
+    without held-out fingerprints.
     """
     drops = prints.drops(unknown_power, step)
     count = prints.held_out_count

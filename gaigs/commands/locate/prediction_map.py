@@ -17,7 +17,7 @@ from gaigs.commands.locate.fingerprints import (
     receptions,
     transmissions,
 )
-from gaigs.commands.locate.likelihood import UnseenPrints, fitted, independent, mismatch
+from gaigs.commands.locate.likelihood import UnseenPrints, choose_likelihood, independent, mismatch
 from gaigs.core import stages
 from gaigs.core.geometry import ExtrapolationWarning, even_places
 from gaigs.core.query import as_positions, evenly
@@ -87,7 +87,7 @@ def fingerprints(
     folds = held_out_folds(maker, model, known)
     trials = trials_of(folds)
     prints = along(prints, [fold.errors for fold in folds])
-    return fitted(prints, trials) if trials else prints
+    return choose_likelihood(prints, trials) if trials else prints
 
 
 def box_of(model: Model, region: object) -> Float[Tensor, "2 3"]:
@@ -185,10 +185,10 @@ class MapMaker:
         else:
             candidates = near_candidates(self.box, self.points, scene.floors, self.links, known)
         values, deviations = predicted(model, candidates.places, self.frequency)
-        hearing = torch.full(values.shape[:2], 0.5)
+        reception_probabilities = torch.full(values.shape[:2], 0.5)
         if len(known) and self.has_whole_transmissions():
             parts = receptions(self.links, known)
-            hearing = reception_probability(candidates.places, *parts, prior=0.5)
+            reception_probabilities = reception_probability(candidates.places, *parts, prior=0.5)
         return Fingerprints(
             scene.task,
             self.frequency,
@@ -197,7 +197,7 @@ class MapMaker:
             torch.eye(values.shape[2]),
             values,
             deviations,
-            hearing,
+            reception_probabilities,
             frame=scene.frame,
         )
 
@@ -291,7 +291,7 @@ def trials_of(folds: Sequence[PrintFold], most: int = 200) -> list[UnseenPrints]
 
 
 def along(prints: Fingerprints, errors: Sequence[Float[Tensor, "_ r m"]]) -> Fingerprints:
-    """A map along the axes of some errors; without any along those of its own differences."""
+    """A map along the axes of some errors; without any, along the axes of its own differences."""
     if not prints.task.shape:
         return replace(prints, axes=torch.eye(1))
     if not errors:

@@ -115,7 +115,7 @@ def smoothed(
         is_received: True for values that a receiver has received. The track is near
             ``straight_lines`` where it is False.
         most: Largest number of candidates of each value that are linked to those before and after.
-        jump: Density of a move to any place over that of a move to the same one: a track may jump.
+        jump: Density of a move to any place over the density of no move: a track may jump.
 
     Source: Rabiner, A tutorial on hidden Markov models, 1989, the forward-backward algorithm.
     """

@@ -31,7 +31,7 @@ class Measured(NamedTuple):
 
 
 class ReceiverReadings(NamedTuple):
-    """ReceiverReadings of one receiver, and its process at the asked places.
+    """Readings of one receiver, and its process at the asked places.
 
     Attributes:
         process: The process.
@@ -75,7 +75,10 @@ def measured_places(
     most: int = 1500,
     tolerated: float = 1.05,
 ) -> Measured:
-    """The measured places, and what they are worth for the mean error at other places.
+    """The measured places, and how much each lowers the mean error at the asked places.
+
+    Superfluous are the places of the least losses that may all be left out while the mean error
+    stays below ``tolerated`` times its value.
 
     Args:
         processes: Processes of the receivers.
@@ -99,15 +102,17 @@ def measured_places(
         readings.append(ReceiverReadings(process, index, which, torch.cat(parts), chance))
 
     def error(is_kept: Bool[Tensor, " k"]) -> float:
+        """Mean standard deviation at the asked places, with the kept places alone."""
         deviations = []
-        for one in readings:
-            whitened, _ = one.process.whitened(asked, one.rows[is_kept[one.places]])
-            deviations.append(one.deviations(whitened))
+        for receiver in readings:
+            rows = receiver.rows[is_kept[receiver.places]]
+            whitened, _ = receiver.process.whitened(asked, rows)
+            deviations.append(receiver.deviations(whitened))
         return mean_of_received(torch.stack(deviations), chances)
 
     losses = known.new_zeros(len(known))
-    for one in track(readings, "places to leave out"):
-        for number, rise in one.rises(asked):
+    for receiver in track(readings, "places to leave out"):
+        for number, rise in receiver.rises(asked):
             losses[number] += rise / chances.sum()
 
     # Bisection: the places of the least losses that may be left out together.

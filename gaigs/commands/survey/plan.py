@@ -117,7 +117,7 @@ def survey(
     A receiver counts at a place as much as it is likely to hear it, by the measured places around.
     Labels do not enter beyond the fitted process, so a plan is made before anything is measured.
     The largest variance would be a poor guide: it is in the corners. The first places of a longer
-    plan are those of a shorter one.
+    plan are the shorter plan.
 
     Args:
         model: ``gaussian_process``, or a trained model with kriging; None: nothing is measured yet,
@@ -127,7 +127,7 @@ def survey(
             floors these.
         count: Number of places; at most as many as there are candidates.
         candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
-        frequency: Carrier [Hz]; None: that of the training links, of several the middle one.
+        frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
             Without a model it has no effect.
 
     Raises:

@@ -154,7 +154,7 @@ class Contents:
 
         Args:
             place: Position [m].
-            receiver: Number of the receiver; levels are those of all receivers.
+            receiver: Number of the receiver; levels cover all receivers.
             step: Rows and columns from one shown pixel of a spectrum to the next.
         """
         asked = None if self.kind == "level" else receiver

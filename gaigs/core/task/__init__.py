@@ -149,12 +149,13 @@ class Task(ABC):
         return means
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor] | None:
-        """Scores of a mean of many labels as the prediction; by default None, unknown.
+        """Scores that the mean of many labels at a place would reach; by default None, unknown.
 
-        Labels that scatter alike and independently leave half of the squared difference.
+        Two labels at a place with independent noise of variance s² differ by 2 s² in the mean
+        square, a label and the mean of many by s²: half.
 
         Args:
-            scores: Scores of one label as the prediction of another.
+            scores: Scores of one label as the prediction of another at the same place.
         """
         return None
 

@@ -30,7 +30,7 @@ class Csi(Task):
 
     - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is the SNR after the best global phase of
       the prediction, for a receiver and a transmitter without a common clock. Where ``phase`` is
-      not known, it is the only SNR, and all scores are those of the aligned error.
+      not known, it is the only SNR, and all scores take the aligned error.
     - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²), at least 0. Its mean is monitored: a few links in
       deep shadow, with an SNR of -50 dB, would dominate a mean SNR.
 

@@ -133,7 +133,7 @@ def check_origin(sample: Sample) -> Iterator[Finding]:
 
 
 def check_each(sample: Sample, names: Sequence[str], most: int = 4) -> Iterator[Finding]:
-    """Findings about receivers whose levels are those of another place, the clearest first."""
+    """Findings about receivers whose levels fit another place, the clearest first."""
     findings = []
     for number, name in enumerate(names):
         alone = _only(sample, torch.tensor([number]))
@@ -192,7 +192,7 @@ def _finding(fault: str, subject: str, gain: Gain, under: str, mend: str) -> Fin
 
 
 def _share(finding: Finding) -> float:
-    """Error of what fits over that of the data as read."""
+    """Error of the fit over the error of the data as read."""
     return (finding.fits or 0.0) / (finding.read or 1.0)
 
 

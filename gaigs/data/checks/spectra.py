@@ -74,7 +74,7 @@ class Limits:
         near: Fewest spectra that show whether near places are alike.
         most: Most spectra that are read.
         pixels: Most rows and columns that are compared; an array resolves fewer.
-        better: Least excess of the score over that of the data as read.
+        better: Least excess of the score over the score of the data as read.
         share: The same as a share of the score.
         known: Score of the data as read above which two faults at once are not sought.
         of_others, of_axes, of_pairs: The excess in standard errors. Axes that point the other way
@@ -156,7 +156,7 @@ class Trials(NamedTuple):
 def trials(
     links: Any, sample: Sample, directions: "Directions", is_known: bool, limits: Limits
 ) -> Iterator[Trials]:
-    """All conventions: single ones, those of axes, and unless the read one is known, pairs."""
+    """All conventions: single ones, axes, and unless the read one is known, pairs."""
     axes = [*of_axes(sample, [("tx",), ("rx",), ("tx", "rx")])]
     units = [*of_units([("tx",), ("rx",)])]  # in any unit of both, directions are the same
     orientations = [*of_orientations(sample)]
@@ -218,7 +218,7 @@ class Directions:
 
     Attributes:
         grid: Directions of the pixels that are compared.
-        ranks: Of each pixel, 0 for the darkest and 1 for the brightest (n, rows, columns).
+        ranks: Rank of each pixel, 0 for the darkest and 1 for the brightest (n, rows, columns).
         places: Number of places that count: within a sixth of the room spectra are alike.
     """
 

@@ -53,7 +53,7 @@ def read(
     -20 dBm. Rows of one place are averaged in dB. Gateways look along the world's axes.
 
     Args:
-        file: The table. Levels lie in [-150, 30] dBm. Empty cells and NaN were not heard.
+        file: The table. Levels lie in [-150, 30] dBm. Empty cells and NaN were not received.
         gateways: Table of ``name,x,y,z``, or YAML of ``name: [x, y, z]``, in the coordinates of the
             places. Gateways that it does not have, or all if it is None, get their place from the
             training links.

@@ -43,7 +43,7 @@ class Columns(NamedTuple):
     Attributes:
         gateways: Numbers of the gateways' columns.
         marks: Values that mean "not heard".
-        silent: Names of gateways that heard nothing.
+        silent: Names of gateways that received nothing.
         ignored: Names of other columns.
     """
 

@@ -16,12 +16,12 @@ from gaigs.core.scene import Scene, carriers
 from gaigs.core.task.spectrum import MIN_MAX
 
 
-class FoundLags(NamedTuple):
-    """Covariances of which labels are the spectra.
+class LagFit(NamedTuple):
+    """Covariances at an array's lags, fitted to labels.
 
     Attributes:
-        lags: Covariance at each of ``array.lags``, but for each label's scale.
-        unexplained: Share of each label's squared norm that is no such spectrum.
+        lags: Covariance at each of ``array.lags``, up to a factor for each label.
+        unexplained: Share of each label's squared norm that the fit leaves.
     """
 
     lags: Complex[Tensor, "b l"]
@@ -89,6 +89,8 @@ class Beamformer:
         """
         grid = self.scene.task.directions
         asked = grid if directions is None else directions
+        # Labels are scaled by the least and largest amplitude over the task's grid: where only some
+        # of its directions are asked, the coarse grid shows these extremes.
         has_extremes = asked is grid or grid.matches(asked)
         # The lags are symmetric: the middle one is the power, the later half determines the rest.
         middle = lags.shape[1] // 2
@@ -100,12 +102,12 @@ class Beamformer:
         spectra = [parts.new_zeros(0, math.prod(asked.shape))]
         order = [torch.zeros(0).long().to(parts.device)]
         for carrier, links in self.by_carrier(query):
-            amplitudes = self._look(parts[links], carrier, query, asked)  # (b, k)
-            shown = amplitudes
+            amplitudes = self._amplitudes(parts[links], carrier, query, asked)  # (b, k)
+            reference = amplitudes
             if not has_extremes:
-                coarse = self._look(parts[links], carrier, query, self.coarse)
-                shown = torch.cat((amplitudes, coarse), 1)
-            spectra.append(_scaled(amplitudes, shown))
+                coarse = self._amplitudes(parts[links], carrier, query, self.coarse)
+                reference = torch.cat((amplitudes, coarse), 1)
+            spectra.append(_scaled(amplitudes, reference))
             order.append(links)
         if len(spectra) == 2:  # a single carrier
             values = spectra[1]
@@ -113,16 +115,15 @@ class Beamformer:
             values = torch.cat(spectra)[torch.cat(order).argsort()]
         return values.unflatten(1, asked.shape)
 
-    def lags(self, labels: Float[Tensor, "b rows columns"], query: Query) -> FoundLags:
-        """Computes the covariances of which labels are the spectra, float64.
+    def lags(self, labels: Float[Tensor, "b rows columns"], query: Query) -> LagFit:
+        """Fits covariances to labels by least squares, float64: the inverse of a call.
 
-        They are the inverse of a call, but for each label's scale. A label of zeros has covariances
-        of 0.
+        The scale of a label stays unknown. A label of zeros has covariances of 0.
 
-        A label y is s - m but for a scale, with the least amplitude m. So y² + 2 m y + m² is linear
-        in the covariances, and they and m are the solution of least squares. What the directions
-        hardly show is left out: of an array of closely spaced elements the noise of the labels
-        would swamp it.
+        Up to a factor a label is y = s - m, with m the least amplitude. So s² = y² + 2 m y + m² is
+        linear in the covariances, which are fitted with m. Combinations of lags that hardly change
+        the spectrum are set to 0 (``rtol``): closely spaced elements have many, and noise of the
+        labels would swamp them.
         """
         grid = self.scene.task.directions
         # At least 40 x 40 pixels.
@@ -152,7 +153,7 @@ class Beamformer:
             imaginary = torch.cat((0 * parts[:, :1], parts[:, half:]), 1)
             later = torch.complex(parts[:, :half], imaginary)  # (b, half)
             lags[links] = torch.cat((later[:, 1:].conj().flip(1), later), 1)
-        return FoundLags(lags, unexplained)
+        return LagFit(lags, unexplained)
 
     def array(self, query: Query) -> Array:
         """The array of a query's receiver."""
@@ -164,7 +165,7 @@ class Beamformer:
         for carrier in frequencies.unique().tolist():
             yield carrier, (frequencies == carrier).nonzero()[:, 0]
 
-    def _look(
+    def _amplitudes(
         self, parts: Float[Tensor, "b m"], carrier: float, query: Query, directions: Directions
     ) -> Float[Tensor, "b k"]:
         """Amplitudes of the beamformer in a few directions."""

@@ -66,7 +66,7 @@ class Projection(ABC):
     """The contract of kind ``projection``.
 
     A projection is a smooth map from directions to the plane, ``coordinates``. A Gaussian's
-    footprint there is that of the map's linearisation at its centre, ``jacobian`` (EWA splatting),
+    footprint there follows from the map linearised at its centre, ``jacobian`` (EWA splatting),
     plus the variance of a square pixel: a splat narrower than a pixel is not lost between two pixel
     centres. docs/methods.md has the limits.
 

@@ -18,7 +18,7 @@ class Mercator(Cylindrical):
     wide. At the default limit, atan(sinh(pi)) = 85.0511 degrees, alpha is 1 and the projection
     conformal: a small round Gaussian stays round wherever it lies.
 
-    Options are those of ``Cylindrical``.
+    Options: see ``Cylindrical``.
 
     Source: GAI-GS, "Projection and Render Module".
     """

@@ -150,7 +150,7 @@ def rasterize(
     # Gaussians that stand still are drawn for all transmitters at once, others one by one.
     moves = means.ndim == 3
     maps = []
-    lefts = []
+    transmittances = []
     for row in [slice(k, k + 1) for k in range(b)] if moves else [slice(None)]:
         places = means[row.start if len(means) > 1 else 0] if moves else means  # (n, 3)
         shape = [_rows(values, row) for values in (quats, scales)]
@@ -158,15 +158,15 @@ def rasterize(
             places, *shape, receiver=receiver, grid=grid, projection=projection, pixel=pixel
         )
         passing = None if attenuations is None else attenuations[row]
-        image, left = chosen(splats, signal[row], opacities[row], passing, plane)
+        image, transmittance = chosen(splats, signal[row], opacities[row], passing, plane)
         maps.append(image)
-        lefts.append(left)
+        transmittances.append(transmittance)
     image = cat(maps)  # (b, c, rows, columns)
-    left = cat(lefts)  # (b, rows, columns)
+    transmittance = cat(transmittances)  # (b, rows, columns)
     if isinstance(grid, Rays):
         image = image[..., 0, :]
-        left = left[..., 0, :]
-    return (image, left) if leading else (image[0], left[0])
+        transmittance = transmittance[..., 0, :]
+    return (image, transmittance) if leading else (image[0], transmittance[0])
 
 
 def _rows(values: Tensor, row: slice) -> Tensor:

@@ -119,9 +119,9 @@ class OpenCLRasterizer:
         self._check(splats, signal, opacities, attenuations, plane)
         queue = open_queue(self.device)
         images = []
-        lefts = []
+        transmittances = []
         for part in signal.split(LAYOUT.channels, 2):
-            image, left = _CompositeByKernels.apply(
+            image, transmittance = _CompositeByKernels.apply(
                 queue,
                 splats,
                 plane,
@@ -133,8 +133,8 @@ class OpenCLRasterizer:
                 attenuations,
             )
             images.append(image)
-            lefts.append(left)
-        return torch.cat(images, 1) if len(images) > 1 else images[0], lefts[0]
+            transmittances.append(transmittance)
+        return torch.cat(images, 1) if len(images) > 1 else images[0], transmittances[0]
 
     def _check(
         self,
@@ -223,8 +223,8 @@ class _CompositeByKernels(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, image_gradient, left_gradient):
-        return None, None, None, None, *ctx.render.backward(image_gradient, left_gradient)
+    def backward(ctx, image_gradient, transmittance_gradient):
+        return None, None, None, None, *ctx.render.backward(image_gradient, transmittance_gradient)
 
 
 class _Sizes(ctypes.Structure):
@@ -332,8 +332,8 @@ class _Render:
         sizes = self.sizes
         shape = (sizes.transmitters, self.channels, sizes.height, sizes.width)
         image = torch.empty(shape, dtype=torch.float32)
-        left = torch.empty(shape[:1] + shape[2:], dtype=torch.float32)
-        outputs = self._share(image), self._share(left)
+        transmittance = torch.empty(shape[:1] + shape[2:], dtype=torch.float32)
+        outputs = self._share(image), self._share(transmittance)
         items = sizes.groups * self.tiles
         ends = self._empty(items)
         checkpoints, bounds = None, None
@@ -345,12 +345,12 @@ class _Render:
         self.path = ends, checkpoints, bounds
         self._run("forward", items, *self.scene, self.loudest, *outputs, *self.path)
         self._finish(*outputs)
-        return image, left
+        return image, transmittance
 
-    def backward(self, image_gradient, left_gradient):
+    def backward(self, image_gradient, transmittance_gradient):
         """Gradients of centres, factors, signal, opacities and attenuations."""
         sizes = self.sizes
-        images = self._share(image_gradient), self._share(left_gradient)
+        images = self._share(image_gradient), self._share(transmittance_gradient)
         partials = self._empty(self.groups_per_list * sizes.entries * self.partials)
         items = sizes.groups * self.tiles
         self._run("backward", items, *self.scene, *self.path, *images, partials)
@@ -442,7 +442,7 @@ def _tiling(
     """A plane in whole tiles, as the kernels read it.
 
     Args:
-        queue: Of the device.
+        queue: Command queue of the device.
         u_content, v_content: Bytes and shapes of u and v.
         period: As in ``Plane``.
 

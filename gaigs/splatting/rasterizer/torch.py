@@ -221,7 +221,7 @@ class _Weights(NamedTuple):
         alpha: A = a G within its bounds (b, t, k, y x).
         live: True where a splat acts (b, t, k, y x).
         transmittance: T, in front of each splat (b, t, k, y x).
-        left: Transmittance behind the last splat (b, t, y x).
+        remaining: Transmittance behind the last splat (b, t, y x).
     """
 
     s: Tensor
@@ -230,7 +230,7 @@ class _Weights(NamedTuple):
     alpha: Tensor
     live: Tensor
     transmittance: Tensor
-    left: Tensor
+    remaining: Tensor
 
 
 def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _SplatParts) -> _Weights:
@@ -260,17 +260,17 @@ def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _SplatParts) -> _We
     if inputs.logs is not None:
         passed.addcmul_(footprint * live, inputs.logs[:, k, None])
     total = passed.cumsum(-2)  # up to and with each splat
-    left = total[..., -1, :].exp()
+    remaining = total[..., -1, :].exp()
     before = torch.nn.functional.pad(total[..., :-1, :], (0, 0, 1, 0))
-    return _Weights(s, y, footprint, alpha, live, before.exp_(), left)
+    return _Weights(s, y, footprint, alpha, live, before.exp_(), remaining)
 
 
 class _Composite(torch.autograd.Function):
     """Composites sorted splats, with the gradient by hand.
 
-    With D_i = signal_i . gradient and S_i = sum_{j>i} D_j A_j T_j + left gradient_left, the
-    derivative by A_i is T_i D_i - S_i / (1 - A_i), and a change of log T behind splat i acts with
-    S_i.
+    With R the transmittance behind all splats, D_i = signal_i . image gradient and S_i =
+    sum_{j>i} D_j A_j T_j + R (gradient of R), the derivative by A_i is T_i D_i - S_i / (1 - A_i),
+    and a change of log T behind splat i acts with S_i.
     """
 
     @staticmethod
@@ -283,28 +283,28 @@ class _Composite(torch.autograd.Function):
         b, _, c = signal.shape
         count, pixels = tiles.down * tiles.across, tiles.edge**2
         image = signal.new_zeros(b, c, count, pixels)
-        left = signal.new_ones(b, count, pixels)
+        remaining = signal.new_ones(b, count, pixels)
         inputs = _SplatParts.filled(means, factors, signal, opacities, logs)
         for chosen, k in tiles.chunks:
             w = _weigh(tiles, chosen, k, inputs)
             # eq. (14): the sum of signal_i A_i T_i over the splats.
             drawn = inputs.signal[:, k].mT @ w.transmittance.mul_(w.alpha)  # (b, t, c, y x)
             image[:, :, chosen] = drawn.transpose(1, 2)
-            left[:, chosen] = w.left
-        return tiles.join(image), tiles.join(left)
+            remaining[:, chosen] = w.remaining
+        return tiles.join(image), tiles.join(remaining)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx, image_gradient, left_gradient):
+    def backward(ctx, image_gradient, remaining_gradient):
         tiles = ctx.tiles
         inputs = _SplatParts.filled(*ctx.saved_tensors)
         gradients = [None if tensor is None else torch.zeros_like(tensor) for tensor in inputs]
         image_gradient = tiles.split(image_gradient)  # (b, c, t, y x)
-        left_gradient = tiles.split(left_gradient)  # (b, t, y x)
+        remaining_gradient = tiles.split(remaining_gradient)  # (b, t, y x)
         for chosen, k in tiles.chunks:
             w = _weigh(tiles, chosen, k, inputs)
             towards = image_gradient[:, :, chosen].transpose(1, 2)  # (b, t, c, y x)
-            parts = _differentiate(w, k, inputs, towards, left_gradient[:, chosen], tiles.edge)
+            parts = _differentiate(w, k, inputs, towards, remaining_gradient[:, chosen], tiles.edge)
             for gradient, part, axis in zip(gradients, parts, (0, 1, 1, 1, 1), strict=True):
                 if gradient is not None:
                     gradient.index_add_(axis, k.flatten(), part.flatten(axis, axis + 1))
@@ -319,7 +319,12 @@ class _Composite(torch.autograd.Function):
 
 
 def _differentiate(
-    w: _Weights, k: Tensor, inputs: _SplatParts, towards: Tensor, left_gradient: Tensor, edge: int
+    w: _Weights,
+    k: Tensor,
+    inputs: _SplatParts,
+    towards: Tensor,
+    remaining_gradient: Tensor,
+    edge: int,
 ) -> _SplatParts:
     """Gradients of a chunk's splats (t, k).
 
@@ -328,7 +333,7 @@ def _differentiate(
         k: Splats of each tile (t, k).
         inputs: All splats.
         towards: Gradient of the map's pixels (b, t, c, y x).
-        left_gradient: Gradient of the transmittance left (b, t, y x).
+        remaining_gradient: Gradient of the remaining transmittance (b, t, y x).
         edge: Edge of a tile [pixels].
     """
     blend = w.alpha * w.transmittance  # A T
@@ -336,7 +341,7 @@ def _differentiate(
     d = inputs.signal[:, k] @ towards  # D, (b, t, k, y x)
     flow = blend.mul_(d)
     behind = flow.flip(-2).cumsum(-2).flip(-2).sub_(flow)
-    behind += (w.left * left_gradient)[..., None, :]  # S
+    behind += (w.remaining * remaining_gradient)[..., None, :]  # S
     # Gradient by the opacity itself, 0 where the splat does nothing or is clamped.
     d_alpha = d.mul_(w.transmittance) - behind / (1 - w.alpha)
     d_alpha = d_alpha.mul_(w.live & (w.alpha < ALPHA_MAX))
@@ -355,7 +360,7 @@ def _differentiate(
 
 
 def _moments(d_exponent: Tensor, s: Tensor, y: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from those of the exponents.
+    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from exponents' gradients.
 
     Sums run over s and y themselves: those over du and dv would cancel where a splat is long and
     thin.

@@ -27,14 +27,18 @@ class MovablePlanes(Placement):
     Neither rounding nor a turn of a plane depends on the world's origin.
 
     Attributes:
-        middle: Of the room [m].
-        diagonal: Of the box that holds transmitters and receivers [m].
+        middle: Middle of the room [m].
+        diagonal: Diagonal of the box that holds transmitters and receivers [m].
         turn: Rotation from the world's axes to the first planes' axes.
-        origin: Normals and offsets at the start, or at the last change of ``step`` (w, 4);
-            ``shifts`` are added.
+        origin: Normals and offsets at the start, or at the last change of ``step`` (w, 4); the
+            offsets are in metres from ``middle``.
+        first: Value of ``origin`` before any training; ``fit`` compares the two.
+        shifts: Learnt changes of normals and offsets (w, 4), in units of ``step`` for normals, and
+            of ``step`` times ``unit`` diagonals for offsets.
         step: Size of a unit of ``shifts``; it follows the wavelength once phases count.
         sequences: Planes of each path, -1 for no plane (n, order).
-        kept, most: Paths that were not dropped (n,), and their number at the start.
+        kept: True for paths in use (n,); pruning drops the others.
+        most: Number of paths in use at the start.
         is_new: True until the planes have learnt anything; set by ``fit``.
 
     Args:
@@ -65,12 +69,12 @@ class MovablePlanes(Placement):
         super().__init__()
         self._check_number("planes", planes, self.faces)
         self._check_number("order", order, 0)
-        most = 100_000  # sequences, each with parameters: 10 planes of order 5
-        highest = largest_order(planes, most)
+        max_sequences = 100_000  # each has parameters; 10 planes of order 5
+        highest = largest_order(planes, max_sequences)
         if order > highest:
             raise ValueError(
-                f"placement.order={order} gives more than {most:,} sequences of {planes} planes, "
-                "each with parameters\n"
+                f"placement.order={order} gives more than {max_sequences:,} sequences of {planes} "
+                "planes, each with parameters\n"
                 f"set placement.order={highest} or less, or fewer placement.planes"
             )
         self.scene = scene
@@ -85,7 +89,7 @@ class MovablePlanes(Placement):
         self.register_buffer("middle", lower + half, persistent=False)
         self.register_buffer("turn", torch.eye(3), persistent=False)
         self.register_buffer("origin", self._first_planes(planes, half))
-        # A model that differs has learnt.
+        # ``fit`` turns the planes only while the two are equal: a checkpoint's origin differs.
         self.register_buffer("first", self.origin.clone(), persistent=False)
         self.register_buffer("step", torch.ones(()))
         self.register_buffer("sequences", all_sequences(planes, order), persistent=False)
@@ -99,7 +103,12 @@ class MovablePlanes(Placement):
             raise ValueError(f"placement.{option} must be at least {least}, got {value}")
 
     def _first_planes(self, planes: int, half: Float[Tensor, "3"]) -> Float[Tensor, "w 4"]:
-        """Faces of a box, given by half of its edges [m], and further planes in its middle."""
+        """Normals and offsets at the start: the faces of a box, then planes through its middle.
+
+        Args:
+            planes: Number of planes w.
+            half: Half of the box's edges [m].
+        """
         further = planes - self.faces
         axes = torch.eye(3)
         normals = torch.cat((axes, -axes, axes.repeat(-(-further // 3), 1)))[:planes]
@@ -110,12 +119,13 @@ class MovablePlanes(Placement):
         return torch.cat((normals, offsets[:, None]), 1)
 
     def _first_paths(self) -> Bool[Tensor, " n"]:
-        """Paths at the faces of the box.
+        """True for paths that meet faces of the box alone.
 
-        Without faces beyond places that all stand at one height, or on one line: their distance is
-        unknown.
+        Faces across an axis are left out if all transmitters and receivers stand at one coordinate
+        of it, such as one height: then no label shows how far away such a face is.
         """
         axes = [flat.axis for flat in self.scene.flat_axes if flat.is_common]
+        # Planes 0 to 5 are the faces +x, +y, +z, -x, -y, -z.
         unseen = torch.tensor(axes, dtype=torch.long)
         blind = torch.isin(torch.arange(self.faces) % 3, unseen).nonzero()[:, 0]
         is_face = (self.sequences < self.faces).all(1)
@@ -137,7 +147,7 @@ class MovablePlanes(Placement):
             self.origin[: self.faces, 3] = farthest + self.margin * self.diagonal
 
     def _place_walls(self, file: Path) -> None:
-        """Starts from the largest planes of a file."""
+        """Starts from the largest planes of a file; only paths by way of these stay."""
         planes = read_planes(file, *self.box).to(self.origin)
         most = len(self.origin)
         if len(planes) > most:
@@ -181,7 +191,7 @@ class MovablePlanes(Placement):
 
     @torch.no_grad()
     def place(self, number: int, plane: Float[Tensor, "4"]) -> None:
-        """Puts one of the ``planes``."""
+        """Replaces a plane by one in the world's frame (normal, offset [m])."""
         self.origin[number] = seen_from(plane.double(), self.middle)
         self.shifts[number] = 0
 
@@ -201,10 +211,12 @@ def upright_turn(
 
     Args:
         places: Transmitters [m].
-        smaller: Largest area over that along the world's axes, whose box is kept otherwise.
-        width: Least width over the length: places along a line say nothing of the room's walls.
-        enough: Fewest places: chance turns hardly any room along the axes that 40 places fill, a
-            quarter of rooms with 10.
+        smaller: Largest ratio of the box's area to the area of the box along the world's axes;
+            above it there is no rotation.
+        width: Least ratio of the box's width to its length: places along a line do not show how
+            the walls stand.
+        enough: Least number of places for a rotation. In a room along the world's axes, chance
+            hardly ever gives one with 40 places, and in a quarter of cases with 10.
     """
     turn = torch.eye(3, dtype=torch.float64)
     if len(places.unique(dim=0)) < enough:

@@ -42,7 +42,7 @@ class Obstacles(nn.Module):
         diagonal = float(edges.norm())
         low, high = lower - 0.05 * edges, upper + 0.05 * edges
         self.register_buffer("origin", (low + high) / 2)
-        # So that learning rates suit rooms of any size.
+        # Unit of the learnt places [m]: the same learning rate suits rooms of any size.
         self.register_buffer("unit", torch.tensor(diagonal * 0.12))
         self.places = nn.Parameter((torch.rand(count, 3) - 0.5) * (high - low) / self.unit)
         # As large as furniture; a path through one is attenuated by a fraction of a decibel.
@@ -94,11 +94,16 @@ _FAINTEST = -80.0
 
 
 class _Depth(torch.autograd.Function):
-    """The depth with its gradient in closed form, in half of autograd's time.
+    """Optical depth (segments, columns of densities), and its gradient in half of autograd's time.
 
-    With r = sqrt(1 / (2 A)), g = exp(-(C - B²/A) / 2), E = erf((A + B) r) - erf(B r), depth = rho l
-    sqrt(pi) r g E, and d E = 2 / sqrt(pi) (e1 d((A + B) r) - e0 d(B r)) with e1 = exp(-((A + B)
-    r)²), e0 = exp(-(B r)²).
+    With A, B, C and rho of ``Obstacles``, l the length of a segment, and
+
+        r = sqrt(1 / (2 A)), g = exp(-(C - B²/A) / 2), E = erf((A + B) r) - erf(B r)
+
+    the depth is the sum over obstacles of rho l sqrt(pi) r g E. With e1 = exp(-((A + B) r)²) and e0
+    = exp(-(B r)²)
+
+        dE = 2 / sqrt(pi) (e1 d((A + B) r) - e0 d(B r))
     """
 
     @staticmethod
@@ -154,7 +159,11 @@ class _Depth(torch.autograd.Function):
 
 
 class _Legs(NamedTuple):
-    """A, B, r, g and E of each segment and obstacle (s, k), and the segments' lengths (s,) [m]."""
+    """Symbols of ``_Depth`` for each segment and obstacle (s, k), and lengths of segments (s,) [m].
+
+    ``near`` is g, the field of an obstacle where the line is closest to it; ``inside`` is E, the
+    part of the line's integral that lies between the ends of the segment.
+    """
 
     a: Tensor
     b: Tensor

@@ -62,7 +62,7 @@ class PathFields(MovablePlanes):
         is_complex: True for channels.
         is_bare: True while only the direct path counts, without obstacles.
         known_blur: Logarithm of the standard deviation of a known path's phase at the start [rad].
-        unknown_blur: The same of a path that adds as power, whose coherence is 0.
+        unknown_blur: The same for a path that adds as power, whose coherence is 0.
         faint: Largest share of a link's power, obstacles apart, of a path that skips the obstacles:
             two of three paths.
     """

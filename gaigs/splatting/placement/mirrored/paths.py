@@ -39,7 +39,7 @@ class Mirrored(PathFields):
 
     Args:
         scene: Its box and receivers give the first planes.
-        channels: Of the signal, 1 (amplitude) or 2 (complex).
+        channels: Channels of the signal, 1 (amplitude) or 2 (complex).
         planes: Largest number of planes; six at the start; the searches of spectra and channels
             find others.
         order: Largest number of reflections of a path; at most 100,000 sequences of planes.
