@@ -57,8 +57,10 @@ def room(scene: gaigs.Scene) -> MirroredSplatting:
     placement = model.placement
     placement.enable_phases(speed_of_light / CARRIER)
     for axis, normal in enumerate(torch.eye(3)):
-        placement.place(axis, normal, float(SIZE[axis] - placement.middle[axis]))
-        placement.place(axis + 3, -normal, float(placement.middle[axis]))
+        far = torch.cat((normal, torch.tensor([SIZE[axis]])))  # normal . x = SIZE
+        near = torch.cat((-normal, torch.zeros(1)))  # -normal . x = 0
+        placement.place(axis, far)
+        placement.place(axis + 3, near)
     with torch.no_grad():
         placement.obstacles.log_densities.add_(2.0)
     return model

@@ -15,7 +15,7 @@ def check_tokenizer(tokenizer: nn.Module, scene: Scene, device: torch.device | s
     """Checks a tokenizer built for the scene: widths, dtype, gradients, independence of the batch.
 
     The inputs include Gaussians that stand elsewhere for each query, and the scene's carriers. The
-    contract is that of ``gaigs.splatting.tokenizer.Tokens``.
+    contract is that of ``gaigs.splatting.gaussians.Tokens``.
     """
     generator = torch.Generator().manual_seed(0)
     cases = (
