@@ -20,14 +20,14 @@ class Estimate(NamedTuple):
 
     Attributes:
         value: The prediction of ``predict`` without an interval.
-        std: Standard deviation of the label about it, in the label's unit; of channels that of the
-            complex error. NaN, as what follows, at elements that an array lacks.
+        std: Standard deviation of the label about it, in the label's unit; a channel has the
+            complex error's. All but the value is NaN at elements that an array lacks.
         lower, upper: Ends of the interval, which holds the label with the asked probability; None
             for channels.
-        radius: Of channels, that of a disc about the value which holds the channel with this
-            probability, in the label's unit; else None.
-        snr_db: Of channels, the expected signal-to-noise ratio of each link's prediction [dB],
-            without the axes of elements and subcarriers; else None.
+        radius: Radius of a disc about the value which holds the channel with this probability, in
+            the label's unit; None for other labels.
+        snr_db: Expected signal-to-noise ratio of each link's channel [dB], without the axes of
+            elements and subcarriers; None for other labels.
 
     Example:
         >>> model = gaigs.train("knn", gaigs.links("synthetic_rssi", transmitters=100))

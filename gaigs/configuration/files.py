@@ -14,7 +14,7 @@ def conf_dir() -> Path:
 
 
 def plugin_conf_dirs() -> list[Path]:
-    """Configuration folders of plug-ins, none of which is imported.
+    """Configuration folders of plug-ins, found without an import.
 
     They are ``plugins/conf``, ``plugins/<folder>/conf``, and ``<package>/conf`` of packages with an
     entry point of gaigs. They hold ``<kind>/<name>.yaml``.

@@ -85,8 +85,8 @@ class Links:
         split: Train, validation and test links; None until a split is chosen, see ``load``.
         bandwidth: Band around each carrier that a label's power is averaged over, 0 for a carrier
             alone [Hz]; None if unknown.
-        held_out: The same links at subcarriers that are held out, with the labels of the test; None
-            if there are none.
+        held_out: The same links at held-out subcarriers, with the labels of the test; None if
+            all subcarriers are trained.
         frame: Place of the world frame on a map; None if unknown.
         uncertainties: Standard deviation of each receiver's place (r,) [m]: 0 if given, infinite
             until ``divide`` estimates it from the training links. None: all are given, and
@@ -216,9 +216,13 @@ def load(data: Mapping, split: Mapping, task: str | None = None, is_checked: boo
     """
     links = registry("data").build(data)
     if task not in (None, links.task.name):
+        from gaigs.configuration import files_of  # with Hydra, which loading a model does without
+
+        # A plug-in's own task has no file of choices.
+        option = "task" if files_of("task", links.task.name) else "task.name"
         raise ValueError(
             f"the labels of data {data['name']!r} are of task {links.task.name!r}, and the "
-            f"configuration is for {task!r}; add task={links.task.name}"
+            f"configuration is for {task!r}; add {option}={links.task.name}"
         )
     origin = {"data": dict(data), "split": dict(split)}
     return replace(divide(links, split, is_checked), origin=origin)

@@ -113,9 +113,7 @@ def refuse(file: Path, wrong: Mapping[int, str], expected: str) -> None:
 
 
 def read_points(file: Path, names: Sequence[str], content: str) -> list[list[float]]:
-    """Coordinates [m], one point a line; the first line may hold their names, and those of other
-    columns.
-    """
+    """Coordinates [m], one point a line; the first line may hold the names of columns."""
     lines = read_lines(file, content)
     delimiter = find_delimiter(lines)
     header = [cell.lower() for cell in split_cells(lines[0], delimiter)]

@@ -54,7 +54,7 @@ def check_type(name: str, value: Any, annotation: Any) -> None:
 
 
 def _allowed(value: Any, annotation: Any) -> list[Any]:
-    """The annotations of ``PLAIN``, one of which a value must suit; empty if it is not checked."""
+    """Annotations of ``PLAIN`` that a value may suit; empty for a value that is not checked."""
     is_union = typing.get_origin(annotation) in (typing.Union, UnionType)
     allowed = [*typing.get_args(annotation)] if is_union else [annotation]
     plain = [kind for kind in allowed if _is_plain_type(_bare(kind))]

@@ -26,8 +26,8 @@ class Budget(Callback):
     Lightning's own ``max_time`` gives each process its own clock.
 
     Args:
-        max_time: Of the search and the training [s]; None if steps alone end it. The training has
-            half of it or more.
+        max_time: Limit of search and training together [s]; None if steps alone end the training,
+            which has half of it or more.
         every: Least time between validations [s], which take at most a fifth of the training; None:
             by steps.
         searched: Duration of the search before the training [s]; of several processes the first

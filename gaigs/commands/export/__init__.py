@@ -41,11 +41,11 @@ def export(
             ``.glb``, ``.gltf``, ``.obj`` or ``.xml`` (a scene of Mitsuba for Sionna RT) for the
             learnt room; ``.deepmimo`` for the paths of mirrored channels, a folder with a scenario
             of DeepMIMO v4.
-        places: Of predictions and scenarios: positions (n, 3) [m], from which each receiver hears;
-            a query; or links, whose test is predicted and written beside its labels.
+        places: Positions (n, 3) [m] of transmitters in predictions and scenarios, for each
+            receiver; a query; or links, whose test is predicted and written beside its labels.
         pitch, height: Grid of a radio map [m], as for ``gaigs.radio_map``.
-        frequency: Carrier of radio map, places and materials of the room [Hz]; None: that of the
-            training links.
+        frequency: Carrier of radio map, places and materials of the room [Hz]; None: the training
+            links' carrier.
         interval: Probability with which the intervals of predictions hold the label.
 
     Returns:

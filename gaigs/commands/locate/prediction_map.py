@@ -166,7 +166,7 @@ class MapMaker:
         is_region: True if transmitters are anywhere in the box alike.
         points: Number of candidates.
         frequency: Carrier [Hz]; None if unknown.
-        links: Links with a split; None if there are none.
+        links: Links with a split; None for a map of the model alone.
     """
 
     box: Float[Tensor, "2 3"]

@@ -35,7 +35,7 @@ TABULATED = {
     "plywood": (2.71, 0.33, 0.0),
     "marble": (7.074, 0.0055, 0.9262),
 }
-"""The same with those of the table that no simulated room has."""
+"""Materials of the standard's table, also those in no simulated room."""
 
 
 @dataclass(frozen=True)

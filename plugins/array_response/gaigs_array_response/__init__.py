@@ -110,8 +110,9 @@ class ArrayResponse(Model):
 
 
 def magnitudes(parts: Float[Tensor, "b 2 pixels"]) -> Float[Tensor, "b pixels"]:
-    """Of real and imaginary parts, with the gradient 0 at 0; ``norm(dim=1)`` takes ten times as
-    long on a CPU.
+    """Magnitudes of real and imaginary parts, with the gradient 0 at 0.
+
+    ``norm(dim=1)`` takes ten times as long on a CPU.
     """
     # Of bfloat16, as trainer.precision=bf16-mixed has it, torch makes no complex numbers.
     parts = parts.to(torch.promote_types(parts.dtype, torch.float32))

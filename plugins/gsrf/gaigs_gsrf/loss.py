@@ -15,8 +15,7 @@ L1, SSIM, FOURIER = 0.44, 0.37, 0.19
 
 
 class GsrfLoss:
-    """Of spectra 0.44 L1 + 0.37 (1 - SSIM) + 0.19 Fourier; of levels the squared error of
-    amplitudes.
+    """Spectra: 0.44 L1 + 0.37 (1 - SSIM) + 0.19 Fourier. Levels: squared error of amplitudes.
 
     The SSIM window spans 11 pixels of the label's own grid; its weights are uniform, as those of
     ``l1_ssim``. The Fourier term is the mean squared difference of the two-dimensional discrete

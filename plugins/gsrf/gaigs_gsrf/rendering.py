@@ -36,7 +36,7 @@ def render(
         radiance: psi of each Gaussian towards each transmitter.
         receiver: In the middle of the sphere.
         vectors: The rays, unit vectors in the array's frame.
-        radius: Of the sphere [m].
+        radius: Radius of the sphere [m].
 
     Source: GSRF (NeurIPS 2025), "Orthographic splatting" and "Complex-valued ray tracing".
     """
@@ -74,7 +74,7 @@ def weights(
         order: Which of them, front to back.
         centres: Unit vectors towards them, world frame.
         rays: Unit vectors, world frame.
-        radius: Of the sphere [m].
+        radius: Radius of the sphere [m].
     """
     least = (NARROWEST * gaussians.log_scales.new_tensor(radius)).log()
     shrinking = radius * (-gaussians.log_scales[order].clamp(min=least)).exp()

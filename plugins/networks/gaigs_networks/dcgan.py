@@ -13,7 +13,7 @@ from gaigs.core.scene import Scene
 from gaigs_networks.network import BatchNorm, Network, check_widths
 
 LAYERS = 4
-"""Of generator and discriminator, as published."""
+"""Layers of generator and of discriminator, as published."""
 
 
 class Dcgan(Network):

@@ -13,7 +13,7 @@ from gaigs.core.scene import Scene
 from gaigs_networks.network import Network, check_widths
 
 DEGREE = 3
-"""Of the splines."""
+"""Degree of the splines."""
 
 
 class WrfKan(Network):

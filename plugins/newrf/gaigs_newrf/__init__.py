@@ -17,12 +17,12 @@ from gaigs.splatting.tokenizer.euclidean import MAX_OCTAVE, fourier_features
 from gaigs_newrf.arrivals import find_origins
 
 MARGIN = 0.5
-"""Of the longest edge of the box of transmitters and receiver. Arrivals are searched in that box,
+"""Share of the longest edge of the box of transmitters and receiver. Arrivals lie in that box,
 enlarged on each side by its own size and by so much: that holds the images behind walls that stand
 up to half of this outside the box."""
 
 MOST_LINKS = 256
-"""Of each receiver, that the arrivals are searched in."""
+"""Most links of a receiver in which arrivals are searched."""
 
 DENSITY = -5.0
 """Where the network's densities start, before the softplus: waves are to come through before

@@ -26,7 +26,7 @@ from .rooms import check_room, find_meshes, known_materials, read_obj
 from .tracer import Tracer, find_tracer
 
 NEPER = 20 / math.log(10)
-"""Of a field [dB]."""
+"""One neper of a field [dB]."""
 
 SILENT = 1e-15
 """Share of the power sent that a receiver reports where no path leads: -150 dB, below the noise of

@@ -85,7 +85,7 @@ class Slabs(NamedTuple):
     def coefficients(
         self, surfaces: Int[Tensor, "*p"], cosines: Float[Tensor, "*p"]
     ) -> tuple[Complex[Tensor, " 2 *p"], Complex[Tensor, " 2 *p"]]:
-        """Of reflection and of passage, each TE and TM.
+        """Coefficients of reflection and of passage, each TE and TM.
 
         Args:
             surfaces: Numbers of materials.

@@ -85,9 +85,9 @@ class Tracer:
         self.data: dict[tuple[float, ...], list[Traced]] = {}
         self.others: dict[tuple[float, ...], list[Traced]] = {}
         self.seconds = 0.0
-        """Of tracing, all together [s]."""
+        """Time of tracing so far [s]."""
         self.places = 0
-        """Traced meanwhile."""
+        """Places traced in that time."""
 
     def remember(self, places: Float[Tensor, "b 3"]) -> None:
         """Traces places that will be asked for time and again, or reads their paths from disk."""

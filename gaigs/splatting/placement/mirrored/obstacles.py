@@ -64,7 +64,7 @@ class Obstacles(nn.Module):
 
     @property
     def densities(self) -> Float[Tensor, " k"]:
-        """At the centres [Np/m]."""
+        """Attenuation at the centres [Np/m]."""
         return self.log_densities.exp()
 
     def forward(
