@@ -41,7 +41,7 @@ PUBLIC = [name for name in gaigs.__all__ if name != "__version__"]
 
 
 @pytest.fixture(scope="module", autouse=True)
-def quick(files_read_once):
+def quick():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("gaigs.runs.radio_map", Mock())
         options = ScalarOptions(neighbours=4, iterations=2)
@@ -309,7 +309,7 @@ def numbers(path):
     """Predictions of a model of the built-in room, and of one of arrays, which are tensors of the
     caller's mode.
     """
-    links = gaigs.links("synthetic_rssi", transmitters=40)
+    links = gaigs.links("synthetic_rssi", transmitters=40, order=0)
     model = gaigs.train(
         "gaigs", links, max_steps=2, count=20, tokenizer="ga", enable_progress_bar=False
     )
@@ -324,9 +324,13 @@ def numbers(path):
     return [*values, model.predict(PLACES), array.array.elements, gaigs.Grid.degrees().elevations]
 
 
+@pytest.fixture(scope="module")
+def usual(tmp_path_factory):
+    return numbers(tmp_path_factory.mktemp("usual") / "room.ckpt")
+
+
 @pytest.mark.parametrize("mode", [double_precision, torch.inference_mode])
-def test_numbers_are_the_same_in_any_mode_of_torch(mode, tmp_path):
-    usual = numbers(tmp_path / "room.ckpt")
+def test_numbers_are_the_same_in_any_mode_of_torch(mode, usual, tmp_path):
     with mode():
         found = numbers(tmp_path / "room.ckpt")
         assert torch.is_inference_mode_enabled() == (mode is torch.inference_mode)

@@ -136,7 +136,7 @@ def place(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def composed(place, files_read_once):
+def composed(place):
     """Composes gaigs's configuration where the documentation's plug-ins are found."""
 
     @functools.cache

@@ -25,7 +25,7 @@ from gaigs.processes import Stopped, only_run
 from gaigs.report.multirun import report
 from gaigs.report.training_log import read_curves
 
-pytestmark = pytest.mark.usefixtures("files_read_once", "unchecked")
+pytestmark = pytest.mark.usefixtures("unchecked")
 
 SMALL = (
     "tokenizer=euclidean",

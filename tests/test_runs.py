@@ -39,7 +39,7 @@ from gaigs.runs.folder import claim
 from gaigs.testing import example_links
 from gaigs.training.descent import Descent
 
-pytestmark = pytest.mark.usefixtures("files_read_once", "unchecked")
+pytestmark = pytest.mark.usefixtures("unchecked")
 
 SMALL = (
     "data.transmitters=30",

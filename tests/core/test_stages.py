@@ -141,7 +141,7 @@ def test_kriging_takes_as_many_links_as_it_has_time_for(clock, monkeypatch):
 
 
 SMALL = (
-    "+experiment=rssi", "data.transmitters=60", "data.order=1", "split.validation=0.3", "tokenizer=euclidean",
+    "+experiment=rssi", "data.transmitters=40", "data.order=0", "split.validation=0.3", "tokenizer=euclidean",
     "rasterizer=torch", "gaussians.count=10", "deformation.width=8", "trainer.accelerator=cpu", "trainer.max_steps=3",
     "trainer.val_check_interval=1", "trainer.enable_progress_bar=false", "baselines=[mean,gaussian_process]",
     "kriging=true",
