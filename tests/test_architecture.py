@@ -26,7 +26,7 @@ LIMITS = {
     "lines of gaigs/": 41_200,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
-    "module constants": 112,
+    "module constants": 106,
     "rooms": 21,
     "files in an import chain": 23,
 }

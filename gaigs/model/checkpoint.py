@@ -29,15 +29,12 @@ SEAL = b"gaigs sha256 "
 """Precedes the digest of all bytes before, which ends the file. Both are the comment of the zip
 archive that ``torch.save`` writes, so the file stays an archive."""
 
-DIGEST = 64
-"""Length of the digest in hexadecimal digits."""
-
 
 def seal(path: Path) -> None:
     """Appends the seal to a file of ``torch.save``, by which ``read`` detects any changed bit."""
     content = path.read_bytes()
     sealed = (
-        content[:-2] + (len(SEAL) + DIGEST).to_bytes(2, "little") + SEAL
+        content[:-2] + (len(SEAL) + 64).to_bytes(2, "little") + SEAL
     )  # the length of the archive's comment
     path.write_bytes(sealed + hashlib.sha256(sealed).hexdigest().encode())
 
@@ -62,7 +59,7 @@ def read(path: str | Path) -> dict:
         )
     data = path.read_bytes()
     try:
-        sealed, digest = data[:-DIGEST], data[-DIGEST:]
+        sealed, digest = data[:-64], data[-64:]  # hexadecimal digits
         if not sealed.endswith(SEAL) or hashlib.sha256(sealed).hexdigest().encode() != digest:
             raise ValueError("another digest")
         with ZipFile(io.BytesIO(data)) as archive:

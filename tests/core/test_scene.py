@@ -176,6 +176,7 @@ def test_each_pair_of_elements_has_its_lag(array):
 # --- frames ---
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize(
     ("frame", "message"),
     [
@@ -201,6 +202,7 @@ def test_frames_that_are_no_projected_metres_are_refused(frame, message):
         Frame(*frame)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_systems_in_metres_are_taken_and_those_of_utm_without_pyproj(monkeypatch):
     pytest.importorskip("pyproj")
     for code, x, y in (
