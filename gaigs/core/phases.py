@@ -37,8 +37,8 @@ def phase_sign(
 
     Divided by free space, a direct path alone is the same number at all links of a receiver. For
     each sign, the mean over links keeps a share of the power, by chance about 1 / links. The larger
-    share wins if it exceeds 0.01 plus four times that of chance: never with fewer than ``TELLING``
-    links a receiver. ``waves`` are ``direct_waves`` of the same links with the sign -1.
+    share wins if it exceeds 0.01 plus four times the share by chance: never with fewer than
+    ``TELLING`` links a receiver. ``waves`` are ``direct_waves`` of the same links with the sign -1.
     """
     received = max(1, int((channels.abs().amax((1, 2)) > 0).sum()))  # links with a signal
     shares = {}

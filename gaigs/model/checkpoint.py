@@ -66,7 +66,7 @@ def read(path: str | Path) -> dict:
             if sum(entry.file_size for entry in archive.infolist()) > len(data):
                 raise ValueError("compressed, which torch.save never does")
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-        # A view can be far larger than the numbers behind it; those of a model are not.
+        # A view can be far larger than the numbers behind it; the views of a model are not.
         if sum(tensor.nbytes for _, tensor in _tensors(content, "")) > 4 * len(data) + 2**26:
             raise ValueError("larger than the file")
     except (

@@ -36,9 +36,9 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
 
     Reflections are compared at the bounces of these paths, weighted by the paths' powers.
     Permittivities alone would not do: a plane may reflect strongly by its permittivity or by its
-    gain. A learnt reflection has the plane's gain and its share of the path's gain over that of the
-    direct path. The thickness is the learnt one or, if a half-space reflects more alike, 1 m: the
-    losses of such a slab hide its back. Where paths have phases of their own, magnitudes are
+    gain. A learnt reflection has the plane's gain and its share of the path's gain over the gain of
+    the direct path. The thickness is the learnt one or, if a half-space reflects more alike, 1 m:
+    the losses of such a slab hide its back. Where paths have phases of their own, magnitudes are
     compared.
 
     Source: ITU-R P.2040-3, table 3; outside 1 to 40 GHz its formulas are extrapolated.

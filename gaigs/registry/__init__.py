@@ -1,4 +1,4 @@
-"""Components by name: built-in ones, those of installed packages and those in ./plugins.
+"""Components by name: built-in ones, from installed packages and in ./plugins.
 
 Names are found without an import; a component is imported when it is built.
 """

@@ -8,7 +8,7 @@ from gaigs.registry.words import listed, suggest
 
 
 def call(owner: str, function: Callable, options: Mapping, /, **context):
-    """Calls a function or class with options, and with those of ``context`` that it takes.
+    """Calls a function or class with options, and with what it takes of ``context``.
 
     Args:
         owner: Name in errors.

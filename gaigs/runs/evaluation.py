@@ -117,7 +117,7 @@ class Evaluation(JupyterMixin):
 
 
 def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> Evaluation:
-    """Scores of a model on the test links, beside those of baselines that are fitted to the other
+    """Scores of a model on the test links, beside scores of baselines that are fitted to the other
     links.
 
     Args:

@@ -26,7 +26,7 @@ class ElementSum(ChannelPooling):
     imaginary ones. x_e is an element's place, a its pattern, w the share of the direction's solid
     angle. F is the wave of free space over the direct distance d (without a common clock its
     amplitude), g the channels' ``strength`` over it. s is ``array_sign``. At other subcarriers than
-    the labels' the map is that of the nearest one.
+    the labels' it is the map of the nearest one.
 
     Args:
         scene: Its task has the subcarriers, its receivers the elements.
