@@ -4,7 +4,9 @@ print.
 
 import math
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
 from zlib import crc32
@@ -51,7 +53,12 @@ ORANGE = "#D55E00"
 GREEN = "#009E73"
 PURPLE = "#CC79A7"
 SKY = "#56B4E9"
-GREY = "#6E6E6E"
+GREY = "#4D4D4D"  # a paler one is green to readers without green cones
+
+OTHERS: dict = {"color": "0.75", "linewidth": 0.7, "linestyle": "-", "zorder": 1}
+"""Look of lines without a colour of their own."""
+
+_is_shown: ContextVar[bool] = ContextVar("is_shown", default=False)
 
 
 def _line(number: int) -> tuple:
@@ -74,6 +81,39 @@ def _marker(number: int) -> dict:
 
 MARKERS = [_marker(number) for number in range(25)]
 """Looks of the points of up to 25 runs."""
+
+
+@contextmanager
+def shown() -> Iterator[None]:
+    """Figures of ``new_figure`` within the context belong to pyplot, which shows them."""
+    token = _is_shown.set(True)
+    try:
+        yield
+    finally:
+        _is_shown.reset(token)
+
+
+def new_figure(width: float, height: float, layout: str = "constrained") -> Figure:
+    """An empty figure [inch]."""
+    if not _is_shown.get():
+        return Figure(figsize=(width, height), layout=layout)
+    from matplotlib import pyplot  # of a window or a notebook
+
+    return pyplot.figure(figsize=(width, height), layout=layout)
+
+
+def ask(figure: Figure, question: str, note: str = "") -> None:
+    """The question that a figure answers as its title, and a note at its foot.
+
+    The note stands in the figure's legend if there is one, which would cover it elsewhere.
+    """
+    figure.suptitle(question, size=8, weight="bold")
+    if note and figure.legends:
+        head = figure.legends[0].get_title().get_text()
+        texts = [text for text in (head, note) if text]
+        figure.legends[0].set_title("\n".join(texts), {"size": 6.5})
+    elif note:
+        figure.supxlabel(note, size=6.5, color=GREY)
 
 
 def save(figure: Figure, file: Path) -> list[Path]:
@@ -104,9 +144,22 @@ def panels(figure: Figure, count: int, columns: int, xlabel: str, ylabel: str) -
     return axes[:count]
 
 
-def wrapped(label: str) -> str:
-    """The label of an axis in lines that fit a figure of one column."""
-    return textwrap.fill(label, width=48)
+def wrapped(label: str, width: int = 48) -> str:
+    """A text in lines of ``width`` letters, by default those of a figure of one column."""
+    return textwrap.fill(label, width=width)
+
+
+def named_ones(
+    scores: Mapping[str, float], higher_is_better: bool, own: str | None = None, most: int = 6
+) -> list[str]:
+    """Lines of a figure that have a colour and a name, best first: more colours are confused.
+
+    ``own`` is always among them.
+    """
+    ranked = sorted(scores, key=lambda name: scores[name], reverse=higher_is_better)
+    first = [] if own is None else [own]
+    named = [*first, *(name for name in ranked if name != own)][:most]
+    return sorted(named, key=ranked.index)
 
 
 def looks(systems: Iterable[str]) -> dict[str, tuple]:

@@ -213,14 +213,14 @@ def test_an_rssi_run_is_drawn_into_its_folder(pixels, rssi_run, spy):
         spy(run_figures, "room"),
     )
     paged = ("predicted_against_measured", "radio_map")
-    assert written(folder, links) == {"room", "error_cdf", *paged, *(f"{name}_2" for name in paged)}
+    assert written(folder, links) == {"room", "error_cdf", *paged}
     (absolute, *_), drawn = distributed[0]
     assert list(absolute) == ["gaigs", "mean", "knn"]
     np.testing.assert_allclose(absolute["mean"], np.abs(errors["mean"]))
     (ax,) = drawn.axes
     assert ax.get_xlim() == (0, pytest.approx(np.quantile(np.abs(errors["mean"]), 0.99)))
-    assert ax.get_xlabel() == "|error| [dB], split random"
-    assert ax.get_ylabel() == "share of test readings"
+    assert ax.get_xlabel() == "|error| [dB]"
+    assert ax.get_ylabel() == "share of 80 test readings"
     _, gateways, readings, *_ = mapped[0][0]
     assert gateways["g3"].tolist() == [3, 0, 2]
     third = links.split.test[links.split.test % 8 == 3]
