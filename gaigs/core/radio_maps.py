@@ -6,6 +6,7 @@ import time
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from numpy import ndarray
 from gaigs.core import stages
 from gaigs.core.geometry import ExtrapolationWarning
 from gaigs.core.query import as_receivers
+from gaigs.core.results import dataset, plot
 from gaigs.core.scene import Scene
 from gaigs.io.files import atomic_write
 
@@ -64,6 +66,25 @@ class RadioMap:
         deviations = None if self.deviations is None else self.deviations[index]
         names = tuple(self.receivers[number] for number in index)
         return replace(self, values=self.values[index], receivers=names, deviations=deviations)
+
+    plot = plot
+
+    def to_xarray(self) -> Any:
+        """An ``xarray.Dataset`` with ``value`` and, if it is known, ``std`` by receiver, y and x.
+
+        Raises:
+            ImportError: Xarray is not installed.
+        """
+        places = {"x": ("x", self.x, {"units": "m"}), "y": ("y", self.y, {"units": "m"})}
+        scalars = {"z": ((), self.height, {"units": "m"})}
+        if self.frequency is not None:
+            scalars["frequency"] = ((), self.frequency, {"units": "Hz"})
+        unit = {"long_name": self.quantity, "units": self.unit}
+        variables = {"value": (("receiver", "y", "x"), self.values, unit)}
+        if self.deviations is not None:
+            variables["std"] = (("receiver", "y", "x"), self.deviations)
+        names = {"receiver": ("receiver", [*self.receivers])}
+        return dataset(variables, names | places | scalars, {})
 
     def save(self, path: str | Path) -> None:
         """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and all other attributes

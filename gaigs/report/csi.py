@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Inexact
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -162,7 +162,7 @@ def _titles(shown: Examples) -> list[str]:
     return titles
 
 
-def decibels(amplitudes: Complex[ndarray, "..."]) -> Float[ndarray, "..."]:
+def decibels(amplitudes: Inexact[ndarray, "..."]) -> Float[ndarray, "..."]:
     """Magnitudes [dB]; of 0 it is -inf, which leaves a gap in a line."""
     with np.errstate(divide="ignore"):
         return 20 * np.log10(np.abs(amplitudes))

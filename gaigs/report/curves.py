@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -96,6 +97,32 @@ def draw_cdf(
     ax.set(xlabel=quantity, ylabel=f"share of {count:,} test {samples}", ylim=(0, 1.01))
     ax.set_xlim(*limits)
     ax.grid(axis="x")
+
+
+def plot_scores(result: Any, ax: Any = None, metric: str | None = None) -> Any:
+    """How large errors are: the distribution of a score over the test links, by model.
+
+    Args:
+        result: An ``Evaluation``.
+        ax: Axes; None: a figure of its own.
+        metric: Name of the score, a key of ``result.scores``; None: the one that picks checkpoints.
+
+    Returns:
+        The axes.
+    """
+    name = result.task.compared_by if metric is None else metric
+    values = {model: scores.get(name) for model, scores in result.scores.items()}
+    known = {model: scores.numpy() for model, scores in values.items() if scores is not None}
+    if not known:
+        names = ", ".join(next(iter(result.scores.values())))
+        raise ValueError(f"metric must be a score of the links, got {name!r}\nthere are {names}")
+    arguments = known, _score_title(name), "links"
+    limits = (None, None)
+    if ax is None:
+        return cdf(*arguments, result.split, limits, result.task.higher_is_better).axes
+    draw_cdf(ax, *arguments, limits, result.task.higher_is_better)
+    ax.legend()
+    return ax
 
 
 def loss_curves(curves: Mapping[str, Curve]) -> Figure:

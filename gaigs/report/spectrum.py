@@ -78,8 +78,8 @@ def spectra(
         "Prediction": [f"SSIM {score:.3f}" for score in shown.scores],
         "Error": [f"MAE {np.abs(error).mean():.3f}" for error in errors],
     }
-    draw = _draw_sky if polar else _draw_plane
-    edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)
+    draw = _draw_sky if polar else draw_plane
+    edges = pixel_edges(azimuths, -np.inf, np.inf), pixel_edges(elevations, -90, 90)
     with rc_context(STYLE):
         height = (2.2 if polar else 0.95) * len(labels) + 1.0
         figure = new_figure(PAGE, height)
@@ -112,12 +112,12 @@ def side_by_side(
     """
     columns = min(4, len(shown))
     rows = ceil(len(shown) / columns)
-    edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)
+    edges = pixel_edges(azimuths, -np.inf, np.inf), pixel_edges(elevations, -90, 90)
     with rc_context(STYLE):
         figure = new_figure(PAGE, 0.8 * rows + 1.0)
         axes = panels(figure, len(shown), columns, "azimuth [deg]", "elevation\n[deg]")
         for ax, (title, values) in zip(axes, shown.items(), strict=True):
-            image = _draw_plane(ax, *edges, values.astype(np.float32))
+            image = draw_plane(ax, *edges, values.astype(np.float32))
             ax.set_title(title)
         bar: dict[str, Any] = {"location": "bottom", "shrink": 0.5, "aspect": 45}
         figure.colorbar(image, ax=axes, label="normalised amplitude", **bar)
@@ -125,7 +125,9 @@ def side_by_side(
     return figure
 
 
-def _edges(centres: Float[ndarray, " n"], lowest: float, highest: float) -> Float[ndarray, " n+1"]:
+def pixel_edges(
+    centres: Float[ndarray, " n"], lowest: float, highest: float
+) -> Float[ndarray, " n+1"]:
     """Borders of the pixels, half-way between their centres, and as far outside the ends."""
     middle = (centres[1:] + centres[:-1]) / 2
     first = 2 * centres[0] - middle[0]
@@ -140,7 +142,7 @@ def _colours(limit: float | None) -> dict[str, Any]:
     return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
 
 
-def _draw_plane(
+def draw_plane(
     ax: Axes,
     azimuths: Float[ndarray, " across"],
     elevations: Float[ndarray, " up"],

@@ -4,7 +4,7 @@ print.
 
 import math
 import textwrap
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache
@@ -85,10 +85,11 @@ MARKERS = [_marker(number) for number in range(25)]
 
 @contextmanager
 def shown() -> Iterator[None]:
-    """Figures of ``new_figure`` within the context belong to pyplot, which shows them."""
+    """The style of all figures; those of ``new_figure`` belong to pyplot, which shows them."""
     token = _is_shown.set(True)
     try:
-        yield
+        with rc_context(STYLE):
+            yield
     finally:
         _is_shown.reset(token)
 
@@ -142,6 +143,40 @@ def panels(figure: Figure, count: int, columns: int, xlabel: str, ylabel: str) -
             ax.set_xlabel(xlabel)
             ax.tick_params(labelbottom=True)
     return axes[:count]
+
+
+def numbered(name: str, pages: Sequence[Figure]) -> dict[str, Figure]:
+    return {f"{name}_{page}" if page > 1 else name: figure for page, figure in enumerate(pages, 1)}
+
+
+def even_pages(items: Sequence, most: int) -> list[Sequence]:
+    """Parts of ``items`` for pages of at most ``most`` panels, which are of one size."""
+    pages = math.ceil(len(items) / most) or 1
+    size = math.ceil(len(items) / pages) or 1
+    return [items[first : first + size] for first in range(0, len(items), size)]
+
+
+def scaled_panels(
+    count: int, width: float, height: float, xlabel: str, ylabel: str
+) -> tuple[Figure, list[Axes]]:
+    """Panels with common axes of an extent in one unit, as large as a page with colour bar and
+    legend allows.
+    """
+    bar = 1.5  # inches beside all panels
+    title = 0.25  # inches above each panel
+    foot = 1.0  # inches above and below all panels
+
+    def scale(columns: int) -> float:
+        """Inches of one unit."""
+        rows = math.ceil(count / columns)
+        return min((PAGE - bar) / (columns * width), 5.6 / (rows * height), 3 / height)
+
+    columns = max(range(1, count + 1), key=scale)
+    rows = math.ceil(count / columns)
+    inches = scale(columns)
+    size = columns * width * inches + bar, rows * (height * inches + title) + foot
+    figure = new_figure(*size, "compressed")
+    return figure, panels(figure, count, columns, xlabel, ylabel)
 
 
 def wrapped(label: str, width: int = 48) -> str:

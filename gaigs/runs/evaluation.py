@@ -23,6 +23,7 @@ from gaigs.calibration.conformal import thinned
 from gaigs.calibration.scores import scores_of_links, shares_within, summarise_intervals
 from gaigs.configuration import composed, files_of
 from gaigs.core import stages
+from gaigs.core.results import plot
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.data import Links
@@ -95,6 +96,7 @@ class Evaluation(JupyterMixin):
     split: str
     scores: Scores
     device: str
+    plot = plot
 
     @property
     def models(self) -> dict[str, dict[str, float]]:

@@ -19,7 +19,7 @@ from gaigs.data import Links, Split
 from gaigs.model import Model
 from gaigs.planes.learnt_room import LearntRoom
 from gaigs.planes.room_paths import LearntPath
-from gaigs.report import csi, figures, run_figures, scalar, spectrum
+from gaigs.report import csi, figures, radio_maps, run_figures, scalar, spectrum
 from gaigs.report.run_figures import figures_of, write_figures
 from gaigs.splatting.gaussians import Gaussians
 
@@ -209,7 +209,7 @@ def test_an_rssi_run_is_drawn_into_its_folder(pixels, rssi_run, spy):
     links, folder, errors = rssi_run
     distributed, mapped, seen = (
         spy(scalar, "cdf"),
-        spy(scalar, "radio_maps"),
+        spy(radio_maps, "radio_maps"),
         spy(run_figures, "room"),
     )
     paged = ("predicted_against_measured", "radio_map")

@@ -12,7 +12,8 @@ from gaigs.core.radio_maps import RadioMap
 from gaigs.core.task.rssi import Rssi
 from gaigs.data import Split
 from gaigs.report import scalar
-from gaigs.report.scalar import map_pages, predicted_against_measured, radio_maps
+from gaigs.report.radio_maps import map_pages, radio_maps
+from gaigs.report.scalar import predicted_against_measured
 from gaigs.report.style import round_step
 from gaigs.testing import example_links
 

@@ -22,7 +22,7 @@ from gaigs.data.maps import find_pyproj
 from gaigs.io.files import atomic_write, write_text
 from gaigs.io.netcdf import Variable, write_netcdf
 from gaigs.report import style
-from gaigs.report.scalar import map_pages
+from gaigs.report.radio_maps import map_pages
 
 log = logging.getLogger(__name__)
 

@@ -21,6 +21,7 @@ from gaigs.commands.survey.processes import (
 )
 from gaigs.core.geometry import Frame, even_places
 from gaigs.core.query import Query, as_positions
+from gaigs.core.results import plot
 from gaigs.core.stages import track
 from gaigs.io.tables import write_table
 from gaigs.kriging.kernel import Process
@@ -60,6 +61,7 @@ class SurveyPlan:
     unit: str = ""
     frame: Frame | None = None
     known_error: float = math.nan
+    plot = plot
 
     def __repr__(self) -> str:
         return f"<{self}>"
