@@ -43,9 +43,20 @@ class Asked(NamedTuple):
         return (*places, *["receiver"] * self.has_axis, *self.axes)
 
 
-class Estimate(NamedTuple):
-    """A prediction with its uncertainty, from ``model.predict(x, interval=0.9)``; tensors shaped as
-    the value.
+class EstimateParts(NamedTuple):
+    """Tensors of an ``Estimate``."""
+
+    value: Tensor
+    std: Tensor
+    lower: Tensor | None
+    upper: Tensor | None
+    radius: Tensor | None = None
+    snr_db: Tensor | None = None
+
+
+class Estimate(EstimateParts):
+    """A prediction with its uncertainty, from ``model.predict(x, interval=0.9)``; a tuple of
+    tensors shaped as the value.
 
     Attributes:
         value: The prediction of ``predict`` without an interval.
@@ -57,7 +68,7 @@ class Estimate(NamedTuple):
             the label's unit; None for other labels.
         snr_db: Expected signal-to-noise ratio of each link's channel [dB], without the axes of
             elements and subcarriers; None for other labels.
-        asked: Names and coordinates of the axes; None if unknown.
+        asked: Names and coordinates of the axes, no part of the tuple; None if unknown.
 
     Example:
         >>> model = gaigs.train("knn", gaigs.links("synthetic_rssi", transmitters=100))
@@ -66,13 +77,12 @@ class Estimate(NamedTuple):
         (torch.Size([2, 4]), True)
     """
 
-    value: Tensor
-    std: Tensor
-    lower: Tensor | None
-    upper: Tensor | None
-    radius: Tensor | None = None
-    snr_db: Tensor | None = None
     asked: Asked | None = None
+
+    def about(self, asked: Asked) -> "Estimate":
+        """The estimate, with the names of its axes."""
+        self.asked = asked
+        return self
 
     def plot(self, ax: Any = None, **options: Any) -> Any:
         """Draws it as ``gaigs.plot`` does, which lists the options."""
@@ -101,7 +111,7 @@ class Estimate(NamedTuple):
         for name, axis in asked.axes.items():  # an array may have fewer elements than another
             coordinates[name] = ((name,), axis.values[: sizes[name]], {"units": axis.unit})
         variables = {}
-        for name in self._fields[:-1]:
+        for name in self._fields:
             part = getattr(self, name)
             if part is not None:
                 unit = {"units": "dB" if name == "snr_db" else asked.unit}

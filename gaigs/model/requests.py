@@ -103,11 +103,11 @@ class Request(NamedTuple):
     def estimates(self, fields: Sequence, scene: Scene) -> Any:
         """Estimates of arranged fields; by receiver where these are dictionaries."""
         if not isinstance(fields[0], dict):
-            return Estimate(*fields)._replace(asked=self.asked(scene))
+            return Estimate(*fields).about(self.asked(scene))
         estimates = {}
         for name in fields[0]:
             parts = Estimate(*(part and part[name] for part in fields))
-            estimates[name] = parts._replace(asked=self.asked(scene, name))
+            estimates[name] = parts.about(self.asked(scene, name))
         return estimates
 
     def to_xarray(self, answer: Any, scene: Scene) -> Any:
@@ -115,7 +115,7 @@ class Request(NamedTuple):
 
         def labelled(part: Any, name: str | None = None) -> Any:
             if not isinstance(part, Estimate):
-                part = Estimate(part, None, None, None, asked=self.asked(scene, name))
+                part = Estimate(part, None, None, None).about(self.asked(scene, name))
             return part.to_xarray()
 
         if not isinstance(answer, dict):

@@ -72,7 +72,7 @@ def write_predictions(
     if task.is_channel:
         lacks = lacking(scene.receivers, query.receivers.cpu(), task.elements)  # (n, elements)
         absent = lacks[..., None].expand_as(absent)
-        estimate = Estimate(*(_blank(part, absent) for part in estimate[:-1]))
+        estimate = Estimate(*(_blank(part, absent) for part in estimate))
         measured = _blank(measured, absent)
     variables = tabulate(query, scene, task, estimate, measured)
     if scene.frame is not None:
