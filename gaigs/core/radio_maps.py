@@ -130,6 +130,7 @@ def _key(unit: str) -> str:
     return f"values_{unit.lower()}" if unit.isascii() and unit.isalpha() else "values"
 
 
+@stages.with_progress
 def radio_map(
     model,
     pitch: float | None = None,
@@ -137,6 +138,8 @@ def radio_map(
     margin: float = 0.5,
     receivers: object = None,
     frequency: float | None = None,
+    *,
+    progress: bool = True,
 ) -> RadioMap:
     """Predictions on a horizontal plane over the box of training transmitters and all receivers,
     widened.
@@ -151,6 +154,7 @@ def radio_map(
         margin: Widening of the box on each side [m].
         receivers: Names or indices, or one of them; None: all receivers.
         frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
+        progress: False for no bars.
 
     Warns:
         ExtrapolationWarning: The frequency is outside the training links' band, or height or margin
@@ -177,7 +181,7 @@ def radio_map(
         height = _usual_height(scene)
     lower, upper = _rectangle(scene, float(height), float(margin))
     for message in _doubts(scene, float(height), float(margin)):
-        warnings.warn(message, ExtrapolationWarning, stacklevel=3)  # a decorator lies between
+        warnings.warn(message, ExtrapolationWarning, stacklevel=4)  # two decorators lie between
     if frequency is None:
         frequency = scene.middle_frequency
     predict = _Predictions(model, chosen, frequency)

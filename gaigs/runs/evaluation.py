@@ -148,7 +148,10 @@ class Evaluation(JupyterMixin):
         return text.getvalue().rstrip()
 
 
-def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> Evaluation:
+@stages.with_progress
+def evaluate(
+    model: Model, links: Links, baselines: Sequence | None = None, *, progress: bool = True
+) -> Evaluation:
     """Scores of a model on the test links, beside those of baselines that are fitted to the other
     links.
 
@@ -156,6 +159,7 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
         model: A trained, fitted or loaded model, of the same receivers and task.
         links: Links with a split.
         baselines: Names or configurations of models without a training; None: the task's own.
+        progress: False for no bars.
 
     Raises:
         TypeError: The model is not a ``gaigs.Model``, or the links are not ``gaigs.Links``.
