@@ -476,3 +476,10 @@ def test_a_given_part_is_trained_itself_not_a_copy(spectra):
     tokenizer.register_forward_hook(lambda module, *_: modes.append(module.training))
     gaigs.train(model, spectra, **FEW)
     assert modes[0], "trained once more, it is in training mode"
+
+
+def test_the_citations_have_the_version_of_the_package():
+    root = Path(__file__).parents[1]
+    cited = re.findall(r"^version: (.+)$", (root / "CITATION.cff").read_text(), re.M)
+    cited += re.findall(r"version = \{(.+)\}", (root / "README.md").read_text())
+    assert cited == [gaigs.__version__] * 2

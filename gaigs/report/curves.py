@@ -23,6 +23,7 @@ from gaigs.report.style import (
     PAGE,
     STYLE,
     ask,
+    distinct_looks,
     looks,
     named_ones,
     new_figure,
@@ -40,14 +41,15 @@ def cdf(
     higher_is_better: bool = False,
 ) -> Figure:
     """The curves of ``draw_cdf``, with the name of the split at the foot."""
-    # Columns of the legend by the letters of the longest name.
-    longest = max(map(len, values))
-    columns = 3 if longest <= 12 else 2 if longest <= 20 else 1
-    height = 2.75 + 0.15 * math.ceil(min(len(values), 7) / columns)
     with rc_context(STYLE):
-        figure = new_figure(COLUMN, height)
+        figure = new_figure(COLUMN, COLUMN)
         ax = figure.subplots()
         draw_cdf(ax, values, quantity, samples, limits, higher_is_better)
+        _, labels = ax.get_legend_handles_labels()
+        # Columns of the legend by the letters of the longest label.
+        longest = max(map(len, labels))
+        columns = 3 if longest <= 17 else 2 if longest <= 25 else 1
+        figure.set_figheight(2.75 + 0.15 * math.ceil(len(labels) / columns))
         key = {"ncols": columns, "handlelength": 2.4, "columnspacing": 1.2}
         figure.legend(loc="outside lower center", title=f"median {quantity}, best first", **key)
         question = "How good are predictions?" if higher_is_better else "How large are errors?"
@@ -78,7 +80,7 @@ def draw_cdf(
     medians = {name: float(np.median(scores)) for name, scores in values.items()}
     own = next(iter(values))
     named = named_ones(medians, higher_is_better, own)
-    systems = looks(values)
+    systems = distinct_looks(named, values)
     ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)
     for name in named:
         colour, dash = systems[name]
@@ -105,10 +107,7 @@ def plot_scores(result: Any, ax: Any = None, metric: str | None = None) -> Any:
     Args:
         result: An ``Evaluation``.
         ax: Axes; None: a figure of its own.
-        metric: Name of the score, a key of ``result.scores``; None: the one that picks checkpoints.
-
-    Returns:
-        The axes.
+        metric: Name of the score, a key of ``result.scores``; None: the main one.
     """
     name = result.task.compared_by if metric is None else metric
     values = {model: scores.get(name) for model, scores in result.scores.items()}
@@ -234,7 +233,7 @@ def learning_curves(
     with rc_context(STYLE):
         figure = new_figure(PAGE, 3.2 + 0.15 * key_rows)
         ax = figure.subplots()
-        systems = looks([*curves, *baselines])
+        systems = distinct_looks(named, [*curves, *baselines])
         for name in named:
             times, scores = curves[name]
             colour, dash = systems[name]

@@ -31,9 +31,6 @@ def plot_estimate(
         ax: Axes; None: a figure of its own.
         receiver: Name or index of the receiver; None: all of real numbers, or else the first.
         place: Number of the place, of a spectrum or a channel.
-
-    Returns:
-        The axes.
     """
     asked = result.asked
     if asked is None:

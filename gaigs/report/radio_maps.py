@@ -45,9 +45,7 @@ def map_pages(
     varied = [index for index, deviation in enumerate(_constants(radio_map)) if deviation is None]
     if radio_map.deviations is not None and varied:
         deviations = deviation_map(radio_map.only(np.array(varied)))
-        question = "Where are predictions uncertain?"
-        maps = radio_maps(deviations, gateways, {}, edges, question)
-        pages |= numbered("deviation_map", maps)
+        pages |= numbered("deviation_map", radio_maps(deviations, gateways, {}, edges))
     return pages
 
 
@@ -105,6 +103,13 @@ class _Drawing(NamedTuple):
         scale = _scale(radio_map.values, shown, _error_unit(radio_map.unit))
         is_low = (edges[..., 2] == edges[..., 2].min(initial=np.inf)).all(1)
         return cls(radio_map, gateways, dots, edges[is_low][..., :2], scale)
+
+    @property
+    def question(self) -> str:
+        """The title of figures."""
+        if self.radio_map.quantity.startswith("standard deviation"):
+            return "Where are predictions uncertain?"
+        return "Where do receivers hear a transmitter?"
 
     @property
     def note(self) -> str:
@@ -174,7 +179,6 @@ def radio_maps(
     gateways: Mapping[str, Float[ndarray, "3"]],
     readings: Mapping[str, Float[ndarray, "k 3"]],
     edges: Float[ndarray, "s 2 3"],
-    question: str = "Where do receivers hear a transmitter?",
     max_panels: int = 9,
 ) -> list[Figure]:
     """The map of each receiver in a panel, all with the same axes and colours.
@@ -185,7 +189,6 @@ def radio_maps(
         readings: x, y [m] and label [radio_map.unit] by receiver; of each at most 100, evenly
             chosen, are drawn.
         edges: Edges of walls; those on the floor are drawn [m].
-        question: Title of the figures.
         max_panels: Most panels of a figure.
     """
     drawing = _Drawing.of(radio_map, gateways, readings, edges)
@@ -200,7 +203,7 @@ def radio_maps(
             drawing.bar(figure, image, axes)
             if key := drawing.key():
                 figure.legend(key.values(), key, loc="outside lower center", ncols=3)
-            ask(figure, question, drawing.note)
+            ask(figure, drawing.question, drawing.note)
             figures.append(figure)
     return figures
 
@@ -220,9 +223,6 @@ def plot_radio_map(
         receiver: Name or index of the receiver; None: all of them.
         deviation: Draw the standard deviations in place of the values.
         links: Bring receivers, walls and test labels into the picture.
-
-    Returns:
-        The axes of a receiver, or an array of the axes of several.
     """
     floor = deviation_map(result) if deviation else result
     if receiver is not None:
@@ -237,8 +237,7 @@ def plot_radio_map(
             parts = [rows[links.query.receivers[test] == k].numpy() for k in range(len(gateways))]
             readings = dict(zip(gateways, parts, strict=True))
     if ax is None:
-        asked = ["Where are predictions uncertain?"] if deviation else []
-        figures = radio_maps(floor, gateways, readings, edges, *asked)
+        figures = radio_maps(floor, gateways, readings, edges)
         return [ax for figure in figures for ax in figure.axes if ax.get_label() != "<colorbar>"]
     if len(floor.receivers) > 1:
         names = ", ".join(floor.receivers[:5])

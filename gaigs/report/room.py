@@ -158,9 +158,6 @@ def plot_room(
         links: Bring transmitters, receivers and walls into the picture.
         show_paths: Draw the paths of a transmitter in place of links and obstacles; they need
             ``links``, and no ``ax``.
-
-    Returns:
-        The axes of the plan and of the side view, or of the plan alone.
     """
     if show_paths and (links is None or not result.paths or ax is not None):
         raise ValueError(

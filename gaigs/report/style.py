@@ -221,6 +221,25 @@ def looks(systems: Iterable[str]) -> dict[str, tuple]:
     return looks_by_name
 
 
+def distinct_looks(named: Sequence[str], systems: Iterable[str]) -> dict[str, tuple]:
+    """``looks`` of lines in one figure, of at most six colours.
+
+    Where systems share a colour, the one that is not a known model takes a free one.
+    """
+    found = looks(systems)
+    models = _models(named)
+    known = _places()
+    taken = set()
+    for name in sorted(named, key=lambda name: models[name] not in known):
+        colour, dash = found[name]
+        if colour in taken and not name.endswith("_trend"):
+            free = [colour for colour, _ in LINES[:6] if colour not in taken]
+            colour = next(iter(free), colour)
+        taken.add(colour)
+        found[name] = colour, dash
+    return found
+
+
 def _models(systems: Iterable[str]) -> dict[str, str]:
     """The model of each system; the first variant, as "GAI-GS split=a", is the model itself."""
     titles = {title: name for name, title in _titles().items()}

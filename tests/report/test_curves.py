@@ -186,4 +186,6 @@ def test_only_six_lines_have_colours(rng):
     labels = [text.get_text() for text in figure.legends[0].get_texts()]
     assert [label.split()[0] for label in labels] == ["s0", "s1", "s2", "s3", "s4", "own", "7"]
     assert labels[-1].startswith("7 others 5.")
+    steps = [line for line in figure.axes[0].lines if line.get_drawstyle().startswith("steps")]
+    assert len({line.get_color() for line in steps if line.get_color() != "0.75"}) == 6
     assert len([line for line in figure.axes[0].lines if line.get_color() == "0.75"]) == 1 + 7 + 1

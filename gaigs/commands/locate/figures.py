@@ -81,15 +81,7 @@ def draw_posterior(axis: Axes, location: Location, label: str) -> None:
 
 
 def plot_location(result: Location, ax: Any = None) -> Any:
-    """Where the transmitters are, from above.
-
-    Args:
-        result: The location.
-        ax: Axes; None: a figure of its own.
-
-    Returns:
-        The axes.
-    """
+    """Draws where the transmitters are from above, on ``ax`` or in a figure of its own."""
     if ax is None:
         return posterior_figure(result).axes[:1]
     draw_posterior(ax, result, "region")

@@ -51,15 +51,7 @@ def figure(plan: SurveyPlan) -> Figure:
 
 
 def plot_plan(result: SurveyPlan, ax: Any = None) -> Any:
-    """Where to measure next, and what it brings.
-
-    Args:
-        result: The plan.
-        ax: Axes for the places; None: a figure of its own.
-
-    Returns:
-        The axes of the places and, of a plan with errors and no ``ax``, those of the errors.
-    """
+    """Draws the places on ``ax``; without it a figure of its own, with the errors too."""
     if ax is None:
         return figure(result).axes
     draw_places(ax, result)
