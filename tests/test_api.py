@@ -444,7 +444,9 @@ def test_the_page_on_python_runs(tmp_path, monkeypatch, capsys):
     assert names["means"].grad.shape == (2, 3)
     assert "gaigs" in names["metrics"]["models"]
     assert names["channel_links"].task.shape == (4, 8)
-    assert {path.name for path in tmp_path.iterdir()} == {"room.ckpt", "parts.ckpt", "runs"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "room.ckpt", "parts.ckpt", "floor.pdf", "runs"
+    }  # fmt: skip
 
 
 def test_links_of_other_receivers_are_not_scored():
