@@ -448,7 +448,9 @@ def test_the_page_on_python_runs(tmp_path, monkeypatch, capsys):
     assert names["means"].grad.shape == (2, 3)
     assert "gaigs" in names["metrics"]["models"]
     assert names["channel_links"].task.shape == (4, 8)
-    assert {path.name for path in tmp_path.iterdir()} == {"room.ckpt", "parts.ckpt", "runs"}
+    assert {path.name for path in tmp_path.iterdir()} == {
+        "room.ckpt", "parts.ckpt", "floor.pdf", "runs"
+    }  # fmt: skip
 
 
 def test_links_of_other_receivers_are_not_scored():
@@ -480,3 +482,10 @@ def test_a_given_part_is_trained_itself_not_a_copy(spectra):
     tokenizer.register_forward_hook(lambda module, *_: modes.append(module.training))
     gaigs.train(model, spectra, **FEW)
     assert modes[0], "trained once more, it is in training mode"
+
+
+def test_the_citations_have_the_version_of_the_package():
+    root = Path(__file__).parents[1]
+    cited = re.findall(r"^version: (.+)$", (root / "CITATION.cff").read_text(), re.M)
+    cited += re.findall(r"version = \{(.+)\}", (root / "README.md").read_text())
+    assert cited == [gaigs.__version__] * 2

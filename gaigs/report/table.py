@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rich.box import SIMPLE_HEAD
+from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
 from gaigs.io import tables
@@ -113,6 +115,12 @@ def terminal(
     return table
 
 
+def table_width(table: Table) -> int:
+    """Letters of a table's longest line."""
+    console = Console(width=1000)
+    return Measurement.get(console, console.options, table).maximum
+
+
 def markdown(lines: Sequence[Sequence[str]]) -> str:
     """A table in Markdown; the first line is the head."""
     head, *rows = lines
@@ -123,6 +131,37 @@ def markdown(lines: Sequence[Sequence[str]]) -> str:
     return text
 
 
+def tex(text: str) -> str:
+    """Plain text in LaTeX."""
+    signs = {sign: f"\\{sign}" for sign in "&%$#_{}"}
+    signs |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    signs |= {"±": r"$\pm$", "²": "$^2$", "−": "$-$", "×": r"$\times$"}
+    return "".join(signs.get(sign, sign) for sign in text)
+
+
+def latex(
+    lines: Sequence[Sequence[str]], texts: int, caption: str, rules: Sequence[int] = ()
+) -> str:
+    """A table in LaTeX without packages; the first line is the head.
+
+    Args:
+        lines: Cells in LaTeX.
+        texts: Number of columns of texts; numbers follow, which are flush right.
+        caption: The caption.
+        rules: Numbers of the lines before which a rule stands.
+    """
+    columns = "l" * texts + "r" * (len(lines[0]) - texts)
+    rows = ""
+    for number, line in enumerate(lines):
+        rule = "\\hline\n" if number in (0, 1, *rules) else ""
+        # A bracket or a star after the end of a row would be an option of it.
+        start = "{}" if line[0][:1] in ("[", "*") else ""
+        rows += f"{rule}{start}{' & '.join(line)} \\\\\n"
+    body = f"\\begin{{tabular}}{{{columns}}}\n{rows}\\hline\n\\end{{tabular}}"
+    head = f"\\begin{{table}}\n\\centering\n\\caption{{{caption}}}\n"
+    return f"{head}{body}\n\\end{{table}}\n"
+
+
 def stacked(title: str) -> str:
     """The head of a narrow column, a word a line."""
-    return escape(title.replace(" ", "\n"))
+    return escape(title.replace(" ", "\n").replace("_", "_\n"))

@@ -202,6 +202,9 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "validation_score": None,
         "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
     }
+    places = links.query[links.split.test].place_keys
+    test = evaluation.compare((links.held_out or links).task, scores, places)
+    metrics["paired"] = None if test is None else test._asdict()
     if validation:
         metrics["validation_score"] = validation[name][links.task.monitor].mean().item()
     metrics |= model.facts()

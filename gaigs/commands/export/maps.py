@@ -22,7 +22,7 @@ from gaigs.data.maps import find_pyproj
 from gaigs.io.files import atomic_write, write_text
 from gaigs.io.netcdf import Variable, write_netcdf
 from gaigs.report import style
-from gaigs.report.scalar import map_pages
+from gaigs.report.radio_maps import map_pages
 
 log = logging.getLogger(__name__)
 
@@ -163,9 +163,7 @@ def write_map_netcdf(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 def write_figures(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     """Writes the maps as figures, pages of one PDF or a PNG each; returns the files."""
     gateways = {one.name: one.pose.position.numpy() for one in scene.receivers}
-    none = {name: np.zeros((0, 3), np.float32) for name in gateways}
-    task: Any = scene.task
-    pages = map_pages(floor, gateways, none, np.zeros((0, 2, 3), np.float32), task)
+    pages = map_pages(floor, gateways, {}, np.zeros((0, 2, 3), np.float32))
     if file.suffix.lower() == ".pdf":
         with atomic_write(file) as part, rc_context(style.STYLE), PdfPages(part) as document:
             for page in pages.values():

@@ -1,6 +1,7 @@
 """Survey planning: where to measure next, and which measured places could have been left out."""
 
 from pathlib import Path
+from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -37,14 +38,25 @@ def run(config: dict, folder: Path) -> None:
 def figure(plan: SurveyPlan) -> Figure:
     """Places from above and, with a model, the expected error after each new one."""
     with rc_context(style.STYLE):
-        drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
+        drawn = style.new_figure(style.PAGE, 0.52 * style.PAGE, "compressed")
         count = 1 if plan.errors is None else 2
         axes = drawn.subplots(1, count, squeeze=False)[0]
         draw_places(axes[0], plan)
         drawn.legend(loc="outside lower left", ncols=3)
         if plan.errors is not None:
             draw_errors(axes[1], plan)
+        gain = "" if plan.errors is None else ", and what does it bring"
+        style.ask(drawn, f"Where to measure next{gain}?")
     return drawn
+
+
+def plot_plan(result: SurveyPlan, ax: Any = None) -> Any:
+    """Draws the places on ``ax``; without it a figure of its own, with the errors too."""
+    if ax is None:
+        return figure(result).axes
+    draw_places(ax, result)
+    ax.legend()
+    return ax
 
 
 def draw_places(axis: Axes, plan: SurveyPlan) -> None:
@@ -69,10 +81,13 @@ def draw_places(axis: Axes, plan: SurveyPlan) -> None:
 
 
 def draw_errors(axis: Axes, plan: SurveyPlan) -> None:
-    """Draws the expected error after each new place."""
+    """Draws the expected error after each new place, at least 5 % of it from end to end."""
     label = f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
     axis.plot(plan.errors.numpy(), color=style.BLUE)
-    axis.set(xlabel="new places", ylabel=label, ylim=(0, 1.05 * plan.errors.max().item()))
+    first, last = plan.errors.max().item(), plan.errors.min().item()
+    # The axis begins at the data: a fall that matters is seen, and a flat line has its numbers.
+    rim = max(0.1 * (first - last), 0.025 * first)
+    axis.set(xlabel="new places", ylabel=label, ylim=(last - rim, first + rim))
     axis.locator_params(axis="x", integer=True)
     axis.grid()
     axis.set_axisbelow(True)

@@ -21,7 +21,8 @@ from gaigs.commands.survey.processes import (
 )
 from gaigs.core.geometry import Frame, even_places
 from gaigs.core.query import Query, as_positions
-from gaigs.core.stages import track
+from gaigs.core.results import plot
+from gaigs.core.stages import track, with_progress
 from gaigs.io.tables import write_table
 from gaigs.kriging.kernel import Process
 from gaigs.kriging.links import coordinates
@@ -60,6 +61,7 @@ class SurveyPlan:
     unit: str = ""
     frame: Frame | None = None
     known_error: float = math.nan
+    plot = plot
 
     def __repr__(self) -> str:
         return f"<{self}>"
@@ -103,6 +105,7 @@ class SurveyPlan:
         return [use, *(f"{number:.3f}" for number in numbers), error]
 
 
+@with_progress
 @torch.no_grad()
 def survey(
     model: Model | None = None,
@@ -110,6 +113,8 @@ def survey(
     count: int = 20,
     candidates: object = None,
     frequency: float | None = None,
+    *,
+    progress: bool = True,
 ) -> SurveyPlan:
     """The next places to measure: each lowers the mean variance over a region most, at all
     receivers together.
@@ -129,6 +134,7 @@ def survey(
         candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
         frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
             Without a model it has no effect.
+        progress: False for no bars.
 
     Raises:
         ValueError: The model has no process over places, the count is less than 1, a place is
