@@ -81,7 +81,7 @@ def read(
 
 def from_table(
     table: tables.Table,
-    gateways: str | Path | Mapping[str, Sequence[float]] | tables.Table | None = None,
+    gateways: str | Path | Mapping | tables.Table | None = None,
     coordinates: list[str] | None = None,
     ignore: list[str] | None = None,
     not_heard: float | list[float] | None = None,
