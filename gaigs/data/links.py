@@ -1,4 +1,4 @@
-"""Links of a registered reader, of a data frame, or of arrays in memory."""
+"""Links of a registered reader, or of data in memory: a data frame, traced paths, arrays."""
 
 from typing import Any
 
@@ -6,19 +6,21 @@ from gaigs import configuration
 from gaigs.data import Links, load
 from gaigs.data.arrays import from_arrays
 from gaigs.data.frames import from_frame
+from gaigs.data.sionna_rt import from_sionna_rt, is_traced
 from gaigs.io.frames import is_frame
 
 
 def links(source: Any = None, /, **options: Any) -> Links:
-    """Links of a registered reader, of a data frame, or of arrays in memory, with their split.
+    """Links of a registered reader, or of data in memory, with their split.
 
     Args:
         source: Name of a registered reader, e.g. ``"synthetic"``, ``"nerf2_spectrum"``,
-            ``"rssi_csv"``; a data frame of levels [dBm], or a mapping of its columns; None for
-            arrays.
+            ``"rssi_csv"``; a data frame of levels [dBm], or a mapping of its columns; ``Paths`` or
+            a ``RadioMap`` of Sionna RT; None for arrays.
         options: Options of reader and split by their names, and ``split``, the name of a registered
             split. For a data frame those of ``gaigs.data.frames.from_frame``: ``x``, ``y``, ``z``,
-            ``receivers``. For arrays those of ``gaigs.data.arrays.from_arrays``: ``task``,
+            ``receivers``. For Sionna RT those of ``gaigs.data.sionna_rt.from_sionna_rt``:
+            ``frequencies``. For arrays those of ``gaigs.data.arrays.from_arrays``: ``task``,
             ``transmitters`` (n, 3) [m], ``receivers``, ``labels``.
 
     Raises:
@@ -46,6 +48,8 @@ def links(source: Any = None, /, **options: Any) -> Links:
                 f"{', '.join(needed)}, receivers; missing: {', '.join(missing)}"
             )
         return from_arrays(**options)
+    if is_traced(source):
+        return from_sionna_rt(source, **options)
     if is_frame(source):
         return from_frame(source, **options)
     if not isinstance(source, str):
