@@ -43,10 +43,10 @@ class Regressor(RegressorMixin, BaseEstimator):
 
     def __init__(
         self,
-        model: str = "gaussian_process",
+        model: Any = "gaussian_process",
         receivers: Any = None,
-        height: float = 1.0,
-        seed: int = 0,
+        height: Any = 1.0,
+        seed: Any = 0,
         **options: Any,
     ):
         self.model = model

@@ -60,8 +60,14 @@ SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "syntheti
 MADE_FOR = {
     "loss": {"l1_ssim": ["spectrum"], "relative_error": ["csi"], "log_relative_error": ["csi"]}
     | dict.fromkeys(("absolute", "squared", "huber"), ("spectrum", "rssi")),
-    # The last two are made from trained models.
-    "model": {"path_loss": ["rssi"], "friis": ["csi"], "kriging": [], "ensemble": []},
+    # The last three are made from trained models, and from a regressor.
+    "model": {
+        "path_loss": ["rssi"],
+        "friis": ["csi"],
+        "kriging": [],
+        "ensemble": [],
+        "sklearn": [],
+    },
 }
 """The tasks of a loss or model that refuses others."""
 

@@ -69,7 +69,7 @@ def _check_call(placement: nn.Module, gaussians: Gaussians | None, query: Query)
         leaves |= {f"gaussians.{name}": leaf for name, leaf in gaussians.named_parameters()}
     checks.require_gradients(placed, leaves)
     nothing = tuple(placement(gaussians, query[:0]).means.shape)
-    require(nothing in ((0, n, 3), (1, n, 3)), "no queries must be placed too")
+    require(nothing in ((0, n, 3), (1, n, 3)), f"no queries must be placed too; {EMPTY}")
 
 
 def _check_fields(placed: Placed, n: int, transmitters: Tensor) -> None:

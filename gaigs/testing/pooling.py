@@ -19,6 +19,7 @@ from gaigs.data import Links
 from gaigs.splatting.pooling import Pooling
 from gaigs.splatting.pooling.paths import PathPooling, ReceivedPaths
 from gaigs.testing.checks import (
+    EMPTY,
     PRECISION,
     require,
     require_close,
@@ -129,7 +130,7 @@ def _check_values(pooling: Pooling, task: Task, inputs: _PoolingInputs, query: Q
     require(quiet.isfinite().all(), "the value of silence must be finite")
     require_gradients([quiet], {f"silent {noun}": inputs.silent})
     none = tuple(pooling(rows_of(received, slice(0, 0)), query[:0]).shape)
-    require(none == (0, *task.shape), f"no {noun} must give no values, got {none}")
+    require(none == (0, *task.shape), f"no {noun} must give no values, got {none}; {EMPTY}")
     return value
 
 
