@@ -84,14 +84,14 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
     require(model.training, "predict must leave the model in the mode it was in")
     require_tensor("predictions", values, (len(places), *task.shape), task.dtype)
     require(not values.requires_grad, "predictions must not carry a gradient")
-    rule = f"two calls must give the same predictions; {checks.RANDOM}"
+    rule = "two calls must give the same predictions; draw random numbers in the constructor"
     require_same(values, model.predict(query), rule)
     singles = _predict(model, query, places, batch_size=1)
     rule = "the batch size must not change predictions; use no statistics of a batch"
     require_close(singles, values, 1e-4, rule)
     none = _predict(model, query, places[:0])
-    is_empty = tuple(none.shape) == (0, *task.shape)
-    require(is_empty, f"no transmitters must give no predictions; {checks.EMPTY}")
+    rule = "no transmitters must give no predictions"
+    checks.require_empty(none.shape, [(0, *task.shape)], rule)
     grid = _predict(model, query, places.expand(2, *places.shape))
     rule = "a grid of positions must give a grid of predictions"
     require_close(grid, values.expand(2, *values.shape), 1e-4, rule)
@@ -143,10 +143,8 @@ def _check_evaluation(model: Model, batch: Batch, mixed: Batch) -> None:
         singles.append(model.evaluate(single))
     rule = "links to several receivers must get the values of single links; read query.receivers"
     require_close(model.evaluate(mixed), torch.cat(singles), 1e-4, rule)
-    none = tuple(model.evaluate(Batch(batch.query[:0], batch.directions)).shape)
-    require(
-        none == (0, *values.shape[1:]), f"no links must give no values, got {none}; {checks.EMPTY}"
-    )
+    none = model.evaluate(Batch(batch.query[:0], batch.directions))
+    checks.require_empty(none.shape, [(0, *values.shape[1:])], "no links must give no values")
 
 
 def _check_directions(model: Model, batch: Batch) -> None:

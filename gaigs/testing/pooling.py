@@ -19,10 +19,10 @@ from gaigs.data import Links
 from gaigs.splatting.pooling import Pooling
 from gaigs.splatting.pooling.paths import PathPooling, ReceivedPaths
 from gaigs.testing.checks import (
-    EMPTY,
     PRECISION,
     require,
     require_close,
+    require_empty,
     require_gradients,
     require_same,
     require_tensor,
@@ -129,8 +129,8 @@ def _check_values(pooling: Pooling, task: Task, inputs: _PoolingInputs, query: Q
     quiet = pooling(inputs.silence, query)
     require(quiet.isfinite().all(), "the value of silence must be finite")
     require_gradients([quiet], {f"silent {noun}": inputs.silent})
-    none = tuple(pooling(rows_of(received, slice(0, 0)), query[:0]).shape)
-    require(none == (0, *task.shape), f"no {noun} must give no values, got {none}; {EMPTY}")
+    none = pooling(rows_of(received, slice(0, 0)), query[:0])
+    require_empty(none.shape, [(0, *task.shape)], f"no {noun} must give no values")
     return value
 
 
