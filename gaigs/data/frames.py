@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -69,12 +69,9 @@ def from_frame(
     config = split_configuration("data frames", from_frame, split, options)
     try:
         table = read_frame(frame)
-        named = _find_receivers(table, receivers, receiver is not None)
         links = from_table(
             table,
-            gateways=named.gateways,
             coordinates=_coordinates(table, x, y, z),
-            ignore=[*_listed(ignore), *named.others],
             not_heard=[*not_heard] if isinstance(not_heard, Sequence) else not_heard,
             height=height,
             storey=storey,
@@ -82,7 +79,7 @@ def from_frame(
             frequency=frequency,
             receiver=receiver,
             level=level,
-            levels=named.columns,
+            **_columns(table, receivers, _listed(ignore), receiver is not None),
         )
         links = divide(links, config)
     except ValueError as error:
@@ -90,46 +87,31 @@ def from_frame(
     return replace(links, remarks=_in_python(links.remarks))
 
 
-class _Named(NamedTuple):
-    """What the option ``receivers`` says.
-
-    Attributes:
-        gateways: Positions, as ``from_table`` takes them.
-        columns: Columns that are receivers whatever their numbers look like.
-        others: Columns that are none.
-    """
-
-    gateways: Mapping[str, list[str]] | Table | None
-    columns: list[str]
-    others: list[str]
-
-
-def _find_receivers(table: Table, receivers: Any, is_long: bool) -> _Named:
-    """The receivers that a mapping, a data frame or a list of names gives.
+def _columns(table: Table, receivers: Any, ignore: list[str], is_long: bool) -> dict[str, Any]:
+    """Options of ``from_table`` for receivers by a mapping, a data frame or a list of columns.
 
     Raises:
         ValueError: A listed name is no column.
     """
-    if receivers is None:
-        return _Named(None, [], [])
     if isinstance(receivers, Mapping) and not {"name", "x", "y"} <= {*receivers}:
         placed = {}
         for name, position in receivers.items():
             if position is not None:
                 placed[str(name)] = [str(one) for one in np.ravel(position).tolist()]
-        columns = [str(name) for name in receivers if str(name) in table.names]
-        return _Named(placed or None, [] if is_long else columns, [])
+        levels = [] if is_long else [str(name) for name in receivers if str(name) in table.names]
+        return {"gateways": placed or None, "levels": levels, "ignore": ignore}
     if is_frame(receivers):
-        return _Named(read_frame(receivers, "receivers"), [], [])
-    if is_long:
+        return {"gateways": read_frame(receivers, "receivers"), "ignore": ignore}
+    names = [] if receivers is None else _listed(receivers)
+    if names and is_long:
         raise ValueError(
             f"{table.heading}: receivers must be positions by name where column receiver names "
             f"them, got {receivers!r}; choose rows in the frame"
         )
-    columns = _listed(receivers)
-    for name in columns:
+    for name in names:
         table.column(name)
-    return _Named(None, columns, [name for name in table.names if name not in columns])
+    others = [name for name in table.names if names and name not in names]
+    return {"levels": names, "ignore": ignore + others}
 
 
 def _listed(names: str | Sequence) -> list[str]:

@@ -17,7 +17,9 @@ def is_frame(value: object) -> bool:
     if isinstance(value, Mapping):
         return True
     has_columns = hasattr(value, "columns") or hasattr(value, "column_names")
-    return (has_columns and hasattr(value, "__getitem__")) or _is_exchanged(value)
+    if has_columns:
+        return hasattr(value, "__getitem__")
+    return _is_exchanged(value) and not hasattr(value, "__array__")  # no single column
 
 
 def _is_exchanged(value: object) -> bool:

@@ -199,6 +199,16 @@ def test_frames_of_labels_name_the_receivers():
         gaigs.links(task="rssi", transmitters=PLACES, labels=labels, receivers=[[0, 0, 0]])
 
 
+@pytest.mark.parametrize("library", ["pandas", "polars"])
+def test_a_single_column_is_an_array(library):
+    column = pytest.importorskip(library).Series(LEVELS[:, 0])
+    arrays = {"task": "rssi", "transmitters": PLACES, "receivers": APS["ap-a"]}
+    links = gaigs.links(**arrays, labels=column)
+    assert torch.equal(links.labels, gaigs.links(**arrays, labels=LEVELS[:, 0]).labels)
+    with pytest.raises(TypeError, match="got Series"):
+        gaigs.links(column)
+
+
 def test_spectra_need_receivers_with_a_place():
     task = gaigs.links("synthetic", transmitters=10, order=0).task
     labels = np.zeros((60, *task.shape))
