@@ -94,6 +94,8 @@ __all__ = [
 
 
 def __getattr__(name: str):
+    if name == "sklearn":  # a module, which takes scikit-learn
+        return importlib.import_module("gaigs.sklearn")
     if name not in PLACES:
         raise AttributeError(f"module 'gaigs' has no attribute {name!r}")
     module = importlib.import_module(f"gaigs.{PLACES[name]}")

@@ -271,7 +271,7 @@ def eight_channels(splats, signal, *others):
             broken(
                 TorchRasterizer, lambda result, *_: [part.float() for part in result], "__call__"
             ),
-            r"random: map must be torch\.float64 as its input, got torch\.float32",
+            r"random: map must be torch\.float64, got torch\.float32; convert it by",
         ),
         (
             broken(TorchRasterizer, mixed, "__call__"),
