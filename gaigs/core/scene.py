@@ -55,6 +55,7 @@ class Scene:
         bandwidth: Band around each carrier over which a label's power is averaged, 0 for a carrier
             alone [Hz]; None if unknown.
         frame: Place of the world frame on a map; None if unknown.
+        places: Number of training places; 0 if unknown.
         floors: Heights of separate floors of training transmitters, that with most places first
             (k,) [m]; empty of one.
 
@@ -75,6 +76,7 @@ class Scene:
     bandwidth: float | None = None
     frame: Frame | None = None
     floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
+    places: int = 0
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
         """Positions of the receivers [m], on the device and in the dtype of ``like``."""
@@ -154,7 +156,7 @@ class Scene:
                 }
             )
         state = {"receivers": receivers, "task": self.task.state()}
-        for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors"):
+        for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors", "places"):
             state[name] = getattr(self, name)
         state["frame"] = None
         if self.frame is not None:

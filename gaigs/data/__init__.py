@@ -179,6 +179,7 @@ class Links:
             bandwidth=self.bandwidth,
             frame=self.frame,
             floors=floors_of(train),
+            places=len(train),
         )
 
 

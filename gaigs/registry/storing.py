@@ -13,7 +13,7 @@ GIVEN = {
     "split": ("links",),
     "placement": ("scene", "channels"),
     "tokenizer": ("scene",),
-    "deformation": ("scene", "channels", "tokenizer_widths"),
+    "deformation": ("scene", "channels", "tokenizer_widths", "count"),
     "projection": ("pixel",),
     "pooling": ("scene",),
     "loss": ("task",),

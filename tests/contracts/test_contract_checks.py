@@ -101,7 +101,7 @@ def test_a_faulty_deformation_is_found(change, message):
     )
     kind = broken(TwoBranch, change)
 
-    def build(tokenizer_widths, channels, scene):
+    def build(tokenizer_widths, channels, **_):
         return kind(tokenizer_widths, channels, width=8, heads=heads, **sizes)
 
     with pytest.raises(AssertionError, match=message):
