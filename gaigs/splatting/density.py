@@ -116,7 +116,7 @@ def _rearrange(
     follower: Deformation | None,
 ) -> None:
     """Replaces the parameters in the modules and in the optimizer."""
-    owned = [(gaussians, name) for name in gaussians.PARAMETERS]
+    owned: list[tuple[nn.Module, str]] = [(gaussians, name) for name in gaussians.PARAMETERS]
     if follower is not None:
         owned += [(follower, name) for name in follower.follows]
     for owner, name in owned:
