@@ -32,7 +32,6 @@ class PlaneGrid(NamedTuple):
         groups: Number of groups of neighbouring places.
         turn: Angle between neighbouring normals [rad].
         shift: Distance of neighbouring offsets [m].
-        candidates: Most planes that are looked at more closely.
     """
 
     title: str
@@ -41,7 +40,6 @@ class PlaneGrid(NamedTuple):
     groups: int
     turn: float
     shift: float
-    candidates: int = 3
 
     @property
     def size(self) -> int:
@@ -115,7 +113,7 @@ class FieldSearch:
             normals = grid.normals.to(self.frame.points)
             lines = self.frame.grid(normals, grid.offsets, self.data.options.margin)
             shift = grid.shift / self.frame.diagonal
-            search = PlaneSearch(self.frame, score, grid.turn / 2, shift / 2, grid.candidates)
+            search = PlaneSearch(self.frame, score, grid.turn / 2, shift / 2)
             larger = search.extend(room, lines)
             if larger is None:
                 continue
@@ -136,8 +134,7 @@ class FieldSearch:
         turn = upright_turn(self.frame.points).to(self.frame.points)
         axes = torch.cat((room_axes(room.planes), torch.eye(3).to(turn), turn.mT))
         normals = torch.stack(distinct(axes, 2e-4))
-        grid = self._make_grid("along the axes", 1, lambda turn: normals)
-        return grid._replace(candidates=6)
+        return self._make_grid("along the axes", 1, lambda turn: normals)
 
     def _make_upright(self) -> PlaneGrid | None:
         def make(turn: float) -> Float[Tensor, "n 3"]:

@@ -100,7 +100,6 @@ class PlaneSearch(Generic[R]):
         score: What planes explain in the labels.
         turn, shift: First steps of the search about a maximum, of normals [rad] and of offsets
             [diagonals].
-        candidates: Most planes that ``propose`` gives.
 
     Source: Hough, Method and means for recognizing complex patterns, 1962, for the candidates.
     """
@@ -111,23 +110,21 @@ class PlaneSearch(Generic[R]):
         score: Score[R],
         turn: float = 0.06,
         shift: float = 0.02,
-        candidates: int = 3,
     ):
         self.frame = frame
         self.score = score
         self.turn = turn
         self.shift = shift
-        self.candidates = candidates
 
     def propose(self, room: R, lines: Float[Tensor, "n k 4"]) -> list[Candidate]:
-        """A few planes apart from the room's: the highest maxima of a grid, sharpened."""
+        """At most three planes apart from the room's: the highest maxima of a grid, sharpened."""
         rough = self.score.rate(room, lines)
         grid = lines.flatten(0, 1)  # (n k, 4)
         ratings = rough.ratings.flatten().clone()
         for plane in room.planes:
             ratings[self.frame.is_like(grid, plane)] = 0
         starts: list[Tensor] = []
-        while len(starts) < 2 * self.candidates + 2 and ratings.max() > 0:
+        while len(starts) < 8 and ratings.max() > 0:
             starts.append(grid[ratings.argmax()])
             ratings[self.frame.is_like(grid, starts[-1])] = 0
         if not starts:
@@ -149,7 +146,7 @@ class PlaneSearch(Generic[R]):
         for number in highest.argsort(descending=True).tolist():
             known = [*room.planes, *(candidate.plane for candidate in candidates)]
             is_known = any(self.frame.is_like(planes[number, None], plane) for plane in known)
-            if len(candidates) < self.candidates and not is_known:
+            if len(candidates) < 3 and not is_known:
                 candidates.append(Candidate(planes[number], highest[number].item()))
         return candidates
 
