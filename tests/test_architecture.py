@@ -23,10 +23,10 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-    "lines of gaigs/": 41_200,
+    "lines of gaigs/": 41_620,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
-    "module constants": 112,
+    "module constants": 113,
     "rooms": 21,
     "files in an import chain": 23,
 }
