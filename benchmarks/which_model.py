@@ -41,15 +41,14 @@ def measure(name, places, data, steps, folder):
     split = {} if places is None else {"split": "sparse", "train": places}
     links = gaigs.links(reader, **paths, **split)
     began = time.process_time()
-    chosen = gaigs.train(
-        links, seed=0, max_steps=steps, val_check_interval=min(50, steps), folder=folder
-    )
+    options = {"max_steps": steps, "val_check_interval": min(50, steps), "seed": 0}
+    chosen = gaigs.train(links, folder=folder, **options, **{"model.max_time": "00:02:00:00"})
     minutes = (time.process_time() - began) / 60
     config = gaigs.compose("model=auto", f"task={links.task.name}")
     models = {"auto": chosen}
     for number, candidate in enumerate(config["model"]["candidates"]):
         checkpoint = folder / "candidates" / str(number) / "best.ckpt"
-        if checkpoint.is_file():
+        if checkpoint.is_file():  # of the trained ones, and of the chosen one
             models[candidate] = gaigs.load(checkpoint)
         else:
             models[candidate] = gaigs.train(candidate, links)

@@ -130,8 +130,8 @@ def _try_each(
         if left <= 0 and (tried or is_trained):
             stages.leave_out(f"model=auto has not tried {label}")
             continue
-        # Trainings share what is left; look-ups end by themselves.
-        share = left / (len(configs) - number) if is_trained else left
+        # The first are the cheapest, and leave time to the others.
+        share = left / (len(configs) - number)
         with stages.watched(max(1.0, share), shown), limited_threads(config["threads"]):
             try:
                 tried.append(work(label, config, links, folder / "candidates" / str(number)))
@@ -202,6 +202,8 @@ def look_up(label: str, config: dict, links: Links, folder: Path) -> Tried:
     gains: dict[int, float] = {}
     for unseen in model.unseen(links):
         gains |= place_gains(unseen.model, links, unseen.asked)
+    if not gains:
+        raise ValueError(f"its fit took {time.monotonic() - began:.0f} s; raise model.max_time")
     return Tried(label, config, folder, gains, time.monotonic() - began)
 
 
