@@ -20,7 +20,7 @@ from torch.autograd.graph import register_multi_grad_hook
 from gaigs.data import load
 from gaigs.registry import registry
 from gaigs.runs.descent import make_trainer
-from gaigs.runs.training import count_gaussians
+from gaigs.runs.fitting import count_gaussians
 from gaigs.training.batches import Batches
 from gaigs.training.budget import make_budget
 

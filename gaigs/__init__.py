@@ -1,10 +1,10 @@
 """Wireless channels predicted with 3-D Gaussian splatting.
 
 >>> import gaigs
->>> links = gaigs.links("synthetic")  # any registered reader
->>> model = gaigs.train("mirrored", links, max_steps=300)  # any registered model
+>>> links = gaigs.links("synthetic_rssi")  # any registered reader
+>>> model = gaigs.train(links, max_steps=300)  # tries several models; or train("mirrored", links)
 >>> print(gaigs.evaluate(model, links))  # beside the task's baselines
->>> spectra = model.predict([[1.0, 2.0, 1.5]])  # [m] -> (places, receivers, rows, columns)
+>>> levels = model.predict([[1.0, 2.0, 1.5]])  # [m] -> (places, receivers) [dBm]
 >>> model.save("room.ckpt")
 >>> model = gaigs.load("room.ckpt")
 

@@ -23,10 +23,10 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-    "lines of gaigs/": 44_900,
+    "lines of gaigs/": 45_500,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
-    "module constants": 107,
+    "module constants": 108,
     "rooms": 22,  # sklearn, whose name users know
     "files in an import chain": 23,
 }

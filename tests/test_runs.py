@@ -635,7 +635,7 @@ def test_a_receiver_without_links_to_learn_from_is_refused_before_the_training(
     links.query.receivers[links.query.receivers == 3] = 2
     links.query.receivers[own[:1]] = 3
     monkeypatch.setattr(runs.data, "load", lambda *_: links)
-    monkeypatch.setattr("gaigs.runs.training.descend", lambda *_: pytest.fail("trained"))
+    monkeypatch.setattr("gaigs.runs.fitting.descend", lambda *_: pytest.fail("trained"))
     with pytest.raises(ValueError, match=f"has no {word} links of north; choose another split"):
         rssi_run(tmp_path)
 

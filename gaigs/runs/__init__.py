@@ -172,7 +172,8 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         )
     # Slow to import: errors in data come first.
     from gaigs.runs import evaluation
-    from gaigs.runs.training import fit
+    from gaigs.runs.choice import NAME, choose
+    from gaigs.runs.fitting import fit
 
     name = config["model"]["name"]
     _log_links(links, config["data"]["name"])
@@ -180,7 +181,10 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     baselines = evaluation.build_baselines(config["baselines"], name, links.scene)
     if baselines:
         check_known(links)  # a training comes before
-    fitted = fit(None, loss, links, config, folder)
+    if name == NAME:
+        fitted = choose(links, config, folder)
+    else:
+        fitted = fit(None, loss, links, config, folder)
     if fitted is None:
         return None
     look_ups = dict(baselines)
@@ -207,7 +211,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     metrics["paired"] = None if test is None else test._asdict()
     if validation:
         metrics["validation_score"] = validation[name][links.task.monitor].mean().item()
-    metrics |= model.facts()
+    metrics |= model.facts() | fitted.facts
     if config["kriging"]:
         metrics["kriging"]["seconds"] = fitted.kriging_seconds
     model.export(folder)
@@ -234,7 +238,7 @@ def _log_links(links: Links, name: str) -> None:
 def _facts(links: Links, seed: int, model: Model, fitted: Any, best: Path) -> dict:
     """What ``metrics.json`` has beside the scores; ``fitted`` is a result of ``training.fit``."""
     from gaigs.runs import evaluation
-    from gaigs.runs.training import count_gaussians
+    from gaigs.runs.fitting import count_gaussians
 
     return {
         "task": links.task.name,

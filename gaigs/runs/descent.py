@@ -123,7 +123,9 @@ def _check_processes(trainer: lightning.Trainer, config: dict) -> None:
             "an ensemble trains in one process; set trainer.devices=1 and trainer.num_nodes=1"
         )
     if math.isfinite(stages.left()):
-        raise ValueError("max_time limits a run of one process; of several set trainer.max_time")
+        raise ValueError(
+            "max_time and model=auto limit a run of one process; of several set trainer.max_time"
+        )
 
 
 def resumable(last: Path, best: Path) -> dict:

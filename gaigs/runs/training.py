@@ -1,41 +1,31 @@
-"""Training of a model on links: fit, gradient descent, kriging."""
+"""Training of a model on links, by name or by choice."""
 
 import contextlib
 import copy
-import logging
 import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import lightning
-import torch
 from lightning.pytorch.utilities.seed import isolate_rng
-from torch import Tensor
 
 from gaigs.configuration import composed, preset
-from gaigs.core import stages
 from gaigs.data import Links
 from gaigs.data.compatibility import check_fit
-from gaigs.kriging.links import check_known
-from gaigs.model import Model, checkpoint
-from gaigs.model.answers import calibrated
+from gaigs.model import Model
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.kriging import Kriging
-from gaigs.processes import is_first, limited_threads, only_run
+from gaigs.processes import limited_threads, only_run
 from gaigs.registry import configuration_of, registry
-from gaigs.runs.descent import descend
+from gaigs.runs.choice import NAME, choose
+from gaigs.runs.fitting import fit
 from gaigs.runs.folder import claim
-from gaigs.splatting.loss import Loss
 from gaigs.training.budget import watched
-
-log = logging.getLogger(__name__)
 
 
 def train(
-    model: str | Model,
-    links: Links,
+    model: str | Model | Links,
+    links: Links | str | None = None,
     /,
     *overrides: str,
     folder: str | Path | None = None,
@@ -46,8 +36,9 @@ def train(
     task.
 
     Args:
-        model: Name of a registered model; or a model, which is trained in place, of a kriged one a
-            copy of its trend.
+        model: Name of a registered model, or ``"auto"``, the default, which tries several and takes
+            the best by the validation links; or a model, which is trained in place, of a kriged one
+            a copy of its trend.
         links: Links to learn from; validation links choose the best step. Test links are not used.
         overrides: Command-line words, e.g. ``"variant=ga"`` or ``"trainer.max_steps=300"``.
         folder: Gets the configuration, the log and the checkpoints; the same call resumes a stopped
@@ -65,11 +56,17 @@ def train(
         KeyboardInterrupt: Ctrl-C.
 
     Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> options = {"max_steps": 1, "enable_progress_bar": False}
+        >>> model = gaigs.train(links, candidates=["path_loss", "knn"], **options)
         >>> links = gaigs.links("synthetic", transmitters=40, order=0)
-        >>> model = gaigs.train("gaigs", links, max_steps=1, count=20, enable_progress_bar=False)
+        >>> model = gaigs.train("gaigs", links, count=20, **options)
         >>> model.predict([[1.0, 2.0, 1.5], [2.5, 1.0, 0.8]]).shape
         torch.Size([2, 1, 90, 360])
     """
+    if isinstance(model, Links):
+        overrides = overrides if links is None else (links, *overrides)  # type: ignore[assignment]
+        model, links = NAME, model
     if not isinstance(model, str | Model) or not isinstance(links, Links):
         raise TypeError(
             f"train takes a model and links, got {type(model).__name__} and {type(links).__name__}"
@@ -90,6 +87,8 @@ def train(
         stack.enter_context(only_run(place))
         claim(place, config)
         stack.enter_context(watched(config))
+        if config["model"]["name"] == NAME:
+            return choose(links, config, place).models[NAME].eval().cpu()
         lightning.seed_everything(config["seed"], verbose=False)
         loss = registry("loss").build(parts.pop("loss", config["loss"]), task=links.task)
         if parts:
@@ -139,158 +138,3 @@ def _configuration(
     if made is not None:
         config["model"] = configuration_of(made)
     return config
-
-
-class Fitted(NamedTuple):
-    """Result of ``fit``.
-
-    Attributes:
-        models: The model by its name; a kriged one is followed by the trained model alone,
-            ``<name>_trend``.
-        unseen: The same, not fitted to validation links; empty for a model without a training.
-        start: Number of Gaussians before the training.
-        seconds: Duration of ``Model.fit``, as of a search for planes, and of the training; None
-            without one.
-        kriging_seconds: Duration of kriging; None without it.
-    """
-
-    models: dict[str, Model]
-    unseen: dict[str, Model]
-    start: int
-    seconds: float | None = None
-    kriging_seconds: float | None = None
-
-
-def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
-    """Builds, fits, trains and kriges a model as configured.
-
-    The result is None in all but the first of several processes.
-    """
-    name = config["model"]["name"]
-    model = _checked(model, links, config)
-    kriged = _untrained_kriging(model, links, config)
-    _log_parts(model, config["model"])
-    # Shares of the run's limit at which parts end: the search 0.3, the training 0.5, kriging and
-    # intervals 0.8.
-    searched, places = _prepare(model, links, name, until=0.3 if model.is_trained else 0.8)
-    start = count_gaussians(model)
-    best = folder / "best.ckpt"
-    if not model.is_trained:
-        with stages.stage(until=0.8):
-            model.calibration = calibrated(model, links)
-        if is_first() and model.state_dict():
-            checkpoint.save(model, best)
-        return Fitted({name: model}, {}, start)
-    with stages.stage(until=0.5 / config["ensemble"]):
-        model, seconds = descend(model, loss, links, config, folder, searched)
-    if not is_first():
-        return None
-    trained = None
-    if config["ensemble"] > 1:
-        model, more = _add_members(model, loss, links, config, folder)
-        seconds += more
-        model.known_places = places
-        kriged = _untrained_kriging(model, links, config)
-        trained = "members.0"  # where the weights of the checkpoint belong
-        checkpoint.update(best, model, trained)
-    model.calibration = calibrated(model, links)
-    if kriged is None:
-        checkpoint.update(best, model)
-        return Fitted({name: model}, {name: model}, start, seconds)
-    began = time.monotonic()
-    with stages.stage(until=0.8):
-        validation_model = kriged.to(model.device).krige(links)
-        kriging_seconds = time.monotonic() - began
-        if stages.is_up():
-            stages.leave_out("the fit of kriging ended early")
-        kriged.calibration = calibrated(validation_model, links)
-        kriged.known_places = places
-    checkpoint.update(best, kriged, "trend" if trained is None else f"trend.{trained}")
-    trend = {f"{name}_trend": model}
-    models = {name: kriged} | trend
-    return Fitted(models, {name: validation_model} | trend, start, seconds, kriging_seconds)
-
-
-def _checked(model: Model | None, links: Links, config: dict) -> Model:
-    """The model, built if there is none; a ``ValueError`` if the configuration cannot train it."""
-    if config["ensemble"] < 1:
-        raise ValueError(f"ensemble must be at least 1 model, got {config['ensemble']}")
-    if model is None:
-        model = registry("model").build(config["model"], scene=links.scene)
-    if isinstance(model, Kriging):
-        raise ValueError(
-            "model=kriging has no training of its own; choose a trained model, and set kriging=true"
-        )
-    if config["kriging"]:
-        check_known(links)  # a training comes before
-    return model
-
-
-def _untrained_kriging(trend: Model, links: Links, config: dict) -> Kriging | None:
-    """Kriging of what a model leaves over, if it is configured."""
-    return Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
-
-
-def _log_parts(model: Model, config: dict) -> None:
-    """Logs the names of a model and its parts; warns of a tokenizer that no part reads."""
-    parts = {}
-    for key, part in config.items():
-        if isinstance(part, dict) and "name" in part:
-            parts[key] = part["name"]
-    tokenizer = parts.get("tokenizer")
-    if tokenizer is not None and getattr(model, "tokenizer", model) is None:
-        if tokenizer != registry("model").options(config["name"]).get("tokenizer", tokenizer):
-            words = "tokenizer=%s is not read, as deformation=%s takes no tokens"
-            log.warning(words, tokenizer, parts["deformation"])
-        parts["tokenizer"] = "none"
-    names = [f"{key} {part}" for key, part in parts.items()]
-    log.info("model: %s", ", ".join([config["name"], *names]))
-
-
-def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float, Tensor]:
-    """Fits what needs no gradient, as a search for planes does.
-
-    Returns:
-        The duration [s], and the keys of all places that the model has learnt from.
-    """
-    began = time.monotonic()
-    places = links.query[links.split.known].place_keys.unique()
-    with stages.stage(until=until):
-        model.fit(links)
-        if stages.is_up():
-            stages.leave_out(f"the time for the fit of {name} was up")
-    if model.is_trained and model.known_places is not None:  # a training before this one
-        places = torch.cat((places, model.known_places)).unique()
-    model.known_places = places
-    return time.monotonic() - began, places
-
-
-def _add_members(
-    model: Model, loss: Loss, links: Links, config: dict, folder: Path
-) -> tuple[Ensemble, float]:
-    """An ensemble of a trained model and of others with the next seeds, each trained in a folder of
-    its own; and the time of the others [s].
-    """
-    members = [model]
-    total = 0.0
-    for number in range(1, config["ensemble"]):
-        place = folder / "members" / str(number)
-        place.mkdir(parents=True, exist_ok=True)
-        seeded = config | {"seed": config["seed"] + number}
-        lightning.seed_everything(seeded["seed"], verbose=False)
-        other = registry("model").build(config["model"], scene=links.scene)
-        with stages.stage(until=0.5 * (number + 1) / config["ensemble"]):
-            began = time.monotonic()
-            other.fit(links)
-            searched = time.monotonic() - began
-            other, seconds = descend(other, loss, links, seeded, place, searched)
-        members.append(other)
-        total += seconds
-    ensemble = Ensemble(links.scene, members).eval().to(model.device)
-    ensemble.fit(links)
-    return ensemble, total
-
-
-def count_gaussians(model: Model) -> int:
-    """The number of Gaussians of a model; 0 for another kind of model."""
-    return 0 if model.primitives is None else len(model.primitives)

@@ -7,6 +7,7 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from gaigs.commands.survey.area import read_area
 from gaigs.commands.survey.plan import SurveyPlan, survey
 from gaigs.io.tables import read_points
 from gaigs.registry import call
@@ -22,9 +23,12 @@ def run(config: dict, folder: Path) -> None:
     model = None if config["folder"] is None else load(config["folder"], config["trust"])
     options = dict(config["survey"])
     if isinstance(options["candidates"], str):
-        options["candidates"] = read_points(
-            Path(options["candidates"]), "xyz", "x,y,z [m] of one candidate a line"
-        )
+        file = Path(options["candidates"])
+        if file.suffix.lower() in (".geojson", ".json"):
+            options["candidates"] = read_area(file, model)
+        else:
+            content = "x,y,z [m] of one candidate a line"
+            options["candidates"] = read_points(file, "xyz", content)
     plan = call("survey", survey, options, model=model)
     folder.mkdir(parents=True, exist_ok=True)
     plan.save(folder / "survey.csv")
@@ -36,14 +40,16 @@ def run(config: dict, folder: Path) -> None:
 
 
 def figure(plan: SurveyPlan) -> Figure:
-    """Places from above and, with a model, the expected error after each new one."""
+    """Places from above and, if it falls, the expected error after each new one."""
     with rc_context(style.STYLE):
         drawn = style.new_figure(style.PAGE, 0.52 * style.PAGE, "compressed")
-        count = 1 if plan.errors is None else 2
+        # A flat curve says no more than the text.
+        falls = plan.errors is not None and plan.errors[-1] < 0.99 * plan.errors[0]
+        count = 2 if falls else 1
         axes = drawn.subplots(1, count, squeeze=False)[0]
         draw_places(axes[0], plan)
         drawn.legend(loc="outside lower left", ncols=3)
-        if plan.errors is not None:
+        if count == 2:
             draw_errors(axes[1], plan)
         gain = "" if plan.errors is None else ", and what does it bring"
         style.ask(drawn, f"Where to measure next{gain}?")
@@ -88,6 +94,9 @@ def draw_errors(axis: Axes, plan: SurveyPlan) -> None:
     # The axis begins at the data: a fall that matters is seen, and a flat line has its numbers.
     rim = max(0.1 * (first - last), 0.025 * first)
     axis.set(xlabel="new places", ylabel=label, ylim=(last - rim, first + rim))
+    # No number of places lowers the error below this.
+    scatter = f"labels at one place scatter by {plan.scatter:.3g} {plan.unit}".rstrip()
+    axis.set_title(scatter, fontsize="medium")
     axis.locator_params(axis="x", integer=True)
     axis.grid()
     axis.set_axisbelow(True)

@@ -46,6 +46,7 @@ class SurveyPlan:
         frame: Place of x and y on a map; None if unknown.
         known_error: Expected mean error over the region, or else the box of the training
             transmitters, now.
+        scatter: Part of the error that no measurement lowers, as labels of one place scatter by it.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -61,6 +62,7 @@ class SurveyPlan:
     unit: str = ""
     frame: Frame | None = None
     known_error: float = math.nan
+    scatter: float = math.nan
     plot = plot
 
     def __repr__(self) -> str:
@@ -72,12 +74,21 @@ class SurveyPlan:
             return (
                 f"{count} places to measure first; without a trained model their error is unknown"
             )
-        first, last = (f"{error:.3g}" for error in (self.errors[0], self.errors[-1]))
-        change = f"from {first} to {last} {self.unit}".rstrip()
         few = int(self.superfluous.sum())
-        return (
-            f"{count} more places bring the expected mean error {change}; "
+        left_out = (
             f"{few} of {len(self.known)} measured places could have been left out for 5 % more"
+        )
+        now, last = (f"{error:.3g} {self.unit}".rstrip() for error in self.errors[[0, -1]])
+        scatter = f"{self.scatter:.3g} {self.unit}".rstrip()
+        if not count:
+            return (
+                f"measure no more: labels at one place scatter by {scatter} of the expected mean "
+                f"error of {now}; {left_out}"
+            )
+        share = 1 - self.errors[-1] / self.errors[0]
+        return (
+            f"{count} more places bring the expected mean error from {now} to {last}, "
+            f"{100 * share:.1f} % less; labels at one place scatter by {scatter}; {left_out}"
         )
 
     def save(self, path: str | Path) -> None:
@@ -113,6 +124,7 @@ def survey(
     count: int = 20,
     candidates: object = None,
     frequency: float | None = None,
+    stop: float = 0.1,
     *,
     progress: bool = True,
 ) -> SurveyPlan:
@@ -121,8 +133,9 @@ def survey(
 
     A receiver counts at a place as much as it is likely to hear it, by the measured places around.
     Labels do not enter beyond the fitted process, so a plan is made before anything is measured.
-    The largest variance would be a poor guide: it is in the corners. The first places of a longer
-    plan are the shorter plan.
+    The largest variance would be a poor guide: it is in the corners. Places stand half a
+    correlation length apart or more, as long as there is room. The first places of a longer plan
+    are the shorter plan. It ends where labels of one place scatter by nearly the whole error.
 
     Args:
         model: ``gaussian_process``, or a trained model with kriging; None: nothing is measured yet,
@@ -134,6 +147,8 @@ def survey(
         candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
         frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
             Without a model it has no effect.
+        stop: Share of the expected error: the plan ends where no number of further places can lower
+            the error by more; 0 gives all places. Without a model it has no effect.
         progress: False for no bars.
 
     Raises:
@@ -162,6 +177,8 @@ def survey(
     check_type("count", count, int)
     if count < 1:
         raise ValueError(f"count must be at least 1 place, got {count}")
+    if not 0 <= stop < 1:
+        raise ValueError(f"stop must be a share from 0 to less than 1, got {stop}")
     places = survey_places(model, region, candidates)
     processes = [] if model is None else processes_of(model)
     check_memory(len(places.candidates), len(processes))
@@ -176,10 +193,13 @@ def survey(
     centres: Sequence = [None] * len(processes)
     if model.scene.task.is_scalar:
         centres = model.scene.positions(asked)
+    spacing = Spacing(processes, asked[: len(places.candidates)])
     pairs = zip(processes, centres, strict=True)
     processes = [with_trend(process, centre) for process, centre in pairs]
     factor = error_factor(model)
-    chosen, errors = Selection(processes, asked, places, factor).choose(count)
+    selection = Selection(processes, asked, places, factor)
+    scatter = selection.scatter()
+    chosen, errors = selection.choose(count, spacing, scatter / (1 - stop))
     box = asked[places.evaluated]
     if region is None and candidates is not None:
         box = coordinates_of(model, training_grid(model), frequency).to(processes[0].places)
@@ -193,6 +213,7 @@ def survey(
         model.scene.task.error_unit,
         model.scene.frame,
         measured.error,
+        scatter,
     )
 
 
@@ -319,14 +340,23 @@ class Selection:
         self.factor = factor
         self.is_free = torch.ones(len(places.candidates), dtype=torch.bool)
 
-    def choose(self, count: int) -> tuple[list[int], Float[Tensor, " n1"]]:
-        """Numbers of so many candidates, or all; and the errors before and after each."""
+    def choose(
+        self, count: int, spacing: "Spacing | None" = None, enough: float = -math.inf
+    ) -> tuple[list[int], Float[Tensor, " n1"]]:
+        """Numbers of so many candidates, or all, until the error is ``enough``; and the errors
+        before and after each.
+        """
         numbers = []
         errors = [self.error()]
         for _ in track(range(min(count, len(self.is_free))), "places to measure"):
-            gains = self.gains().cpu().masked_fill(~self.is_free, -math.inf)
+            if errors[-1] <= enough:
+                break
+            is_free = self.is_free if spacing is None else spacing.apart(self.is_free)
+            gains = self.gains().cpu().masked_fill(~is_free, -math.inf)
             number = int(gains.argmax())
             self.measure(number)
+            if spacing is not None:
+                spacing.add(number)
             numbers.append(number)
             errors.append(self.error())
         return numbers, torch.tensor(errors)
@@ -337,6 +367,12 @@ class Selection:
         variances = variances.clamp_min(0)  # (r, e)
         deviations = (variances + variances.new_tensor(self.noises)[:, None]).sqrt()
         return self.factor * mean_of_received(deviations, self.chances[:, self.evaluated])
+
+    def scatter(self) -> float:
+        """Mean error if the process were known: that of the noise of a reading."""
+        noises = self.chances.new_tensor(self.noises)[:, None].sqrt()  # (r, 1)
+        chances = self.chances[:, self.evaluated]  # (r, e)
+        return self.factor * mean_of_received(noises.expand_as(chances), chances)
 
     def gains(self) -> Float[Tensor, " c"]:
         """Fall of the summed variances by a reading at each candidate."""
@@ -356,3 +392,46 @@ class Selection:
             column = part[number]
             fall = chances[number] * torch.outer(column, column)
             part -= fall / (part[number, number] + noise)
+
+
+class Spacing:
+    """Distances of candidates from the chosen ones, by the correlation of their labels.
+
+    A second place nearby mostly averages noise, and a hyperparameter that is wrong makes it look
+    better than a place farther off.
+
+    Args:
+        processes: Processes of the receivers, without their trends.
+        asked: Coordinates of the candidates.
+        most: Largest mean correlation of two places of a plan; the default is that of half a
+            correlation length.
+    """
+
+    def __init__(
+        self,
+        processes: Sequence[Process],
+        asked: Float[Tensor, "c d"],
+        most: float = math.exp(-0.5),
+    ):
+        self.processes = processes
+        self.asked = asked
+        self.most = most
+        self.nearest = torch.zeros(len(asked))  # largest correlation with a chosen place
+
+    def apart(self, is_free: Bool[Tensor, " c"]) -> Bool[Tensor, " c"]:
+        """Free candidates that are apart; once there is none, half the distance counts."""
+        while self.most < 0.99:
+            is_apart = is_free & (self.nearest <= self.most)
+            if is_apart.any():
+                return is_apart
+            self.most **= 0.5
+        return is_free
+
+    def add(self, number: int) -> None:
+        """Adds a chosen candidate."""
+        chosen = self.asked[number : number + 1]
+        total = torch.zeros_like(self.asked[:, 0])
+        for process in self.processes:
+            variance = process.covariances(chosen, chosen)[0, 0]
+            total += process.covariances(chosen, self.asked)[0] / variance
+        self.nearest = torch.maximum(self.nearest, (total / len(self.processes)).cpu().float())

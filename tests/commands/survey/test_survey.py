@@ -1,6 +1,7 @@
 """Survey plans against covariances by numpy, and against places drawn at random."""
 
 import csv
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,10 @@ import torch
 from scipy.spatial.distance import cdist
 
 import gaigs
+from gaigs.commands.survey import figure
+from gaigs.commands.survey.area import read_area
 from gaigs.commands.survey.measured import measured_places
-from gaigs.commands.survey.plan import mean_absolute
+from gaigs.commands.survey.plan import Selection, Spacing, SurveyPlaces, mean_absolute
 from gaigs.commands.survey.processes import posterior, reception_chances, with_trend
 from gaigs.core.geometry import Frame, even_places
 from gaigs.kriging.kernel import Process
@@ -135,7 +138,7 @@ def test_plans_count_a_receiver_where_it_is_heard():
         )
     )
     region = torch.stack((places.amin(0), places.amax(0)))
-    plan = gaigs.survey(model, region=region, count=6)
+    plan = gaigs.survey(model, region=region, count=6, stop=0.0)
     assert (plan.places[:, 0] < 6).sum() >= 4
     asked, stands = even_places(*region, 1000).double(), model.scene.positions(places.double())
     processes = [with_trend(model.process_at(k), stands[k]) for k in range(2)]
@@ -219,6 +222,8 @@ def test_plans_are_written_and_wrong_ones_are_refused(tmp_path):
         gaigs.survey(model, count=0)
     with pytest.raises(ValueError, match="candidates, got 0"):
         gaigs.survey(model, candidates=torch.zeros(0, 3))
+    with pytest.raises(ValueError, match="stop must be a share"):
+        gaigs.survey(model, stop=1.0)
     with pytest.raises(ValueError, match="carrier in Hz"):
         gaigs.survey(model, frequency=2.4)
     with pytest.raises(ValueError, match="two corners"):
@@ -292,5 +297,117 @@ def test_no_place_lies_between_two_floors():
     links = gaigs.links(
         task="rssi", transmitters=places, receivers=[[0, 0, 2], [6, 6, 5]], labels=labels
     )
-    heights = gaigs.survey(fitted(links), count=6).places[:, 2]
+    heights = gaigs.survey(fitted(links), count=6, stop=0.0).places[:, 2]
     assert {*heights.tolist()} == {1.0, 4.0}
+
+
+def noise_alone():
+    """A process of labels that nothing but noise tells apart."""
+    rng = np.random.default_rng(0)
+    places = rng.uniform(0, 8, (60, 3))
+    labels = rng.normal(-60, 3, (60, 1))
+    links = gaigs.links(task="rssi", transmitters=places, receivers=[[0, 0, 2]], labels=labels)
+    return fitted(links)
+
+
+def test_a_plan_ends_where_labels_scatter_by_the_whole_error():
+    model = noise_alone()
+    plan = gaigs.survey(model, count=5)
+    assert len(plan.places) == 0
+    assert plan.scatter > 0.9 * plan.errors[0]
+    assert str(plan).startswith(
+        f"measure no more: labels at one place scatter by {plan.scatter:.3g} dB"
+    )
+    whole = gaigs.survey(model, count=3, stop=0.0)
+    assert len(whole.places) == 3
+    assert len(figure(plan).axes) == len(figure(whole).axes) == 1  # a flat curve is not drawn
+
+
+def test_places_of_a_plan_stand_half_a_length_apart_while_there_is_room():
+    noisy = replace(process(known=0), noise=40.0)  # a reading leaves much to know of its place
+    row = torch.arange(0, 12.0, 0.25, dtype=torch.float64)
+    asked = torch.nn.functional.pad(row[:, None], (0, 2))  # (48, 3)
+    places = SurveyPlaces(asked, asked[:0])
+
+    def chosen(count, spacing):
+        numbers, _ = Selection([noisy], asked, places, MEAN).choose(count, spacing)
+        return row[numbers].sort().values
+
+    assert chosen(12, None).diff().min() < 0.75
+    apart = chosen(12, Spacing([noisy], asked))
+    assert apart.diff().min() >= 0.75  # half of 1.5 m
+    assert len(chosen(40, Spacing([noisy], asked))) == 40  # no room: nearer ones
+
+
+AREA = {
+    "type": "FeatureCollection",
+    "features": [
+        {"type": "Feature", "geometry": {"type": "Point", "coordinates": [9, 9]}},
+        {
+            "type": "Feature",
+            "geometry": {
+                "type": "Polygon",
+                "coordinates": [
+                    [[0, 0], [4, 0], [4, 4], [0, 4], [0, 0]],
+                    [[1, 1], [3, 1], [3, 3], [1, 3], [1, 1]],
+                ],
+            },
+        },
+    ],
+}
+"""A square ring of edges 4 m and 2 m."""
+
+
+def test_candidates_lie_in_drawn_areas(tmp_path):
+    file = tmp_path / "area.geojson"
+    file.write_text(json.dumps(AREA))
+    model = fitted(gaigs.links("synthetic_rssi", transmitters=40, order=0))
+    places = read_area(file, model)
+    offsets = (places[:, :2] - 2).abs().amax(1)
+    assert 500 <= len(places) <= 2000
+    assert ((offsets >= 1) & (offsets <= 2)).all()
+    middle = (model.scene.lower[2] + model.scene.upper[2]) / 2
+    assert torch.allclose(places[:, 2], middle)
+    with pytest.raises(ValueError, match="needs a height, its third number"):
+        read_area(file, None)
+    # The room's origin lies at an easting and a northing, of which the file has degrees.
+    pyproj = pytest.importorskip("pyproj")
+    model.scene = replace(model.scene, frame=Frame(32632, 5e5, 5.4e6))
+    transformer = pyproj.Transformer.from_crs(32632, 4326, always_xy=True)
+    square = [(5e5, 5.4e6), (5e5 + 4, 5.4e6), (5e5 + 4, 5.4e6 + 4), (5e5, 5.4e6)]
+    for corners in (square, [transformer.transform(*corner) for corner in square]):
+        file.write_text(json.dumps({"type": "Polygon", "coordinates": [corners]}))
+        there = read_area(file, model)
+        assert (there[:, :2] > -0.01).all()
+        assert (there[:, :2] < 4.01).all()
+        assert (there[:, 1] < there[:, 0] + 0.01).all()
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "as GeoJSON: JSONDecodeError"),
+        ("[]", "as GeoJSON: TypeError"),
+        ('{"type": "Point", "coordinates": [0, 0]}', "has no polygon"),
+        ('{"type": "Polygon", "coordinates": [[[0], [1], [2]]]}', "two or three finite numbers"),
+        ('{"type": "Polygon", "coordinates": [[[0, 0, 1], [1]]]}', "as GeoJSON: ValueError"),
+    ],
+)
+def test_files_without_an_area_are_refused(tmp_path, text, message):
+    file = tmp_path / "area.geojson"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=message) as raised:
+        read_area(file, None)
+    assert str(raised.value).count("\n") <= 1
+
+
+def test_the_command_takes_a_drawn_area(tmp_path):
+    positions = [[0, 0, 1.5], [4, 0, 1.5], [4, 4, 1.5], [0, 0, 1.5]]
+    file = tmp_path / "area.geojson"
+    file.write_text(json.dumps({"type": "Polygon", "coordinates": [positions]}))
+    words = "command=survey", f"survey.candidates={file}", "survey.count=3"
+    gaigs.run(gaigs.compose(*words), tmp_path)
+    with (tmp_path / "survey.csv").open() as text:
+        rows = [*csv.DictReader(text)]
+    assert len(rows) == 3
+    assert all(float(row["z"]) == 1.5 and float(row["y"]) < float(row["x"]) for row in rows)

@@ -1,0 +1,309 @@
+"""The choice of a model by validation links: ``model=auto``."""
+
+import logging
+import shutil
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import lightning
+import torch
+from jaxtyping import Int
+from omegaconf import OmegaConf
+from torch import Tensor
+
+from gaigs.configuration import composed, differences, preset
+from gaigs.core import stages
+from gaigs.core.task import Task
+from gaigs.data import Links
+from gaigs.model import Model
+from gaigs.model.answers import predicted
+from gaigs.processes import limited_threads
+from gaigs.registry import call, registry
+from gaigs.runs.fitting import Fitted, fit
+from gaigs.runs.folder import claim
+from gaigs.training.budget import seconds
+
+log = logging.getLogger(__name__)
+
+NAME = "auto"
+"""The name of the choice in place of a model's: ``model=auto``."""
+
+
+class Tried(NamedTuple):
+    """A candidate and its scores where it has not learnt.
+
+    Attributes:
+        label: Its name and options.
+        config: Configuration of a run with it.
+        folder: Folder of this run.
+        gains: Mean score of the links at each place, higher ones better, by the place's key.
+        seconds: Duration of fits, training and scores.
+        unseen: The model by name, not fitted to validation links; empty before a look-up's
+            validation.
+        fitted: Result of the training; None for a look-up, which is fitted once it is chosen.
+    """
+
+    label: str
+    config: dict
+    folder: Path
+    gains: dict[int, float]
+    seconds: float
+    unseen: Mapping[str, Model] = {}
+    fitted: Fitted | None = None
+
+
+class ChosenModel(NamedTuple):
+    """The chosen candidate, and why: a sentence."""
+
+    chosen: Tried
+    reason: str
+
+
+def choose(links: Links, config: dict, folder: Path) -> Fitted:
+    """The simplest candidate that is level with the best, as a run of its own gives it, under the
+    name ``auto``.
+
+    Look-ups are compared at all known places, by folds of which each is predicted from the others;
+    the best of them with trained candidates at the validation places. Each candidate is a run in
+    ``candidates/<number>``, with which a stopped choice goes on. The folder gets checkpoint and log
+    of the chosen one.
+
+    Args:
+        links: Links with validation links.
+        config: Configuration of a run with ``model=auto``.
+        folder: The run folder.
+
+    Raises:
+        ValueError: There are no validation links or candidates, a candidate does not fit the task,
+            or only some candidates have an option.
+    """
+    if not len(links.split.validation):
+        raise ValueError(
+            "model=auto chooses by validation links, and the split has none\n"
+            "set split.validation=0.1, or choose a model, such as model=gaussian_process"
+        )
+    began = time.monotonic()
+    options = {key: value for key, value in config["model"].items() if key != "name"}
+    configs, limit = call("model", _options, options, config=config, links=links)
+    # A run with a limit of its own needs the rest for scores and figures.
+    end = began + min(limit, 0.8 * stages.left())
+    looked = _try_each(look_up, configs, links, folder, end)
+    contenders = []
+    reasons = []
+    if looked:
+        best = pick(looked, links.task)
+        reasons = [f"of look-ups {best.reason}"] if len(looked) > 1 else []
+        contenders = [_validated(best.chosen, links)]
+    trained = _try_each(train_candidate, configs, links, folder, end)
+    if not looked and not trained:
+        raise ValueError("model=auto has no candidate left; the lines above say why")
+    choice = pick([*contenders, *trained], links.task)
+    reason = "; ".join([choice.reason, *reasons] if trained else reasons or [choice.reason])
+    log.info("auto: %s", reason)
+    # In Python nothing shows the log, unless the caller has set it up.
+    if stages.current().shown and not log.isEnabledFor(logging.INFO):
+        print(f"auto: {reason}")
+    facts = _facts([*looked, *trained], choice.chosen, reason, links.task)
+    return _finish(choice.chosen, links, folder, time.monotonic() - began)._replace(facts=facts)
+
+
+def _try_each(
+    work: Callable[[str, dict, Links, Path], Tried],
+    configs: Mapping[str, dict],
+    links: Links,
+    folder: Path,
+    end: float,
+) -> list[Tried]:
+    """Tries the candidates that some work is for, one by one until a time of the clock."""
+    tried: list[Tried] = []
+    shown = stages.current().shown
+    for number, (label, config) in enumerate(configs.items()):
+        lightning.seed_everything(config["seed"], verbose=False)
+        is_trained = registry("model").build(config["model"], scene=links.scene).is_trained
+        if is_trained != (work is train_candidate):
+            continue
+        left = end - time.monotonic()
+        if left <= 0 and (tried or is_trained):
+            stages.leave_out(f"model=auto has not tried {label}")
+            continue
+        # The first are the cheapest, and leave time to the others.
+        share = left / (len(configs) - number)
+        with stages.watched(max(1.0, share), shown), limited_threads(config["threads"]):
+            try:
+                tried.append(work(label, config, links, folder / "candidates" / str(number)))
+            except ValueError as error:  # such as of a training that diverges
+                log.warning("auto: %s is left out: %s", label, error)
+    return tried
+
+
+def _options(
+    candidates: list, max_time: str | dict, config: dict, links: Links
+) -> tuple[dict[str, dict], float]:
+    """Configurations of the candidates by label, and the time limit [s]."""
+    configs: dict[str, dict] = {}
+    usual = composed(preset(NAME, links.task.name), {})
+    changes = differences(usual, config)
+    for candidate in candidates:
+        options = {"name": candidate} if isinstance(candidate, str) else candidate
+        if not isinstance(options, Mapping) or options.get("name") in (None, NAME):
+            raise ValueError(
+                f"model.candidates must be names or configurations of models, got {candidate!r}"
+            )
+        others = {key: value for key, value in options.items() if key != "name"}
+        label = ", ".join([options["name"], *(f"{key}={others[key]}" for key in others)])
+        made = composed(
+            preset(options["name"], links.task.name), {"model": others} if others else {}
+        )
+        configs[label] = _with_changes(made, config, changes)
+    if not configs:
+        raise ValueError("model.candidates must have a model or more, got none")
+    # A candidate that does not fit the task ends the choice before the first training.
+    for made in configs.values():
+        registry("model").build(made["model"], scene=links.scene)
+    return configs, seconds("model.max_time", max_time)
+
+
+def _with_changes(made: dict, config: dict, changes: Mapping[str, tuple]) -> dict:
+    """The configuration of a candidate with what the run with ``model=auto`` has changed.
+
+    Raises:
+        ValueError: The run has an option that only some models have.
+    """
+    shared = ("loss", "training", "trainer", "ensemble", "seed")  # of all that are trained
+    kept = ("data", "split", "save_every", "tensorboard", "figures")
+    made |= {key: config[key] for key in kept} | {"threads": config["threads"] or made["threads"]}
+    shows = config["trainer"].get("enable_progress_bar", True)
+    made["trainer"]["enable_progress_bar"] = shows
+    ours, theirs = OmegaConf.create(made), OmegaConf.create(config)
+    for key in changes:
+        part, _, rest = key.partition(".")
+        if part in shared:
+            # Another component brings all its options along.
+            path = part if rest == "name" else key
+            OmegaConf.update(ours, path, OmegaConf.select(theirs, path), force_add=True)
+        elif part not in (*kept, "model", "baselines", "max_time"):
+            raise ValueError(
+                f"{key} is an option of some models, and model=auto tries several\n"
+                "choose one, such as model=mirrored, or leave the option out"
+            )
+    plain: Any = OmegaConf.to_container(ours)
+    return plain
+
+
+def look_up(label: str, config: dict, links: Links, folder: Path) -> Tried:
+    """A look-up with its scores at known places, each predicted without its fold."""
+    began = time.monotonic()
+    model = registry("model").build(config["model"], scene=links.scene)
+    model.fit(links)
+    gains: dict[int, float] = {}
+    for unseen in model.unseen(links):
+        gains |= place_gains(unseen.model, links, unseen.asked)
+    if not gains:
+        raise ValueError(f"its fit took {time.monotonic() - began:.0f} s; raise model.max_time")
+    return Tried(label, config, folder, gains, time.monotonic() - began)
+
+
+def train_candidate(label: str, config: dict, links: Links, folder: Path) -> Tried:
+    """A trained candidate with its scores at the validation places."""
+    began = time.monotonic()
+    fitted = _fit(config, links, folder)
+    name = config["model"]["name"]
+    gains = place_gains(fitted.unseen[name], links, links.split.validation)
+    unseen = {name: fitted.unseen[name]}
+    return Tried(label, config, folder, gains, time.monotonic() - began, unseen, fitted)
+
+
+def _validated(look_up: Tried, links: Links) -> Tried:
+    """A look-up with its scores at the validation places, as trained candidates have them."""
+    model = registry("model").build(look_up.config["model"], scene=links.scene)
+    model.fit(replace(links, split=links.split.validating()))
+    gains = place_gains(model, links, links.split.validation)
+    return look_up._replace(gains=gains, unseen={look_up.config["model"]["name"]: model})
+
+
+def place_gains(model: Model, links: Links, index: Int[Tensor, " k"]) -> dict[int, float]:
+    """Mean monitored score of some links at each of their places, higher ones better.
+
+    Links of one place have errors alike: they count as one.
+    """
+    task = links.task
+    labels = torch.cat([links.labels[part] for part in index.split(64)])
+    scores = task.scores(labels, predicted(model, links, index))[task.monitor].double()
+    keys, places = links.query[index].place_keys.unique(return_inverse=True)
+    sums = scores.new_zeros(len(keys)).index_add(0, places, scores)
+    means = sums / places.bincount()  # (p,)
+    if not task.higher_is_better:
+        means = -means
+    return dict(zip(keys.tolist(), means.tolist(), strict=True))
+
+
+def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
+    """The first candidate whose score is behind the best by at most a standard error of the
+    difference.
+
+    Differences are paired: what is hard at a place is hard for both.
+
+    Source: Breiman, Friedman, Olshen and Stone, Classification and regression trees, 1984, section
+    3.4.3, the rule of one standard error.
+    """
+    # The time limit may have left out folds of some.
+    shared = set.intersection(*(set(one.gains) for one in tried))
+    gains = torch.tensor([[one.gains[key] for key in sorted(shared)] for one in tried])  # (c, p)
+    means = gains.mean(1)
+    best = int(means.argmax())
+    gaps = gains[best] - gains  # (c, p)
+    # One place tells no scatter: the best is taken.
+    scatter = gaps.std(1) / len(shared) ** 0.5 if len(shared) > 1 else 0 * means
+    chosen = int((gaps.mean(1) <= scatter).int().argmax())
+    signed = means if task.higher_is_better else -means
+    texts = [f"{one.label} {mean:.3g}" for one, mean in zip(tried, signed.tolist(), strict=True)]
+    scores = f"mean {task.monitor} at {len(shared)} places: {', '.join(texts)}"
+    if chosen == best:
+        return ChosenModel(tried[best], f"{tried[best].label} is the best, {scores}")
+    reason = (
+        f"{tried[chosen].label} is the simplest level with the best, {tried[best].label}, which is "
+        f"ahead by {gaps[chosen].mean():.2g}, standard error {scatter[chosen]:.2g}, {scores}"
+    )
+    return ChosenModel(tried[chosen], reason)
+
+
+def _facts(tried: Sequence[Tried], chosen: Tried, reason: str, task: Task) -> dict:
+    """Entry of ``metrics.json`` on the choice."""
+    candidates = {}
+    for one in tried:
+        score = statistics.fmean(one.gains.values())
+        score = score if task.higher_is_better else -score
+        facts = {task.monitor: score, "places": len(one.gains), "seconds": one.seconds}
+        candidates[one.label] = facts
+    return {NAME: {"chosen": chosen.label, "reason": reason, "candidates": candidates}}
+
+
+def _fit(config: dict, links: Links, folder: Path) -> Fitted:
+    """The result of a candidate's run, also of one that was stopped."""
+    folder.mkdir(parents=True, exist_ok=True)
+    claim(folder, config)
+    lightning.seed_everything(config["seed"], verbose=False)
+    loss = registry("loss").build(config["loss"], task=links.task)
+    fitted = fit(None, loss, links, config, folder)
+    assert fitted is not None  # a time limit is for one process
+    return fitted
+
+
+def _finish(chosen: Tried, links: Links, folder: Path, seconds: float) -> Fitted:
+    """The result of the chosen candidate's run, whose checkpoint and log the folder gets.
+
+    A look-up is fitted to all known links.
+    """
+    fitted = chosen.fitted or _fit(chosen.config, links, chosen.folder)
+    if (chosen.folder / "best.ckpt").is_file():
+        shutil.copy(chosen.folder / "best.ckpt", folder / "best.ckpt")
+    if (chosen.folder / "log").is_dir():
+        shutil.copytree(chosen.folder / "log", folder / "log", dirs_exist_ok=True)
+    name = chosen.config["model"]["name"]
+    models = {NAME if key == name else key: model for key, model in fitted.models.items()}
+    unseen = {NAME: chosen.unseen[name]}
+    return fitted._replace(models=models, unseen=unseen, seconds=seconds)
