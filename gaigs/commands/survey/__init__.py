@@ -44,7 +44,7 @@ def figure(plan: SurveyPlan) -> Figure:
     with rc_context(style.STYLE):
         drawn = style.new_figure(style.PAGE, 0.52 * style.PAGE, "compressed")
         # A flat curve says no more than the text.
-        falls = plan.errors is not None and plan.errors[-1] < 0.99 * plan.errors[0]
+        falls = plan.errors is not None and plan.errors[-1] < 0.98 * plan.errors[0]
         count = 2 if falls else 1
         axes = drawn.subplots(1, count, squeeze=False)[0]
         draw_places(axes[0], plan)
