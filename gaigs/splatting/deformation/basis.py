@@ -91,7 +91,7 @@ class Basis(Deformation):
 def suitable_width(places: int) -> int:
     """Width of the network for this many training places.
 
-    Chosen on validation parts of six sets of 42 to 4,408 places (docs/results.md).
+    Chosen on validation parts of sets of 42, 252 and 4,408 places (docs/results.md).
     """
     if places < 100:
         return 128
