@@ -104,18 +104,6 @@ class _Drawing(NamedTuple):
         is_low = (edges[..., 2] == edges[..., 2].min(initial=np.inf)).all(1)
         return cls(radio_map, gateways, dots, edges[is_low][..., :2], scale)
 
-    def key(self) -> dict[str, Line2D]:
-        """The legend's entries by their texts."""
-        key = {}
-        if self.gateways:
-            key["receiver"] = _gateway_mark(np.zeros((2, 0)))
-        if len(self.walls):
-            key["walls and furniture"] = Line2D([], [], color="black", linewidth=0.9)
-        if any(map(len, self.dots.values())):
-            ring = {"markeredgecolor": "black", "markersize": 4, "color": GREY}
-            key["test labels, in the map's colours"] = Line2D([], [], ls="", marker="o", **ring)
-        return key
-
     def draw(self, ax: Axes, name: str) -> Any:
         """Draws the map of a receiver; returns its image."""
         index = self.radio_map.receivers.index(name)
@@ -181,6 +169,14 @@ def radio_maps(
     question = "Where do receivers hear a transmitter?"
     if radio_map.quantity.startswith("standard deviation"):
         question = "Where are predictions uncertain?"
+    key = {}
+    if gateways:
+        key["receiver"] = _gateway_mark(np.zeros((2, 0)))
+    if len(drawing.walls):
+        key["walls and furniture"] = Line2D([], [], color="black", linewidth=0.9)
+    if any(map(len, drawing.dots.values())):
+        ring = {"markeredgecolor": "black", "markersize": 4, "color": GREY}
+        key["test labels, in the map's colours"] = Line2D([], [], ls="", marker="o", **ring)
     figures = []
     with rc_context(STYLE):
         for names in even_pages(radio_map.receivers, max_panels):
@@ -188,7 +184,7 @@ def radio_maps(
             for ax, name in zip(axes, names, strict=True):
                 image = drawing.draw(ax, name)
             drawing.bar(figure, image, axes)
-            if key := drawing.key():
+            if key:
                 figure.legend(key.values(), key, loc="outside lower center", ncols=3)
             ask(figure, question, f"{_title(radio_map, len(gateways))}, a line every {step}")
             figures.append(figure)
