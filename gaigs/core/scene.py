@@ -220,6 +220,15 @@ def check_elements(owner: str, scene: Scene, pads: bool = False) -> Task:
     return task
 
 
+def check_one_carrier(owner: str, scene: Scene) -> None:
+    """Raises a ``ValueError`` if the links have several carriers; ``owner`` names a component."""
+    if scene.has_band:
+        raise ValueError(
+            f"{owner} learns one carrier, and the training links have {len(scene.frequencies)}\n"
+            "give the links of one carrier, or take a model of several, such as gaigs"
+        )
+
+
 def direct_waves(
     scene: Scene,
     query: Query,
