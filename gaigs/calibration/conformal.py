@@ -11,7 +11,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from gaigs.core.query import Query, evenly, thin_labels
-from gaigs.core.results import dataset, plot
+from gaigs.core.results import library, plot
 from gaigs.core.task import Axis, Task
 from gaigs.io import FAR
 from gaigs.kriging.links import distances
@@ -116,7 +116,8 @@ class Estimate(EstimateParts):
             if part is not None:
                 unit = {"units": "dB" if name == "snr_db" else asked.unit}
                 variables[name] = (dimensions[: part.ndim], part.cpu().numpy(), unit)
-        return dataset(variables, coordinates, {"title": f"{asked.quantity} predicted by gaigs"})
+        title = {"title": f"{asked.quantity} predicted by gaigs"}
+        return library("xarray", "to_xarray").Dataset(variables, coordinates, title)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from numpy import ndarray
 from gaigs.core import stages
 from gaigs.core.geometry import ExtrapolationWarning
 from gaigs.core.query import as_receivers
-from gaigs.core.results import dataset, plot
+from gaigs.core.results import library, plot
 from gaigs.core.scene import Scene
 from gaigs.io.files import atomic_write
 
@@ -84,7 +84,8 @@ class RadioMap:
         if self.deviations is not None:
             variables["std"] = (("receiver", "y", "x"), self.deviations)
         names = {"receiver": ("receiver", [*self.receivers])}
-        return dataset(variables, names | places | scalars, {})
+        xarray = library("xarray", "to_xarray")
+        return xarray.Dataset(variables, names | places | scalars)
 
     def save(self, path: str | Path) -> None:
         """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and all other attributes

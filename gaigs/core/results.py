@@ -1,7 +1,6 @@
 """Results as plots and data sets, by libraries that are imported when they are asked for."""
 
 import importlib
-from collections.abc import Mapping
 from types import ModuleType
 from typing import Any
 
@@ -54,6 +53,8 @@ def plot(result: Any, /, ax: Any = None, **options: Any) -> Any:
     if name not in functions:
         raise TypeError(f"plot takes one of {', '.join(functions)}, got {name}\nhelp(gaigs.plot)")
     library("matplotlib", "a plot")
+    if ax is not None and not hasattr(ax, "plot"):
+        raise TypeError(f"ax must be one axes of matplotlib, got {type(ax).__name__}")
     module, _, function = functions[name].rpartition(".")
     draw = getattr(importlib.import_module(f"gaigs.{module}"), function)
     style = importlib.import_module("gaigs.report.style")
@@ -71,10 +72,3 @@ def library(name: str, purpose: str) -> ModuleType:
     except ImportError as error:
         problem = f"{purpose} needs {name}, which cannot be imported ({error})"
         raise ImportError(f"{problem}\npip install {name}") from None
-
-
-def dataset(
-    variables: Mapping[str, tuple], coordinates: Mapping[str, tuple], attributes: Mapping[str, Any]
-) -> Any:
-    """An ``xarray.Dataset`` of variables and coordinates, each (dimensions, values, attributes)."""
-    return library("xarray", "to_xarray").Dataset(dict(variables), coordinates, attributes)

@@ -197,13 +197,6 @@ def split_configuration(
     return config
 
 
-def _are_receivers(receivers: Any) -> bool:
-    """True for a ``Receiver`` or several, in contrast to their positions."""
-    if isinstance(receivers, Receiver):
-        return True
-    return isinstance(receivers, Sequence) and all(isinstance(r, Receiver) for r in receivers)
-
-
 class _Ends(NamedTuple):
     """Receivers, the receiver of each link if known, and deviations of their places [m]."""
 
@@ -223,8 +216,9 @@ def _find_ends(
     remarks: list[str],
 ) -> _Ends:
     """The receivers that are given, or made from positions or from the shape of labels."""
-    if _are_receivers(receivers):
-        receivers = (receivers,) if isinstance(receivers, Receiver) else tuple(receivers)
+    receivers = (receivers,) if isinstance(receivers, Receiver) else receivers
+    if isinstance(receivers, Sequence) and all(isinstance(one, Receiver) for one in receivers):
+        receivers = tuple(receivers)
         ends = _Ends(receivers, index, torch.zeros(len(receivers)))
     else:
         stands = _find_stands(receivers, names, np.shape(labels), index, height, task)

@@ -7,7 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from numpy import ndarray
+from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
 from gaigs.core.task import Metric
@@ -22,7 +24,6 @@ from gaigs.report.table import (
     columns_of,
     latex,
     markdown,
-    table_width,
     terminal,
     tex,
     write_csv,
@@ -283,25 +284,16 @@ def _terminal(
 ) -> Table:
     columns = [column for column in columns_of(rows) if column not in hidden]
     styles = [{"unfinished": "red", "baseline": "dim"}.get(row["status"]) for row in rows]
+    console = Console(width=1000)
     while True:
-        table = _table(title, rows, columns, titles, caption, styles)
-        if table_width(table) <= 80 or columns[-1] not in COSTS:
+        heads = {}
+        for column in columns:
+            heads[titles.get(column, column.replace(".", ".\n"))] = column in titles
+        lines = []
+        for row in rows:
+            lines.append([escape(_text(row.get(column), "\n")) for column in columns])
+        table = terminal(title, heads, lines, caption, styles)
+        width = Measurement.get(console, console.options, table).maximum
+        if width <= 80 or columns[-1] not in COSTS:
             return table
         columns.pop()  # a cost, which is in the files
-
-
-def _table(
-    title: str,
-    rows: Sequence[Mapping],
-    columns: Sequence[str],
-    titles: Mapping[str, str],
-    caption: str,
-    styles: Sequence,
-) -> Table:
-    heads = {}
-    for column in columns:
-        heads[titles.get(column, column.replace(".", ".\n"))] = column in titles
-    lines = []
-    for row in rows:
-        lines.append([escape(_text(row.get(column), "\n")) for column in columns])
-    return terminal(title, heads, lines, caption, styles)

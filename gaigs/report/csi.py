@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from jaxtyping import Complex, Float, Inexact
 from matplotlib import rc_context
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 from numpy import ndarray
@@ -93,7 +92,10 @@ def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) ->
             angles = np.rad2deg(np.angle(pair))
             for look, level, angle in zip(looks.values(), levels, angles, strict=True):
                 magnitude.plot(across, level, **look)
-                _draw_phase(phase, across, angle, **look)
+                # A line with a gap where the phase wraps.
+                jumps = np.flatnonzero(np.abs(np.diff(angle)) > 180) + 1
+                x = np.insert(across, jumps, np.nan)
+                phase.plot(x, np.insert(angle, jumps, np.nan), **look)
             magnitude.set(title=title, ylabel="|h| [dB]", ylim=_limits(levels))
             phase.set(ylabel="phase [deg]", ylim=(-190, 190))
             phase.yaxis.set_major_locator(MultipleLocator(90))
@@ -224,14 +226,6 @@ def _limits(levels: Float[ndarray, "... 2 n"]) -> tuple[float, float]:
     lowest = max(levels[np.isfinite(levels)].min(), peak - 60)
     rim = max(1.0, 0.05 * (highest - lowest))
     return float(lowest - rim), float(highest + rim)
-
-
-def _draw_phase(
-    ax: Axes, frequencies: Float[ndarray, " s"], angles: Float[ndarray, " s"], **look
-) -> None:
-    """A line with a gap where the phase [deg] wraps."""
-    jumps = np.flatnonzero(np.abs(np.diff(angles)) > 180) + 1
-    ax.plot(np.insert(frequencies, jumps, np.nan), np.insert(angles, jumps, np.nan), **look)
 
 
 def impulse_response(

@@ -44,6 +44,9 @@ def plot_estimate(
     if receiver is not None and asked.has_axis:
         chosen = as_receivers(receiver, names.tolist()).reshape(-1).numpy()
     rank = result.value.ndim - len(asked.axes)  # axes of places and receivers
+    count = result.value[(..., *[0] * len(asked.axes))].numel() // len(names)
+    if asked.axes and not 0 <= place < count:
+        raise ValueError(f"place must be from 0 to {count - 1}, got {place}")
     parts = {}
     for name in ("value", "std", "lower", "upper", "radius"):
         part = getattr(result, name)
@@ -72,7 +75,7 @@ def _draw_numbers(
         look = {"color": colour, "marker": "o", "markersize": 3, "linestyle": "", "label": name}
         ax.errorbar(x + shift, values, [values - low, high - values], linewidth=0.8, **look)
     ax.set(xlabel="number of the place", ylabel=title)
-    ax.locator_params(axis="x", integer=True)
+    ax.locator_params(axis="x", integer=True, min_n_ticks=1)
     ax.grid(axis="y")
     if any(names):
         ax.legend()

@@ -71,6 +71,8 @@ def paired(
                 gaps.setdefault((name, key), []).append(value - theirs[key])
     p: dict[str, dict[str, float]] = {}
     for (name, key), differences in gaps.items():
+        if np.isnan(differences).any():  # a score is unknown, or both are infinite
+            continue
         # Two-sided: the smaller tail of the differences, the observed one counted in.
         tails = np.less_equal(differences, 0).sum(), np.greater_equal(differences, 0).sum()
         p.setdefault(name, {})[key] = min(1.0, 2 * (int(min(tails)) + 1) / (resamples + 1))

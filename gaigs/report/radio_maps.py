@@ -104,31 +104,6 @@ class _Drawing(NamedTuple):
         is_low = (edges[..., 2] == edges[..., 2].min(initial=np.inf)).all(1)
         return cls(radio_map, gateways, dots, edges[is_low][..., :2], scale)
 
-    @property
-    def question(self) -> str:
-        """The title of figures."""
-        if self.radio_map.quantity.startswith("standard deviation"):
-            return "Where are predictions uncertain?"
-        return "Where do receivers hear a transmitter?"
-
-    @property
-    def note(self) -> str:
-        """A sentence on the map, its height and its contours."""
-        step = f"{self.scale.step:g} {_error_unit(self.radio_map.unit)}".strip()
-        return f"{_title(self.radio_map, len(self.gateways))}, a line every {step}"
-
-    def key(self) -> dict[str, Line2D]:
-        """The legend's entries by their texts."""
-        key = {}
-        if self.gateways:
-            key["receiver"] = _gateway_mark(np.zeros((2, 0)))
-        if len(self.walls):
-            key["walls and furniture"] = Line2D([], [], color="black", linewidth=0.9)
-        if any(map(len, self.dots.values())):
-            ring = {"markeredgecolor": "black", "markersize": 4, "color": GREY}
-            key["test labels, in the map's colours"] = Line2D([], [], ls="", marker="o", **ring)
-        return key
-
     def draw(self, ax: Axes, name: str) -> Any:
         """Draws the map of a receiver; returns its image."""
         index = self.radio_map.receivers.index(name)
@@ -149,18 +124,14 @@ class _Drawing(NamedTuple):
         ax.scatter(x, y, 14, label, **ring, **look)
         if name in self.gateways:
             ax.add_line(_gateway_mark(self.gateways[name][:2, None]))
-        ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), title=self.title(index))
+        title = name
+        constant = _constants(self.radio_map)[index]
+        if constant is not None:
+            size = f"{constant:#.3g} {_error_unit(self.radio_map.unit)}".strip()
+            title = f"{name}, ± {size} everywhere"
+        ax.set(xlim=(lower[0], upper[0]), ylim=(lower[1], upper[1]), title=title)
         ax.locator_params(nbins=5, steps=(1, 2, 5, 10))
         return image
-
-    def title(self, index: int) -> str:
-        """The receiver's name, with its deviation if that is the same everywhere."""
-        name = self.radio_map.receivers[index]
-        constant = _constants(self.radio_map)[index]
-        if constant is None:
-            return name
-        size = f"{constant:#.3g} {_error_unit(self.radio_map.unit)}".strip()
-        return f"{name}, ± {size} everywhere"
 
     def bar(self, figure: Figure, image: Any, axes: Sequence[Axes]) -> None:
         """Draws the colour bar of panels."""
@@ -194,6 +165,18 @@ def radio_maps(
     drawing = _Drawing.of(radio_map, gateways, readings, edges)
     _, lower, upper = _extent(radio_map, drawing.walls)
     width, height = upper - lower
+    step = f"{drawing.scale.step:g} {_error_unit(radio_map.unit)}".strip()
+    question = "Where do receivers hear a transmitter?"
+    if radio_map.quantity.startswith("standard deviation"):
+        question = "Where are predictions uncertain?"
+    key = {}
+    if gateways:
+        key["receiver"] = _gateway_mark(np.zeros((2, 0)))
+    if len(drawing.walls):
+        key["walls and furniture"] = Line2D([], [], color="black", linewidth=0.9)
+    if any(map(len, drawing.dots.values())):
+        ring = {"markeredgecolor": "black", "markersize": 4, "color": GREY}
+        key["test labels, in the map's colours"] = Line2D([], [], ls="", marker="o", **ring)
     figures = []
     with rc_context(STYLE):
         for names in even_pages(radio_map.receivers, max_panels):
@@ -201,9 +184,9 @@ def radio_maps(
             for ax, name in zip(axes, names, strict=True):
                 image = drawing.draw(ax, name)
             drawing.bar(figure, image, axes)
-            if key := drawing.key():
+            if key:
                 figure.legend(key.values(), key, loc="outside lower center", ncols=3)
-            ask(figure, drawing.question, drawing.note)
+            ask(figure, question, f"{_title(radio_map, len(gateways))}, a line every {step}")
             figures.append(figure)
     return figures
 

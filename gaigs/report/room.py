@@ -80,24 +80,6 @@ class _Content(NamedTuple):
             raise ValueError("the model has learnt no planes\npass links= to draw the links")
         return np.concatenate(corners)
 
-    @property
-    def question(self) -> str:
-        """The title of a figure."""
-        if self.planes or self.matter is not None:
-            return "What has the model learnt of the room?"
-        return f"Where are the {'links' if self.cloud is None else 'Gaussians'}?"
-
-    @property
-    def note(self) -> str:
-        """What a reader has to know of obstacles."""
-        if self.matter is None:
-            return ""
-        return (
-            "Obstacles are losses that explain the training labels. They are no evidence of a "
-            "wall:\nthey also stand for all else that weakens paths, and are arbitrary where few "
-            "paths pass."
-        )
-
     def draw(self, view: _View, arrow: float) -> list[AxesImage | EllipseCollection]:
         """Draws all in a panel; returns what a colour bar explains, Gaussians last."""
         coloured: list[AxesImage | EllipseCollection] = []
@@ -119,7 +101,11 @@ class _Content(NamedTuple):
             shown = f"{len(self.cloud.means):,} strongest of {self.cloud.count:,} Gaussians"
             figure.colorbar(drawn[0][-1], label=f"|signal| × opacity, {shown}", **bar)
         if self.matter is not None:
-            _scale_losses([images[0] for images in drawn])
+            # One scale of all views. It spans at least 1 dB, so that a negligible loss is pale, and
+            # at most 40 dB, where nothing is left to see.
+            highest = [np.quantile(images[0].get_array().data, 0.99) for images in drawn]
+            for images in drawn:
+                images[0].set_clim(0, min(40.0, max(1.0, *highest)))
             label = "fitted loss by obstacles along the line of sight [dB]"
             figure.colorbar(drawn[0][0], label=label, **bar)
 
@@ -138,12 +124,20 @@ def room(
     cloud = None if gaussians is None else _strongest(gaussians)
     matter = None if learnt is None else learnt.matter
     content = _Content(links, cloud, _drawn_planes(learnt), matter)
+    question = f"Where are the {'links' if cloud is None else 'Gaussians'}?"
+    if content.planes or matter is not None:
+        question = "What has the model learnt of the room?"
+    note = (
+        "Obstacles are losses that explain the training labels. They are no evidence of a "
+        "wall:\nthey also stand for all else that weakens paths, and are arbitrary where few "
+        "paths pass."
+    )
     with rc_context(STYLE):
         views = _views(content.corners)
         drawn = [content.draw(view, views.arrow) for view in views.panels]
         content.draw_bars(drawn, views.axes)
         _legend(views)
-        ask(views.figure, content.question, content.note)
+        ask(views.figure, question, "" if matter is None else note)
     return views.figure
 
 
@@ -388,17 +382,6 @@ def _bells(values: Float[ndarray, " n"], matter: Matter, axis: int) -> Float[nda
     """The Gaussian functions of obstacles along one axis."""
     offsets = (values[:, None] - matter.centres[:, axis]) / matter.widths[:, axis]  # (n, k)
     return np.exp(-(offsets**2) / 2)
-
-
-def _scale_losses(images: Sequence[AxesImage]) -> None:
-    """One scale of colours of all views.
-
-    It spans at least 1 dB, so that a negligible loss is pale, and at most 40 dB, where nothing is
-    left to see.
-    """
-    highest = [np.quantile(image.get_array().data, 0.99) for image in images]
-    for image in images:
-        image.set_clim(0, min(40.0, max(1.0, *highest)))
 
 
 def _draw_paths(view: _View, paths: Sequence[LearntPath]) -> LineCollection:

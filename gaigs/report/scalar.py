@@ -114,8 +114,9 @@ def predicted_against_measured(
                 ax.axline((start, start), slope=1, color="0.3", linewidth=0.7)
                 limits = (start, cells.edges[-1])
                 ax.set(xlim=limits, ylim=limits, aspect="equal")
-                error = _with_digits(errors[of_receiver].mean(), task.error_unit)
-                ax.set_title(f"{names[index]}, MAE {error}")
+                error = errors[of_receiver].mean()
+                digits = f"{error:.2f}" if task.error_unit == "dB" else f"{error:#.3g}"
+                ax.set_title(f"{names[index]}, MAE {digits} {task.error_unit}".rstrip())
                 ax.grid()
                 ax.set_axisbelow(True)
             if not has_few:
@@ -163,11 +164,6 @@ def _cells(
         count, *_ = np.histogram2d(across[of_receiver], up[of_receiver], (edges, edges))
         counts[int(index)] = count.T
     return _Cells(width, width * edges, limits, counts)
-
-
-def _with_digits(error: float, unit: str) -> str:
-    """An error with its unit: two decimals of decibels, three digits of all else."""
-    return f"{error:.2f} dB" if unit == "dB" else f"{error:#.3g} {unit}".strip()
 
 
 def _draw_counts(figure: Figure, axes: list[Axes], image: Any, label: str) -> None:

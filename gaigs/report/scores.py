@@ -76,7 +76,7 @@ def metrics_table(metrics: Mapping) -> Group:
             columns.append(_texts(models, name, shown))
     if test := metrics.get("paired"):
         table.add_column(stacked(f"p against {test['baseline']}"), justify="right")
-        columns.append({one: f"{p[first]:.2g}" for one, p in test["p"].items()})
+        columns.append({one: f"{p[first]:.2g}" for one, p in test["p"].items() if first in p})
     if validation := metrics.get("validation"):
         table.add_column(stacked(f"{metric.title}, validation"), justify="right")
         columns.append(_texts(validation, first, metric))
@@ -134,25 +134,17 @@ def score_latex(metrics: Mapping) -> str:
     for name, metric in task_class(metrics["task"]).metrics().items():
         if all(name in scores for scores in models.values()):
             texts = _texts(models, name, metric, r"\textbf{{{}}}")
-            cells = [f"{text}{star(test, model, name)}" for model, text in texts.items()]
-            columns.append([tex(metric.title), *cells])
+            for model in texts if test else ():
+                texts[model] += "$^*$" if test["p"].get(model, {}).get(name, 1.0) < 0.05 else ""
+            columns.append([tex(metric.title), *texts.values()])
     lines = [[*line] for line in zip(*columns, strict=True)]
-    return latex(lines, 1, f"Test scores on split {tex(metrics['split'])}. {tex_note(test)}")
-
-
-def star(test: Mapping | None, model: str, metric: str) -> str:
-    """A star in LaTeX if a score differs from the best baseline's by more than chance."""
-    p = 1.0 if test is None else test["p"].get(model, {}).get(metric, 1.0)
-    return "$^*$" if p < 0.05 else ""
-
-
-def tex_note(test: Mapping | None) -> str:
-    """What bold and stars mean, in LaTeX."""
-    note = "Bold: the best, and all that print alike."
-    if test is None:
-        return note
-    chance = f"$p<0.05$ in a paired bootstrap over {test['places']:,} places"
-    return f"{note} $^*$: differs from {tex(test['baseline'])}, the best baseline ({chance})."
+    note = (
+        f"Test scores on split {tex(metrics['split'])}. Bold: the best, and all that print alike."
+    )
+    if test:
+        chance = f"$p<0.05$ in a paired bootstrap over {test['places']:,} places"
+        note += f" $^*$: differs from {tex(test['baseline'])}, the best baseline ({chance})."
+    return latex(lines, 1, note)
 
 
 def verdict(metrics: Mapping) -> str:

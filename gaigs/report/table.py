@@ -1,14 +1,13 @@
 """Tables: values as text, and rows for a terminal, in Markdown and in CSV."""
 
+import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console
 from rich.markup import escape
-from rich.measure import Measurement
 from rich.table import Table
 
 from gaigs.io import tables
@@ -44,11 +43,11 @@ def best_in_bold(
 ) -> list[str]:
     """Values of a column as text; all that print as the best one are in the format ``bold``."""
     numbers = [value.mean if isinstance(value, Spread) else value for value in values]
-    known = [number for number in numbers if number is not None]
-    best = max(known) if higher_is_better else min(known)
+    known = [number for number in numbers if number is not None and not math.isnan(number)]
+    best = (max if higher_is_better else min)(known, default=None)
     texts = []
     for value, number in zip(values, numbers, strict=True):
-        is_best = number is not None and written(number) == written(best)
+        is_best = number in known and written(number) == written(best)
         texts.append(bold.format(written(value)) if is_best else written(value))
     return texts
 
@@ -113,12 +112,6 @@ def terminal(
     for line, style in zip(lines, styles or [None] * len(lines), strict=True):
         table.add_row(*line, style=style)
     return table
-
-
-def table_width(table: Table) -> int:
-    """Letters of a table's longest line."""
-    console = Console(width=1000)
-    return Measurement.get(console, console.options, table).maximum
 
 
 def markdown(lines: Sequence[Sequence[str]]) -> str:

@@ -110,6 +110,8 @@ def test_mistakes_end_in_two_lines(results, monkeypatch):
         results["map"].plot(reciever="west")
     with pytest.raises(ValueError, match="receiver must be one of 0 = west"):
         results["map"].plot(receiver="attic")
+    with pytest.raises(TypeError, match="one axes of matplotlib, got ndarray"):
+        results["map"].plot(Figure().subplots(2))
     with pytest.raises(TypeError, match="got list") as error:
         gaigs.plot([1.0])
     assert "RadioMap" in two_lines(error)[0]
@@ -130,6 +132,8 @@ def test_spectra_and_channels_show_one_place():
     np.testing.assert_array_equal(ax.collections[0].get_array(), spectra.value[1, 0])
     links = gaigs.links("synthetic_csi", transmitters=60, order=0)
     channels = gaigs.train("gaussian_process", links).predict(PLACES, interval=0.5)
+    with pytest.raises(ValueError, match="place must be from 0 to"):
+        channels.plot(place=99)
     (line,) = channels.plot(place=2).lines
     strongest = channels.value[2, 0].abs().square().sum(1).argmax()
     truth = 20 * channels.value[2, 0, strongest].abs().log10()

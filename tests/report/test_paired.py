@@ -1,5 +1,6 @@
 """Paired tests over places, and tables for papers."""
 
+import math
 import re
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 import gaigs
 from gaigs.core.task.rssi import Rssi
 from gaigs.report.paired import paired
-from gaigs.report.table import latex, tex
+from gaigs.report.table import best_in_bold, latex, tex
 
 
 def errors(seed, places=40, links=4, shift=0.0):
@@ -56,6 +57,13 @@ def test_p_is_uniform_without_a_difference():
 def test_there_is_no_test_without_baselines_or_places():
     assert paired(Rssi(), {"own": errors(0), "own_trend": errors(1)}, PLACES) is None
     assert paired(Rssi(), {"own": errors(0), "mean": errors(1)}, 0 * PLACES) is None
+
+
+def test_an_unknown_score_differs_from_none_and_is_not_the_best():
+    unknown = {"mae_db": torch.full((160,), torch.nan)}
+    test = paired(Rssi(), {"own": errors(0), "lost": unknown, "mean": errors(1)}, PLACES, 50)
+    assert test.p.get("lost", {}) == {}
+    assert best_in_bold([math.nan, 2.0, None], False, "<{}>") == ["nan", "<2.000>", ""]
 
 
 def cells(text):
