@@ -22,7 +22,7 @@ from gaigs.data.parts import check_parts
 from gaigs.data.readings import loud_remark, marks_of
 from gaigs.io.frames import is_frame, read_frame
 from gaigs.io.tables import number_places, shortened
-from gaigs.registry import check_instance, check_type, registry, suggest
+from gaigs.registry import check_instance, registry, suggest
 
 log = logging.getLogger(__name__)
 
@@ -103,7 +103,8 @@ def from_arrays(
     parts: Any = None
     if test_rows is not None:
         parts = _parts(row, len(places), test_rows, train_rows)
-        remarks += _shared_places(sites[row], *parts)
+        shared = int(torch.isin(sites[row[parts[1]]], sites[row[parts[0]]]).sum())
+        remarks += [f"{shared} test links stand at places of training links"] * (shared > 0)
     undivided = Links(
         query=Query(places[row], index[received].long(), _carriers(frequency, task, row, places)),
         receivers=receivers,
@@ -116,18 +117,9 @@ def from_arrays(
         frame=frame,
         remarks="; ".join(remarks),
     )
-    links = _divided(undivided, config)
+    links = divide(undivided, config)
     _warn_of_untrained(receivers, links.receivers)
     return links
-
-
-def _check_options(bandwidth: Any, frame: Any) -> None:
-    """Raises an error unless a band is one and a frame is a ``Frame``."""
-    check_type("bandwidth", bandwidth, float | None)
-    if frame is not None:
-        check_instance("frame", frame, Frame)
-    if bandwidth is not None and not 0 <= bandwidth < math.inf:
-        raise ValueError(f"bandwidth must be 0 Hz or more, and finite, got {bandwidth}")
 
 
 def _warn_of_untrained(receivers: Sequence[Receiver], trained: Sequence[Receiver]) -> None:
@@ -141,17 +133,12 @@ def _warn_of_untrained(receivers: Sequence[Receiver], trained: Sequence[Receiver
         )
 
 
-def _divided(links: Links, split: Mapping) -> Links:
-    """Links with their split; an error says if the ends of the links seem exchanged."""
-    try:
-        return divide(links, split)
-    except ValueError:
-        if len(links.receivers) == 1 or len(links.query.transmitters.unique(dim=0)) > 1:
-            raise
-        raise ValueError(
-            "transmitters all stand at one place; if receivers move, give their places as "
-            "transmitters, and the fixed end as receiver: a channel is the same both ways"
-        ) from None
+def _check_options(bandwidth: Any, frame: Any) -> None:
+    """Raises an error unless a band is one and a frame is a ``Frame``."""
+    if frame is not None:
+        check_instance("frame", frame, Frame)
+    if bandwidth is not None and not 0 <= bandwidth < math.inf:
+        raise ValueError(f"bandwidth must be 0 Hz or more, and finite, got {bandwidth}")
 
 
 def _check_names(receivers: Sequence[Receiver]) -> None:
@@ -257,7 +244,8 @@ def _find_stands(
             raise ValueError(f"labels have no column {', '.join(others)} of receivers")
         receivers = [receivers.get(name) for name in names]
     elif receivers is None:
-        count = 1 if index is None else int(np.max(index)) + 1
+        numbers = as_tensor("index", 0 if index is None else index, "numbers of receivers")
+        count = int(np.nanmax(numbers.numpy(), initial=0)) + 1
         count = shape[1] if index is None and len(shape) > 1 else count
         receivers = [None] * count
     if isinstance(receivers, Sequence) and any(position is None for position in receivers):
@@ -371,9 +359,7 @@ def _one_a_link(labels: Tensor, index: Any, count: int, receivers: int, task: Ta
             f"link in index, or {(count, receivers, *shape)}, one for each transmitter and "
             f"receiver, got {tuple(labels.shape)}"
         )
-    is_whole = not (index.is_floating_point() or index.is_complex() or index.dtype == torch.bool)
-    is_fitting = is_whole and index.shape == (len(rows),)
-    if not is_fitting or not ((index >= 0) & (index < receivers)).all():
+    if index.shape != (len(rows),) or not _are_numbers(index, receivers):
         raise ValueError(
             f"index must be {count} whole numbers from 0 to {receivers - 1}, got "
             f"{index.tolist()[:5]} ..."
@@ -450,33 +436,27 @@ def _parts(
     return torch.isin(row, training).nonzero()[:, 0], torch.isin(row, testing).nonzero()[:, 0]
 
 
-def _shared_places(
-    sites: Int[Tensor, " m"], train: Int[Tensor, " k"], test: Int[Tensor, " l"]
-) -> list[str]:
-    """A remark if test links stand at places of training links."""
-    shared = torch.isin(sites[test], sites[train])
-    if not shared.any():
-        return []
-    return [f"{int(shared.sum())} test links stand at places of training links"]
-
-
 def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
     """Ascending numbers of rows, given as such or as a mask of all ``count`` rows."""
     rows = as_tensor(name, values, "numbers of rows")
     if rows.dtype == torch.bool and rows.shape == (count,):
         rows = rows.nonzero()[:, 0]
-    is_whole = not (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool)
-    numbers = rows.long()
     given = reprlib.repr(values)
-    is_list = is_whole and rows.ndim == 1 and len(rows)
-    if not is_list or not ((numbers >= 0) & (numbers < count)).all():
+    if rows.ndim != 1 or not len(rows) or not _are_numbers(rows, count):
         raise ValueError(
             f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got "
             f"{given}"
         )
+    numbers = rows.long()
     if len(numbers.unique()) < len(numbers):
         raise ValueError(
             f"{name} must hold each row once, got {given}; a mask must be boolean, of True and "
             "False"
         )
     return numbers.sort().values
+
+
+def _are_numbers(values: Tensor, count: int) -> bool:
+    """True for whole numbers from 0 to ``count`` - 1."""
+    is_whole = not (values.is_floating_point() or values.is_complex() or values.dtype == torch.bool)
+    return is_whole and bool(((values >= 0) & (values < count)).all())

@@ -17,12 +17,12 @@ from gaigs.io.tables import Table
 
 def from_frame(
     frame: Any,
-    x: str | None = None,
-    y: str | None = None,
-    z: str | None = None,
+    x: str | int | None = None,
+    y: str | int | None = None,
+    z: str | int | None = None,
     receivers: Any = None,
-    receiver: str | None = None,
-    level: str | None = None,
+    receiver: str | int | None = None,
+    level: str | int | None = None,
     ignore: str | Sequence[str] = (),
     not_heard: float | Sequence[float] | None = None,
     height: float = 1.0,
@@ -72,13 +72,13 @@ def from_frame(
         links = from_table(
             table,
             coordinates=_coordinates(table, x, y, z),
-            not_heard=[*not_heard] if isinstance(not_heard, Sequence) else not_heard,
+            not_heard=not_heard if not_heard is None else np.ravel(not_heard).tolist(),
             height=height,
             storey=storey,
             epsg=epsg,
             frequency=frequency,
-            receiver=receiver,
-            level=level,
+            receiver=None if receiver is None else str(receiver),
+            level=None if level is None else str(level),
             **_columns(table, receivers, _listed(ignore), receiver is not None),
         )
         links = divide(links, config)
@@ -119,15 +119,15 @@ def _listed(names: str | Sequence) -> list[str]:
     return [names] if isinstance(names, str) else [str(name) for name in names]
 
 
-def _coordinates(table: Table, x: str | None, y: str | None, z: str | None) -> list[str] | None:
+def _coordinates(table: Table, x: Any, y: Any, z: Any) -> list[str] | None:
     """Columns of the coordinates; None if all are to be found by their names."""
-    if x is None and y is None and z is None:
+    if x is y is z is None:
         return None
-    heights = [z] if z is not None else []
+    heights = [] if z is None else [str(z)]
     for kinds in (HEIGHTS, FLOORS):
         if not heights:
             heights = [name for name in table.names if plain_name(name)[0] in kinds][:1]
-    return [x or "x", y or "y", *heights]
+    return ["x" if x is None else str(x), "y" if y is None else str(y), *heights]
 
 
 def _in_python(text: str) -> str:

@@ -1,5 +1,7 @@
 """Links of a registered reader, or of data in memory: a data frame, traced paths, arrays."""
 
+import inspect
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from gaigs import configuration
@@ -8,6 +10,7 @@ from gaigs.data.arrays import from_arrays
 from gaigs.data.frames import from_frame
 from gaigs.data.sionna_rt import from_sionna_rt, is_traced
 from gaigs.io.frames import is_frame
+from gaigs.registry import check_type
 
 
 def links(source: Any = None, /, **options: Any) -> Links:
@@ -47,11 +50,11 @@ def links(source: Any = None, /, **options: Any) -> Links:
                 f"links takes a reader's name or a data frame first, or arrays: "
                 f"{', '.join(needed)}, receivers; missing: {', '.join(missing)}"
             )
-        return from_arrays(**options)
+        return _checked(from_arrays, options)(**options)
     if is_traced(source):
-        return from_sionna_rt(source, **options)
+        return _checked(from_sionna_rt, options)(source, **options)
     if is_frame(source):
-        return from_frame(source, **options)
+        return _checked(from_frame, options)(source, **options)
     if not isinstance(source, str):
         raise TypeError(
             f"links takes a reader's name or a data frame first, got {type(source).__name__}; "
@@ -61,3 +64,11 @@ def links(source: Any = None, /, **options: Any) -> Links:
         raise ValueError("test_rows and train_rows are for arrays; of a reader choose a split")
     config = configuration.composed([f"data={source}"], options, ("data", "split"))
     return load(config["data"], config["split"])
+
+
+def _checked(reader: Callable, options: Mapping) -> Callable:
+    """The reader of data in memory; raises a ``TypeError`` for an option of a wrong type."""
+    for key, parameter in inspect.signature(reader).parameters.items():
+        if key in options and options[key] is not parameter.default:
+            check_type(key, options[key], parameter.annotation)
+    return reader

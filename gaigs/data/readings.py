@@ -67,7 +67,7 @@ def to_dbm(
 
 def marks_given(not_heard: float | Sequence[float]) -> list[float]:
     """The values of the option ``not_heard``, one number or several."""
-    return [float(mark) for mark in (not_heard if isinstance(not_heard, Sequence) else [not_heard])]
+    return np.ravel(not_heard).astype(float).tolist()
 
 
 def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:

@@ -63,7 +63,7 @@ def _read_columns(frame: Any, name: str) -> tuple[list[str], list[ndarray]]:
     keys = _keys(frame)
     if keys and not isinstance(frame, Mapping) and not hasattr(frame[keys[0]], "__array__"):
         keys = []
-    if not keys and _is_exchanged(frame):
+    if not keys and _is_exchanged(frame) and len(getattr(frame, "columns", "?")):
         frame = _by_pyarrow(frame)
         keys = _keys(frame)
     names = [str(key) for key in keys]

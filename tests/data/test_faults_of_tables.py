@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import gaigs
-from gaigs.data import nerf2_rssi, rssi_csv, rssi_wide
+from gaigs.data import divide, nerf2_rssi, rssi_csv, rssi_wide
 from gaigs.data.readings import marks_of, match_names
 
 PLACES = np.array([[x, y] for x in range(8) for y in range(5)]) + 0.25
@@ -327,20 +327,22 @@ def test_columns_of_the_folder_layout_are_matched_alike(rssi_folder):
         nerf2_rssi.read(rssi_folder)
 
 
-@pytest.mark.parametrize(("unit", "factor"), [("cm", 100), ("mm", 1000)])
-def test_gateways_in_another_unit_are_converted_or_named(wide, unit, factor):
+@pytest.mark.parametrize(
+    ("unit", "factor", "doubt"), [("cm", 100, "if rx are in cm"), ("mm", 1000, "are places in mm?")]
+)
+def test_gateways_in_another_unit_are_converted_or_doubted(wide, unit, factor, doubt):
     heading = f"name,x [{unit}],y [{unit}],z [{unit}]"
     links = wide(survey(), stations(heading=heading, factor=factor))
     np.testing.assert_allclose(links.receivers[1].pose.position, STANDS["apB"])
-    message = (
-        f"gateways of aps.csv are probably in {unit}: name the unit in its heading, as x [{unit}]"
-    )
-    assert message not in links.remarks
-    assert message in wide(survey(), stations(factor=factor)).remarks
+    split = {"name": "random", "test": 0.2, "validation": 0.1, "seed": 0}
+    assert doubt not in divide(links, split).remarks
+    assert doubt in divide(wide(survey(), stations(factor=factor)), split).remarks
 
 
 def test_gateways_of_a_campus_around_a_small_survey_are_in_metres(wide):
     draw = np.random.default_rng(0)
     apart = np.linalg.norm(PLACES[:, None] - 100 * np.array([*STANDS.values()])[:, :2], axis=2)
     cells = np.round(-20 - 30 * np.log10(apart + 1) + draw.normal(0, 4, apart.shape))
-    assert "probably" not in wide(survey(cells=cells), stations(factor=100)).remarks
+    split = {"name": "random", "test": 0.2, "validation": 0.1, "seed": 0}
+    remarks = divide(wide(survey(cells=cells), stations(factor=100)), split).remarks
+    assert "are in cm" not in remarks

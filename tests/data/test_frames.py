@@ -142,6 +142,8 @@ def test_some_receivers_may_have_no_place():
     ("frame", "options", "message"),
     [
         (WIDE, {"x": "xx"}, r"data frame: expected a column 'xx', got x, y, ap-a.*\(did you mean 'x'"),
+        (WIDE, {"x": "x", "y": "x"}, "x=, y= and z= must be different columns"),
+        (LONG, {"receiver": "bssid", "level": "x"}, "level='x' must differ from each other and from the coord"),
         (WIDE, {"receivers": ["ap-d"]}, r"expected a column 'ap-d', got .*did you mean 'ap-"),
         (WIDE, {"receivers": {"bridge": [0, 0, 2]}}, "none of its gateways is a column of data frame"),
         (WIDE, {"receivers": {"ap-a": 3.0}}, "receivers: ap-a must be 3 finite numbers"),
@@ -164,6 +166,21 @@ def test_mistakes_end_in_two_lines_that_help(frame, options, message):
         gaigs.links(frame, **options)
     assert str(caught.value).count("\n") <= 1
     assert "data." not in str(caught.value)
+
+
+def test_columns_may_have_numbers_and_line_breaks_for_names():
+    numbered = dict(enumerate(LONG.values()))
+    links = gaigs.links(numbered, x=0, y=1, receiver=2, level=3)
+    assert_same(links, gaigs.links(LONG, receiver="bssid", level="rssi"))
+    renamed = {name.replace("ap-a", "ap\na"): column for name, column in WIDE.items()}
+    assert gaigs.links(renamed).receivers[0].name == "ap\na"
+
+
+def test_options_of_a_wrong_type_are_named():
+    with pytest.raises(TypeError, match="height must be a number, got '1'"):
+        gaigs.links(WIDE, height="1")
+    with pytest.raises(TypeError, match="height must be a number, got '1'"):
+        gaigs.links(task="rssi", transmitters=PLACES, labels=LEVELS, height="1")
 
 
 def test_an_array_alone_is_refused():

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from gaigs.core.geometry import Frame
@@ -18,12 +18,7 @@ from gaigs.data import Links
 from gaigs.data.maps import check_metres, is_utm, to_utm
 from gaigs.data.readings import and_list, carriers_of, gateway, loud_remark
 from gaigs.data.rssi_wide.columns import Axes, find_axes, find_gateways
-from gaigs.data.rssi_wide.places import (
-    name_of_gateways,
-    read_gateways,
-    read_points,
-    unit_of_gateways,
-)
+from gaigs.data.rssi_wide.places import name_of_gateways, read_gateways, read_points
 from gaigs.data.rssi_wide.readings import Survey, averaged, pivoted, refuse_readings
 from gaigs.io import FAR, tables
 from gaigs.registry import register
@@ -121,20 +116,20 @@ def from_table(
     received = ~(np.isnan(readings) | np.isin(readings, columns.marks))
     survey = averaged(world.points[:count], readings, received)
     rows, receivers = survey.counts.nonzero()
-    measured = _count_places(rows, table.file)
-    present = np.unique(receivers)
-    names = [table.names[columns.gateways[k]] for k in present]
-    unit = ""
-    if placed and not world.remark:
-        unit = unit_of_gateways(survey, dict(zip(names, present.tolist(), strict=True)), stands)
-
+    measured = len(np.unique(rows))
+    if measured < 2:
+        raise ValueError(
+            f"{table.file}: expected levels at two places or more, got {measured}; see "
+            "data.not_heard"
+        )
+    names = [table.names[columns.gateways[k]] for k in np.unique(receivers)]
     silent = [table.names[k] for k in columns.gateways if table.names[k] not in names]
     remarks = [
         f"{len(rows)} readings of {measured} places at {len(names)} gateways",
         *_remarks_on_readings(survey, received, columns.marks, columns.silent + silent),
     ]
     if placed:
-        remarks += _remarks_on_gateways(name_of_gateways(gateways), names, stands, unit, unused)
+        remarks += _remarks_on_gateways(name_of_gateways(gateways), names, stands, unused)
     if count < len(points):
         remarks.append(f"{len(points) - count} rows without coordinates are left out")
     remarks += [*_remarks_on_heights(axes, placed, height, storey), world.remark]
@@ -183,16 +178,6 @@ def _read_table(file: str | Path) -> tables.Table:
     return table
 
 
-def _count_places(rows: Int[ndarray, " n"], file: Path) -> int:
-    """Number of places with a reading; a ``ValueError`` if it is below two."""
-    count = len(np.unique(rows))
-    if count < 2:
-        raise ValueError(
-            f"{file}: expected levels at two places or more, got {count}; see data.not_heard"
-        )
-    return count
-
-
 def _remarks_on_readings(
     survey: Survey,
     received: Bool[ndarray, "rows g"],
@@ -229,18 +214,13 @@ def _remarks_on_heights(axes: Axes, placed: Mapping, height: float, storey: floa
 
 
 def _remarks_on_gateways(
-    file: str, names: Sequence[str], stands: Mapping, unit: str, unused: Sequence[str]
+    file: str, names: Sequence[str], stands: Mapping, unused: Sequence[str]
 ) -> list[str]:
-    """Remarks on the file of gateways: those that it lacks, its unit, those without a column."""
+    """Remarks on the file of gateways: those that it lacks, and those without a column."""
     remarks = []
     unplaced = [name for name in names if name not in stands]
     if unplaced:
         remarks.append(f"gateways without a place in {file}: {tables.shortened(unplaced)}")
-    if unit:
-        remarks.append(
-            f"gateways of {file} are probably in {unit}: name the unit in its heading, as "
-            f"x [{unit}]"
-        )
     if unused:
         remarks.append(f"gateways of {file} without a column: {tables.shortened(unused)}")
     return remarks

@@ -71,7 +71,7 @@ class Axes(NamedTuple):
 def plain_name(name: str) -> tuple[str, float | None]:
     """Name of a column in small letters and digits, and its unit [m]; None if it has no unit."""
     unit = r"[\s_]*[\[(]?\s*(mm|cm|km|m|ft|feet|deg|°)?\s*[\])]?"
-    match = re.fullmatch(rf"(.*?){unit}", name.strip().lower())
+    match = re.fullmatch(rf"(?s)(.*?){unit}", name.strip().lower())
     return re.sub(r"[\W_]", "", match[1]), UNITS.get(match[2])
 
 

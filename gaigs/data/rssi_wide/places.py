@@ -10,14 +10,12 @@ from numpy import ndarray
 from gaigs.data.readings import match_names, suggested
 from gaigs.data.rssi_wide.columns import (
     NAMES,
-    UNITS,
     Axes,
     find_axes,
     plain_name,
     refuse_cells,
     units_of,
 )
-from gaigs.data.rssi_wide.readings import Survey
 from gaigs.io import tables
 from gaigs.io.yaml import read_mapping, to_vector
 
@@ -31,7 +29,10 @@ def read_points(
     table: tables.Table, axes: Axes, height: float, storey: float, epsg: int | None
 ) -> Float[ndarray, "rows 3"]:
     """Coordinates of all rows; NaN where they are empty."""
-    columns = [axes.x, axes.y, *([axes.z] if axes.z >= 0 else [])]
+    columns = axes.columns
+    if len({*columns}) < len(columns):
+        names = [table.names[column] for column in columns]
+        raise ValueError(f"data.coordinates must be different columns, got {names}")
     points = table.numbers[:, columns]
     refuse_cells(table, columns, np.isinf(points), "a finite number")
     points = points * units_of(table, axes, epsg)[: len(columns)]
@@ -126,30 +127,3 @@ def _listed_gateways(
             repeated[row] = tables.quote(name)
     given.refuse(repeated, "each gateway once")
     return dict(zip(names, points.tolist(), strict=True))
-
-
-def unit_of_gateways(
-    survey: Survey, columns: Mapping[str, int], stands: Mapping[str, Sequence[float]]
-) -> str:
-    """The unit, cm or mm, in which far gateways explain the levels by distance; or ""."""
-    known = [name for name in columns if name in stands]
-    means = np.where(survey.counts > 0, survey.means, np.nan)
-    levels = means[:, [columns[name] for name in known]]  # (n, k)
-    positions = np.array([stands[name] for name in known])  # (k, 3)
-    places = survey.places
-    extent = np.ptp(places[:, :2], axis=0).max()
-    if np.ptp(positions[:, :2], axis=0).max() <= 30 * extent:
-        return ""
-    # Correlations of levels with log distances within gateways. A false unit puts gateways so far
-    # away that distances hardly differ.
-    falls = {"": 0.5}
-    for unit in ("cm", "mm"):
-        apart = np.linalg.norm(places[:, None] - UNITS[unit] * positions, axis=2).clip(
-            0.1
-        )  # (n, k)
-        x = np.where(np.isnan(levels), np.nan, np.log10(apart))
-        x = x - np.nanmean(x, 0)
-        y = levels - np.nanmean(levels, 0)
-        norms = np.sqrt(np.nansum(x**2) * np.nansum(y**2))
-        falls[unit] = -np.nansum(x * y) / max(norms, 1e-9)
-    return max(falls, key=falls.__getitem__)

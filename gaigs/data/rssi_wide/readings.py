@@ -41,6 +41,11 @@ def pivoted(table: tables.Table, axes: Axes, receiver: str | None, level: str | 
         )
     named = table.column(receiver)
     column = table.column(level)
+    if column == named or {column, named} & {*axes.columns}:
+        raise ValueError(
+            f"{table.heading}: data.receiver={receiver} and data.level={level} must differ from "
+            "each other and from the coordinates"
+        )
     count = len(table.numbers)
     texts = [table.text(row, named) for row in range(count)]
     nameless = {row: f"none in column {receiver}" for row, text in enumerate(texts) if not text}
