@@ -10,14 +10,14 @@ from gaigs.data.links import links
 from gaigs.runs.training import train
 
 try:
-    from sklearn.base import BaseEstimator, RegressorMixin
+    from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
     from sklearn.metrics import r2_score
     from sklearn.utils.validation import check_is_fitted, validate_data
 except ImportError:
     raise ImportError("scikit-learn is missing: pip install 'gaigs[sklearn]'") from None
 
 
-class Regressor(RegressorMixin, BaseEstimator):
+class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """A model of levels [dBm] with the interface of scikit-learn.
 
     Args:
@@ -133,11 +133,6 @@ class Regressor(RegressorMixin, BaseEstimator):
         if not scores:
             raise ValueError("a score takes two levels of a receiver or more, got none")
         return float(np.mean(scores))
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.target_tags.multi_output = True
-        return tags
 
 
 def _names_of(receivers: Any) -> list[str]:

@@ -2,7 +2,7 @@
 
 import importlib
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import torch
@@ -94,12 +94,17 @@ class SklearnRegressor(LookUp):
         query = asked if isinstance(asked, Query) else self.links.query[asked]
         return coordinates(self.scene, query, 1.0).numpy()
 
-    def forward(self, batch: Batch) -> Prediction:
-        task, query = self.scene.task, batch.query
-        labels = torch.full((len(query), *task.shape), torch.nan, dtype=task.dtype)
+    def _predictions(self, query: Query, **options: bool) -> Iterator[tuple[Tensor, Any]]:
+        """Queries of each receiver, as a mask, and what its regressor predicts for them."""
         for receiver in query.receivers.unique().tolist() if self.fitted else ():
             is_asked = query.receivers == receiver
-            predicted = self.fitted[receiver].predict(self._inputs(query[is_asked]))
+            inputs = self._inputs(query[is_asked])
+            yield is_asked, self.fitted[receiver].predict(inputs, **options)
+
+    def forward(self, batch: Batch) -> Prediction:
+        task = self.scene.task
+        labels = torch.full((len(batch.query), *task.shape), torch.nan, dtype=task.dtype)
+        for is_asked, predicted in self._predictions(batch.query):
             values = torch.from_numpy(predicted)
             if task.dtype.is_complex:
                 values = torch.view_as_complex(values.reshape(-1, *task.shape, 2).contiguous())
@@ -110,13 +115,9 @@ class SklearnRegressor(LookUp):
         has_std = "return_std" in inspect.signature(self.estimator.predict).parameters
         if not has_std or not self.scene.task.is_scalar:
             return None
-        query = batch.query
-        deviations = torch.ones(len(query))
-        for receiver in query.receivers.unique().tolist():
-            is_asked = query.receivers == receiver
-            regressor = self.fitted[receiver]
-            _, deviation = regressor.predict(self._inputs(query[is_asked]), return_std=True)
-            deviations[is_asked] = torch.from_numpy(deviation).float()
+        deviations = torch.ones(len(batch.query))
+        for is_asked, predicted in self._predictions(batch.query, return_std=True):
+            deviations[is_asked] = torch.from_numpy(predicted[1]).float()
         return deviations
 
 
