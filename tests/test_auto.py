@@ -103,6 +103,10 @@ def test_a_trained_choice_is_that_of_its_own_run(links, tmp_path, monkeypatch):
     monkeypatch.setattr(Descent, "training_step", lambda *_: pytest.fail("trained"))
     again = gaigs.train(links, folder=tmp_path, candidates=["path_loss", "gaigs"], **BRIEF)
     torch.testing.assert_close(again.predict(asked), model.predict(asked))
+    with pytest.raises(ValueError, match="max_steps was 2, is 3"):
+        gaigs.train(
+            links, folder=tmp_path, candidates=["path_loss", "gaigs"], **BRIEF | {"max_steps": 3}
+        )
 
 
 def test_candidates_without_time_are_left_out(links, caplog, monkeypatch):

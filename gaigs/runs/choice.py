@@ -132,9 +132,13 @@ def _try_each(
             continue
         # The first are the cheapest, and leave time to the others.
         share = left / (len(configs) - number)
+        place = folder / "candidates" / str(number)
+        if is_trained:
+            place.mkdir(parents=True, exist_ok=True)
+            claim(place, config)
         with stages.watched(max(1.0, share), shown), limited_threads(config["threads"]):
             try:
-                tried.append(work(label, config, links, folder / "candidates" / str(number)))
+                tried.append(work(label, config, links, place))
             except ValueError as error:  # such as of a training that diverges
                 log.warning("auto: %s is left out: %s", label, error)
     return tried
@@ -285,7 +289,6 @@ def _facts(tried: Sequence[Tried], chosen: Tried, reason: str, task: Task) -> di
 def _fit(config: dict, links: Links, folder: Path) -> Fitted:
     """The result of a candidate's run, also of one that was stopped."""
     folder.mkdir(parents=True, exist_ok=True)
-    claim(folder, config)
     lightning.seed_everything(config["seed"], verbose=False)
     loss = registry("loss").build(config["loss"], task=links.task)
     fitted = fit(None, loss, links, config, folder)
