@@ -9,9 +9,8 @@ gain changes [dB] where one training link is scaled by 1e-6, ten by 1e-3, and on
 docs/results.md has the numbers.
 """
 
-import sys
-
 import torch
+from common import words
 from jaxtyping import Complex
 from torch import Tensor
 
@@ -104,4 +103,4 @@ def main(rooms: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    main(words(__doc__, "ROOM"))

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from common import words
 from jaxtyping import Bool, Complex, Int
 from numpy import ndarray
 from torch import Tensor
@@ -91,4 +92,4 @@ def main(rooms: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:] or ["l_shape", "slanted", "furnished"])
+    main(words(__doc__, "ROOM") or ["l_shape", "slanted", "furnished"])

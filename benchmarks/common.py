@@ -47,6 +47,16 @@ def command_line(doc: str, takes_overrides: bool = True) -> argparse.ArgumentPar
     return parser
 
 
+def words(doc: str, metavar: str = "") -> list[str]:
+    """The words behind a script's name; ``--help`` prints its docstring."""
+    parser = argparse.ArgumentParser(
+        description=doc, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    if metavar:
+        parser.add_argument("words", nargs="*", metavar=metavar)
+    return getattr(parser.parse_args(), "words", [])
+
+
 def positive(text: str) -> int:
     """A whole number of at least 1, as a type of ``argparse``."""
     if int(text) < 1:

@@ -17,6 +17,7 @@ import tempfile
 from pathlib import Path
 
 import torch
+from common import words
 from jaxtyping import Complex
 from torch import Tensor
 
@@ -115,4 +116,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else FOLDER)
+    main(*map(Path, words(__doc__, "FOLDER")[:1] or [FOLDER]))

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from common import words
 from scipy.constants import speed_of_light
 
 import gaigs
@@ -73,4 +74,5 @@ def nmse(labels: torch.Tensor, expected: torch.Tensor) -> float:
 
 
 if __name__ == "__main__":
+    words(__doc__)
     main()

@@ -1,7 +1,7 @@
 """Tables of options, drawn from the docstring of each component when the site is built.
 
 A line ``::: options KIND NAME [OTHERS]`` on a page stands for the options of a component. Where its
-docstring refers to that of another component, the others are named after it.
+docstring refers to another component's, the others are named after it.
 """
 
 import inspect

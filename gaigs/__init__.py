@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from gaigs.core.geometry import Frame, Grid, Pose, Rays
     from gaigs.core.query import Query
     from gaigs.core.radio_maps import radio_map
+    from gaigs.core.results import plot
     from gaigs.core.scene import Scene
     from gaigs.core.task import Metric
     from gaigs.data import Links
@@ -68,6 +69,7 @@ PLACES = {
     "Pose": "core.geometry",
     "Query": "core.query",
     "radio_map": "core.radio_maps",
+    "plot": "core.results",
     "Scene": "core.scene",
     "Metric": "core.task",
     "Links": "data",
@@ -86,11 +88,14 @@ __all__ = [
     "Array", "Description", "Estimate", "Fingerprints", "Frame", "Grid", "Links", "Location",
     "Metric", "Model", "Pose", "Query", "Rays", "Receiver", "Scene", "SurveyPlan", "View",
     "__version__", "compose", "describe", "evaluate", "export", "fingerprints", "links", "load",
-    "locate", "radio_map", "rasterize", "register", "registries", "run", "survey", "train", "view",
+    "locate", "plot", "radio_map", "rasterize", "register", "registries", "run", "survey",
+    "train", "view",
 ]  # fmt: skip
 
 
 def __getattr__(name: str):
+    if name == "sklearn":  # a module, which takes scikit-learn
+        return importlib.import_module("gaigs.sklearn")
     if name not in PLACES:
         raise AttributeError(f"module 'gaigs' has no attribute {name!r}")
     module = importlib.import_module(f"gaigs.{PLACES[name]}")

@@ -5,10 +5,13 @@ Properties are tried on the same examples each time, and none is timed.
 """
 
 import copy
+import functools
 import gc
+import inspect
 import os
 import signal
 import sys
+from collections import Counter
 from pathlib import Path
 
 import jaxtyping
@@ -36,6 +39,46 @@ settings.register_profile(
     suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("gaigs")
+
+check_all_calls = jaxtyping.jaxtyped
+checked_calls = Counter()
+"""Calls that were checked in the current test, by the code of the function."""
+
+
+def check_first_calls(function=None, *, typechecker, calls=20):
+    """``jaxtyping.jaxtyped`` for the first calls in each test, made when they come.
+
+    A loop calls a function with the same shapes thousands of times; checking all of them takes as
+    long as all else.
+    """
+    if function is None:
+        return functools.partial(check_first_calls, typechecker=typechecker)
+    if not inspect.isfunction(function):
+        return check_all_calls(function, typechecker=typechecker)  # which hands over its methods
+    if not function.__annotations__:
+        return function
+    key, checked = id(function.__code__), None  # a nested function has one code, however often made
+
+    @functools.wraps(function)
+    def checked_at_first(*args, **kwargs):
+        nonlocal checked
+        if checked_calls[key] >= calls:
+            return function(*args, **kwargs)
+        checked_calls[key] += 1
+        checked = checked or check_all_calls(function, typechecker=typechecker)
+        return checked(*args, **kwargs)
+
+    return checked_at_first
+
+
+jaxtyping.jaxtyped = jaxtyping._decorator.jaxtyped = check_first_calls
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup():
+    checked_calls.clear()
+
+
 # Modules and tests stay: a search for garbage among them takes a fifth of their collection
 gc.disable()
 
@@ -88,17 +131,20 @@ def composed_once():
         yield
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session", autouse=True)
 def files_read_once():
-    """For modules that compose many different words and change no file: reading takes a third of a
-    composition.
-    """
+    """Copies of a configuration's file while none changes: reading takes a third of a composition."""
     from hydra._internal.config_repository import ConfigRepository
 
     read, found = ConfigRepository.load_config, {}
 
+    def written(source, name):
+        file = Path(source.path, name).with_suffix(".yaml")
+        return file.stat().st_mtime_ns if source.scheme() == "file" and file.exists() else None
+
     def once(self, config_path):
-        key = (*(source.path for source in self.sources), config_path)
+        states = ((source.path, written(source, config_path)) for source in self.sources)
+        key = (*states, config_path)
         if key not in found:
             found[key] = read(self, config_path)
         return copy.deepcopy(found[key])

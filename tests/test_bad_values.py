@@ -72,7 +72,7 @@ def names():
 
 
 @pytest.fixture(scope="module", autouse=True)
-def found_once(files_read_once):
+def found_once():
     """The folders are looked through once, not for each value."""
     find = functools.cache(registry_module.find_holders)
     with pytest.MonkeyPatch.context() as patch, repository():

@@ -20,7 +20,7 @@ TRENDS = {"spectrum": None, "rssi": {"name": "mean"}, "csi": None}
 
 
 @pytest.fixture(scope="module")
-def configure(files_read_once):
+def configure():
     """Composes the configuration; with Hydra's own part, as it stands."""
 
     def configure(*overrides, with_hydra=False):

@@ -60,8 +60,14 @@ SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "syntheti
 MADE_FOR = {
     "loss": {"l1_ssim": ["spectrum"], "relative_error": ["csi"], "log_relative_error": ["csi"]}
     | dict.fromkeys(("absolute", "squared", "huber"), ("spectrum", "rssi")),
-    # The last two are made from trained models.
-    "model": {"path_loss": ["rssi"], "friis": ["csi"], "kriging": [], "ensemble": []},
+    # The last three are made from trained models, and from a regressor.
+    "model": {
+        "path_loss": ["rssi"],
+        "friis": ["csi"],
+        "kriging": [],
+        "ensemble": [],
+        "sklearn": [],
+    },
 }
 """The tasks of a loss or model that refuses others."""
 
@@ -381,7 +387,7 @@ def test_training(device):
 )
 def test_a_task_that_a_component_is_not_made_for_is_refused(kind, name, task):
     links = example_links(task)
-    with pytest.raises(ValueError, match=r"label|needs option (trend|members)"):
+    with pytest.raises(ValueError, match=r"label|needs (option (trend|members)|a regressor)"):
         registry(kind).build({"name": name}, scene=links.scene, task=links.task)
 
 

@@ -25,7 +25,7 @@ from gaigs.processes import Stopped, only_run
 from gaigs.report.multirun import report
 from gaigs.report.training_log import read_curves
 
-pytestmark = pytest.mark.usefixtures("files_read_once", "unchecked")
+pytestmark = pytest.mark.usefixtures("unchecked")
 
 SMALL = (
     "tokenizer=euclidean",
@@ -181,6 +181,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ("~nothing", "Hydra cannot read it: Could not delete from config. 'nothing' does not exist."),
         ("density=null", "a part is chosen by the name of its file (Config group"),
         ("+tokenizer.widht=3", "tokenizer 'euclidean' has no option 'widht' (did you mean 'width'?)"),
+        ("data=nerf2_spectrum data.root=nowhere +split.sede=3", "has no option 'sede' (did you mean 'seed'?)"),
         ("trainer.accelerator=gpu", "No supported gpu backend found!)\ncheck its options: accelerator=gpu\n"),
         ("seed=${sed}", "the configuration is not complete: Interpolation key 'sed' not found"),
         ("trainer.val_check_interval=1.5", "trainer.val_check_interval must be a whole number, got 1.5"),

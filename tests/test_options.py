@@ -122,7 +122,7 @@ def test_impossible_options_are_refused(kind, name, options, task, message):
     links = example_links(task)
     context = {
         "loss": {"task": links.task},
-        "deformation": {"channels": 2, "tokenizer_widths": (5, 4, 6)},
+        "deformation": {"channels": 2, "tokenizer_widths": (5, 4, 6), "count": 7},
     }
     with pytest.raises(ValueError, match=message):
         registry(kind).build({"name": name, **options}, scene=links.scene, **context.get(kind, {}))

@@ -9,6 +9,7 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+from hatchling.builders.sdist import SdistBuilder
 from hatchling.builders.wheel import WheelBuilder
 
 from gaigs.registry import registry
@@ -202,6 +203,32 @@ print(json.dumps([str(conf_dir()), registry("projection").names()]))
     conf, projections = place.python(script, gaigs=unpacked)
     assert Path(conf) == unpacked / "gaigs" / "conf"
     assert "mercator" in projections
+
+
+def test_the_package_installs_from_its_source_archive(tmp_path):
+    """As ``pipx run --spec dist/*.whl gaigs --help`` does, without the dependencies."""
+    (archive,) = SdistBuilder(str(ROOT)).build(directory=str(tmp_path), versions=["standard"])
+    site = tmp_path / "site"
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "install",
+        "--no-deps",
+        "--no-index",
+        "--no-build-isolation",
+    ]
+    subprocess.run([*pip, "-q", "--target", str(site), archive], check=True, cwd=tmp_path)
+    script = site / "bin" / "gaigs"
+    done = subprocess.run(
+        [sys.executable, str(script), "--help"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(site)},
+    )
+    assert done.returncode == 0, done.stderr
+    assert "mirrored_rssi" in done.stdout, "experiments are those of the installed conf"
 
 
 def test_the_table_of_shipped_plug_ins_has_all_entry_points():

@@ -39,7 +39,7 @@ from gaigs.runs.folder import claim
 from gaigs.testing import example_links
 from gaigs.training.descent import Descent
 
-pytestmark = pytest.mark.usefixtures("files_read_once", "unchecked")
+pytestmark = pytest.mark.usefixtures("unchecked")
 
 SMALL = (
     "data.transmitters=30",
@@ -82,7 +82,7 @@ CASES = {
 METRICS = [
     "task", "data", "split", "seed", "device", "rasterizer", "train_seconds", "inference_ms", "render_ms",
     "num_gaussians", "num_gaussians_start", "num_parameters", "checkpoint_bytes", "models", "validation",
-    "validation_score", "receivers",
+    "validation_score", "receivers", "paired",
 ]  # fmt: skip
 
 

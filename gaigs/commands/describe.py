@@ -175,11 +175,12 @@ def figure(links: Links) -> Figure:
     """Places and receivers from above, and a histogram of levels."""
     levels = Levels.of(links)
     with rc_context(style.STYLE):
-        drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
+        drawn = style.new_figure(style.PAGE, 0.46 * style.PAGE, "compressed")
         above, histogram = drawn.subplots(1, 2)
         draw_places(above, links, levels)
         drawn.legend(loc="outside lower left")
         draw_histogram(histogram, levels, links.task.is_noisy)
+        style.ask(drawn, "Where was measured, and what?")
     return drawn
 
 

@@ -16,9 +16,6 @@ MANY = 30
 LEAST = 0.01
 """Least share of power that the direct wave keeps in a mean over links, beside chance."""
 
-ALIKE = 0.7
-"""Least share of a response that elements or subcarriers share; calibrated arrays have 0.99."""
-
 
 class StrangeParts(NamedTuple):
     """Parts of a receiver whose fixed phases or strengths geometry does not explain.
@@ -40,8 +37,8 @@ def phase_sign(
 
     Divided by free space, a direct path alone is the same number at all links of a receiver. For
     each sign, the mean over links keeps a share of the power, by chance about 1 / links. The larger
-    share wins if it exceeds 0.01 plus four times that of chance: never with fewer than ``TELLING``
-    links a receiver. ``waves`` are ``direct_waves`` of the same links with the sign -1.
+    share wins if it exceeds 0.01 plus four times the share by chance: never with fewer than
+    ``TELLING`` links a receiver. ``waves`` are ``direct_waves`` of the same links with the sign -1.
     """
     received = max(1, int((channels.abs().amax((1, 2)) > 0).sum()))  # links with a signal
     shares = {}
@@ -80,12 +77,14 @@ def strange_parts(
     receivers: Int[Tensor, " k"],
     frequencies: Float[Tensor, " s"],
     sign: int,
+    common_share: float = 0.7,
 ) -> dict[int, StrangeParts]:
     """Receivers at which geometry does not explain fixed phases or strengths of the direct wave.
 
     A receiver counts with ``MANY`` links or more that have a direct wave. Its elements count if
-    they resolve the directions of the waves: from one direction, reflections look the same. Other
-    arguments are as for ``phase_sign``.
+    they resolve the directions of the waves: from one direction, reflections look the same.
+    ``common_share`` is the least share of a response that elements or subcarriers share; calibrated
+    arrays have 0.99. Other arguments are as for ``phase_sign``.
     """
     strange = {}
     for receiver, response in common_responses(channels, waves, receivers, sign).items():
@@ -100,21 +99,21 @@ def strange_parts(
         # The power of the mean response without the part that chance leaves in it.
         by_chance = (1 - share) / links / share
         power = response.abs().square().mean() * (1 - by_chance)
-        if response.mean().abs().square() > ALIKE * power:
+        if response.mean().abs().square() > common_share * power:
             continue
         over_subcarriers = response.mean(1).abs().square().mean()
         over_elements = response.mean(0).abs().square().mean()
         # Elements resolve directions if the waves' phases between them differ from link to link.
         relative_turns = turns * turns.mean(1, keepdim=True).sgn().conj()
         alike = relative_turns.mean(0).abs().square().mean()
-        elements = bool(over_elements < ALIKE * power and alike < 0.5)
-        subcarriers = bool(over_subcarriers < ALIKE * power)
+        elements = bool(over_elements < common_share * power and alike < 0.5)
+        subcarriers = bool(over_subcarriers < common_share * power)
         delay = None
         if subcarriers:
             rates = 2 * math.pi * (frequencies - frequencies.mean())
             late = _best_delays(response.sum(0), rates)
             aligned = response * torch.polar(torch.ones_like(rates), late * rates)
-            if aligned.mean().abs().square() > ALIKE * power:
+            if aligned.mean().abs().square() > common_share * power:
                 delay = -sign * late.item()
         if elements or subcarriers:
             strange[receiver] = StrangeParts(elements, subcarriers, delay)

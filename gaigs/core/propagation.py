@@ -138,8 +138,8 @@ def fit_gain(
 ) -> Complex[Tensor, ""]:
     """The complex gain of measured channels h over waves w predicted at a gain of 1; complex128.
 
-    Its magnitude is the median over the links of |h| / |w|, its phase that of the sum of w* h /
-    (|w| |h|). So each link counts once, weak or strong. Links with h = 0 or w = 0 do not count;
+    Its magnitude is the median over the links of |h| / |w|, its phase the phase of the sum of w* h
+    / (|w| |h|). So each link counts once, weak or strong. Links with h = 0 or w = 0 do not count;
     without any other the gain is 0.
     """
     h = channels.to(torch.complex128).flatten(1)  # (k, numbers)

@@ -6,6 +6,7 @@ import time
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,6 +16,7 @@ from numpy import ndarray
 from gaigs.core import stages
 from gaigs.core.geometry import ExtrapolationWarning
 from gaigs.core.query import as_receivers
+from gaigs.core.results import library, plot
 from gaigs.core.scene import Scene
 from gaigs.io.files import atomic_write
 
@@ -65,6 +67,26 @@ class RadioMap:
         names = tuple(self.receivers[number] for number in index)
         return replace(self, values=self.values[index], receivers=names, deviations=deviations)
 
+    plot = plot
+
+    def to_xarray(self) -> Any:
+        """An ``xarray.Dataset`` with ``value`` and, if it is known, ``std`` by receiver, y and x.
+
+        Raises:
+            ImportError: Xarray is not installed.
+        """
+        places = {"x": ("x", self.x, {"units": "m"}), "y": ("y", self.y, {"units": "m"})}
+        scalars = {"z": ((), self.height, {"units": "m"})}
+        if self.frequency is not None:
+            scalars["frequency"] = ((), self.frequency, {"units": "Hz"})
+        unit = {"long_name": self.quantity, "units": self.unit}
+        variables = {"value": (("receiver", "y", "x"), self.values, unit)}
+        if self.deviations is not None:
+            variables["std"] = (("receiver", "y", "x"), self.deviations)
+        names = {"receiver": ("receiver", [*self.receivers])}
+        xarray = library("xarray", "to_xarray")
+        return xarray.Dataset(variables, names | places | scalars)
+
     def save(self, path: str | Path) -> None:
         """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and all other attributes
         that are known.
@@ -109,6 +131,7 @@ def _key(unit: str) -> str:
     return f"values_{unit.lower()}" if unit.isascii() and unit.isalpha() else "values"
 
 
+@stages.with_progress
 def radio_map(
     model,
     pitch: float | None = None,
@@ -116,6 +139,8 @@ def radio_map(
     margin: float = 0.5,
     receivers: object = None,
     frequency: float | None = None,
+    *,
+    progress: bool = True,
 ) -> RadioMap:
     """Predictions on a horizontal plane over the box of training transmitters and all receivers,
     widened.
@@ -130,6 +155,7 @@ def radio_map(
         margin: Widening of the box on each side [m].
         receivers: Names or indices, or one of them; None: all receivers.
         frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
+        progress: False for no bars.
 
     Warns:
         ExtrapolationWarning: The frequency is outside the training links' band, or height or margin
@@ -156,7 +182,7 @@ def radio_map(
         height = _usual_height(scene)
     lower, upper = _rectangle(scene, float(height), float(margin))
     for message in _doubts(scene, float(height), float(margin)):
-        warnings.warn(message, ExtrapolationWarning, stacklevel=3)  # a decorator lies between
+        warnings.warn(message, ExtrapolationWarning, stacklevel=4)  # two decorators lie between
     if frequency is None:
         frequency = scene.middle_frequency
     predict = _Predictions(model, chosen, frequency)

@@ -1,15 +1,19 @@
 """Stages of a run: a bar with the time left of each, and the time limit of the whole run."""
 
 import contextlib
+import functools
+import importlib
+import io
 import logging
 import math
 import threading
 import time
-from collections.abc import Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sized
 from contextvars import ContextVar
 from typing import Any
 
 import rich
+from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TimeRemainingColumn
 
 log = logging.getLogger(__name__)
@@ -123,7 +127,8 @@ def stage(
     timer.daemon = True
     opened.keeper.stages.append(opened)
     is_main = threading.current_thread() is threading.main_thread()
-    if name and total > 1 and opened.keeper.shown and is_main and rich.get_console().is_terminal:
+    has_reader = rich.get_console().is_terminal or rich.get_console().is_jupyter
+    if name and total > 1 and opened.keeper.shown and is_main and has_reader:
         timer.start()
     try:
         yield opened
@@ -173,8 +178,50 @@ def leave_out(what: str) -> None:
     log.warning("max_time: %s", what)
 
 
+def with_progress(function: Callable) -> Callable:
+    """Hides the bars of calls with ``progress=False``, a keyword that the function declares."""
+
+    @functools.wraps(function)
+    def shown(*arguments, **options):
+        keeper = current()
+        before = keeper.shown
+        keeper.shown = before and options.get("progress", True)
+        try:
+            return function(*arguments, **options)
+        finally:
+            keeper.shown = before
+
+    return shown
+
+
+class NotebookBars(Progress):
+    """Bars in a notebook: a text that is replaced twice a second, without a widget."""
+
+    def start(self) -> None:
+        if not self.disable:
+            display = importlib.import_module("IPython.display").display
+            self.output = display({"text/plain": ""}, raw=True, display_id=True)
+            self.drawn = 0.0
+
+    def update(self, *arguments: Any, **options: Any) -> None:
+        super().update(*arguments, **options)
+        if not self.disable and time.monotonic() - self.drawn > 0.5:
+            self.drawn = time.monotonic()
+            self._write(self.get_renderable())
+
+    def stop(self) -> None:
+        if not self.disable:
+            self._write("" if self.live.transient else self.get_renderable())
+
+    def _write(self, content: Any) -> None:
+        page = Console(file=io.StringIO(), width=100, force_jupyter=False, record=True)
+        page.print(content)
+        self.output.update({"text/plain": page.export_text()}, raw=True)
+
+
 def make_bars(**options: Any) -> Progress:
     """Bars with description, count, time left and scores in a line each."""
     count, scores = "{task.fields[count]}", "{task.fields[scores]}"
     columns = "{task.description}", BarColumn(None), count, TimeRemainingColumn(), scores
-    return Progress(*columns, console=rich.get_console(), expand=True, **options)
+    kind = NotebookBars if rich.get_console().is_jupyter else Progress
+    return kind(*columns, console=rich.get_console(), expand=True, **options)

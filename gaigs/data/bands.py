@@ -15,7 +15,7 @@ from gaigs.data import Links, kept_links
 def hold_out_band(
     links: Links, band_train: Sequence[float] | None, band_test: Sequence[float] | None
 ) -> Links:
-    """Channels with the subcarriers of one band, whose ``held_out`` have those of another.
+    """Channels with the subcarriers of one band, whose ``held_out`` have another band's.
 
     Args:
         links: Channels at all subcarriers.

@@ -28,7 +28,8 @@ def check_fit(links: Links, scene: Scene | None = None) -> None:
             f"links must have the model's labels, {expected} with the same axes, got {got}"
         )
     if not are_alike(_antennas(scene.receivers), _antennas(links.receivers)):
-        expected, got = (_names(receivers) for receivers in (scene.receivers, links.receivers))
+        expected = ", ".join(receiver.name for receiver in scene.receivers)
+        got = ", ".join(receiver.name for receiver in links.receivers)
         raise ValueError(
             "links must have the model's receivers in the same order, with the same poses and "
             f"arrays: {expected}; got {got}"
@@ -42,10 +43,6 @@ def _antennas(receivers: tuple[Receiver, ...]) -> list[tuple]:
         array = receiver.array
         antennas.append((pose.position, pose.rotation, array.elements, array.pattern))
     return antennas
-
-
-def _names(receivers: tuple[Receiver, ...]) -> str:
-    return ", ".join(receiver.name for receiver in receivers)
 
 
 def are_alike(a: Any, b: Any) -> bool:

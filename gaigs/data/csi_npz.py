@@ -108,19 +108,31 @@ def read(
             "data.parts must be first or last, the axis of real and imaginary part, or null, "
             f"got {parts!r}"
         )
-    loaded, ignored = _load(file, arrays, parts)
+    links = to_links(file, *_load(file, arrays, parts), phase)
+    return hold_out_band(links, band_train, band_test)
+
+
+def to_links(
+    file: Path, arrays: dict[str, np.ndarray], ignored: Sequence[str], phase: str
+) -> Links:
+    """Links of the arrays that ``read`` describes, by name.
+
+    Args:
+        file: File of the arrays, or a word for them in messages.
+        ignored: Names of other arrays.
+        phase: See ``read``.
+    """
     added: list[str] = []
-    if "a" in loaded:
+    if "a" in arrays:
         try:
-            loaded, added = from_sionna(loaded, needs_delays=phase != "per_link_and_delay")
+            arrays, added = from_sionna(arrays, needs_delays=phase != "per_link_and_delay")
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from None
-    _check_shapes(file, loaded)
-    _check_values(file, loaded)
-    check_parts(f"{file}: h", loaded["h"])
-    _move_missing_elements_last(file, loaded)
-    links = _to_links(loaded, phase, added, ignored)
-    return hold_out_band(links, band_train, band_test)
+    _check_shapes(file, arrays)
+    _check_values(file, arrays)
+    check_parts(f"{file}: h", arrays["h"])
+    _move_missing_elements_last(file, arrays)
+    return _to_links(arrays, phase, added, ignored)
 
 
 def _to_links(

@@ -5,6 +5,7 @@ Errors name file, line and content.
 
 import codecs
 import csv
+import difflib
 import functools
 import math
 import os
@@ -98,18 +99,19 @@ def read_lines(file: Path, content: str) -> list[str]:
     return lines
 
 
-def refuse(file: Path, wrong: Mapping[int, str], expected: str) -> None:
+def refuse(file: Path, wrong: Mapping[int, str], expected: str, unit: str = "line") -> None:
     """Raises a ``ValueError`` that names the first wrong line and counts the others.
 
     Args:
         wrong: Contents of the wrong lines by number; empty without any.
+        unit: Word for a line, ``row`` in a data frame.
     """
     if not wrong:
         return
     number, got = next(iter(wrong.items()))
     count = len(wrong) - 1
-    others = {0: "", 1: " and 1 other line"}.get(count, f" and {count} other lines")
-    raise ValueError(f"{file}, line {number}{others}: expected {expected}, got {got}")
+    others = {0: "", 1: f" and 1 other {unit}"}.get(count, f" and {count} other {unit}s")
+    raise ValueError(f"{file}, {unit} {number}{others}: expected {expected}, got {got}")
 
 
 def read_points(file: Path, names: Sequence[str], content: str) -> list[list[float]]:
@@ -212,17 +214,33 @@ def described(cell: str) -> str:
 
 
 class Table(NamedTuple):
-    """A table in numbers, a column a name: NaN for an empty cell, infinity for another text."""
+    """A table in numbers, a column a name.
+
+    Attributes:
+        file: File, or a word for a table in memory.
+        names: Names of the columns.
+        numbers: Numbers, NaN for an empty cell and infinity for another text.
+        text: Text of a cell by its row and column.
+        unit: Word for a row in messages.
+        first: Number of the first row in messages.
+    """
 
     file: Path
-    lines: list[str]
-    delimiter: str
     names: list[str]
     numbers: Float[ndarray, "rows columns"]
+    text: Callable[[int, int], str]
+    unit: str = "line"
+    first: int = 2
 
-    def text(self, row: int, column: int) -> str:
-        """The text of a cell."""
-        return split_cells(self.lines[row + 1], self.delimiter)[column]
+    @property
+    def heading(self) -> str:
+        """The place of the columns' names, for messages."""
+        return f"{self.file}, line 1" if self.unit == "line" else str(self.file)
+
+    def refuse(self, wrong: Mapping[int, str], expected: str) -> None:
+        """Raises a ``ValueError`` for wrong cells by the numbers of their rows, as ``refuse``."""
+        numbered = {self.first + row: cell for row, cell in wrong.items()}
+        refuse(self.file, numbered, expected, self.unit)
 
     def cell(self, row: int, column: int) -> str:
         """The text of a cell with its column, for messages."""
@@ -231,9 +249,10 @@ class Table(NamedTuple):
     def column(self, name: str) -> int:
         """The number of a column; a ``ValueError`` if there is none of that name."""
         if name not in self.names:
-            raise ValueError(
-                f"{self.file}, line 1: expected a column {quote(name)}, got {shortened(self.names)}"
-            )
+            near = difflib.get_close_matches(name, self.names, n=1)
+            hint = f" (did you mean {near[0]!r}?)" if near else ""
+            got = f"{shortened(self.names)}{hint}"
+            raise ValueError(f"{self.heading}: expected a column {quote(name)}, got {got}")
         return self.names.index(name)
 
 
@@ -271,7 +290,7 @@ def read_table(file: Path, content: str) -> Table:
         if name and count > 1:
             got = f"{quote(name)} {count} times"
             raise ValueError(f"{file}, line 1: expected each column once, got {got}")
-    number = functools.cache(functools.partial(_level, has_commas=delimiter != ","))
+    number = functools.cache(functools.partial(to_level, has_commas=delimiter != ","))
     rows: list[ndarray] = []
     wrong: dict[int, str] = {}
     for line, text in enumerate(lines[1:], 2):
@@ -282,10 +301,14 @@ def read_table(file: Path, content: str) -> Table:
     refuse(file, wrong, f"{len(names)} columns {quote(delimiter.join(names))}")
     if not rows:
         raise ValueError(f"{file}: no rows below the heading")
-    return Table(file, lines, delimiter, names, np.stack(rows))
+
+    def text_of(row: int, column: int) -> str:
+        return split_cells(lines[row + 1], delimiter)[column]
+
+    return Table(file, names, np.stack(rows), text_of)
 
 
-def _level(cell: str, has_commas: bool) -> float:
+def to_level(cell: str, has_commas: bool = False) -> float:
     """The number of a cell, NaN for an empty one, infinity for another text.
 
     Args:

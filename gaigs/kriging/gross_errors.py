@@ -16,9 +16,9 @@ def without_gross_errors(links: Links, size: float = 6.0) -> Links:
     whole fit.
 
     Levels fall with the logarithm of the distance to their receiver. A level is left out if its
-    error by this law is more than ``size`` standard deviations, and as far from those of the five
-    nearest levels of its receiver: what neighbours share is a part of the room. So is what more
-    than one in twenty have. The line has Cauchy's weights, so few levels do not move it. The
+    error by this law is more than ``size`` standard deviations, and as far from the errors of the
+    five nearest levels of its receiver: what neighbours share is a part of the room. So is what
+    more than one in twenty have. The line has Cauchy's weights, so few levels do not move it. The
     deviation is 1.48 times the median error, the larger one of the receiver and of all receivers, 1
     dB or more. Fewer than 20 known links keep all.
 
@@ -55,8 +55,8 @@ def are_alone(
     most: Float[Tensor, ""],
     neighbours: int = 5,
 ) -> Bool[Tensor, " k"]:
-    """True for errors above ``most`` that are as far from those of the nearest places; all False if
-    more than one in twenty are.
+    """True for errors above ``most`` that are as far from the errors of the nearest places; all
+    False if more than one in twenty are.
     """
     is_alone = torch.zeros_like(errors, dtype=torch.bool)
     far = (errors.abs() > most).nonzero()[:, 0]
@@ -72,7 +72,7 @@ def are_alone(
 
 
 def errors_of_law(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-    """Levels less those of a line over the logarithm of the distance, by least squares with
+    """Levels less a line over the logarithm of the distance, by least squares with
     Cauchy's weights.
     """
     weights = torch.ones_like(levels)

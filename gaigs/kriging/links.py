@@ -35,7 +35,7 @@ def known_links(links: Links) -> list[Int[Tensor, " k"]]:
 
 
 def check_known(links: Links) -> None:
-    """Raises the ``ValueError`` of ``known_links`` for all known links, and for those of a
+    """Raises the ``ValueError`` of ``known_links`` for all known links, and for the links of a
     validation.
     """
     known_links(links)

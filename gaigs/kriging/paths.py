@@ -46,7 +46,7 @@ class Equations:
     The channel of a link is predicted as h + sum_i u_i m_i, with the field m_i of path i per unit
     of its process. With the residual r, and noise of ``nugget`` times p, the log likelihood is -|r
     - sum_i u_i m_i|² / (nugget p): a quadratic form. p is the mean power of the residual's numbers,
-    plus a ten-thousandth of that of the label's, which has the gain of the prediction: links in
+    plus a ten-thousandth of the label's, which has the gain of the prediction: links in
     shadow have far larger residuals than others.
 
     Attributes:

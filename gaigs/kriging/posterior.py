@@ -41,7 +41,7 @@ class Posterior(nn.Module):
         raise NotImplementedError
 
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
-        """Takes the known links; ``residuals`` gives those of some of their rows (j, *shape)."""
+        """Takes the known links; ``residuals`` gives residuals of some rows (j, *shape)."""
         raise NotImplementedError
 
     @abstractmethod

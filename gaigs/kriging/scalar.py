@@ -28,10 +28,10 @@ class ScalarProcess(nn.Module):
     """y = z + noise: residuals of a trend, z a Gaussian process over places at each receiver.
 
     Each receiver has a correlation length l [m], a standard deviation of z and one of the noise, in
-    the label's unit. Their logarithms scatter about those of all receivers as Student's t: one
-    receiver may be far noisier than the others. Kernel (Matern-1/2 or -3/2) and noise (normal, or
-    Student's t) are the same for all receivers. All maximise the likelihood of held-out readings,
-    each given those around it. ``options`` has the numbers.
+    the label's unit. Their logarithms scatter about the logarithms of all receivers as Student's t:
+    one receiver may be far noisier than the others. Kernel (Matern-1/2 or -3/2) and noise (normal,
+    or Student's t) are the same for all receivers. All maximise the likelihood of held-out
+    readings, each given those around it. ``options`` has the numbers.
 
     Student's t is a normal distribution whose variance is random. Expectation and maximisation give
     each reading a variance of its own, so that one that disagrees with all around it counts little.

@@ -24,12 +24,7 @@ from gaigs.data import Links
 from gaigs.kriging.kernel import Process
 from gaigs.kriging.links import single_readings
 from gaigs.model import checkpoint
-from gaigs.model.requests import (
-    Request,
-    as_known_subcarriers,
-    lacks_elements,
-    usual_batch_size,
-)
+from gaigs.model.requests import Request, as_known_subcarriers, lacks_elements, usual_batch_size
 from gaigs.registry import check_type
 from gaigs.registry.torch_modes import usual_modes
 from gaigs.splatting.gaussians import Gaussians
@@ -252,12 +247,15 @@ class Model(nn.Module):
         for parts in zip(*batches, strict=True):
             joined = None if parts[0] is None else torch.cat(parts)
             fields.append(None if joined is None else request.arranged(joined, self.scene))
-        if not isinstance(fields[0], dict):
-            return Estimate(*fields)
-        estimates = {}
-        for name in fields[0]:
-            estimates[name] = Estimate(*(part and part[name] for part in fields))
-        return estimates
+        return request.estimates(fields, self.scene)
+
+    def to_xarray(self, transmitters: object, interval: float | None = None, **named: Any) -> Any:
+        """``predict`` with arguments by name as an ``xarray.Dataset``; without an interval it has
+        ``value`` alone. Where arrays have different numbers of elements, a dictionary by receiver.
+        """
+        asked = (named.get(name) for name in ("receiver", "frequency", "directions", "frequencies"))
+        answer = self.predict(transmitters, interval=interval, **named)  # type: ignore[arg-type]
+        return self._request(transmitters, *asked).to_xarray(answer, self.scene)
 
     def predict_batches(
         self,
@@ -285,7 +283,7 @@ class Model(nn.Module):
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Model":
         """A copy of a model with ``any_frequency`` whose labels have other subcarriers [Hz]."""
-        scene = replace(self.scene, task=self.scene.task.at_frequencies(frequencies))
+        scene = self.scene.at_frequencies(frequencies)
         other = copy.deepcopy(self)
         for part in other.modules():
             if hasattr(part, "scene"):

@@ -29,15 +29,12 @@ SEAL = b"gaigs sha256 "
 """Precedes the digest of all bytes before, which ends the file. Both are the comment of the zip
 archive that ``torch.save`` writes, so the file stays an archive."""
 
-DIGEST = 64
-"""Length of the digest in hexadecimal digits."""
-
 
 def seal(path: Path) -> None:
     """Appends the seal to a file of ``torch.save``, by which ``read`` detects any changed bit."""
     content = path.read_bytes()
     sealed = (
-        content[:-2] + (len(SEAL) + DIGEST).to_bytes(2, "little") + SEAL
+        content[:-2] + (len(SEAL) + 64).to_bytes(2, "little") + SEAL
     )  # the length of the archive's comment
     path.write_bytes(sealed + hashlib.sha256(sealed).hexdigest().encode())
 
@@ -62,14 +59,14 @@ def read(path: str | Path) -> dict:
         )
     data = path.read_bytes()
     try:
-        sealed, digest = data[:-DIGEST], data[-DIGEST:]
+        sealed, digest = data[:-64], data[-64:]  # hexadecimal digits
         if not sealed.endswith(SEAL) or hashlib.sha256(sealed).hexdigest().encode() != digest:
             raise ValueError("another digest")
         with ZipFile(io.BytesIO(data)) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > len(data):
                 raise ValueError("compressed, which torch.save never does")
         content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-        # A view can be far larger than the numbers behind it; those of a model are not.
+        # A view can be far larger than the numbers behind it; the views of a model are not.
         if sum(tensor.nbytes for _, tensor in _tensors(content, "")) > 4 * len(data) + 2**26:
             raise ValueError("larger than the file")
     except (

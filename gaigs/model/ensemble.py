@@ -52,7 +52,7 @@ class Ensemble(Wrapper):
         return self.members[0]  # type: ignore[return-value]
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
-        """That of all members, one after the other."""
+        """Renders by all members, one after the other."""
         parts = [member.rendering(batch) for member in self.members]  # type: ignore[operator]
         return None if None in parts else lambda: [part() for part in parts]
 

@@ -119,7 +119,9 @@ class GaussianSplatting(Model):
             name = deformation if isinstance(deformation, str) else deformation["name"]
             component = registry("deformation").get(name)
         self.tokenizer = None
-        context: dict[str, Any] = {"scene": scene, "channels": channels}
+        is_fixed = self.gaussians is not None and not self.placement.has_own
+        count = len(self.gaussians) if is_fixed else None
+        context: dict[str, Any] = {"scene": scene, "channels": channels, "count": count}
         if component.reads_tokens:
             built = self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
             widths = built.scene_width, built.gaussian_width, built.transmitter_width
@@ -209,7 +211,10 @@ class GaussianSplatting(Model):
 
     @property
     def learning_rates(self) -> dict[str, float]:  # type: ignore[override]
-        return {**Gaussians.learning_rates, **self.placement.learning_rates, **Model.learning_rates}
+        rates = {**Gaussians.learning_rates, **self.placement.learning_rates}
+        return rates | {
+            "network": self.deformation.learning_rate or super().learning_rates["network"]
+        }
 
     @property
     def penalty_weights(self) -> dict[str, float]:  # type: ignore[override]

@@ -52,7 +52,7 @@ class GaussianProcess(LookUp):
     frequency, d² = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are
     processes of their own with one kernel.
 
-    Length l [m], nugget (variance of the noise over that of the signal) and s [m] maximise the
+    Length l [m], nugget (variance of the noise over the signal's) and s [m] maximise the
     likelihood of the validation links given the training links around them, see
     ``gaigs.kriging.fit``. All receivers share the three. The signal's variance is each receiver's
     most likely one.

@@ -348,7 +348,8 @@ class Kriging(Wrapper):
     def deviations(self, batch: Batch) -> Tensor:
         """Standard deviations of the labels; of spectra means over their pixels.
 
-        Those of kriged paths have no noise, and treat paths as if the elements resolved them all.
+        Processes of kriged paths have no noise, and treat paths as if the elements resolved them
+        all.
         """
         return self.posterior.deviations(batch)
 

@@ -18,8 +18,8 @@ from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
-from gaigs.planes.channel_links import ChannelOptions
 from gaigs.planes.channel_search import ChannelSearch
+from gaigs.planes.field_search import FieldSearch
 from gaigs.planes.lag_search import LagSearch
 from gaigs.planes.learnt_room import LearntRoom, build_room
 from gaigs.planes.level_search import LevelSearch
@@ -149,10 +149,11 @@ class MirroredSplatting(GaussianSplatting):
     def _fit_channels(self, links: Links, task: Task, pooling: ChannelPooling) -> None:
         """Starts from free space, and puts planes for the first revision.
 
-        Planes are those that ``ChannelSearch`` finds. Channels of few numbers have the faces of the
-        box.
+        Planes are those that ``ChannelSearch`` finds; of channels of few numbers, ``FieldSearch``.
+        Without a phase in common these have the faces of the box.
         """
         placement = self.placement
+        links = replace(links, labels=self.scene.equalised(links.query, links.labels))
         train = links.split.train
         sign = int(pooling.sign)
         query = links.query[train]
@@ -162,15 +163,19 @@ class MirroredSplatting(GaussianSplatting):
         gains = self._receiver_gains(links.labels[train], query, waves, pooling)
         placement.start_from_free_space(gains.conj() if sign > 0 else gains)
         placement.enable_phases(speed_of_light / task.frequencies.mean().item())
-        numbers = links.labels[train][0].numel()
-        if placement.fixed or not placement.order or numbers < ChannelOptions.fewest_numbers:
+        if placement.fixed or not placement.order:
+            return
+        is_known = task.phase == "known" and sign != 0
+        if placement.has_few_numbers:
+            if is_known:
+                self._search_field(links, sign, start, pooling)
             return
         labels = links.labels.clone()
         labels[train] = task.align(labels[train], waves)  # without delays that paths do not have
         planes, slabs = ChannelSearch(
             replace(links, labels=labels),
             int(pooling.array_sign),
-            task.phase == "known" and sign != 0,
+            is_known,
             placement.order,
             len(placement.origin),
             start,
@@ -181,6 +186,28 @@ class MirroredSplatting(GaussianSplatting):
         placement.most.copy_(placement.planned.sum())
         placement.step.mul_(0.1)  # the search is exact to millimetres
         placement.found.fill_(True)
+
+    def _search_field(
+        self, links: Links, sign: int, start: Float[Tensor, "w 4"], pooling: ChannelPooling
+    ) -> None:
+        """Starts from the planes and strengths that ``FieldSearch`` finds."""
+        placement = self.placement
+        search = FieldSearch(links, sign, placement.order, len(placement.origin), start)
+        room = search.run()
+        planes = search.frame.to_world(room.planes)
+        for number, (plane, slab) in enumerate(zip(planes, room.slabs, strict=True)):
+            placement.place(number, plane, slab)
+        placement.planned.copy_(placement.sequences_of(torch.arange(len(planes))))
+        longer = (placement.sequences >= 0).sum(1) > search.data.order
+        placement.planned[longer] = False
+        placement.most.copy_(placement.planned.sum())
+        placement.found.fill_(True)
+        if not len(planes):
+            return
+        unit = pooling.strength.item() * search.data.wavelength / (4 * math.pi)
+        receivers = torch.tensor(search.data.numbers)
+        placement.start_strengths(room.gains, receivers, room.receivers / unit)
+        placement.step.mul_(0.1)
 
     def _receiver_gains(
         self,

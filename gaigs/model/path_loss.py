@@ -17,7 +17,7 @@ from gaigs.registry import register
 class PathLoss(Model):
     """T - 10 gamma log10(distance / 1 m) for each receiver; NaN before ``fit``.
 
-    It is meant for RSSI [dBm], and accepts any task of one real number a link. T is that of least
+    It is meant for RSSI [dBm], and accepts any task of one real number a link. T is fitted by least
     squares. So is gamma, but drawn towards the mean of all receivers as far as chance explains
     their scatter: a few readings alone give wild slopes. Negative exponents are kept: there
     distance explains nothing. If all links of a receiver are equally long, gamma is that mean;

@@ -1,15 +1,20 @@
 """Arguments of ``Model.predict``: checked, with the axes of the answer and the warnings."""
 
+import copy
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gaigs.calibration.conformal import Asked, Estimate
 from gaigs.core.antenna import Receiver
-from gaigs.core.geometry import Directions
+from gaigs.core.geometry import Directions, Grid, Rays
 from gaigs.core.query import ROUNDING, Query, as_directions, as_receivers, as_subcarriers
 from gaigs.core.scene import Scene
+from gaigs.core.task import Axis
 
 
 class Subcarriers(NamedTuple):
@@ -70,6 +75,52 @@ class Request(NamedTuple):
         warnings = [subcarriers.warning] if subcarriers.warning else []
         warnings += extrapolations(query[::each], scene)
         return cls(query, axes, receiver, each, directions, subcarriers, warnings)
+
+    def asked(self, scene: Scene, name: str | None = None) -> Asked:
+        """Names and coordinates of the answer's axes; of its part at receiver ``name``."""
+        task = scene.task
+        if self.subcarriers.exchanged is not None:
+            task = task.at_frequencies(self.subcarriers.exchanged)
+        elif self.subcarriers.columns is not None:
+            task = task.at_frequencies(task.frequencies[self.subcarriers.columns])
+        if isinstance(self.directions, Grid):
+            task = copy.copy(task)
+            task.directions = self.directions
+        axes = task.axes()
+        if isinstance(self.directions, Rays):
+            shape = self.directions.shape
+            axes = {f"direction_{k}": Axis(np.arange(size)) for k, size in enumerate(shape)}
+        names = np.array([receiver.name for receiver in scene.receivers])
+        places = self.axes[:-1] if self.receiver is None else self.axes
+        positions = self.query.transmitters[:: self.each].reshape(*places, 3)
+        has_axis = self.receiver is None and name is None
+        if name is not None:
+            names = np.full(places, name)
+        elif not has_axis:
+            names = names[self.query.receivers.cpu()].reshape(places)
+        return Asked(positions, names, has_axis, axes, task.quantity, task.unit)
+
+    def estimates(self, fields: Sequence, scene: Scene) -> Any:
+        """Estimates of arranged fields; by receiver where these are dictionaries."""
+        if not isinstance(fields[0], dict):
+            return Estimate(*fields).about(self.asked(scene))
+        estimates = {}
+        for name in fields[0]:
+            parts = Estimate(*(part and part[name] for part in fields))
+            estimates[name] = parts.about(self.asked(scene, name))
+        return estimates
+
+    def to_xarray(self, answer: Any, scene: Scene) -> Any:
+        """An answer as a data set, or a dictionary of data sets by receiver."""
+
+        def labelled(part: Any, name: str | None = None) -> Any:
+            if not isinstance(part, Estimate):
+                part = Estimate(part, None, None, None).about(self.asked(scene, name))
+            return part.to_xarray()
+
+        if not isinstance(answer, dict):
+            return labelled(answer)
+        return {name: labelled(part, name) for name, part in answer.items()}
 
     def arranged(self, values: Tensor, scene: Scene, axes: tuple[int, ...] | None = None) -> Any:
         """Values of links (b, ...) with the axes of the answer, or with other ones.

@@ -35,8 +35,6 @@ class ChannelOptions:
 
     Attributes:
         ridge: Ridge of path strengths over their mean power.
-        fewest_numbers: Fewest numbers of a channel, elements times subcarriers: one path explains
-            any single number.
         fewest_free: Numbers of a channel, elements times delays that its band resolves in the room,
             below which free strengths explain it by any planes. A room of six has as many paths of
             up to two reflections.
@@ -62,7 +60,6 @@ class ChannelOptions:
     """
 
     ridge: float = 1e-3
-    fewest_numbers: int = 8
     fewest_free: int = 37
     certain_share: float = 0.006
     faint_share: float = 0.003
@@ -280,10 +277,12 @@ class ChannelData:
         self.order = min(order, 2)
         self.options = options
         received = []
+        self.numbers: list[int] = []  # of these receivers
         for number in links.query.receivers[links.split.train].unique().tolist():
             receiver = ReceiverChannels.of(links, number, sign)
             if len(receiver.places):
                 received.append(receiver)
+                self.numbers.append(number)
         ends = []
         for receiver in received:
             ends += [receiver.places, receiver.position[None]]

@@ -147,7 +147,7 @@ class FreeScore(Score[FreeRoom]):
     def rate_lines(
         self,
         receivers: list[ReceiverChannels],
-        profiles: list[Float[Tensor, "b e t 2"]],
+        profiles: list[Float[Tensor, "_ _ t 2"]],
         lines: Float[Tensor, "n k 4"],
     ) -> Float[Tensor, "n k"]:
         """Mean share of power that one more image explains; 0 for a plane between the ends.

@@ -1,7 +1,7 @@
 """The learnt room of mirrored Gaussians: planes as polygons, obstacles and paths, for figures."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -9,6 +9,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from gaigs.core.propagation import fresnel
+from gaigs.core.results import plot
 from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.planes.room_paths import (
@@ -79,6 +80,10 @@ class LearntRoom(NamedTuple):
     planes: list[LearntPlane]
     matter: Matter | None
     paths: list[LearntPath]
+
+    def plot(self, ax: Any = None, **options: Any) -> Any:
+        """Draws it as ``gaigs.plot`` does, which lists the options."""
+        return plot(self, ax, **options)
 
 
 @torch.no_grad()

@@ -14,9 +14,6 @@ from gaigs.data.synthetic.image_source import TABULATED, conductivity
 from gaigs.splatting.placement.mirrored.paths import Mirrored
 from gaigs.splatting.placement.mirrored.reflections import polarised
 
-HALF_SPACE = 1.0
-"""Thickness [m] from which a slab reflects as a half-space: its losses hide the back."""
-
 
 class Material(NamedTuple):
     """A material of ``TABULATED``, and the thickness of its slab [m]."""
@@ -39,9 +36,10 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
 
     Reflections are compared at the bounces of these paths, weighted by the paths' powers.
     Permittivities alone would not do: a plane may reflect strongly by its permittivity or by its
-    gain. A learnt reflection has the plane's gain and its share of the path's gain over that of the
-    direct path. The thickness is the learnt one or, if a half-space reflects more alike,
-    ``HALF_SPACE``. Where paths have phases of their own, magnitudes are compared.
+    gain. A learnt reflection has the plane's gain and its share of the path's gain over the gain of
+    the direct path. The thickness is the learnt one or, if a half-space reflects more alike, 1 m:
+    the losses of such a slab hide its back. Where paths have phases of their own, magnitudes are
+    compared.
 
     Source: ITU-R P.2040-3, table 3; outside 1 to 40 GHz its formulas are extrapolated.
     """
@@ -75,7 +73,7 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
 
 def _list_slabs(placement: Mirrored, frequency: float) -> list[SlabOption]:
     """Each material as a half-space and with the learnt thicknesses."""
-    half_space = torch.full((len(placement.normals),), HALF_SPACE).to(placement.normals)
+    half_space = torch.full((len(placement.normals),), 1.0).to(placement.normals)
     learnt = half_space
     if placement.log_thicknesses is not None:
         learnt = placement.log_thicknesses.exp()

@@ -98,13 +98,23 @@ class PlaneSearch(Generic[R]):
     Args:
         frame: Transmitters and receivers.
         score: What planes explain in the labels.
+        turn, shift: First steps of the search about a maximum, of normals [rad] and of offsets
+            [diagonals].
 
     Source: Hough, Method and means for recognizing complex patterns, 1962, for the candidates.
     """
 
-    def __init__(self, frame: RoomFrame, score: Score[R]):
+    def __init__(
+        self,
+        frame: RoomFrame,
+        score: Score[R],
+        turn: float = 0.06,
+        shift: float = 0.02,
+    ):
         self.frame = frame
         self.score = score
+        self.turn = turn
+        self.shift = shift
 
     def propose(self, room: R, lines: Float[Tensor, "n k 4"]) -> list[Candidate]:
         """At most three planes apart from the room's: the highest maxima of a grid, sharpened."""
@@ -121,7 +131,7 @@ class PlaneSearch(Generic[R]):
             return []
         planes = torch.stack(starts)
         # A random search about each maximum, over half the distance in each round.
-        turn, shift = 0.06, 0.02 * self.frame.diagonal
+        turn, shift = self.turn, self.shift * self.frame.diagonal
         for _ in range(4):
             noise = torch.randn(len(planes), 24, 4, generator=self.frame.generator).to(planes)
             noise[:, 0] = 0  # the plane itself

@@ -1,4 +1,4 @@
-"""Components by name: built-in ones, those of installed packages and those in ./plugins.
+"""Components by name: built-in ones, from installed packages and in ./plugins.
 
 Names are found without an import; a component is imported when it is built.
 """
@@ -13,7 +13,7 @@ from contextvars import ContextVar
 from pathlib import Path
 from types import MappingProxyType
 
-from gaigs.registry.building import call, named_parameters
+from gaigs.registry.building import call, check_known, named_parameters
 from gaigs.registry.discovery import Holder, find_holders, sources
 from gaigs.registry.option_types import check_instance, check_type, is_built, is_plain
 from gaigs.registry.shipped import not_installed
@@ -137,6 +137,17 @@ class Registry:
                 if key not in given
             }
         return {key: value for key, value in options.items() if is_plain(value)}
+
+    def check_options(self, config: Mapping) -> None:
+        """Raises a ``ValueError`` for an option that the component of a configuration lacks.
+
+        The component is imported only if its source does not show the option.
+        """
+        name = config["name"]
+        options = config.keys() - {"name"}
+        if not options <= self.options(name).keys():
+            given = GIVEN.get(self.kind, ())
+            check_known(f"{self.kind} {name!r}", self.get(name), sorted(options), given)
 
     def choices(self, name: str) -> dict[str, str]:
         """The task and the split that a reader's registration chooses; no module is imported."""

@@ -1,14 +1,14 @@
 """Calls of components with the options of a configuration."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping
 
 from gaigs.registry.option_types import check_type
 from gaigs.registry.words import listed, suggest
 
 
 def call(owner: str, function: Callable, options: Mapping, /, **context):
-    """Calls a function or class with options, and with those of ``context`` that it takes.
+    """Calls a function or class with options, and with what it takes of ``context``.
 
     Args:
         owner: Name in errors.
@@ -21,13 +21,10 @@ def call(owner: str, function: Callable, options: Mapping, /, **context):
     """
     if not isinstance(options, Mapping):
         raise TypeError(f"{owner} must be a mapping of options, got {options!r}")
+    check_known(owner, function, options, context)
     named = named_parameters(function)
     takes_all = _takes_all(function)
     known = [key for key in named if key not in context]
-    unknown = [key for key in options if key in context or not (takes_all or key in named)]
-    if unknown:
-        words = " or ".join(suggest(key, known) for key in unknown)
-        raise ValueError(f"{owner} has no option {words}; it has: {listed(known)}")
     passed = {key: value for key, value in context.items() if takes_all or key in named}
     arguments = {**options, **passed}
     mandatory = [key for key, parameter in named.items() if parameter.default is parameter.empty]
@@ -45,6 +42,19 @@ def call(owner: str, function: Callable, options: Mapping, /, **context):
         cause = " ".join(f"{type(error).__name__}: {error}".split())
         advice = f"check its options: {_suspects(str(error), options)}"
         raise ValueError(f"{owner} cannot be made ({cause})\n{advice}") from error
+
+
+def check_known(
+    owner: str, function: Callable, options: Iterable[str], given: Container[str]
+) -> None:
+    """Raises a ``ValueError`` for an option that a function lacks, or that its caller gives."""
+    named = named_parameters(function)
+    takes_all = _takes_all(function)
+    unknown = [key for key in options if key in given or not (takes_all or key in named)]
+    if unknown:
+        known = [key for key in named if key not in given]
+        words = " or ".join(suggest(key, known) for key in unknown)
+        raise ValueError(f"{owner} has no option {words}; it has: {listed(known)}")
 
 
 def named_parameters(function: Callable) -> dict[str, inspect.Parameter]:

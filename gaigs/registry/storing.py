@@ -13,7 +13,7 @@ GIVEN = {
     "split": ("links",),
     "placement": ("scene", "channels"),
     "tokenizer": ("scene",),
-    "deformation": ("scene", "channels", "tokenizer_widths"),
+    "deformation": ("scene", "channels", "tokenizer_widths", "count"),
     "projection": ("pixel",),
     "pooling": ("scene",),
     "loss": ("task",),
@@ -45,8 +45,8 @@ def configuration_of(component: object) -> dict:
 def storable(value: Any, where: str) -> Any:
     """A value in plain dictionaries, lists, numbers and strings.
 
-    It holds these, registered components, paths, and numbers of numpy or torch; another type is a
-    ``ValueError``.
+    It holds these, registered components, estimators of scikit-learn, paths, and numbers of numpy
+    or torch; another type is a ``ValueError``.
     """
     if isinstance(value, Mapping):
         return {key: storable(entry, f"{where}, {key}") for key, entry in value.items()}
@@ -61,8 +61,24 @@ def storable(value: Any, where: str) -> Any:
         return value
     if hasattr(value, "configuration"):
         return configuration_of(value)
+    if type(value).__module__.startswith("sklearn.") and hasattr(value, "get_params"):
+        return {"_target_": _target_of(value), **storable(_own_options(value), where)}
     kinds = "a number, a text, a list or a registered component"
     raise ValueError(f"{where} must be {kinds} to be stored, got {type(value).__name__}")
+
+
+def _target_of(estimator: Any) -> str:
+    """The name of an estimator's class, ``sklearn.<module>.<class>``."""
+    module = type(estimator).__module__
+    public = [word for word in module.split(".") if not word.startswith("_")]
+    return ".".join((*public, type(estimator).__name__))
+
+
+def _own_options(estimator: Any) -> dict:
+    """Options of an estimator of scikit-learn that are not its defaults."""
+    known = inspect.signature(type(estimator)).parameters
+    options = estimator.get_params(deep=False)
+    return {key: value for key, value in options.items() if value is not known[key].default}
 
 
 def note_arguments(kind: str, name: str, component: Any) -> Any:

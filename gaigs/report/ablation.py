@@ -7,16 +7,28 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 from numpy import ndarray
+from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
 from rich.table import Table
 
 from gaigs.core.task import Metric
 from gaigs.io.files import write_text
 from gaigs.report.curves import speed_against_error
 from gaigs.report.run_folders import Run, by_seed
-from gaigs.report.scores import COSTS, train_seconds
+from gaigs.report.scores import COSTS, headline, train_seconds
 from gaigs.report.style import save
-from gaigs.report.table import Spread, columns_of, markdown, terminal, write_csv, written
+from gaigs.report.table import (
+    Spread,
+    best_in_bold,
+    columns_of,
+    latex,
+    markdown,
+    terminal,
+    tex,
+    write_csv,
+    written,
+)
 
 
 def ablation(runs: Sequence[Run]) -> tuple[list[dict], dict]:
@@ -58,10 +70,19 @@ def _row(run: Run, varied: Sequence[str], facts: Sequence[str]) -> dict:
     row |= {"status": "done", "model": row["model"] or model}
     row |= {fact: run.metrics[fact] for fact in facts}
     row |= scores
+    if (p := _p_value(run.metrics)) is not None:
+        row["p"] = p
     row["train_seconds"] = train_seconds(run.metrics)
     for cost in ("num_gaussians", "num_parameters", "inference_ms"):
         row[cost] = run.metrics.get(cost)
     return row
+
+
+def _p_value(metrics: Mapping) -> float | None:
+    """Probability of the run's difference from the best baseline by chance, by its first metric."""
+    name, _ = headline(metrics["task"], metrics["models"])
+    test = metrics.get("paired") or {"p": {}}
+    return test["p"].get(next(iter(metrics["models"])), {}).get(name)
 
 
 def _baselines(metrics: Mapping | None, has_split: bool) -> list[dict]:
@@ -99,6 +120,9 @@ def over_seeds(runs: Sequence[Run], shared: Mapping) -> list[dict]:
         for name in scores[0]:
             if all(name in score for score in scores):
                 row[name] = Spread.of([score[name] for score in scores])
+        tests = [_p_value(one) for one in metrics]
+        if None not in tests:
+            row["p"] = max(filter(None, tests))
         rows.append(row)
     return rows
 
@@ -110,16 +134,16 @@ def write_ablation(
     shared: Mapping,
     metrics: Mapping[str, Metric],
 ) -> list[Table]:
-    """Writes ``ablation.csv``, ``ablation.md`` and, once a run has ended, the figure of speed.
+    """Writes ``ablation.csv``, ``ablation.md``, ``ablation.tex`` for a paper and, once a run has
+    ended, the figure of speed.
 
     ``rows`` and ``shared`` are results of ``ablation``, ``metrics`` of the task. The result are
-    tables for a terminal of 80 columns. Metrics that are not brief are in the files only.
+    tables for a terminal of 80 columns. All columns are in the CSV file alone.
     """
     intervals = {
+        "p": "p against best",
         "coverage_50": "within 50 %",
-        "coverage_50_error": "standard error of it",
         "coverage_90": "within 90 %",
-        "coverage_90_error": "standard error of it",
         "width_90": "width of 90 %",
         "crps": "CRPS",
         "nll": "NLL",
@@ -135,26 +159,31 @@ def write_ablation(
         doubts += [f"{run.name}: {doubt}" for doubt in run.doubts]
 
     write_csv(folder / "ablation.csv", [*rows, *groups], ("_sd", "_least"))
-    page = f"{_markdown(rows, titles)}\n{settings}\n"
-    page += "".join(f"- without a result: {failure}\n" for failure in failures)
-    page += "".join(f"- {doubt}\n" for doubt in doubts)
-    if groups:
-        page += f"\n{spread}\n\n{_markdown(groups, titles)}"
-    write_text(folder / "ablation.md", page)
-    if metrics:
-        save(_speed(runs, rows, shared, titles), folder / "speed_against_error.png")
-
-    hidden = {name for name, metric in metrics.items() if not metric.is_brief}
-    hidden |= {"num_gaussians"} | intervals.keys() - {"coverage_90"}
+    rows = [_without_errors(row) for row in rows]
+    groups = [_without_errors(row) for row in groups]
+    hidden = set()
     if not any(row["status"] == "unfinished" for row in rows):
         hidden.add("status")
     varied = [_settings(run, shared) for run in runs]
     if len({*varied}) == len(varied):
         hidden.add("run")  # its name would repeat the varied overrides
-    caption = "\n".join([*failures, *doubts, f"{settings}; all columns in ablation.md"])
+    page = f"{_markdown(rows, titles, hidden)}\n{settings}\n"
+    page += "".join(f"- without a result: {failure}\n" for failure in failures)
+    page += "".join(f"- {doubt}\n" for doubt in doubts)
+    if groups:
+        page += f"\n{spread}\n\n{_markdown(groups, titles, {'status'})}"
+    write_text(folder / "ablation.md", page)
+    if metrics:
+        save(_speed(runs, rows, shared, titles), folder / "speed_against_error.png")
+        text = _latex(groups or rows, rows, metrics, shared)
+        write_text(folder / "ablation.tex", text)
+
+    hidden |= {name for name, metric in metrics.items() if not metric.is_brief}
+    hidden |= {"num_gaussians"} | intervals.keys() - {"coverage_90", "p"}
+    caption = "\n".join([*failures, *doubts, f"{settings}; all columns in ablation.csv"])
     tables = [_terminal(f"Runs of {folder}", rows, titles, hidden, caption)]
     if groups:
-        about = f"{spread}; all columns in ablation.md"
+        about = f"{spread}; all columns in ablation.csv"
         tables.append(_terminal("Over seeds", groups, titles, hidden | {"status"}, about))
     return tables
 
@@ -198,23 +227,73 @@ def _text(value: float | int | str | Spread | None, separator: str) -> str:
     return written(value)
 
 
-def _markdown(rows: Sequence[Mapping], titles: Mapping[str, str]) -> str:
-    columns = columns_of(rows)
+def _without_errors(row: Mapping) -> dict:
+    """A row with the standard errors of coverages beside these, and not in columns of their own."""
+    shown = {key: value for key, value in row.items() if not key.endswith("_error")}
+    for key in row.keys() & {"coverage_50", "coverage_90"}:
+        error = row.get(f"{key}_error")
+        if isinstance(error, float) and isinstance(row[key], float):
+            shown[key] = f"{written(row[key])} ± {written(error)}"
+    return shown
+
+
+def _markdown(rows: Sequence[Mapping], titles: Mapping[str, str], hidden: set[str]) -> str:
+    columns = [column for column in columns_of(rows) if column not in hidden]
     lines = [[titles.get(column, column) for column in columns]]
     for row in rows:
         lines.append([_text(row.get(column), ", ") for column in columns])
     return markdown(lines)
 
 
+def _latex(
+    results: Sequence[Mapping],
+    rows: Sequence[Mapping],
+    metrics: Mapping[str, Metric],
+    shared: Mapping,
+) -> str:
+    """Runs, or their means over seeds, above the baselines: settings, metrics, training time."""
+    shown = [row for row in results if row["status"] in ("done", "seeds")]
+    rule = len(shown) + 1
+    shown += [row for row in rows if row["status"] == "baseline"]
+    known = columns_of(shown)
+    numbers = [name for name in metrics if name in known]
+    first = known.index(numbers[0])
+    texts = [name for name in known[:first] if name not in ("run", "status", "seed", "runs")]
+    columns = [[tex(name), *(tex(_text(row.get(name), "")) for row in shown)] for name in texts]
+    for name in numbers:
+        values = [None if row.get(name) is None else row[name] for row in shown]
+        bold = r"\textbf{{{}}}"
+        cells = best_in_bold(values, metrics[name].higher_is_better, bold)
+        if name == numbers[0]:
+            for place, row in enumerate(shown):
+                cells[place] += "$^*$" if (row.get("p") or 1.0) < 0.05 else ""
+        columns.append([tex(metrics[name].title), *(cell.replace("±", r"$\pm$") for cell in cells)])
+    settings = ", ".join(f"{key}={value}" for key, value in shared.items())
+    split = f" on split {tex(shared['split'])}" if "split" in shared else ""
+    caption = f"Test scores{split}. Bold: the best, and all that print alike."
+    if results[0]["status"] == "seeds":
+        caption += r" $\pm$: standard deviation over seeds."
+    if any("$^*$" in cell for cell in columns[len(texts)]):
+        caption += " $^*$: differs from the best baseline ($p<0.05$, paired bootstrap over places)."
+    lines = [[*line] for line in zip(*columns, strict=True)]
+    return f"% {settings}\n{latex(lines, len(texts), caption, [rule])}"
+
+
 def _terminal(
     title: str, rows: Sequence[Mapping], titles: Mapping[str, str], hidden: set[str], caption: str
 ) -> Table:
     columns = [column for column in columns_of(rows) if column not in hidden]
-    heads = {}
-    for column in columns:
-        heads[titles.get(column, column.replace(".", ".\n"))] = column in titles
-    lines = []
-    for row in rows:
-        lines.append([escape(_text(row.get(column), "\n")) for column in columns])
     styles = [{"unfinished": "red", "baseline": "dim"}.get(row["status"]) for row in rows]
-    return terminal(title, heads, lines, caption, styles)
+    console = Console(width=1000)
+    while True:
+        heads = {}
+        for column in columns:
+            heads[titles.get(column, column.replace(".", ".\n"))] = column in titles
+        lines = []
+        for row in rows:
+            lines.append([escape(_text(row.get(column), "\n")) for column in columns])
+        table = terminal(title, heads, lines, caption, styles)
+        width = Measurement.get(console, console.options, table).maximum
+        if width <= 80 or columns[-1] not in COSTS:
+            return table
+        columns.pop()  # a cost, which is in the files

@@ -2,15 +2,14 @@
 power.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Inexact
 from matplotlib import rc_context
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MultipleLocator
 from numpy import ndarray
@@ -20,7 +19,7 @@ from gaigs.data import Links
 from gaigs.report.curves import cdf
 from gaigs.report.figures import TaskFigures
 from gaigs.report.predictions import Examples, own_scores, read_examples, scores_of_systems
-from gaigs.report.style import COLUMN, MARKERS, PAGE, SKY, STYLE, looks, wrapped
+from gaigs.report.style import COLUMN, MARKERS, PAGE, SKY, STYLE, ask, looks, new_figure, wrapped
 
 
 class CsiFigures(TaskFigures):
@@ -31,7 +30,7 @@ class CsiFigures(TaskFigures):
         split = links.split.name
         frequencies = task.frequencies.numpy()
         scores = own_scores(file, task.compared_by)
-        errors = own_scores(file, "error_power")
+        powers_of_errors = own_scores(file, "error_power")
         powers = next(iter(own_scores(file, "label_power").values()))
         shown = read_examples(file, task.compared_by)
         predictions = torch.from_numpy(shown.predictions)
@@ -40,8 +39,16 @@ class CsiFigures(TaskFigures):
         figures = {"channels": magnitudes_and_phases(shown, frequencies)}
         if len(frequencies) > 1:
             figures["impulse_response"] = impulse_responses(shown, frequencies)
-        figures["error_power"] = error_against_power(powers, errors, split)
-        return figures | {"snr_cdf": cdf(scores, task.pair_score, "channels", split, (None, None))}
+        if links.front_ends is not None:
+            responses = links.front_ends.responses.numpy()
+            errors = links.front_ends.errors.numpy()
+            names = [receiver.name for receiver in links.receivers]
+            known: Any = links.task
+            figures["front_end"] = front_ends(responses, errors, known.frequencies.numpy(), names)
+        figures["error_power"] = error_against_power(powers, powers_of_errors, split)
+        return figures | {
+            "snr_cdf": cdf(scores, task.pair_score, "channels", split, (None, None), True)
+        }
 
     def of_systems(
         self, task: type[Csi], files: Mapping[str, Path], split: str
@@ -49,18 +56,19 @@ class CsiFigures(TaskFigures):
         kind, title = "snr_db", "SNR [dB]"
         if not own_scores(next(iter(files.values())), kind):  # of unknown phase
             kind, title = "snr_aligned_db", "SNR, phase removed [dB]"
-        return {"cdf": cdf(scores_of_systems(files, kind), title, "channels", split, (None, None))}
+        scores = scores_of_systems(files, kind)
+        return {"cdf": cdf(scores, title, "channels", split, (None, None), True)}
 
 
 def _looks(marker: str = "") -> dict[str, dict[str, Any]]:
-    """Looks of predicted and measured channels, by label.
+    """Looks of predicted channels and labels, by name.
 
     A thin dark line upon a broad pale one: both are visible where they coincide, in grey print too.
     """
     broad = {"color": SKY, "linewidth": 2.4, "markersize": 5}
     thin = {"color": "0.1", "linewidth": 0.8, "markersize": 2}
     looks = {}
-    for name, look in (("predicted", broad), ("measured", thin)):
+    for name, look in (("prediction", broad), ("label", thin)):
         looks[name] = look | {"label": name, "marker": marker}
     return looks
 
@@ -75,8 +83,8 @@ def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) ->
     across = frequencies / (1e9 if unit == "GHz" else 1e6)
     looks = _looks("o" if len(frequencies) <= 32 else "")
     with rc_context(STYLE):
-        height = 1.35 * len(shown.labels) + 0.7
-        figure = Figure(figsize=(PAGE, height), layout="constrained")
+        height = 1.35 * len(shown.labels) + 0.95
+        figure = new_figure(PAGE, height)
         axes = figure.subplots(len(shown.labels), 2, sharex=True, squeeze=False)
         rows = zip(axes, _pairs(shown)[..., order], _titles(shown), strict=True)
         for (magnitude, phase), pair, title in rows:
@@ -84,7 +92,10 @@ def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) ->
             angles = np.rad2deg(np.angle(pair))
             for look, level, angle in zip(looks.values(), levels, angles, strict=True):
                 magnitude.plot(across, level, **look)
-                _draw_phase(phase, across, angle, **look)
+                # A line with a gap where the phase wraps.
+                jumps = np.flatnonzero(np.abs(np.diff(angle)) > 180) + 1
+                x = np.insert(across, jumps, np.nan)
+                phase.plot(x, np.insert(angle, jumps, np.nan), **look)
             magnitude.set(title=title, ylabel="|h| [dB]", ylim=_limits(levels))
             phase.set(ylabel="phase [deg]", ylim=(-190, 190))
             phase.yaxis.set_major_locator(MultipleLocator(90))
@@ -95,6 +106,48 @@ def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) ->
         for ax in axes[-1]:
             ax.set_xlabel(f"frequency [{unit}]")
         figure.legend(handles=axes[0, 0].lines[::-1], loc="outside lower center", ncols=2)
+        ask(figure, "Do predicted channels follow the labels over frequency?")
+    return figure
+
+
+def front_ends(
+    responses: Complex[ndarray, "r e s"],
+    errors: Float[ndarray, "r e s"],
+    frequencies: Float[ndarray, " s"],
+    names: Sequence[str],
+) -> Figure:
+    """Level and phase of receivers' responses over frequency [Hz], a line for each element.
+
+    Bands are one standard error wide to either side. Receivers without a response have no row.
+    """
+    rows = [number for number, error in enumerate(errors) if error.any()]
+    order = np.argsort(frequencies)
+    across = frequencies[order] / 1e9
+    with rc_context(STYLE):
+        figure = Figure(figsize=(PAGE, 1 + 1.8 * len(rows)), layout="constrained")
+        axes = figure.subplots(len(rows), 2, sharex=True, squeeze=False)
+        for (level_axes, phase_axes), row in zip(axes, rows, strict=True):
+            for response, error in zip(
+                responses[row][:, order], errors[row][:, order], strict=True
+            ):
+                if not error.any():  # an element that the array lacks
+                    continue
+                relative = error / np.abs(response)
+                phase = np.unwrap(np.angle(response))
+                curves = (
+                    (level_axes, decibels(response), 20 / np.log(10) * relative),
+                    (phase_axes, np.rad2deg(phase), np.rad2deg(relative)),
+                )
+                for ax, curve, width in curves:
+                    (line,) = ax.plot(across, curve, linewidth=0.8)
+                    band = curve - width, curve + width
+                    ax.fill_between(across, *band, color=line.get_color(), alpha=0.2, linewidth=0)
+            level_axes.set(title=f"front end of {names[row]}", ylabel="|R| [dB]")
+            phase_axes.set(ylabel="phase of R [deg]")
+        for ax in axes.flat:
+            ax.grid()
+        for ax in axes[-1]:
+            ax.set_xlabel("frequency [GHz]")
     return figure
 
 
@@ -116,7 +169,7 @@ def impulse_responses(shown: Examples, frequencies: Float[ndarray, " s"]) -> Fig
     levels -= levels[:, 1:].max(-1, keepdims=True)
     titles = _titles(shown)
     with rc_context(STYLE):
-        figure = Figure(figsize=(PAGE, 2.7), layout="constrained")
+        figure = new_figure(PAGE, 2.95)
         axes = figure.subplots(1, len(titles), sharey=True, squeeze=False)[0]
         for ax, pair, title in zip(axes, levels, titles, strict=True):
             for look, level in zip(_looks().values(), pair, strict=True):
@@ -130,6 +183,7 @@ def impulse_responses(shown: Examples, frequencies: Float[ndarray, " s"]) -> Fig
         axes[0].set_ylabel("|impulse response|, Hann window\n[dB relative to the label's peak]")
         axes[0].set_ylim(_limits(levels))
         figure.legend(handles=axes[0].lines[::-1], loc="outside lower center", ncols=2)
+        ask(figure, "At which delays do paths arrive?")
     return figure
 
 
@@ -157,7 +211,7 @@ def _titles(shown: Examples) -> list[str]:
     return titles
 
 
-def decibels(amplitudes: Complex[ndarray, "..."]) -> Float[ndarray, "..."]:
+def decibels(amplitudes: Inexact[ndarray, "..."]) -> Float[ndarray, "..."]:
     """Magnitudes [dB]; of 0 it is -inf, which leaves a gap in a line."""
     with np.errstate(divide="ignore"):
         return 20 * np.log10(np.abs(amplitudes))
@@ -172,14 +226,6 @@ def _limits(levels: Float[ndarray, "... 2 n"]) -> tuple[float, float]:
     lowest = max(levels[np.isfinite(levels)].min(), peak - 60)
     rim = max(1.0, 0.05 * (highest - lowest))
     return float(lowest - rim), float(highest + rim)
-
-
-def _draw_phase(
-    ax: Axes, frequencies: Float[ndarray, " s"], angles: Float[ndarray, " s"], **look
-) -> None:
-    """A line with a gap where the phase [deg] wraps."""
-    jumps = np.flatnonzero(np.abs(np.diff(angles)) > 180) + 1
-    ax.plot(np.insert(frequencies, jumps, np.nan), np.insert(angles, jumps, np.nan), **look)
 
 
 def impulse_response(
@@ -220,7 +266,7 @@ def error_against_power(
     colours = looks(errors)
     x = 10 * np.log10(powers)
     with rc_context(STYLE):
-        figure = Figure(figsize=(COLUMN, COLUMN), layout="constrained")
+        figure = new_figure(COLUMN, COLUMN)
         ax = figure.subplots()
         line = {"color": "0.75", "linewidth": 0.8, "zorder": 0, "label": "SNR 0 dB"}
         ax.axline((x.max(), x.max()), slope=1, **line)
@@ -234,8 +280,9 @@ def error_against_power(
             ax.plot(x, 10 * np.log10(error), **look, label=f"{name}, NMSE {nmse:.1f} dB")
         # With a few links, too, the line of 0 dB has a slope.
         ax.set_xlim(x.min() - 5, x.max() + 5)
-        ax.set_xlabel(wrapped(f"power of the channel [dB], split {split}"))
+        ax.set_xlabel("power of the channel [dB]")
         ax.set_ylabel("power of the error [dB]")
         ax.grid()
         ax.legend()
+        ask(figure, "Are weak channels predicted, too?", wrapped(f"split {split}", 70))
     return figure

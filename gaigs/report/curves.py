@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from itertools import cycle
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +15,20 @@ from matplotlib.ticker import LogLocator, NullLocator
 from numpy import ndarray
 
 from gaigs.core.task import Metric
-from gaigs.report.style import COLUMN, LINES, MARKERS, PAGE, STYLE, looks, wrapped
+from gaigs.report.style import (
+    COLUMN,
+    LINES,
+    MARKERS,
+    OTHERS,
+    PAGE,
+    STYLE,
+    ask,
+    distinct_looks,
+    looks,
+    named_ones,
+    new_figure,
+    wrapped,
+)
 from gaigs.report.training_log import Curve
 
 
@@ -24,72 +38,136 @@ def cdf(
     samples: str,
     split: str,
     limits: tuple[float | None, float | None],
+    higher_is_better: bool = False,
 ) -> Figure:
+    """The curves of ``draw_cdf``, with the name of the split at the foot."""
+    with rc_context(STYLE):
+        figure = new_figure(COLUMN, COLUMN)
+        ax = figure.subplots()
+        draw_cdf(ax, values, quantity, samples, limits, higher_is_better)
+        _, labels = ax.get_legend_handles_labels()
+        # Columns of the legend by the letters of the longest label.
+        longest = max(map(len, labels))
+        columns = 3 if longest <= 17 else 2 if longest <= 25 else 1
+        figure.set_figheight(2.75 + 0.15 * math.ceil(len(labels) / columns))
+        key = {"ncols": columns, "handlelength": 2.4, "columnspacing": 1.2}
+        figure.legend(loc="outside lower center", title=f"median {quantity}, best first", **key)
+        question = "How good are predictions?" if higher_is_better else "How large are errors?"
+        ask(figure, question, wrapped(f"split {split}", 70))
+    return figure
+
+
+def draw_cdf(
+    ax: Axes,
+    values: Mapping[str, Float[ndarray, " t"]],
+    quantity: str,
+    samples: str,
+    limits: tuple[float | None, float | None],
+    higher_is_better: bool = False,
+) -> None:
     """Share of test samples with at most a given value, one step curve a model, medians marked.
 
+    The run's own model and the best others have a colour, see ``named_ones``; the rest is grey.
+
     Args:
+        ax: Gets the curves.
         values: Values of every test sample by model, the run's own model first.
         quantity: Name of the values, with their unit.
         samples: Name of the samples, e.g. "links".
-        split: Name of the split.
         limits: Ends of the axis of values; None for the ends of the data.
+        higher_is_better: True for similarities.
     """
-    # Columns of the legend by the letters of the longest name.
-    longest = max(map(len, values))
-    columns = 3 if longest <= 12 else 2 if longest <= 20 else 1
-    height = 2.45 + 0.15 * math.ceil(len(values) / columns)
-    with rc_context(STYLE):
-        figure = Figure(figsize=(COLUMN, height), layout="constrained")
-        ax = figure.subplots()
-        ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)
-        for name, (colour, dash) in looks(values).items():
-            median = float(np.median(values[name]))
-            ax.ecdf(
-                values[name],
-                color=colour,
-                linestyle=dash,
-                zorder=2.5 if name == next(iter(values)) else 2,
-                label=f"{name} {median:#.3g}",
-            )
-            edge = {"markeredgecolor": "white", "markeredgewidth": 0.6}
-            ax.plot(median, 0.5, "o", color=colour, markersize=4, **edge)
-        ax.set(
-            xlabel=wrapped(f"{quantity}, split {split}"),
-            ylabel=f"share of test {samples}",
-            ylim=(0, 1.01),
-        )
-        ax.set_xlim(*limits)
-        key = {"ncols": columns, "handlelength": 2.4, "columnspacing": 1.2}
-        figure.legend(loc="outside upper center", title=f"median {quantity}", **key)
-        ax.grid(axis="x")
-    return figure
+    medians = {name: float(np.median(scores)) for name, scores in values.items()}
+    own = next(iter(values))
+    named = named_ones(medians, higher_is_better, own)
+    systems = distinct_looks(named, values)
+    ax.axhline(0.5, color="0.75", linewidth=0.6, zorder=0)
+    for name in named:
+        colour, dash = systems[name]
+        look = {"color": colour, "linestyle": dash, "zorder": 2.5 if name == own else 2}
+        ax.ecdf(values[name], label=f"{name} {medians[name]:#.3g}", **look)
+        edge = {"markeredgecolor": "white", "markeredgewidth": 0.6}
+        ax.plot(medians[name], 0.5, "o", color=colour, markersize=4, **edge)
+    others = sorted({medians[name] for name in medians if name not in named})
+    for name in values:
+        if name not in named:
+            ax.ecdf(values[name], **OTHERS)
+    if others:
+        span = f"{others[0]:#.3g} to {others[-1]:#.3g}"
+        ax.plot([], [], label=f"{len(values) - len(named)} others {span}", **OTHERS)
+    count = len(values[own])
+    ax.set(xlabel=quantity, ylabel=f"share of {count:,} test {samples}", ylim=(0, 1.01))
+    ax.set_xlim(*limits)
+    ax.grid(axis="x")
+
+
+def plot_scores(result: Any, ax: Any = None, metric: str | None = None) -> Any:
+    """How large errors are: the distribution of a score over the test links, by model.
+
+    Args:
+        result: An ``Evaluation``.
+        ax: Axes; None: a figure of its own.
+        metric: Name of the score, a key of ``result.scores``; None: the main one.
+    """
+    name = result.task.compared_by if metric is None else metric
+    values = {model: scores.get(name) for model, scores in result.scores.items()}
+    known = {model: scores.numpy() for model, scores in values.items() if scores is not None}
+    if not known:
+        names = ", ".join(next(iter(result.scores.values())))
+        raise ValueError(f"metric must be a score of the links, got {name!r}\nthere are {names}")
+    arguments = known, _score_title(name), "links"
+    limits = (None, None)
+    if ax is None:
+        return cdf(*arguments, result.split, limits, result.task.higher_is_better).axes
+    draw_cdf(ax, *arguments, limits, result.task.higher_is_better)
+    ax.legend()
+    return ax
 
 
 def loss_curves(curves: Mapping[str, Curve]) -> Figure:
-    """Loss with its terms, penalties and validation scores against steps, a panel each.
+    """Loss with its terms, penalties, and each validation score against steps, a panel each.
 
     Names of curves begin with ``train/``, ``penalty/`` or ``validation/``.
     """
-    titles = {
-        "train": "loss and its terms",
-        "penalty": "penalties, unweighted",
-        "validation": "validation score",
-    }
-    panels = {group: _of_group(curves, group) for group in titles}
-    panels = {group: names for group, names in panels.items() if names}
+    panels = {}
+    for group, title in (("train", "loss and its terms"), ("penalty", "penalties, unweighted")):
+        if names := _of_group(curves, group):
+            panels[title] = names
+    # Scores have units of their own.
+    for name, curve in _of_group(curves, "validation").items():
+        panels[f"validation {_score_title(name)}"] = {name: curve}
+    columns = min(len(panels), 3)
+    rows = math.ceil(len(panels) / columns)
     with rc_context(STYLE):
-        figure = Figure(figsize=(min(COLUMN * len(panels), PAGE), 2.6), layout="constrained")
-        axes = figure.subplots(1, len(panels), squeeze=False)[0]
-        for ax, (group, names) in zip(axes, panels.items(), strict=True):
-            for (name, curve), (colour, dash) in zip(names.items(), cycle(LINES), strict=False):
-                _draw_smoothed(ax, *curve, color=colour, linestyle=dash, label=name)
-            ax.set(xlabel="step", title=titles[group])
+        figure = new_figure(min(COLUMN * columns, PAGE), 2.4 * rows + 0.3)
+        axes = [*figure.subplots(rows, columns, squeeze=False).flat]
+        for ax in axes[len(panels) :]:
+            ax.remove()
+        for ax, (title, names) in zip(axes, panels.items(), strict=False):
+            sizes = {name: float(abs(values).mean()) for name, (_, values) in names.items()}
+            named = named_ones(sizes, True, next(iter(names)))
+            for name, curve in names.items():
+                look = OTHERS
+                if name in named:
+                    colour, dash = LINES[named.index(name)]
+                    look = {"color": colour, "linestyle": dash, "label": name}
+                _draw_smoothed(ax, *curve, **look)
+            ax.set(xlabel="step", title=title)
             ax.grid()
-            ax.legend()
-            if group != "validation" and any((values > 0).any() for _, values in names.values()):
+            if len(names) > 1:
+                ax.legend()
+            is_score = title.startswith("validation")
+            if not is_score and any((values > 0).any() for _, values in names.values()):
                 ax.set_yscale("log")
                 _round_ticks(ax.yaxis, (1, 2, 5))
+        ask(figure, "Has the training settled?")
     return figure
+
+
+def _score_title(name: str) -> str:
+    """The title of a logged score, as "MAE [dB]" for ``mae_db``."""
+    first, *others = name.removesuffix("_db").split("_")
+    return " ".join([first.upper(), *others]) + " [dB]" * name.endswith("_db")
 
 
 def _of_group(curves: Mapping[str, Curve], group: str) -> dict[str, Curve]:
@@ -117,7 +195,7 @@ def speed_against_error(
     key_columns = 1 if max(map(len, names)) > 55 else 2  # letters that fit half a page
     key_rows = (len(names) + len(baselines) + 1) // key_columns
     with rc_context(STYLE):
-        figure = Figure(figsize=(PAGE, 2.4 + 0.15 * key_rows), layout="constrained")
+        figure = new_figure(PAGE, 2.6 + 0.15 * key_rows)
         axes = figure.subplots(1, len(times), sharey=True, squeeze=False)[0]
         for ax, (label, values) in zip(axes, times.items(), strict=True):
             for run, (name, look) in enumerate(zip(names, cycle(MARKERS), strict=False)):
@@ -137,6 +215,7 @@ def speed_against_error(
         axes[0].set_ylabel(score_label)
         handles, labels = axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="outside lower center", ncols=key_columns)
+        ask(figure, "Which run is good for its time?")
     return figure
 
 
@@ -148,15 +227,23 @@ def learning_curves(
 
     Errors have a logarithmic axis, so that large ones at the start leave space for small ones.
     """
-    key_rows = (len(curves) + len(baselines) + 3) // 4
+    last = {name: float(scores[-1]) for name, (_, scores) in curves.items()}
+    named = named_ones(last, score.higher_is_better)
+    key_rows = (len(named) + len(baselines) + 4) // 4
     with rc_context(STYLE):
-        figure = Figure(figsize=(PAGE, 3.0 + 0.15 * key_rows), layout="constrained")
+        figure = new_figure(PAGE, 3.2 + 0.15 * key_rows)
         ax = figure.subplots()
-        systems = looks([*curves, *baselines])
-        for name, (times, scores) in curves.items():
+        systems = distinct_looks(named, [*curves, *baselines])
+        for name in named:
+            times, scores = curves[name]
             colour, dash = systems[name]
             look = {"marker": ".", "markersize": 4, "color": colour, "linestyle": dash}
             ax.plot(times, scores, label=name, **look)
+        for name, (times, scores) in curves.items():
+            if name not in named:
+                ax.plot(times, scores, **OTHERS)
+        if len(named) < len(curves):
+            ax.plot([], [], label=f"{len(curves) - len(named)} others", **OTHERS)
         for name, value in baselines.items():
             colour, dash = systems[name]
             ax.axhline(value, color=colour, linestyle=dash, linewidth=0.7, zorder=0, label=name)
@@ -167,6 +254,7 @@ def learning_curves(
             _round_ticks(ax.yaxis, (1, 2, 3, 4, 5, 6, 8))
         ax.grid()
         figure.legend(loc="outside lower center", ncols=4)
+        ask(figure, "How fast does each system learn?")
     return figure
 
 

@@ -16,7 +16,7 @@ from numpy import ndarray
 
 from gaigs.core.task import Task
 from gaigs.report.predictions import own_scores
-from gaigs.report.style import PAGE, STYLE, looks
+from gaigs.report.style import PAGE, STYLE, ask, looks, new_figure
 
 
 def intervals(folder: Path, task: Task, split: str) -> Figure | None:
@@ -37,10 +37,10 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
     errors = np.sqrt(np.mean(_magnitudes(predictions - labels) ** 2, 1, where=exists))
     stated = np.sqrt(np.mean(_magnitudes(deviations) ** 2, 1, where=exists))
     with rc_context(STYLE):
-        figure = Figure(figsize=(PAGE, 0.46 * PAGE), layout="compressed")
+        figure = new_figure(PAGE, 0.52 * PAGE, "compressed")
         left, right = figure.subplots(1, 2)
         _draw_shares(left, shares)
-        left.set_title(f"split {split}")
+        left.set_title("how often intervals hold")
         left.legend()
         name = next(iter(shares))
         (colour, _) = looks(shares)[name]
@@ -55,6 +55,7 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
             ax.axline((0, 0), slope=1, color="0.3", linewidth=0.7)
             ax.grid()
             ax.set_axisbelow(True)
+        ask(figure, "Can the stated uncertainty be trusted?", f"split {split}")
     return figure
 
 

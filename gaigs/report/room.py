@@ -20,7 +20,7 @@ from numpy import ndarray
 from gaigs.data import Links
 from gaigs.planes.learnt_room import LearntPlane, LearntRoom, Matter
 from gaigs.planes.room_paths import LearntPath
-from gaigs.report.style import BLUE, GREEN, ORANGE, STYLE
+from gaigs.report.style import BLUE, GREEN, ORANGE, STYLE, ask, new_figure
 from gaigs.splatting.gaussians import SH_DC, Gaussians
 
 
@@ -41,7 +41,7 @@ class _Views(NamedTuple):
 
     figure: Figure
     panels: tuple[_View, _View]
-    arrow: np.floating
+    arrow: float
 
     @property
     def axes(self) -> list[Axes]:
@@ -57,9 +57,62 @@ class _Cloud(NamedTuple):
     count: int
 
 
+class _Content(NamedTuple):
+    """What is drawn of a room."""
+
+    links: Links | None
+    cloud: _Cloud | None
+    planes: list[LearntPlane]
+    matter: Matter | None
+
+    @property
+    def corners(self) -> Float[ndarray, "k 3"]:
+        """Points that a panel shows [m]."""
+        corners = [plane.corners for plane in self.planes]
+        if self.links is not None:
+            query = self.links.query
+            corners += [_receivers(self.links), self.links.edges.numpy().reshape(-1, 3)]
+            for part in (self.links.split.train, self.links.split.test):
+                corners.append(query.transmitters[part].numpy())
+        if self.cloud is not None:
+            corners.append(np.quantile(self.cloud.means, (0.1, 0.9), axis=0))
+        if not corners:
+            raise ValueError("the model has learnt no planes\npass links= to draw the links")
+        return np.concatenate(corners)
+
+    def draw(self, view: _View, arrow: float) -> list[AxesImage | EllipseCollection]:
+        """Draws all in a panel; returns what a colour bar explains, Gaussians last."""
+        coloured: list[AxesImage | EllipseCollection] = []
+        if self.matter is not None:
+            coloured.append(_draw_matter(view, self.matter))
+        if self.cloud is not None:
+            coloured.append(_draw_gaussians(view, self.cloud))
+        _draw_planes(view, self.planes)
+        if self.links is not None:
+            _draw_walls(view, self.links.edges.numpy())
+            _draw_links(view, self.links, arrow)
+        return coloured
+
+    def draw_bars(self, drawn: Sequence[list], axes: Sequence[Axes]) -> None:
+        """Draws the colour bars of panels, whose results of ``draw`` are ``drawn``."""
+        figure = axes[0].figure
+        bar: dict[str, Any] = {"ax": axes, "extend": "max", "aspect": 30, "shrink": 0.7}
+        if self.cloud is not None:
+            shown = f"{len(self.cloud.means):,} strongest of {self.cloud.count:,} Gaussians"
+            figure.colorbar(drawn[0][-1], label=f"|signal| × opacity, {shown}", **bar)
+        if self.matter is not None:
+            # One scale of all views. It spans at least 1 dB, so that a negligible loss is pale, and
+            # at most 40 dB, where nothing is left to see.
+            highest = [np.quantile(images[0].get_array().data, 0.99) for images in drawn]
+            for images in drawn:
+                images[0].set_clim(0, min(40.0, max(1.0, *highest)))
+            label = "fitted loss by obstacles along the line of sight [dB]"
+            figure.colorbar(drawn[0][0], label=label, **bar)
+
+
 @torch.no_grad()
 def room(
-    links: Links, gaussians: Gaussians | None = None, learnt: LearntRoom | None = None
+    links: Links | None, gaussians: Gaussians | None = None, learnt: LearntRoom | None = None
 ) -> Figure:
     """Plan (x, y) and side view (x, z) of the room, to one scale.
 
@@ -69,36 +122,52 @@ def room(
     the loss by obstacles along the line of sight.
     """
     cloud = None if gaussians is None else _strongest(gaussians)
-    planes = _drawn_planes(learnt)
     matter = None if learnt is None else learnt.matter
-    edges = links.edges.numpy()
-    corners = [links.query.transmitters[links.split.train].numpy()]
-    corners.append(links.query.transmitters[links.split.test].numpy())
-    corners += [_receivers(links), edges.reshape(-1, 3)]
-    if cloud is not None:
-        corners.append(np.quantile(cloud.means, (0.1, 0.9), axis=0))
-    corners += [plane.corners for plane in planes]
+    content = _Content(links, cloud, _drawn_planes(learnt), matter)
+    question = f"Where are the {'links' if cloud is None else 'Gaussians'}?"
+    if content.planes or matter is not None:
+        question = "What has the model learnt of the room?"
+    note = (
+        "Obstacles are losses that explain the training labels. They are no evidence of a "
+        "wall:\nthey also stand for all else that weakens paths, and are arbitrary where few "
+        "paths pass."
+    )
     with rc_context(STYLE):
-        views = _views(np.concatenate(corners))
-        losses = []
-        for view in views.panels:
-            if matter is not None:
-                losses.append(_draw_matter(view, matter))
-            if cloud is not None:
-                ellipses = _draw_gaussians(view, cloud)
-            _draw_planes(view, planes)
-            _draw_walls(view, edges)
-            _draw_links(view, links, views.arrow)
-        bar: dict[str, Any] = {"ax": views.axes, "extend": "max", "aspect": 30, "shrink": 0.7}
-        if cloud is not None:
-            shown = f"{len(cloud.means):,} strongest of {cloud.count:,} Gaussians"
-            views.figure.colorbar(ellipses, label=f"|signal| × opacity, {shown}", **bar)
-        if losses:
-            _scale_losses(losses)
-            label = "loss by obstacles along the line of sight [dB]"
-            views.figure.colorbar(losses[0], label=label, **bar)
+        views = _views(content.corners)
+        drawn = [content.draw(view, views.arrow) for view in views.panels]
+        content.draw_bars(drawn, views.axes)
         _legend(views)
+        ask(views.figure, question, "" if matter is None else note)
     return views.figure
+
+
+def plot_room(
+    result: LearntRoom, ax: Any = None, links: Links | None = None, show_paths: bool = False
+) -> Any:
+    """What a model has learnt of the room.
+
+    Args:
+        result: Planes, obstacles and paths, as of ``model.learnt_room(links)``.
+        ax: Axes for the plan; None: plan and side view in a figure of their own.
+        links: Bring transmitters, receivers and walls into the picture.
+        show_paths: Draw the paths of a transmitter in place of links and obstacles; they need
+            ``links``, and no ``ax``.
+    """
+    if show_paths and (links is None or not result.paths or ax is not None):
+        raise ValueError(
+            "paths need links and a figure of their own\n"
+            "pass links=, both here and to model.learnt_room(links), and no ax"
+        )
+    if ax is None:
+        figure = paths(links, result) if show_paths else room(links, None, result)
+        return figure.axes[:2]
+    content = _Content(links, None, _drawn_planes(result), result.matter)
+    ends, arrow = _rims(content.corners)
+    _fit(ax, ends, 1)
+    ax.set_xlabel("x [m]")
+    content.draw_bars([content.draw(_View(ax, up=1, along=2), arrow)], [ax])
+    ax.legend()
+    return ax
 
 
 def paths(links: Links, learnt: LearntRoom) -> Figure:
@@ -122,11 +191,11 @@ def paths(links: Links, learnt: LearntRoom) -> Figure:
             look = {"color": ORANGE, "markeredgecolor": "white"}
             view.ax.plot(*view.project(transmitter), "o", label="transmitter", **look)
         place = ", ".join(f"{number:.2f}" for number in transmitter)
-        title = f"The {len(points)} strongest paths of a transmitter at ({place}) m"
-        views.axes[0].set_title(title)
+        question = f"How does the signal from ({place}) m arrive?"
         label = "power over that of the strongest path [dB]"
         views.figure.colorbar(lines, ax=views.axes, label=label, aspect=30, shrink=0.7)
         _legend(views)
+        ask(views.figure, question, f"the {len(points)} strongest paths that the model has learnt")
     return views.figure
 
 
@@ -161,7 +230,7 @@ def _draw_receivers(view: _View, places: Float[ndarray, "receivers 3"], label: s
     view.ax.plot(*view.project(places).T, "s", label=label, **look)
 
 
-def _draw_links(view: _View, links: Links, arrow: np.floating) -> None:
+def _draw_links(view: _View, links: Links, arrow: float) -> None:
     """Transmitters, receivers, and the axes of arrays, each as long as an arrow [m]."""
     train = links.query.transmitters[links.split.train].numpy()
     test = links.query.transmitters[links.split.test].numpy()
@@ -179,21 +248,28 @@ def _draw_links(view: _View, links: Links, arrow: np.floating) -> None:
         _draw_axes(view, receiver.pose.position.numpy(), axes)
 
 
+def _rims(corners: Float[ndarray, "k 3"]) -> tuple[Float[ndarray, "2 3"], float]:
+    """A box about some points with a rim, and the length of arrows in it [m]."""
+    ends = np.stack((corners.min(0), corners.max(0)))
+    arrow = 0.1 * float(np.ptp(ends, 0).max())
+    return ends + 1.2 * arrow * np.array([[-1], [1]]), arrow
+
+
+def _fit(ax: Axes, ends: Float[ndarray, "2 3"], up: int) -> None:
+    """Sets the axes of a panel."""
+    ax.set(xlim=ends[:, 0], ylim=ends[:, up], ylabel="xyz"[up] + " [m]", aspect="equal")
+
+
 def _views(corners: Float[ndarray, "k 3"]) -> _Views:
     """Empty plan and side view that contain some points [m]."""
-    lower = corners.min(0)
-    upper = corners.max(0)
-    arrow = 0.1 * (upper - lower).max()
-    lower = lower - 1.2 * arrow
-    upper = upper + 1.2 * arrow
-    width, depth, height = upper - lower
+    ends, arrow = _rims(corners)
+    width, depth, height = np.ptp(ends, 0)
     inches = min(5.8 / width, 6.8 / (depth + height))  # of one metre on the page
-    size = (width * inches + 1.3, (depth + height) * inches + 1.0)
-    figure = Figure(figsize=size, layout="compressed")
+    size = (width * inches + 1.3, (depth + height) * inches + 1.4)
+    figure = new_figure(*size, "compressed")
     plan, side = figure.subplots(2, 1, sharex=True, height_ratios=(depth, height))
-    for ax, up in ((plan, 1), (side, 2)):
-        ax.set(xlim=(lower[0], upper[0]), ylim=(lower[up], upper[up]))
-        ax.set(ylabel="xyz"[up] + " [m]", aspect="equal")
+    _fit(plan, ends, 1)
+    _fit(side, ends, 2)
     side.set_xlabel("x [m]")
     return _Views(figure, (_View(plan, up=1, along=2), _View(side, up=2, along=1)), arrow)
 
@@ -306,17 +382,6 @@ def _bells(values: Float[ndarray, " n"], matter: Matter, axis: int) -> Float[nda
     """The Gaussian functions of obstacles along one axis."""
     offsets = (values[:, None] - matter.centres[:, axis]) / matter.widths[:, axis]  # (n, k)
     return np.exp(-(offsets**2) / 2)
-
-
-def _scale_losses(images: Sequence[AxesImage]) -> None:
-    """One scale of colours of all views.
-
-    It spans at least 1 dB, so that a negligible loss is pale, and at most 40 dB, where nothing is
-    left to see.
-    """
-    highest = [np.quantile(image.get_array().data, 0.99) for image in images]
-    for image in images:
-        image.set_clim(0, min(40.0, max(1.0, *highest)))
 
 
 def _draw_paths(view: _View, paths: Sequence[LearntPath]) -> LineCollection:

@@ -2,15 +2,17 @@
 
 import itertools
 from collections.abc import Mapping
+from typing import Any
 
 from rich.console import Group
 from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
+from gaigs.core.results import library
 from gaigs.core.task import Metric, Task
 from gaigs.registry import registry
-from gaigs.report.table import best_in_bold, stacked
+from gaigs.report.table import best_in_bold, latex, stacked, tex
 
 COSTS = {
     "train_seconds": "training [s]",
@@ -67,11 +69,14 @@ def metrics_table(metrics: Mapping) -> Group:
     table.add_column("model", no_wrap=True)
     columns = []
     for name, shown in known.items():
-        # A terminal has room for five metrics; of more, only the brief ones are shown.
-        has_room = shown.is_brief or len(known) <= 5
+        # A terminal has room for five numbers; of more, only the brief metrics are shown.
+        has_room = shown.is_brief or len(known) + bool(metrics.get("paired")) <= 5
         if has_room and all(name in scores for scores in models.values()):
             table.add_column(stacked(shown.title), justify="right")
             columns.append(_texts(models, name, shown))
+    if test := metrics.get("paired"):
+        table.add_column(stacked(f"p against {test['baseline']}"), justify="right")
+        columns.append({one: f"{p[first]:.2g}" for one, p in test["p"].items() if first in p})
     if validation := metrics.get("validation"):
         table.add_column(stacked(f"{metric.title}, validation"), justify="right")
         columns.append(_texts(validation, first, metric))
@@ -89,34 +94,85 @@ def _receivers_table(receivers: Mapping, name: str, metric: Metric, max_rows: in
             f"the first {max_rows} of {len(receivers)} receivers; all are in metrics.json"
         )
     for model in next(iter(receivers.values())):
-        table.add_column(escape(model), justify="right")
+        table.add_column(stacked(model), justify="right")
     for receiver, models in itertools.islice(receivers.items(), max_rows):
         # Markup would make emojis of addresses such as 00:cd:11.
         table.add_row(Text(receiver), *_texts(models, name, metric).values())
     return table
 
 
-def _texts(models: Mapping[str, Mapping], name: str, metric: Metric) -> dict[str, str]:
-    """One metric by model, the best in bold."""
+def _texts(
+    models: Mapping[str, Mapping], name: str, metric: Metric, bold: str = "[bold]{}[/bold]"
+) -> dict[str, str]:
+    """One metric by model, the best in the format ``bold``."""
     values = [scores[name] for scores in models.values()]
-    return dict(zip(models, best_in_bold(values, metric.higher_is_better), strict=True))
+    return dict(zip(models, best_in_bold(values, metric.higher_is_better, bold), strict=True))
+
+
+def score_frame(metrics: Mapping) -> Any:
+    """The scores as a ``pandas.DataFrame``, each beside the ``p`` of its paired test."""
+    pandas = library("pandas", "to_dataframe")
+    test = metrics.get("paired") or {"p": {}}
+    rows: dict[str, dict] = {}
+    for model, scores in metrics["models"].items():
+        rows[model] = {}
+        for name, metric in task_class(metrics["task"]).metrics().items():
+            if name in scores:
+                rows[model][metric.title] = scores[name]
+                rows[model][f"{metric.title}, p"] = test["p"].get(model, {}).get(name)
+    frame = pandas.DataFrame.from_dict(rows, orient="index").astype(float)
+    frame.index.name = "model"
+    frame.attrs = {"split": metrics["split"], "best_baseline": test.get("baseline")}
+    return frame
+
+
+def score_latex(metrics: Mapping) -> str:
+    """The scores as a table in LaTeX, see ``Evaluation.to_latex``."""
+    models = metrics["models"]
+    test = metrics.get("paired")
+    columns = [["model", *map(tex, models)]]
+    for name, metric in task_class(metrics["task"]).metrics().items():
+        if all(name in scores for scores in models.values()):
+            texts = _texts(models, name, metric, r"\textbf{{{}}}")
+            for model in texts if test else ():
+                texts[model] += "$^*$" if test["p"].get(model, {}).get(name, 1.0) < 0.05 else ""
+            columns.append([tex(metric.title), *texts.values()])
+    lines = [[*line] for line in zip(*columns, strict=True)]
+    note = (
+        f"Test scores on split {tex(metrics['split'])}. Bold: the best, and all that print alike."
+    )
+    if test:
+        chance = f"$p<0.05$ in a paired bootstrap over {test['places']:,} places"
+        note += f" $^*$: differs from {tex(test['baseline'])}, the best baseline ({chance})."
+    return latex(lines, 1, note)
 
 
 def verdict(metrics: Mapping) -> str:
-    """A sentence that compares the run's model, the first one, with the baselines by one metric."""
+    """A sentence that compares the run's model, the first one, with the best baseline by one
+    metric, and one on the model before its kriging.
+    """
     (model, scores), *baselines = metrics["models"].items()
     name, metric = headline(metrics["task"], metrics["models"])
     quantity, _, unit = metric.title.removesuffix("]").partition(" [")
     digits = 2 if unit else 3
-    if unit:
-        unit = f" {unit}"
-    comparisons = []
+    unit = unit and f" {unit}"
+    text = f"{model}: {quantity} {scores[name]:.{digits}f}{unit}"
+    trend = ""
+    values = {}
     for other, theirs in baselines:
-        gap = f"{scores[name] - theirs[name]:+.{digits}f}"
-        side = "above" if gap[0] == "+" else "below"
-        is_level = float(gap) == 0
-        comparisons.append(f"level with {other}" if is_level else f"{gap[1:]}{unit} {side} {other}")
-    listed = [", ".join(comparisons[:-1]), *comparisons[-1:]]
-    text = " and ".join(filter(None, listed)) or f"at {scores[name]:.{digits}f}{unit}"
-    hint = "" if metric.higher_is_better else " (lower is better)"
-    return f"{model} is {text} in {quantity}{hint} on split {metrics['split']}."
+        if other == f"{model}_trend":
+            trend = f" Before kriging ({other}) it is {theirs[name]:.{digits}f}{unit}."
+        else:
+            values[other] = theirs[name]
+    if values:
+        best = (max if metric.higher_is_better else min)(values, key=lambda one: values[one])
+        gap = scores[name] - values[best]
+        size = f"{abs(gap):.{digits}f}"
+        is_better = (gap > 0) == metric.higher_is_better
+        side = f"{size}{unit} {'better' if is_better else 'worse'} than"
+        text += f", {side if float(size) else 'level with'} {best}, the best baseline"
+        test = metrics.get("paired")
+        p = None if test is None else test["p"].get(model, {}).get(name)
+        if p is not None and float(size):
+            text += f" (p = {p:.2g}{'' if p < 0.05 else ', may be chance'})"
+    return f"{text}, on split {metrics['split']}.{trend}"

@@ -19,7 +19,7 @@ from gaigs.data import Links
 from gaigs.report.curves import cdf
 from gaigs.report.figures import TaskFigures
 from gaigs.report.predictions import Examples, own_scores, read_examples, scores_of_systems
-from gaigs.report.style import PAGE, STYLE, panels
+from gaigs.report.style import PAGE, STYLE, ask, new_figure, panels
 
 
 class SpectrumFigures(TaskFigures):
@@ -34,7 +34,7 @@ class SpectrumFigures(TaskFigures):
         return {
             "spectra": spectra(shown, elevations, azimuths),
             "spectra_polar": spectra(shown, elevations, azimuths, polar=True),
-            "ssim_cdf": cdf(scores, "SSIM", "spectra", links.split.name, (None, 1)),
+            "ssim_cdf": cdf(scores, "SSIM", "spectra", links.split.name, (None, 1), True),
         }
 
     def of_systems(
@@ -53,7 +53,7 @@ class SpectrumFigures(TaskFigures):
                 azimuths = np.rad2deg(run["azimuths"])
         shown = {"label": label} | predictions
         return {
-            "cdf": cdf(scores, "SSIM", "spectra", split, (None, 1)),
+            "cdf": cdf(scores, "SSIM", "spectra", split, (None, 1), True),
             "spectra": side_by_side(shown, elevations, azimuths),
         }
 
@@ -78,11 +78,11 @@ def spectra(
         "Prediction": [f"SSIM {score:.3f}" for score in shown.scores],
         "Error": [f"MAE {np.abs(error).mean():.3f}" for error in errors],
     }
-    draw = _draw_sky if polar else _draw_plane
-    edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)
+    draw = _draw_sky if polar else draw_plane
+    edges = pixel_edges(azimuths, -np.inf, np.inf), pixel_edges(elevations, -90, 90)
     with rc_context(STYLE):
-        height = (2.2 if polar else 0.95) * len(labels) + 0.75
-        figure = Figure(figsize=(PAGE, height), layout="constrained")
+        height = (2.2 if polar else 0.95) * len(labels) + 1.0
+        figure = new_figure(PAGE, height)
         projection = {"projection": "polar"} if polar else {}
         axes = figure.subplots(len(labels), 3, squeeze=False, subplot_kw=projection)
         columns = zip(axes.T, titles, (labels, predictions, errors), strict=True)
@@ -98,6 +98,7 @@ def spectra(
             for ax in axes.flat:
                 ax.set(xlabel="azimuth [deg]", ylabel="elevation\n[deg]")
                 ax.label_outer()
+        ask(figure, "Are the right directions predicted?")
     return figure
 
 
@@ -111,19 +112,22 @@ def side_by_side(
     """
     columns = min(4, len(shown))
     rows = ceil(len(shown) / columns)
-    edges = _edges(azimuths, -np.inf, np.inf), _edges(elevations, -90, 90)
+    edges = pixel_edges(azimuths, -np.inf, np.inf), pixel_edges(elevations, -90, 90)
     with rc_context(STYLE):
-        figure = Figure(figsize=(PAGE, 0.8 * rows + 0.75), layout="constrained")
+        figure = new_figure(PAGE, 0.8 * rows + 1.0)
         axes = panels(figure, len(shown), columns, "azimuth [deg]", "elevation\n[deg]")
         for ax, (title, values) in zip(axes, shown.items(), strict=True):
-            image = _draw_plane(ax, *edges, values.astype(np.float32))
+            image = draw_plane(ax, *edges, values.astype(np.float32))
             ax.set_title(title)
         bar: dict[str, Any] = {"location": "bottom", "shrink": 0.5, "aspect": 45}
         figure.colorbar(image, ax=axes, label="normalised amplitude", **bar)
+        ask(figure, "Which system predicts the right directions?")
     return figure
 
 
-def _edges(centres: Float[ndarray, " n"], lowest: float, highest: float) -> Float[ndarray, " n+1"]:
+def pixel_edges(
+    centres: Float[ndarray, " n"], lowest: float, highest: float
+) -> Float[ndarray, " n+1"]:
     """Borders of the pixels, half-way between their centres, and as far outside the ends."""
     middle = (centres[1:] + centres[:-1]) / 2
     first = 2 * centres[0] - middle[0]
@@ -138,7 +142,7 @@ def _colours(limit: float | None) -> dict[str, Any]:
     return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
 
 
-def _draw_plane(
+def draw_plane(
     ax: Axes,
     azimuths: Float[ndarray, " across"],
     elevations: Float[ndarray, " up"],

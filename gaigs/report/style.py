@@ -4,7 +4,9 @@ print.
 
 import math
 import textwrap
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from functools import cache
 from pathlib import Path
 from zlib import crc32
@@ -51,7 +53,12 @@ ORANGE = "#D55E00"
 GREEN = "#009E73"
 PURPLE = "#CC79A7"
 SKY = "#56B4E9"
-GREY = "#6E6E6E"
+GREY = "#4D4D4D"  # a paler one is green to readers without green cones
+
+OTHERS: dict = {"color": "0.75", "linewidth": 0.7, "linestyle": "-", "zorder": 1}
+"""Look of lines without a colour of their own."""
+
+_is_shown: ContextVar[bool] = ContextVar("is_shown", default=False)
 
 
 def _line(number: int) -> tuple:
@@ -74,6 +81,40 @@ def _marker(number: int) -> dict:
 
 MARKERS = [_marker(number) for number in range(25)]
 """Looks of the points of up to 25 runs."""
+
+
+@contextmanager
+def shown() -> Iterator[None]:
+    """The style of all figures; those of ``new_figure`` belong to pyplot, which shows them."""
+    token = _is_shown.set(True)
+    try:
+        with rc_context(STYLE):
+            yield
+    finally:
+        _is_shown.reset(token)
+
+
+def new_figure(width: float, height: float, layout: str = "constrained") -> Figure:
+    """An empty figure [inch]."""
+    if not _is_shown.get():
+        return Figure(figsize=(width, height), layout=layout)
+    from matplotlib import pyplot  # of a window or a notebook
+
+    return pyplot.figure(figsize=(width, height), layout=layout)
+
+
+def ask(figure: Figure, question: str, note: str = "") -> None:
+    """The question that a figure answers as its title, and a note at its foot.
+
+    The note stands in the figure's legend if there is one, which would cover it elsewhere.
+    """
+    figure.suptitle(question, size=8, weight="bold")
+    if note and figure.legends:
+        head = figure.legends[0].get_title().get_text()
+        texts = [text for text in (head, note) if text]
+        figure.legends[0].set_title("\n".join(texts), {"size": 6.5})
+    elif note:
+        figure.supxlabel(note, size=6.5, color=GREY)
 
 
 def save(figure: Figure, file: Path) -> list[Path]:
@@ -104,9 +145,56 @@ def panels(figure: Figure, count: int, columns: int, xlabel: str, ylabel: str) -
     return axes[:count]
 
 
-def wrapped(label: str) -> str:
-    """The label of an axis in lines that fit a figure of one column."""
-    return textwrap.fill(label, width=48)
+def numbered(name: str, pages: Sequence[Figure]) -> dict[str, Figure]:
+    return {f"{name}_{page}" if page > 1 else name: figure for page, figure in enumerate(pages, 1)}
+
+
+def even_pages(items: Sequence, most: int) -> list[Sequence]:
+    """Parts of ``items`` for pages of at most ``most`` panels, which are of one size."""
+    pages = math.ceil(len(items) / most) or 1
+    size = math.ceil(len(items) / pages) or 1
+    return [items[first : first + size] for first in range(0, len(items), size)]
+
+
+def scaled_panels(
+    count: int, width: float, height: float, xlabel: str, ylabel: str
+) -> tuple[Figure, list[Axes]]:
+    """Panels with common axes of an extent in one unit, as large as a page with colour bar and
+    legend allows.
+    """
+    bar = 1.5  # inches beside all panels
+    title = 0.25  # inches above each panel
+    foot = 1.0  # inches above and below all panels
+
+    def scale(columns: int) -> float:
+        """Inches of one unit."""
+        rows = math.ceil(count / columns)
+        return min((PAGE - bar) / (columns * width), 5.6 / (rows * height), 3 / height)
+
+    columns = max(range(1, count + 1), key=scale)
+    rows = math.ceil(count / columns)
+    inches = scale(columns)
+    size = columns * width * inches + bar, rows * (height * inches + title) + foot
+    figure = new_figure(*size, "compressed")
+    return figure, panels(figure, count, columns, xlabel, ylabel)
+
+
+def wrapped(label: str, width: int = 48) -> str:
+    """A text in lines of ``width`` letters, by default those of a figure of one column."""
+    return textwrap.fill(label, width=width)
+
+
+def named_ones(
+    scores: Mapping[str, float], higher_is_better: bool, own: str | None = None, most: int = 6
+) -> list[str]:
+    """Lines of a figure that have a colour and a name, best first: more colours are confused.
+
+    ``own`` is always among them.
+    """
+    ranked = sorted(scores, key=lambda name: scores[name], reverse=higher_is_better)
+    first = [] if own is None else [own]
+    named = [*first, *(name for name in ranked if name != own)][:most]
+    return sorted(named, key=ranked.index)
 
 
 def looks(systems: Iterable[str]) -> dict[str, tuple]:
@@ -131,6 +219,25 @@ def looks(systems: Iterable[str]) -> dict[str, tuple]:
         colour, dash = LINES[places[model]]
         looks_by_name[name] = colour, ":" if name.endswith("_trend") else dash
     return looks_by_name
+
+
+def distinct_looks(named: Sequence[str], systems: Iterable[str]) -> dict[str, tuple]:
+    """``looks`` of lines in one figure, of at most six colours.
+
+    Where systems share a colour, the one that is not a known model takes a free one.
+    """
+    found = looks(systems)
+    models = _models(named)
+    known = _places()
+    taken = set()
+    for name in sorted(named, key=lambda name: models[name] not in known):
+        colour, dash = found[name]
+        if colour in taken and not name.endswith("_trend"):
+            free = [colour for colour, _ in LINES[:6] if colour not in taken]
+            colour = next(iter(free), colour)
+        taken.add(colour)
+        found[name] = colour, dash
+    return found
 
 
 def _models(systems: Iterable[str]) -> dict[str, str]:

@@ -59,7 +59,11 @@ def find_systems(
     for row in baselines:
         model = row["model"]
         scores = {key: [value] for key, value in row.items() if isinstance(value, float)}
-        if not _scores_alike(values.get(model, {}), scores):
+        known = values.get(model, {})
+        common = known.keys() & scores.keys()
+        # As printed: a baseline that is a system, too, has one row.
+        alike = [written(known[key][0]) == written(scores[key][0]) for key in common]
+        if not (known and all(alike)):
             name = as_baseline(model) if model in values else model
             title = " ".join(filter(None, (name, row.get("split"))))
             systems.append(System(model, title, [], scores))
@@ -91,13 +95,6 @@ def _system(group: Sequence[Run], shared: Mapping, names: Mapping) -> System:
             failures.append(f"seed {seed}: {cause}" if seed else cause)
     name = " ".join([names.get(model, model), *varied])
     return System(model, name, runs, values, failures, bool(varied))
-
-
-def _scores_alike(system: Mapping[str, Sequence], baseline: Mapping[str, Sequence]) -> bool:
-    """True if a system has the scores of a baseline, as printed."""
-    common = system.keys() & baseline.keys()
-    alike = [written(system[key][0]) == written(baseline[key][0]) for key in common]
-    return bool(system) and all(alike)
 
 
 def _costs(metrics: Mapping) -> dict[str, float | None]:

@@ -1,5 +1,6 @@
 """Tables: values as text, and rows for a terminal, in Markdown and in CSV."""
 
+import math
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -42,11 +43,11 @@ def best_in_bold(
 ) -> list[str]:
     """Values of a column as text; all that print as the best one are in the format ``bold``."""
     numbers = [value.mean if isinstance(value, Spread) else value for value in values]
-    known = [number for number in numbers if number is not None]
-    best = max(known) if higher_is_better else min(known)
+    known = [number for number in numbers if number is not None and not math.isnan(number)]
+    best = (max if higher_is_better else min)(known, default=None)
     texts = []
     for value, number in zip(values, numbers, strict=True):
-        is_best = number is not None and written(number) == written(best)
+        is_best = number in known and written(number) == written(best)
         texts.append(bold.format(written(value)) if is_best else written(value))
     return texts
 
@@ -123,6 +124,37 @@ def markdown(lines: Sequence[Sequence[str]]) -> str:
     return text
 
 
+def tex(text: str) -> str:
+    """Plain text in LaTeX."""
+    signs = {sign: f"\\{sign}" for sign in "&%$#_{}"}
+    signs |= {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    signs |= {"±": r"$\pm$", "²": "$^2$", "−": "$-$", "×": r"$\times$"}
+    return "".join(signs.get(sign, sign) for sign in text)
+
+
+def latex(
+    lines: Sequence[Sequence[str]], texts: int, caption: str, rules: Sequence[int] = ()
+) -> str:
+    """A table in LaTeX without packages; the first line is the head.
+
+    Args:
+        lines: Cells in LaTeX.
+        texts: Number of columns of texts; numbers follow, which are flush right.
+        caption: The caption.
+        rules: Numbers of the lines before which a rule stands.
+    """
+    columns = "l" * texts + "r" * (len(lines[0]) - texts)
+    rows = ""
+    for number, line in enumerate(lines):
+        rule = "\\hline\n" if number in (0, 1, *rules) else ""
+        # A bracket or a star after the end of a row would be an option of it.
+        start = "{}" if line[0][:1] in ("[", "*") else ""
+        rows += f"{rule}{start}{' & '.join(line)} \\\\\n"
+    body = f"\\begin{{tabular}}{{{columns}}}\n{rows}\\hline\n\\end{{tabular}}"
+    head = f"\\begin{{table}}\n\\centering\n\\caption{{{caption}}}\n"
+    return f"{head}{body}\n\\end{{table}}\n"
+
+
 def stacked(title: str) -> str:
     """The head of a narrow column, a word a line."""
-    return escape(title.replace(" ", "\n"))
+    return escape(title.replace(" ", "\n").replace("_", "_\n"))

@@ -4,6 +4,7 @@ import json
 import logging
 import math
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from gaigs.io.files import write_text
 from gaigs.kriging.links import check_known
 from gaigs.model import Model, checkpoint
 from gaigs.processes import is_first, limited_threads, only_run
-from gaigs.registry import check_type, name_of, only_recorded, registry
+from gaigs.registry import KINDS, check_type, name_of, only_recorded, registry
 from gaigs.report.scores import metrics_table, verdict
 from gaigs.runs.folder import claim, is_configuration, store, stored_software, warn_of_changes
 
@@ -147,6 +148,14 @@ def links_of(folder: str | Path, trust: bool) -> Links:
         return data.load(config["data"], config["split"], config["task"]["name"])
 
 
+def _check_options(config: dict) -> None:
+    """Raises a ``ValueError`` for an unknown option of a part: data may take long to read."""
+    parts = {kind: config[kind] for kind in ("data", "split", "loss", "model", "training")}
+    for kind, part in (parts | config["model"]).items():
+        if kind in KINDS and isinstance(part, Mapping) and "name" in part:
+            registry(kind).check_options(part)
+
+
 def train_and_test(config: dict, folder: Path) -> dict | None:
     """Contents of ``metrics.json`` of a run in a claimed folder.
 
@@ -154,6 +163,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     """
     import lightning
 
+    _check_options(config)
     lightning.seed_everything(config["seed"], verbose=False)
     links = data.load(config["data"], config["split"], config["task"]["name"])
     if not len(links.split.test):
@@ -196,6 +206,9 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         "validation_score": None,
         "receivers": evaluation.by_receiver(scores, links) if len(links.receivers) > 1 else {},
     }
+    places = links.query[links.split.test].place_keys
+    test = evaluation.compare((links.held_out or links).task, scores, places)
+    metrics["paired"] = None if test is None else test._asdict()
     if validation:
         metrics["validation_score"] = validation[name][links.task.monitor].mean().item()
     metrics |= model.facts() | fitted.facts

@@ -8,6 +8,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from gaigs.calibration.conformal import thinned
 from gaigs.calibration.scores import scores_of_links, shares_within, summarise_intervals
 from gaigs.configuration import composed, files_of
 from gaigs.core import stages
+from gaigs.core.results import plot
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.data import Links
@@ -32,7 +34,8 @@ from gaigs.model import Model
 from gaigs.model.answers import calibrated, predicted, spreads
 from gaigs.model.kriging import Kriging
 from gaigs.registry import name_of, registry
-from gaigs.report.scores import metrics_table, verdict
+from gaigs.report.paired import Paired, paired
+from gaigs.report.scores import metrics_table, score_frame, score_latex, verdict
 
 log = logging.getLogger(__name__)
 
@@ -89,26 +92,55 @@ class Evaluation(JupyterMixin):
         scores: Scores of every test link (k,), by the names of model and score; the evaluated model
             first.
         device: Name of the device that computed them.
+        places: A number for the place of each test link (k,); None if unknown.
     """
 
     task: Task
     split: str
     scores: Scores
     device: str
+    places: Tensor | None = None
+    plot = plot
 
     @property
     def models(self) -> dict[str, dict[str, float]]:
         """The numbers of the table, by the model's name and the metric's."""
         return {name: summary(self.task, values) for name, values in self.scores.items()}
 
+    @cached_property
+    def paired(self) -> Paired | None:
+        """A paired test of each score against the best baseline's; None if there is none."""
+        return None if self.places is None else compare(self.task, self.scores, self.places)
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The entries of a ``metrics.json`` that tables show."""
+        facts = {"task": self.task.name, "split": self.split, "device": self.device}
+        return facts | {"models": self.models, "paired": self.paired and self.paired._asdict()}
+
+    def to_dataframe(self) -> Any:
+        """A ``pandas.DataFrame``, models down; beside each score its ``p``, the probability of such
+        a difference from the best baseline by chance, see ``gaigs.report.paired``.
+
+        Raises:
+            ImportError: Pandas is not installed.
+
+        Example:
+            >>> links = gaigs.links("synthetic_rssi", transmitters=50)
+            >>> table = gaigs.evaluate(gaigs.train("knn", links), links).to_dataframe()
+            >>> table.columns[:2].tolist()
+            ['MAE [dB]', 'MAE [dB], p']
+        """
+        return score_frame(self.facts)
+
+    def to_latex(self) -> str:
+        """A table for a paper, which needs no package: the best and all that print alike in bold,
+        a star at a score that differs from the best baseline's by more than chance.
+        """
+        return score_latex(self.facts)
+
     def __rich__(self) -> Group:
-        facts = {
-            "task": self.task.name,
-            "split": self.split,
-            "device": self.device,
-            "models": self.models,
-        }
-        return Group(metrics_table(facts), escape(verdict(facts)))
+        return Group(metrics_table(self.facts), escape(verdict(self.facts)))
 
     def __str__(self) -> str:
         text = io.StringIO()
@@ -116,14 +148,18 @@ class Evaluation(JupyterMixin):
         return text.getvalue().rstrip()
 
 
-def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> Evaluation:
-    """Scores of a model on the test links, beside those of baselines that are fitted to the other
+@stages.with_progress
+def evaluate(
+    model: Model, links: Links, baselines: Sequence | None = None, *, progress: bool = True
+) -> Evaluation:
+    """Scores of a model on the test links, beside scores of baselines that are fitted to the other
     links.
 
     Args:
         model: A trained, fitted or loaded model, of the same receivers and task.
         links: Links with a split.
         baselines: Names or configurations of models without a training; None: the task's own.
+        progress: False for no bars.
 
     Raises:
         TypeError: The model is not a ``gaigs.Model``, or the links are not ``gaigs.Links``.
@@ -175,7 +211,13 @@ def evaluate(model: Model, links: Links, baselines: Sequence | None = None) -> E
         )
     baselines = [baselines] if isinstance(baselines, str) else baselines
     scores = score(models, build_baselines(baselines, model_name, links.scene), links)
-    return Evaluation(task, links.split.name, scores, device_name(model.device))
+    places = links.query[links.split.test].place_keys
+    return Evaluation(task, links.split.name, scores, device_name(model.device), places)
+
+
+def compare(task: Task, scores: Scores, places: Tensor) -> Paired | None:
+    """The paired test of a task's scores, without scores of intervals."""
+    return paired(task, {name: task_scores(parts) for name, parts in scores.items()}, places)
 
 
 def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:

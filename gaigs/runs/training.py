@@ -29,6 +29,7 @@ def train(
     /,
     *overrides: str,
     folder: str | Path | None = None,
+    progress: bool = True,
     **options,
 ) -> Model:
     """Trains a model on links as the command line does, by the preset of the model and the links'
@@ -42,6 +43,7 @@ def train(
         overrides: Command-line words, e.g. ``"variant=ga"`` or ``"trainer.max_steps=300"``.
         folder: Gets the configuration, the log and the checkpoints; the same call resumes a stopped
             training there. None: no files.
+        progress: False for no bars, as ``enable_progress_bar=False``.
         options: Values by their keys or names, as in ``gaigs.compose``: ``max_steps=300, seed=0``.
 
     Returns:
@@ -69,6 +71,8 @@ def train(
         raise TypeError(
             f"train takes a model and links, got {type(model).__name__} and {type(links).__name__}"
         )
+    if not progress:
+        options["enable_progress_bar"] = False
     made = _made(model)
     check_fit(links, None if made is None else made.scene)
     parts = {key: option for key, option in options.items() if hasattr(option, "configuration")}

@@ -14,18 +14,25 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from gaigs.core.geometry import quaternions_to_rotations
+from gaigs.splatting.deformation import Deformation
 from gaigs.splatting.gaussians import Gaussians
 
 SelectRows = Callable[[Tensor], Tensor]
 
 
-def prune(gaussians: Gaussians, optimizer: Optimizer, gone: Bool[Tensor, " n"]) -> None:
+def prune(
+    gaussians: Gaussians,
+    optimizer: Optimizer,
+    gone: Bool[Tensor, " n"],
+    follower: Deformation | None = None,
+) -> None:
     """Removes Gaussians.
 
     Args:
         gaussians: They lose rows in place.
         optimizer: Their optimizer.
         gone: True for each Gaussian to remove.
+        follower: Its parameters that follow the Gaussians lose rows, too.
 
     Raises:
         ValueError: All Gaussians would be removed.
@@ -39,17 +46,22 @@ def prune(gaussians: Gaussians, optimizer: Optimizer, gone: Bool[Tensor, " n"]) 
     def select(rows: Tensor) -> Tensor:
         return rows[keep]
 
-    _rearrange(gaussians, optimizer, select, select)
+    _rearrange(gaussians, optimizer, select, select, follower)
 
 
-def clone(gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]) -> None:
+def clone(
+    gaussians: Gaussians,
+    optimizer: Optimizer,
+    chosen: Bool[Tensor, " n"],
+    follower: Deformation | None = None,
+) -> None:
     """Doubles the chosen Gaussians in place.
 
     Two of opacity a' = 1 - sqrt(1 - a) cover as much as one of opacity a.
 
     Source: Kerbl et al., 2023, section 5.2, which copies the opacity too.
     """
-    copies = _append(gaussians, optimizer, chosen)
+    copies = _append(gaussians, optimizer, chosen, follower)
     with torch.no_grad():
         # logit a' = log(exp(softplus(logit a) / 2) - 1): accurate for opacities near 0 and 1.
         logits = gaussians.opacity_logits[copies]
@@ -61,13 +73,14 @@ def split(
     optimizer: Optimizer,
     chosen: Bool[Tensor, " n"],
     generator: torch.Generator,
+    follower: Deformation | None = None,
 ) -> None:
     """Replaces each chosen Gaussian by two smaller ones, whose centres are drawn from it.
 
     Source: Kerbl et al., 2023, section 5.2.
     """
     shrinkage = 1.6  # as Kerbl et al. shrink them
-    halves = _append(gaussians, optimizer, chosen)
+    halves = _append(gaussians, optimizer, chosen, follower)
     with torch.no_grad():
         scales = gaussians.scales[halves]  # (m, 3) [m]
         rotations = quaternions_to_rotations(gaussians.quats[halves])  # (m, 3, 3)
@@ -77,7 +90,10 @@ def split(
 
 
 def _append(
-    gaussians: Gaussians, optimizer: Optimizer, chosen: Bool[Tensor, " n"]
+    gaussians: Gaussians,
+    optimizer: Optimizer,
+    chosen: Bool[Tensor, " n"],
+    follower: Deformation | None,
 ) -> Bool[Tensor, " m"]:
     """Appends copies of the chosen Gaussians; returns a mask of originals and copies."""
 
@@ -88,18 +104,25 @@ def _append(
         # A copy has no history: its moments in the optimizer start at zero.
         return torch.cat((rows, torch.zeros_like(rows[chosen])))
 
-    _rearrange(gaussians, optimizer, with_copies, with_zeros)
+    _rearrange(gaussians, optimizer, with_copies, with_zeros, follower)
     return torch.cat((chosen, chosen[chosen]))
 
 
 def _rearrange(
-    gaussians: Gaussians, optimizer: Optimizer, select: SelectRows, select_state: SelectRows
+    gaussians: Gaussians,
+    optimizer: Optimizer,
+    select: SelectRows,
+    select_state: SelectRows,
+    follower: Deformation | None,
 ) -> None:
-    """Replaces the parameters in the module and in the optimizer."""
-    for name in gaussians.PARAMETERS:
-        old = getattr(gaussians, name)
+    """Replaces the parameters in the modules and in the optimizer."""
+    owned: list[tuple[nn.Module, str]] = [(gaussians, name) for name in gaussians.PARAMETERS]
+    if follower is not None:
+        owned += [(follower, name) for name in follower.follows]
+    for owner, name in owned:
+        old = getattr(owner, name)
         new = nn.Parameter(select(old.detach()), old.requires_grad)
-        setattr(gaussians, name, new)
+        setattr(owner, name, new)
         for group in optimizer.param_groups:
             parameters = group["params"]
             group["params"] = [new if parameter is old else parameter for parameter in parameters]

@@ -86,7 +86,7 @@ def drawn(
 ) -> Int[Tensor, " g"]:
     """Groups of some links in random order.
 
-    With ``rows``, whose numbers are those of groups, it is the order of rows: a repeated place
+    With ``rows``, numbers of groups, it is the order of rows: a repeated place
     changes no other draw.
     """
     present = groups[links] if rows is None else torch.cat((groups[links], rows[links]))

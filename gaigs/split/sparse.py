@@ -9,11 +9,11 @@ from gaigs.split import part, places_of, rows_of
 def sparse(
     links: Links, train: int, test: float = 0.2, validation: float | None = None, seed: int = 0
 ) -> Split:
-    """Few random places train and validate, fewer as a subset of more; test places are those of
-    ``random``.
+    """Few random places train and validate, fewer as a subset of more; test places are the places
+    of ``random``.
 
     Args:
-        train: Places to train and validate on. Other options and errors are those of
+        train: Places to train and validate on. Other options and errors are as for
             ``gaigs.split.part``.
     """
     return part(

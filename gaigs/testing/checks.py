@@ -19,6 +19,12 @@ def require(holds: object, rule: str) -> None:
         raise AssertionError(rule)
 
 
+def require_empty(got: Sequence[int], shapes: Collection[Sequence[int]], rule: str) -> None:
+    """Requires one of the shapes of an answer to a batch without links."""
+    remedy = "with b = 0, flatten(1) works and reshape(b, -1) does not"
+    require(tuple(got) in shapes, f"{rule}, got {tuple(got)}; {remedy}")
+
+
 def require_refusal(call: Callable[[], object], rule: str) -> None:
     """Requires a ``ValueError`` of a call, or a type checker's error."""
     try:
@@ -68,10 +74,12 @@ def require_tensor(
     """Requires a finite tensor of that shape, dtype and type of device."""
     shapes = tuple(shape), tuple(tensor.shape)
     require(shapes[0] == shapes[1], f"{name} must be of shape {shapes[0]}, got {shapes[1]}")
-    require(tensor.dtype == dtype, f"{name} must be {dtype} as its input, got {tensor.dtype}")
+    rule = f"{name} must be {dtype}, got {tensor.dtype}; convert it by .to({dtype})"
+    require(tensor.dtype == dtype, rule)
     stays = device is None or tensor.device.type == torch.device(device).type
-    require(stays, f"{name} must be on {device} as its input, got {tensor.device}")
-    require(tensor.isfinite().all(), f"{name} must be finite")
+    rule = f"{name} must be on {device} as its input, got {tensor.device}"
+    require(stays, f"{rule}; keep constants by register_buffer")
+    require(tensor.isfinite().all(), f"{name} must be finite; clamp before log and division")
 
 
 def require_independence(
@@ -90,9 +98,11 @@ def require_independence(
             missing = second is None and last is None
             require(missing, f"{name} must be given for all queries or for none")
             continue
-        require_same(first, second, f"two calls must give the same {name}")
+        rule = f"two calls must give the same {name}; draw random numbers in the constructor"
+        require_same(first, second, rule)
         row = first[-1:] if name in per_query else first
-        require_close(last, row, tolerance, f"{name} must not depend on the other queries")
+        rule = f"{name} must not depend on the other queries; sum over no axis of queries"
+        require_close(last, row, tolerance, rule)
 
 
 def require_gradients(outputs: Iterable[Tensor | None], leaves: Mapping[str, Tensor]) -> None:
@@ -108,7 +118,8 @@ def require_gradients(outputs: Iterable[Tensor | None], leaves: Mapping[str, Ten
     )
     for name, gradient in zip(leaves, gradients, strict=True):
         is_finite = gradient is None or gradient.isfinite().all()
-        require(is_finite, f"the gradient of {name} must be finite")
+        rule = f"the gradient of {name} must be finite; clamp before log, sqrt and division"
+        require(is_finite, rule)
 
 
 def require_groups(groups: Mapping[str, Iterable[nn.Parameter]], module: nn.Module) -> None:
@@ -116,7 +127,7 @@ def require_groups(groups: Mapping[str, Iterable[nn.Parameter]], module: nn.Modu
     grouped: list[int] = []
     for group in groups.values():
         grouped += map(id, group)
-    rule = "each parameter must be in one of parameter_groups"
+    rule = "each parameter must be in one of parameter_groups; add those that are missing"
     require(sorted(grouped) == sorted(map(id, module.parameters())), rule)
 
 

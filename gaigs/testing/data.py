@@ -115,8 +115,9 @@ def check_parts(parts: dict[str, Tensor], n: int) -> None:
     """Checks the parts of n links: ascending, without repetition, with links to train and test."""
     for name, part in parts.items():
         is_index = part.ndim == 1 and part.dtype == torch.long
-        require(is_index, f"{name} must be the numbers of links, got {part.dtype}")
-        require(part.diff().gt(0).all(), f"{name} must ascend")
+        rule = f"{name} must be the numbers of links, got {part.dtype}"
+        require(is_index, f"{rule}; of a mask mask.nonzero()[:, 0]")
+        require(part.diff().gt(0).all(), f"{name} must ascend; take part.sort().values")
     everything = torch.cat([*parts.values()])
     once = len(everything.unique()) == len(everything)
     require(once, f"no link may stand twice in {', '.join(parts)}")
@@ -130,16 +131,16 @@ def _check_query(links: Links) -> None:
     index = links.query.receivers
     require_tensor("transmitters", links.query.transmitters, (n, 3), torch.float32)
     is_index = tuple(index.shape) == (n,) and index.dtype == torch.long
-    require(is_index, "receivers must hold an integer for each link")
+    require(is_index, "receivers must hold an integer for each link; take .long()")
     points = index.lt(len(links.receivers)) & index.ge(0)
-    require(points.all(), "the query must point into receivers")
+    require(points.all(), "the query must point into receivers; count them from 0")
     frequencies = links.query.frequencies
     if frequencies is not None:
         require_tensor("frequencies", frequencies, (n,), frequencies.dtype)
         require(frequencies.dtype.is_floating_point, "frequencies must be floats [Hz]")
         low, high = CARRIERS
         inside = frequencies.ge(low) & frequencies.le(high)
-        require(inside.all(), f"frequencies must be from {low:g} to {high:g} Hz")
+        require(inside.all(), f"frequencies must be from {low:g} to {high:g} Hz; not in GHz")
 
 
 def _check_receivers(links: Links) -> None:
@@ -166,7 +167,8 @@ def _check_rows(links: Links) -> None:
     members = torch.zeros(int(which.max()) + 1, dtype=torch.long)
     members.scatter_(0, which, torch.arange(len(rows)))  # one link of each row
     at_one_place = torch.equal(places[members[which]], places)
-    require(at_one_place, "links of one row must have one transmitter position")
+    rule = "links of one row must have one transmitter position; number rows by place"
+    require(at_one_place, rule)
 
 
 def _check_labels(links: Links) -> None:
@@ -174,13 +176,15 @@ def _check_labels(links: Links) -> None:
     index = torch.linspace(0, len(links) - 1, 9).long().flip(0)
     labels = links.labels[index]
     require_tensor("labels", labels, (len(index), *task.shape), task.dtype)
-    require(torch.equal(labels, links.labels[index]), "labels read twice must be the same")
+    rule = "labels read twice must be the same; draw random numbers once, with a seed"
+    require(torch.equal(labels, links.labels[index]), rule)
     alone = torch.equal(labels[-1:], links.labels[index[-1:]])
     require(alone, "a label must not depend on the others that are read")
     batch = links.batch(index)
     require(torch.equal(batch.labels, labels), "a batch must have the labels of its links")
     if task.directions is not None:
-        require((labels.ge(0) & labels.le(1)).all(), "spectra must lie in [0, 1]")
+        rule = "spectra must lie in [0, 1]; scale each by its minimum and maximum"
+        require((labels.ge(0) & labels.le(1)).all(), rule)
         elevations, azimuths = task.directions.elevations.abs(), task.directions.azimuths.abs()
         require(elevations.max() <= math.pi / 2 + 1e-6, "elevations must be in radians")
         require(azimuths.max() <= 2 * math.pi + 1e-6, "azimuths must be in radians")

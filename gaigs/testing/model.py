@@ -55,7 +55,8 @@ def check_model(
         # Predicted again: a training step may move running statistics, as of a batch normalisation.
         values = model.train().predict(query)
         restored = twin.train().predict(query)
-        require_same(values, restored, "a model's state dict must restore its predictions")
+        rule = "a model's state dict must restore its predictions; register_buffer what fit learns"
+        require_same(values, restored, rule)
 
 
 def _hard_query(links: Links, query: Query) -> Query:
@@ -83,12 +84,14 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
     require(model.training, "predict must leave the model in the mode it was in")
     require_tensor("predictions", values, (len(places), *task.shape), task.dtype)
     require(not values.requires_grad, "predictions must not carry a gradient")
-    require_same(values, model.predict(query), "two calls must give the same predictions")
+    rule = "two calls must give the same predictions; draw random numbers in the constructor"
+    require_same(values, model.predict(query), rule)
     singles = _predict(model, query, places, batch_size=1)
-    require_close(singles, values, 1e-4, "the batch size must not change predictions")
+    rule = "the batch size must not change predictions; use no statistics of a batch"
+    require_close(singles, values, 1e-4, rule)
     none = _predict(model, query, places[:0])
-    is_empty = tuple(none.shape) == (0, *task.shape)
-    require(is_empty, "no transmitters must give no predictions")
+    rule = "no transmitters must give no predictions"
+    checks.require_empty(none.shape, [(0, *task.shape)], rule)
     grid = _predict(model, query, places.expand(2, *places.shape))
     rule = "a grid of positions must give a grid of predictions"
     require_close(grid, values.expand(2, *values.shape), 1e-4, rule)
@@ -138,10 +141,10 @@ def _check_evaluation(model: Model, batch: Batch, mixed: Batch) -> None:
     for i in range(len(mixed)):
         single = replace(mixed, query=mixed.query[i : i + 1], labels=None)
         singles.append(model.evaluate(single))
-    rule = "links to several receivers must get the values of single links"
+    rule = "links to several receivers must get the values of single links; read query.receivers"
     require_close(model.evaluate(mixed), torch.cat(singles), 1e-4, rule)
-    none = tuple(model.evaluate(Batch(batch.query[:0], batch.directions)).shape)
-    require(none == (0, *values.shape[1:]), f"no links must give no values, got {none}")
+    none = model.evaluate(Batch(batch.query[:0], batch.directions))
+    checks.require_empty(none.shape, [(0, *values.shape[1:])], "no links must give no values")
 
 
 def _check_directions(model: Model, batch: Batch) -> None:
@@ -193,7 +196,8 @@ def _check_training(model: Model, batch: Batch) -> None:
     value, penalties = model.train()(batch)
     labels = batch.labels
     require_tensor("the value", value, labels.shape, labels.dtype, labels.device)
-    require(value.requires_grad, "the value must carry a gradient to the parameters")
+    rule = "the value must carry a gradient to the parameters; detach nothing of them"
+    require(value.requires_grad, rule)
     for name, penalty in penalties.items():
         require_tensor(f"the penalty {name}", penalty, (), torch.float32, labels.device)
     checks.require_gradients([value, *penalties.values()], dict(model.named_parameters()))

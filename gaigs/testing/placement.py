@@ -68,8 +68,8 @@ def _check_call(placement: nn.Module, gaussians: Gaussians | None, query: Query)
     if gaussians is not None:
         leaves |= {f"gaussians.{name}": leaf for name, leaf in gaussians.named_parameters()}
     checks.require_gradients(placed, leaves)
-    nothing = tuple(placement(gaussians, query[:0]).means.shape)
-    require(nothing in ((0, n, 3), (1, n, 3)), "no queries must be placed too")
+    nothing = placement(gaussians, query[:0]).means
+    checks.require_empty(nothing.shape, [(0, n, 3), (1, n, 3)], "no queries must be placed too")
 
 
 def _check_fields(placed: Placed, n: int, transmitters: Tensor) -> None:

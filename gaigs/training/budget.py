@@ -128,7 +128,7 @@ class Budget(Callback):
 
 
 def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
-    """The options of Lightning's trainer without those of the budget, and the budget after a search
+    """The options of Lightning's trainer without the budget's, and the budget after a search
     [s].
 
     The budget takes ``max_time`` and a ``val_check_interval`` that is a time.

@@ -84,6 +84,7 @@ class DensityControl(Callback):
     @torch.no_grad()
     def on_train_batch_end(self, trainer, module, *_) -> None:
         gaussians = module.model.primitives
+        follower = getattr(module.model, "deformation", None)
         optimizer = trainer.optimizers[0]
         step = trainer.global_step
         is_due = step % self.every == 0 and self.start <= step <= self.stop
@@ -98,13 +99,13 @@ class DensityControl(Callback):
         # et al., 2023).
         wide = gaussians.scales.amax(-1) / self._distances(module) > self.split_angle  # (n,)
         split = pulled & wide
-        density.clone(gaussians, optimizer, pulled & ~wide)
+        density.clone(gaussians, optimizer, pulled & ~wide, follower)
         # Clones are last, and are not split.
         split = torch.cat((split, split.new_zeros(len(gaussians) - len(split))))
-        density.split(gaussians, optimizer, split, seeded(self.seed, step))
+        density.split(gaussians, optimizer, split, seeded(self.seed, step), follower)
         faint = gaussians.opacities < self.opacity
         if faint.any():
-            density.prune(gaussians, optimizer, faint)
+            density.prune(gaussians, optimizer, faint, follower)
         self.steps = 0
         if trainer.world_size > 1:
             # All processes have the same Gaussians, but Lightning's wrapper still holds the

@@ -20,7 +20,7 @@ def check_deformation(
     independence of the batch.
 
     The contract is that of ``gaigs.splatting.deformation.Deformation``.
-    ``build(scene=, channels=, tokenizer_widths=)`` makes it.
+    ``build(scene=, channels=, tokenizer_widths=, count=)`` makes it.
     """
     generator = torch.Generator().manual_seed(0)
     cases = [(widths, 1) for widths in ((5, 4, 6), (5, 0, 0), (0, 4, 6), (0, 0, 0))] + [
@@ -28,16 +28,14 @@ def check_deformation(
     ]
     for widths, sets in cases:
         for dtype in PRECISION:
-            module = (
-                build(scene=scene, channels=2, tokenizer_widths=widths).to(device, dtype).eval()
-            )
-            for parameter in module.parameters():  # zero heads would hide earlier layers
-                parameter.data += 0.1 * torch.randn(parameter.shape, generator=generator).to(
-                    parameter
-                )
             for n, b in ((7, 3), (1, 1)):
                 if b < sets:
                     continue
+                context = {"channels": 2, "tokenizer_widths": widths, "count": n}
+                module = build(scene=scene, **context).to(device, dtype).eval()
+                for parameter in module.parameters():  # zero heads would hide earlier layers
+                    noise = torch.randn(parameter.shape, generator=generator)
+                    parameter.data += 0.1 * noise.to(parameter)
 
                 def random(*shape, to=dtype):
                     return torch.randn(*shape, generator=generator).to(device, to)

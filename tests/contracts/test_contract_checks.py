@@ -101,7 +101,7 @@ def test_a_faulty_deformation_is_found(change, message):
     )
     kind = broken(TwoBranch, change)
 
-    def build(tokenizer_widths, channels, scene):
+    def build(tokenizer_widths, channels, **_):
         return kind(tokenizer_widths, channels, width=8, heads=heads, **sizes)
 
     with pytest.raises(AssertionError, match=message):
@@ -271,7 +271,7 @@ def eight_channels(splats, signal, *others):
             broken(
                 TorchRasterizer, lambda result, *_: [part.float() for part in result], "__call__"
             ),
-            r"random: map must be torch\.float64 as its input, got torch\.float32",
+            r"random: map must be torch\.float64, got torch\.float32; convert it by",
         ),
         (
             broken(TorchRasterizer, mixed, "__call__"),

@@ -84,6 +84,34 @@ def test_bars_are_silent_where_nobody_reads_them(terminal, shown, is_terminal, n
     assert terminal.file.getvalue() == ""
 
 
+@pytest.mark.parametrize("progress", [True, False])
+def test_progress_false_is_quiet(terminal, progress):
+    links = example_links("rssi")
+    model = gaigs.train("gaussian_process", links, progress=progress)
+    gaigs.evaluate(model, links, ["knn"], progress=progress)
+    gaigs.radio_map(model, pitch=0.5, progress=progress)
+    gaigs.locate(model, links.labels[:2], links, progress=progress)
+    gaigs.survey(model, count=3, progress=progress)
+    assert ("places to measure" in terminal.file.getvalue()) == progress
+    assert ("intervals" in terminal.file.getvalue()) == progress
+    assert terminal.file.getvalue() or not progress
+
+
+def test_bars_in_a_notebook_need_no_widgets(monkeypatch):
+    notebook = Console(file=io.StringIO(), force_jupyter=True, width=80)
+    monkeypatch.setattr(rich, "get_console", lambda: notebook)
+    monkeypatch.setattr(stages.threading, "Timer", AtOnce)
+    pages = []
+    output = SimpleNamespace(update=lambda page, raw: pages.append(page["text/plain"]))
+    shown = SimpleNamespace(display=lambda page, raw, display_id: output)
+    monkeypatch.setattr(stages.importlib, "import_module", {"IPython.display": shown}.get)
+    with stages.watched():
+        for _ in stages.track(range(3), "kriging"):
+            pass
+    assert any("kriging" in page and "1/3" in page for page in pages)
+    assert pages[-1].strip() == "", "a stage that has ended leaves nothing"
+
+
 def test_a_stage_ends_at_its_share_of_the_limit(clock):
     assert math.isinf(stages.left())
     with stages.watched(100.0):
@@ -141,7 +169,7 @@ def test_kriging_takes_as_many_links_as_it_has_time_for(clock, monkeypatch):
 
 
 SMALL = (
-    "+experiment=rssi", "data.transmitters=60", "data.order=1", "split.validation=0.3", "tokenizer=euclidean",
+    "+experiment=rssi", "data.transmitters=40", "data.order=0", "split.validation=0.3", "tokenizer=euclidean",
     "rasterizer=torch", "gaussians.count=10", "deformation.width=8", "trainer.accelerator=cpu", "trainer.max_steps=3",
     "trainer.val_check_interval=1", "trainer.enable_progress_bar=false", "baselines=[mean,gaussian_process]",
     "kriging=true",

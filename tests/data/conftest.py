@@ -90,3 +90,9 @@ def configured():
             return compose("config", [*overrides])
 
     return run
+
+
+@pytest.fixture
+def checked_when_described(monkeypatch):
+    """Data are checked where they are described, and not where they are loaded, too."""
+    monkeypatch.setattr("gaigs.data.check", lambda links: ())

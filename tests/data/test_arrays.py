@@ -77,8 +77,8 @@ def test_each_link_has_a_receiver_of_its_own():
         ),
         ({"labels": np.zeros(12), "index": [5] * 12}, "index must be 12 whole numbers from 0 to 1"),
         (
-            {"transmitters": PLACES[:, :2]},
-            r"transmitters must be \(..., 3\) positions \[m\], got shape \(12, 2\)",
+            {"transmitters": PLACES[:, :1]},
+            r"transmitters must be \(..., 3\) positions \[m\], got shape \(12, 1\)",
         ),
         ({"transmitters": PLACES * np.nan}, "transmitters must be finite"),
         (

@@ -23,6 +23,7 @@ CARRIER = 5e9
 WITHOUT_SETTINGS = {
     "kriging": "is made of a trained model",
     "ensemble": "is made of trained models",
+    "sklearn": "is made of a regressor",
     "ray_tracing": "needs a mesh of the room",
 }
 NAMES = [name for name in registry("model").names() if name not in WITHOUT_SETTINGS]

@@ -125,7 +125,8 @@ def test_residuals(name, size, n):
     tokens = [size * torch.randn(*shape, generator=generator) for shape in ((b, 5), (n, 4), (b, 6))]
     stands = means[None, :n].clone()
     stands[0, :1] = receiver
-    module = build("deformation", name, scene=SCENE, channels=2, tokenizer_widths=widths)
+    context = {"scene": SCENE, "channels": 2, "tokenizer_widths": widths, "count": n}
+    module = build("deformation", name, **context)
 
     def ask(module, transmitters, stands, *tokens):
         return module(

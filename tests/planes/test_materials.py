@@ -7,7 +7,7 @@ import torch
 
 import gaigs
 from gaigs.data.synthetic.image_source import permittivity
-from gaigs.planes.materials import HALF_SPACE, materials
+from gaigs.planes.materials import materials
 from gaigs.planes.room_paths import spread_links
 from gaigs.splatting.placement.mirrored.paths import Mirrored
 
@@ -26,7 +26,7 @@ def placement():
     return placement
 
 
-def paint(placement, plane, value, thickness=HALF_SPACE):
+def paint(placement, plane, value, thickness=1.0):
     with torch.no_grad():
         placement.log_permittivities[plane] = math.log(value.real - 1)
         placement.log_conductivities[plane] = math.log(-value.imag)

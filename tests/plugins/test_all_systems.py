@@ -13,8 +13,6 @@ from gaigs.core.task.scalar import Scalar
 from gaigs.core.task.spectrum import Spectrum
 from gaigs.testing import check_model
 
-pytestmark = pytest.mark.usefixtures("files_read_once")
-
 IMAGES = "model.octaves=[-2,0] model.pixel=20"
 SPLATS = "gaussians.count=40 deformation.width=16 rasterizer=torch"
 SMALL = {

@@ -56,7 +56,7 @@ def test_magnitude_and_phase_are_those_of_the_strongest_element(rng):
     ]
     for row, element in enumerate((2, 0)):
         magnitude, phase = figure.axes[2 * row : 2 * row + 2]
-        for name, channel in (("measured", labels), ("predicted", predictions)):
+        for name, channel in (("label", labels), ("prediction", predictions)):
             x, y = lines(magnitude)[name].get_data()
             np.testing.assert_allclose(x, frequencies / 1e9)
             np.testing.assert_allclose(10 ** (y / 20), np.abs(channel[row, element]))
@@ -69,7 +69,7 @@ def test_magnitude_and_phase_are_those_of_the_strongest_element(rng):
             )
         assert (magnitude.get_ylabel(), phase.get_ylabel()) == ("|h| [dB]", "phase [deg]")
     assert [ax.get_xlabel() for ax in figure.axes] == ["", "", "frequency [GHz]", "frequency [GHz]"]
-    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["measured", "predicted"]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["label", "prediction"]
 
 
 def test_a_turning_phase_has_gaps_instead_of_falls():
@@ -92,7 +92,7 @@ def test_frequencies_may_come_in_any_order(rng):
             for index in (np.arange(64), order)
         )
         for ax, other in zip(sorted_.axes, shuffled.axes, strict=True):
-            for name in ("measured", "predicted"):
+            for name in ("label", "prediction"):
                 np.testing.assert_allclose(
                     lines(ax)[name].get_xydata(), lines(other)[name].get_xydata(), atol=1e-6
                 )
@@ -102,8 +102,8 @@ def test_a_prediction_of_nothing_is_drawn_as_nothing(rng):
     label = random(rng, 1, 1, 64)
     for function in (magnitudes_and_phases, impulse_responses):
         ax = draw(function, label, 0 * label, EVEN).axes[0]
-        assert np.isneginf(lines(ax)["predicted"].get_ydata()).all()
-        measured = lines(ax)["measured"].get_ydata()
+        assert np.isneginf(lines(ax)["prediction"].get_ydata()).all()
+        measured = lines(ax)["label"].get_ydata()
         assert ax.get_ylim()[0] > measured.max() - 60 - 10
 
 
@@ -113,7 +113,7 @@ def test_deep_fades_do_not_squeeze_the_rest(rng):
     prediction[..., 5] *= 1e-12
     (magnitude, _) = draw(magnitudes_and_phases, label, prediction, EVEN).axes
     low, high = magnitude.get_ylim()
-    measured = lines(magnitude)["measured"].get_ydata()
+    measured = lines(magnitude)["label"].get_ydata()
     assert measured.max() < high
     assert measured.max() - 60 - 5 < low < measured.max() - 60 + 5
 
@@ -125,13 +125,13 @@ def test_deep_fades_do_not_squeeze_the_rest(rng):
 def test_a_path_peaks_at_its_delay_and_height(frequencies, delay):
     label, prediction = path(frequencies, 0.3e-6), path(frequencies, delay, 0.1)
     (ax,) = draw(impulse_responses, label, prediction, frequencies).axes
-    x, y = lines(ax)["predicted"].get_data()
+    x, y = lines(ax)["prediction"].get_data()
     near = abs(x - 1e9 * delay) < 400
     assert x[near][y[near].argmax()] == pytest.approx(
         1e9 * delay, abs=2
     )  # ns, of 15 or more that the band resolves
     assert y.max() == pytest.approx(-20, abs=0.1)
-    x, y = lines(ax)["measured"].get_data()
+    x, y = lines(ax)["label"].get_data()
     assert (x[y.argmax()], y.max()) == (pytest.approx(300, abs=2), 0)
     assert ax.get_xlabel() == "delay [ns]"
     assert ax.get_ylabel() == "|impulse response|, Hann window\n[dB relative to the label's peak]"
@@ -140,7 +140,7 @@ def test_a_path_peaks_at_its_delay_and_height(frequencies, delay):
 def test_evenly_spaced_subcarriers_give_the_inverse_fourier_transform(rng):
     label, prediction = random(rng, 2, 64)
     (ax,) = draw(impulse_responses, label[None, None], prediction[None, None], EVEN).axes
-    x, measured = lines(ax)["measured"].get_data()
+    x, measured = lines(ax)["label"].get_data()
     count = len(x)
     np.testing.assert_allclose(np.diff(x), 1000 / count)  # one period of 1 us in all
     assert -1000 / 32 < x[0] < 0
@@ -154,7 +154,7 @@ def test_evenly_spaced_subcarriers_give_the_inverse_fourier_transform(rng):
         for channel in (label, prediction)
     ]
     np.testing.assert_allclose(10 ** (measured / 20), truth[0] / truth[0].max(), atol=1e-9)
-    predicted = lines(ax)["predicted"].get_ydata()
+    predicted = lines(ax)["prediction"].get_ydata()
     np.testing.assert_allclose(10 ** (predicted / 20), truth[1] / truth[0].max(), atol=1e-9)
 
 
@@ -162,7 +162,7 @@ def test_two_bands_far_apart_do_not_take_all_memory():
     frequencies = np.concatenate((2.4e9 + 1e3 * np.arange(4), 5e9 + 1e3 * np.arange(4)))
     label = path(frequencies, 0.0)
     (ax,) = draw(impulse_responses, label, label, frequencies).axes
-    x = lines(ax)["measured"].get_xdata()
+    x = lines(ax)["label"].get_xdata()
     assert len(x) == 2**14
     assert x[-1] - x[0] == pytest.approx(1e6, rel=1e-3)  # one over the median spacing, 1 ms
 

@@ -4,12 +4,15 @@ import csv
 
 import numpy as np
 import pytest
+from matplotlib.colors import to_rgb
+from scipy.spatial.distance import pdist
 from scipy.stats import ecdf
+from skimage.color import rgb2lab
 
 from gaigs.core.task import Metric
 from gaigs.registry import registry
 from gaigs.report.curves import cdf, learning_curves, loss_curves, speed_against_error
-from gaigs.report.style import looks
+from gaigs.report.style import LINES, looks
 from gaigs.report.training_log import read_curves
 
 
@@ -24,21 +27,22 @@ def lines(ax):
 
 def test_cdf_is_the_empirical_one(rng):
     scores = {"gaigs": rng.random(40), "mean": rng.random(41), "knn": rng.random(40)}
-    figure = cdf(scores, "SSIM", "spectra", "runs of 20", (None, 1))
+    figure = cdf(scores, "SSIM", "spectra", "runs of 20", (None, 1), True)
     ax = figure.axes[0]
     steps = [line for line in ax.lines if line.get_drawstyle().startswith("steps")]
     dots = [line for line in ax.lines if line.get_marker() == "o"]
     assert len(steps) == len(dots) == 3
-    for (name, ssim), step, dot in zip(scores.items(), steps, dots, strict=True):
+    best_first = sorted(scores.items(), key=lambda item: -np.median(item[1]))
+    for (name, ssim), step, dot in zip(best_first, steps, dots, strict=True):
         truth = ecdf(ssim).cdf
         x, y = step.get_data()
         np.testing.assert_allclose(x[1:], truth.quantiles)
         np.testing.assert_allclose(y[1:], truth.probabilities)
         assert dot.get_xydata()[0] == pytest.approx((np.median(ssim), 0.5))
         assert step.get_label() == f"{name} {np.median(ssim):.3f}"
-    assert (ax.get_xlabel(), ax.get_ylabel()) == ("SSIM, split runs of 20", "share of test spectra")
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("SSIM", "share of 40 test spectra")
     assert ax.get_xlim()[1] == 1
-    assert figure.legends[0].get_title().get_text() == "median SSIM"
+    assert figure.legends[0].get_title().get_text() == "median SSIM, best first\nsplit runs of 20"
 
 
 def write_losses(path, steps=30):
@@ -62,6 +66,7 @@ def test_curves_leave_out_the_gaps_of_the_log(tmp_path):
     assert list(curves) == ["train/loss", "train/l1", "validation/ssim"]
     np.testing.assert_array_equal(curves["validation/ssim"], [[9, 19, 29], [0.09, 0.19, 0.29]])
     train, validation = loss_curves(curves).axes
+    assert validation.get_title() == "validation SSIM"
     assert set(lines(train)) == {"loss", "l1"}
     np.testing.assert_allclose(
         lines(train)["loss"].get_xydata(), [(k, 1 / (k + 1)) for k in range(30)]
@@ -97,7 +102,7 @@ def test_a_system_has_one_look_in_all_figures(rng):
     scores = {name: rng.random(9) for name in ("mirrored", "knn", "mean")}
     drawn = cdf(scores, "SSIM", "spectra", "random", (None, 1)).axes[0]
     steps = [line.get_color() for line in drawn.lines if line.get_drawstyle().startswith("steps")]
-    assert steps == [found[name][0] for name in scores]
+    assert {*steps} == {found[name][0] for name in scores}
     two = [((1.0, 2.0), (0.5, 0.6))] * 2
     curves = learning_curves(
         dict(zip(("mirrored Gaussians", "GAI-GS"), two, strict=True)),
@@ -113,6 +118,14 @@ def test_a_system_has_one_look_in_all_figures(rng):
         ["a", "b", "c"], np.ones(3), times, "SSIM", {"knn official": 0.8}, models
     ).axes
     assert [line.get_color() for line in ax.lines] == [found[name][0] for name in (*models, "knn")]
+
+
+def test_each_score_has_an_axis_of_its_own():
+    steps = np.arange(9.0)
+    names = [f"validation/{name}" for name in ("ssim", "mae", "snr_aligned_db")]
+    figure = loss_curves(dict.fromkeys(names, (steps, steps)))
+    titles = [ax.get_title().removeprefix("validation ") for ax in figure.axes]
+    assert titles == ["SSIM", "MAE", "SNR aligned [dB]"]
 
 
 def test_many_steps_are_smoothed_in_place():
@@ -146,3 +159,33 @@ def test_speed_against_error(longest, scale):
     assert points["c"].get_xydata().tolist() == [[longest, 0.9]]
     assert set(points["knn"].get_ydata()) == {0.85}
     assert (ax.get_xscale(), ax.get_ylabel()) == (scale, "median SSIM")
+
+
+# What deuteranopes, protanopes and tritanopes see, for linear RGB (Machado, Oliveira and Fernandes,
+# A physiologically-based model for simulation of color vision deficiency, 2009, severity 1).
+READERS = {
+    "all cones": np.eye(3),
+    "no green cones": [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+    "no red cones": [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+    "no blue cones": [[1.256, -0.077, -0.179], [-0.078, 0.931, 0.148], [0.005, 0.691, 0.304]],
+}
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_colours_differ_for_every_reader(reader):
+    colours = [to_rgb(colour) for colour, _ in LINES[:6]]
+    seen = np.array(colours) ** 2.2 @ np.transpose(READERS[reader])
+    points = rgb2lab(seen.clip(0, 1) ** (1 / 2.2))
+    apart = pdist(points)  # a just noticeable difference is 2.3
+    assert apart.min() > 15, f"{apart.min():.1f} in CIELAB"
+
+
+def test_only_six_lines_have_colours(rng):
+    scores = {f"s{k}": k + rng.random(9) for k in range(12)}
+    figure = cdf({"own": 20 + rng.random(9)} | scores, "error", "links", "random", (0, None))
+    labels = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [label.split()[0] for label in labels] == ["s0", "s1", "s2", "s3", "s4", "own", "7"]
+    assert labels[-1].startswith("7 others 5.")
+    steps = [line for line in figure.axes[0].lines if line.get_drawstyle().startswith("steps")]
+    assert len({line.get_color() for line in steps if line.get_color() != "0.75"}) == 6
+    assert len([line for line in figure.axes[0].lines if line.get_color() == "0.75"]) == 1 + 7 + 1

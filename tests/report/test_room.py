@@ -184,7 +184,7 @@ def test_obstacles_are_shown_by_what_they_take_along_the_line_of_sight(walls, rn
     )
     figure = room(links(POINT), learnt=LearntRoom(walls, matter, []))
     plan, side, bar = figure.axes
-    assert bar.get_ylabel() == "loss by obstacles along the line of sight [dB]"
+    assert bar.get_ylabel() == "fitted loss by obstacles along the line of sight [dB]"
 
     def density(point):
         return (
@@ -222,7 +222,7 @@ def test_paths_are_drawn_from_end_to_end_the_strongest_on_top(walls):
     plan, side, bar = paths(
         links(POINT, receivers=ends[1], edges=edges), LearntRoom(walls, None, routes)
     ).axes
-    assert plan.get_title() == "The 3 strongest paths of a transmitter at (1.00, 1.00, 1.00) m"
+    assert plan.figure.get_suptitle() == "How does the signal from (1.00, 1.00, 1.00) m arrive?"
     assert bar.get_ylabel() == "power over that of the strongest path [dB]"
     assert plan.get_xlim()[0] < -7
     for ax, view in ((plan, [0, 1]), (side, [0, 2])):

@@ -12,7 +12,8 @@ from gaigs.core.radio_maps import RadioMap
 from gaigs.core.task.rssi import Rssi
 from gaigs.data import Split
 from gaigs.report import scalar
-from gaigs.report.scalar import predicted_against_measured, radio_maps
+from gaigs.report.radio_maps import map_pages, radio_maps
+from gaigs.report.scalar import predicted_against_measured
 from gaigs.report.style import round_step
 from gaigs.testing import example_links
 
@@ -28,6 +29,12 @@ NANOSECONDS = task("delay spread", "ns", "ns")
 
 def panels(figure):
     return [ax for ax in figure.axes if ax.get_label() != "<colorbar>"]
+
+
+def note(figure):
+    """The note at the foot, in the legend if there is one."""
+    head = [legend.get_title().get_text() for legend in figure.legends]
+    return "".join(head) or figure.get_supxlabel()
 
 
 def counts(ax):
@@ -82,10 +89,11 @@ def test_readings_are_counted_where_they_were_measured_and_predicted():
 def test_many_receivers_take_several_figures():
     labels = np.linspace(-80, -50, 80)
     drawn = predicted_against_measured(
-        labels, labels, np.arange(80) % 8, [f"g{i}" for i in range(8)], Rssi()
+        labels, labels, np.arange(80) % 8, [f"g{i}" for i in range(8)], Rssi(), max_panels=6
     )
-    assert [len(panels(figure)) for figure in drawn] == [6, 2]
-    assert panels(drawn[1])[0].get_title().startswith("g6,")
+    assert [len(panels(figure)) for figure in drawn] == [4, 4], "pages are of one size"
+    assert panels(drawn[1])[0].get_title().startswith("g4,")
+    assert len({tuple(figure.get_size_inches()) for figure in drawn}) == 1
 
 
 @pytest.mark.parametrize("scale", [1e-9, 0.03, 1.0, 4e6])
@@ -105,8 +113,8 @@ def test_cells_and_margins_follow_from_the_data_in_other_units(scale):
     assert digit == pytest.approx(1) or digit == pytest.approx(2) or digit == pytest.approx(5)
     assert edges[-1] <= labels.max() + (20 + 2) * cell
     assert (ax.get_xlabel(), ax.get_ylabel()) == (
-        "measured delay spread [ns]",
-        "predicted delay spread [ns]",
+        "label, delay spread [ns]",
+        "prediction, delay spread [ns]",
     )
     written = float(ax.get_title().removeprefix("hall, MAE ").removesuffix(" ns"))
     assert written == pytest.approx(np.abs(predictions - labels).mean(), rel=6e-3)
@@ -144,7 +152,7 @@ def maps(count, x=None, y=None, seed=3, scale=1.0, **words):
     return RadioMap(values, x, y, 1.25, tuple(f"g{i}" for i in range(count)), **words)
 
 
-def draw(radio_map, readings=None, edges=WALLS, gateways=None, task=None):
+def draw(radio_map, readings=None, edges=WALLS, gateways=None):
     names = radio_map.receivers
     readings = {name: np.array([[1.0, 2, -60]]) for name in names} if readings is None else readings
     gateways = (
@@ -152,7 +160,7 @@ def draw(radio_map, readings=None, edges=WALLS, gateways=None, task=None):
         if gateways is None
         else gateways
     )
-    return radio_maps(radio_map, gateways, readings, edges, task or Rssi())
+    return radio_maps(radio_map, gateways, readings, edges)
 
 
 def dots(ax):
@@ -172,7 +180,7 @@ def test_each_receiver_has_its_map_gateway_and_readings_in_one_scale_of_colours(
         np.testing.assert_array_equal(dots(ax).get_array(), readings[f"g{i}"][:, 2])
         (gateway,) = ax.lines
         assert gateway.get_xydata().tolist() == [[i, 0.5]]
-    assert "1.25 m" in figure.get_suptitle()
+    assert "1.25 m" in note(figure)
 
 
 def test_a_pixel_lies_around_its_point_with_y_upwards_and_metres_alike():
@@ -215,9 +223,23 @@ def test_levels_have_lines_every_ten_decibels_and_the_scale_ends_on_fives():
         artist for artist in panels(figure)[0].collections if isinstance(artist, QuadContourSet)
     )
     assert contours.levels.tolist() == [-70]
-    assert figure.get_suptitle().endswith("at z = 1.25 m, a line every 10 dB")
+    assert note(figure).endswith("at z = 1.25 m, a line every 10 dB")
     assert panels(figure)[0].images[0].get_clim() == (-80, -55)
     assert figure.axes[-1].get_ylabel() == "RSSI [dBm]"
+
+
+def test_a_constant_deviation_is_a_sentence_and_no_map():
+    drawn = maps(3)
+    deviations = np.full(drawn.values.shape, 3.25, np.float32)
+    deviations[2] += np.linspace(0, 2, deviations[2].size).reshape(deviations[2].shape)
+    pages = map_pages(replace(drawn, deviations=deviations), {}, {}, WALLS)
+    assert [*pages] == ["radio_map", "deviation_map"]
+    titles = [ax.get_title() for ax in panels(pages["radio_map"])]
+    assert titles == ["g0, ± 3.25 dB everywhere", "g1, ± 3.25 dB everywhere", "g2"]
+    assert [ax.get_title() for ax in panels(pages["deviation_map"])] == ["g2"]
+    assert "standard deviation of RSSI" in note(pages["deviation_map"])
+    pages = map_pages(replace(drawn.only(np.arange(2)), deviations=deviations[:2]), {}, {}, WALLS)
+    assert [*pages] == ["radio_map"]
 
 
 @pytest.mark.parametrize("scale", [-1e-6, -1.0, -1e5])
@@ -225,7 +247,7 @@ def test_lines_and_colours_follow_from_the_data_in_other_units(scale):
     drawn = maps(
         1, scale=scale, quantity="delay spread", unit="ns", frequency=2.45e9
     )  # 50 to 80 times the scale
-    (figure,) = draw(drawn, {"g0": np.array([[1.0, 2, -60 * scale]])}, task=NANOSECONDS)
+    (figure,) = draw(drawn, {"g0": np.array([[1.0, 2, -60 * scale]])})
     (ax,) = panels(figure)
     (contours,) = (artist for artist in ax.collections if isinstance(artist, QuadContourSet))
     step = np.diff(contours.levels).mean()
@@ -234,7 +256,7 @@ def test_lines_and_colours_follow_from_the_data_in_other_units(scale):
     low, high = ax.images[0].get_clim()
     assert -48 * scale < low <= 51 * -scale
     assert -79 * scale <= high < -83 * scale
-    assert figure.get_suptitle() == (
+    assert note(figure) == (
         f"Predicted delay spread of a transmitter at z = 1.25 m at 2.45 GHz, a line every {step:g} "
         "ns"
     )
@@ -244,7 +266,7 @@ def test_lines_and_colours_follow_from_the_data_in_other_units(scale):
 def test_a_flat_map_of_zeros_has_colours():
     flat = maps(1, unit="ns")
     flat.values[:] = 0
-    (figure,) = draw(flat, {"g0": np.array([[1.0, 2, 0]])}, task=NANOSECONDS)
+    (figure,) = draw(flat, {"g0": np.array([[1.0, 2, 0]])})
     low, high = panels(figure)[0].images[0].get_clim()
     assert low <= 0 < high
 
@@ -259,7 +281,7 @@ def test_a_wild_map_has_no_endless_lines():
     assert len(contours.levels) < 40
 
 
-@pytest.mark.parametrize("count", [1, 7])
+@pytest.mark.parametrize("count", [1, 8, 10])
 def test_no_panel_is_lost_and_the_lowest_tell_their_metres(count):
     figures = draw(maps(count))
     for figure in figures:
@@ -315,5 +337,5 @@ def test_a_run_draws_the_receivers_with_most_readings(tmp_path):
     assert {*drawn} == {"error_cdf", *(f"{name}{page}" for name in names for page in ("", "_2"))}
     titles = [ax.get_title() for page in ("", "_2") for ax in panels(drawn[f"radio_map{page}"])]
     assert titles == [f"g{i}" for i in (0, 1, 2, 3, 4, 6, 8, 10, 12, 14, 16, 18)]
-    assert "12 of 20 receivers" in drawn["radio_map"].get_suptitle()
-    assert drawn["predicted_against_measured"].get_suptitle() == "12 of 20 receivers"
+    assert "12 of 20 receivers" in note(drawn["radio_map"])
+    assert note(drawn["predicted_against_measured"]) == "12 of 20 receivers"

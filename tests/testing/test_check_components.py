@@ -103,7 +103,7 @@ def weighted_by_receiver(placed, _, query):
         ),
         (
             broken(Mirror, field("gains", lambda part: part.real)),
-            "gains must be torch.complex64 as its input",
+            "gains must be torch.complex64, got .*; convert it by .to",
         ),
         (
             broken(Mirror, weighted_by_receiver),

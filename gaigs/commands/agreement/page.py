@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from gaigs.core.task import Task
 from gaigs.io.files import write_text
-from gaigs.report.style import COLUMN, LINES, STYLE, save
+from gaigs.report.style import COLUMN, LINES, STYLE, ask, new_figure, save
 from gaigs.report.table import markdown
 
 
@@ -95,7 +95,7 @@ def figure(score: str, cells: Sequence[Cell]) -> Figure:
     distances = list(dict.fromkeys(cell.distance for cell in cells))
     columns = sorted({cell.separation for cell in cells})
     with rc_context(STYLE):
-        figure = Figure(figsize=(COLUMN, 2.9), layout="constrained")
+        figure = new_figure(COLUMN, 3.15)
         ax = figure.subplots()
         for number, column in enumerate(columns):
             members = [cell for cell in cells if cell.separation == column]
@@ -118,7 +118,8 @@ def figure(score: str, cells: Sequence[Cell]) -> Figure:
         labels = [_distance(distance) for distance in distances]
         ax.set_xticks(range(len(distances)), labels, rotation=40, ha="right")
         ax.grid(axis="y")
-        figure.legend(loc="outside upper center", ncols=2, title="measurements apart")
+        figure.legend(loc="outside lower center", ncols=2, title="measurements apart")
+        ask(figure, "How far do near labels agree?")
     return figure
 
 

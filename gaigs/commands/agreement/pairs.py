@@ -106,8 +106,8 @@ def measure(
     Args:
         links: All links in the order of the files, which counts as the order of measurement.
         random: Draws the pairs.
-        counted: Largest number of computed distances; of more pairs, those of random links with all
-            others count.
+        counted: Largest number of computed distances; of more pairs, the pairs of random links with
+            all others count.
         block: Number of distances in memory at a time.
         most: Largest number of pairs of a cell whose labels are compared; at least 30 of large
             labels.

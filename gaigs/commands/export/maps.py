@@ -4,12 +4,11 @@ import itertools
 import json
 import logging
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from xml.sax.saxutils import escape
 
 import numpy as np
 import tifffile
-from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.backends.backend_pdf import PdfPages
 from numpy import ndarray
@@ -22,27 +21,15 @@ from gaigs.data.maps import find_pyproj
 from gaigs.io.files import atomic_write, write_text
 from gaigs.io.netcdf import Variable, write_netcdf
 from gaigs.report import style
-from gaigs.report.scalar import map_pages
+from gaigs.report.radio_maps import deviation_map, map_pages
 
 log = logging.getLogger(__name__)
 
 
-class Layer(NamedTuple):
-    """Values, or deviations, of a radio map, with their quantity and unit."""
-
-    quantity: str
-    unit: str
-    values: Float[ndarray, "receivers rows columns"]
-
-
-def layers(floor: RadioMap, scene: Scene) -> dict[str, Layer]:
-    """``value`` and, if the model states deviations, ``deviation``."""
-    parts = {"value": Layer(floor.quantity, floor.unit, floor.values)}
-    if floor.deviations is not None:
-        unit = scene.task.error_unit
-        quantity = f"standard deviation of {floor.quantity}"
-        parts["deviation"] = Layer(quantity, unit, floor.deviations)
-    return parts
+def layers(floor: RadioMap) -> dict[str, RadioMap]:
+    """Maps of the ``value`` and, if the model states them, of the ``deviation``."""
+    parts = {"value": floor}
+    return parts if floor.deviations is None else parts | {"deviation": deviation_map(floor)}
 
 
 def title(floor: RadioMap) -> str:
@@ -62,7 +49,7 @@ def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     x, y = axes_on_map(file, floor, scene.frame)
     width = np.diff(x[:2])[0]
     height = np.diff(y[:2])[0]
-    kinds = layers(floor, scene).values()
+    kinds = layers(floor).values()
     # Rows run from north to south.
     upright = np.stack([kind.values[:, ::-1] for kind in kinds], 1)  # (receivers, kinds, rows, ...)
     bands = upright.reshape(-1, len(y), len(x)).astype(np.float32)
@@ -104,7 +91,7 @@ def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     if scene.frame is not None:
         transformer = find_pyproj().Transformer.from_crs(scene.frame.epsg, 4326, always_xy=True)
         x, y = transformer.transform(x, y)
-    kinds = layers(floor, scene)
+    kinds = layers(floor)
     # Names that are also another's with "deviation": every key then ends with its kind.
     full_names = {" ".join(pair) for pair in itertools.product(floor.receivers, kinds)}
     collide = full_names & {*floor.receivers}
@@ -153,7 +140,7 @@ def write_map_netcdf(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
         carrier = {"units": "Hz", "standard_name": "radiation_frequency"}
         variables["frequency"] = Variable((), np.array(floor.frequency), carrier)
         shared["coordinates"] += " frequency"
-    for name, kind in layers(floor, scene).items():
+    for name, kind in layers(floor).items():
         about = {"long_name": kind.quantity, "units": kind.unit or "1", **shared}
         variables[name] = Variable(("receiver", "y", "x"), kind.values.astype(np.float32), about)
     write_netcdf(file, variables, {"title": title(floor)})
@@ -163,9 +150,7 @@ def write_map_netcdf(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 def write_figures(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     """Writes the maps as figures, pages of one PDF or a PNG each; returns the files."""
     gateways = {one.name: one.pose.position.numpy() for one in scene.receivers}
-    none = {name: np.zeros((0, 3), np.float32) for name in gateways}
-    task: Any = scene.task
-    pages = map_pages(floor, gateways, none, np.zeros((0, 2, 3), np.float32), task)
+    pages = map_pages(floor, gateways, {}, np.zeros((0, 2, 3), np.float32))
     if file.suffix.lower() == ".pdf":
         with atomic_write(file) as part, rc_context(style.STYLE), PdfPages(part) as document:
             for page in pages.values():

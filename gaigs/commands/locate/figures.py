@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -51,26 +51,42 @@ class Cells(NamedTuple):
         return cls(x, y, places)
 
 
-def posterior_figure(location: Location, level: float) -> Figure:
-    """Where the transmitters are from above: the probability of cells.
+def posterior_figure(location: Location, level: float | None = None) -> Figure:
+    """Where the transmitters are from above: the probability of cells."""
+    with rc_context(style.STYLE):
+        drawn = style.new_figure(0.6 * style.PAGE, 0.66 * style.PAGE, "compressed")
+        axis = drawn.subplots()
+        draw_posterior(
+            axis, location, "region" if level is None else f"region of {100 * level:g} %"
+        )
+        drawn.legend(loc="outside lower left", ncols=3)
+        is_one = len(location.mean) == 1
+        style.ask(drawn, "Where is the transmitter?" if is_one else "Where are the transmitters?")
+    return drawn
 
-    A single value has its region, too.
-    """
+
+def draw_posterior(axis: Axes, location: Location, label: str) -> None:
+    """Draws the probability of cells, and the region of a single value with its ``label``."""
     cells = Cells.around(location.places[:, :2].double().numpy())
     # Smooth over neighbouring cells: they hold different numbers of candidates.
     chances = gaussian_filter(cells.sums(location.probabilities.mean(0).double().numpy()), 1)
-    with rc_context(style.STYLE):
-        drawn = Figure(figsize=(0.6 * style.PAGE, 0.6 * style.PAGE), layout="compressed")
-        axis = drawn.subplots()
-        image = axis.pcolormesh(cells.x, cells.y, 100 * chances, cmap="Blues", rasterized=True)
-        drawn.colorbar(image, ax=axis, location="bottom", label="probability of a cell [%]")
-        x, y = location.mean[:, :2].T.numpy()
-        axis.plot(x, y, "o", markersize=4, color=style.ORANGE, label="mean")
-        if len(location.mean) == 1:
-            outline(axis, cells, location, f"region of {100 * level:g} %")
-        axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
-        drawn.legend(loc="outside lower left", ncols=3)
-    return drawn
+    image = axis.pcolormesh(cells.x, cells.y, 100 * chances, cmap="Blues", rasterized=True)
+    title = "probability of a cell [%]"
+    axis.figure.colorbar(image, ax=axis, location="bottom", shrink=0.7, aspect=30, label=title)
+    x, y = location.mean[:, :2].T.numpy()
+    axis.plot(x, y, "o", markersize=4, color=style.ORANGE, markeredgecolor="white", label="mean")
+    if len(location.mean) == 1:
+        outline(axis, cells, location, label)
+    axis.set(aspect="equal", xlabel="x [m]", ylabel="y [m]")
+
+
+def plot_location(result: Location, ax: Any = None) -> Any:
+    """Draws where the transmitters are from above, on ``ax`` or in a figure of its own."""
+    if ax is None:
+        return posterior_figure(result).axes[:1]
+    draw_posterior(ax, result, "region")
+    ax.legend()
+    return ax
 
 
 def outline(axis: Axes, cells: Cells, location: Location, label: str) -> None:
@@ -100,7 +116,7 @@ def error_figure(
         most: Largest number of transmitters from above.
     """
     with rc_context(style.STYLE):
-        drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
+        drawn = style.new_figure(style.PAGE, 0.52 * style.PAGE, "compressed")
         above, shares = drawn.subplots(1, 2)
         chosen = evenly(torch.arange(len(truth)), most)
         dots = {"color": style.GREY, "markersize": 1.5, "label": "known places"}
@@ -122,4 +138,5 @@ def error_figure(
         shares.set_axisbelow(True)
         shares.legend(loc="lower right")
         drawn.legend(*above.get_legend_handles_labels(), loc="outside lower left", ncols=3)
+        style.ask(drawn, "How far off are located transmitters?")
     return drawn

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gaigs.core.geometry import Frame
+from gaigs.core.results import plot
 from gaigs.io.tables import write_table
 from gaigs.kriging.links import distances
 
@@ -47,6 +48,7 @@ class Location:
     sizes: Float[Tensor, " n"]
     calibrated: bool
     frame: Frame | None = None
+    plot = plot
 
     def __repr__(self) -> str:
         return f"<{self.summary()}>"

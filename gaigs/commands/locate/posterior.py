@@ -17,12 +17,14 @@ from gaigs.commands.locate.prediction_map import fingerprints
 from gaigs.commands.locate.tracks import track
 from gaigs.commands.locate.values import as_fingerprints
 from gaigs.core.geometry import ExtrapolationWarning
+from gaigs.core.stages import with_progress
 from gaigs.data import Links
 from gaigs.kriging.links import distances
 from gaigs.model import Model
 from gaigs.registry import check_type
 
 
+@with_progress
 @torch.no_grad()
 def locate(
     model: Model | Fingerprints,
@@ -32,6 +34,8 @@ def locate(
     unknown_power: bool = False,
     step: float | None = None,
     level: float = 0.9,
+    *,
+    progress: bool = True,
 ) -> Location:
     """Places where transmitters may be, by the values that receivers measure of them.
 
@@ -51,6 +55,7 @@ def locate(
         level: Probability with which the region holds the transmitter, by held-out fingerprints (9
             or more for 0.9), with ``step`` by walks among them, once for each step. With fewer and
             without links the posterior counts, whose regions are often too small.
+        progress: False for no bars.
 
     Raises:
         ValueError: A value has another shape than the labels, or was received by no receiver and is
@@ -83,7 +88,7 @@ def locate(
                 f"readings are up to {excess:.3g} {unit} beyond all predicted ones; "
                 "check their unit, and leave out what was not heard",
                 ExtrapolationWarning,
-                stacklevel=3,  # as for a radio map
+                stacklevel=4,  # as for a radio map
             )
     return posterior(prints, asked, unknown_power, step, level)
 

@@ -29,6 +29,7 @@ from gaigs.registry import check_instance, check_type
 from gaigs.split import rows_of
 
 
+@stages.with_progress
 @torch.no_grad()
 def fingerprints(
     model: Model,
@@ -36,6 +37,8 @@ def fingerprints(
     region: object = None,
     frequency: float | None = None,
     points: int | None = None,
+    *,
+    progress: bool = True,
 ) -> Fingerprints:
     """The map of predictions in which ``locate`` looks values up; make it once for many of them.
 
@@ -51,6 +54,7 @@ def fingerprints(
             of several the middle one.
         points: Number of candidate places; None: 20,000, fewer where the model takes more than a
             minute for them.
+        progress: False for no bars.
 
     Raises:
         ValueError: The model has no intervals, or an option is impossible.

@@ -1,6 +1,7 @@
 """Survey planning: where to measure next, and which measured places could have been left out."""
 
 from pathlib import Path
+from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -41,16 +42,27 @@ def run(config: dict, folder: Path) -> None:
 def figure(plan: SurveyPlan) -> Figure:
     """Places from above and, if it falls, the expected error after each new one."""
     with rc_context(style.STYLE):
-        drawn = Figure(figsize=(style.PAGE, 0.46 * style.PAGE), layout="compressed")
+        drawn = style.new_figure(style.PAGE, 0.52 * style.PAGE, "compressed")
         # A flat curve says no more than the text.
-        falls = plan.errors is not None and plan.errors[-1] < 0.99 * plan.errors[0]
+        falls = plan.errors is not None and plan.errors[-1] < 0.98 * plan.errors[0]
         count = 2 if falls else 1
         axes = drawn.subplots(1, count, squeeze=False)[0]
         draw_places(axes[0], plan)
         drawn.legend(loc="outside lower left", ncols=3)
         if count == 2:
             draw_errors(axes[1], plan)
+        gain = "" if plan.errors is None else ", and what does it bring"
+        style.ask(drawn, f"Where to measure next{gain}?")
     return drawn
+
+
+def plot_plan(result: SurveyPlan, ax: Any = None) -> Any:
+    """Draws the places on ``ax``; without it a figure of its own, with the errors too."""
+    if ax is None:
+        return figure(result).axes
+    draw_places(ax, result)
+    ax.legend()
+    return ax
 
 
 def draw_places(axis: Axes, plan: SurveyPlan) -> None:
@@ -75,13 +87,16 @@ def draw_places(axis: Axes, plan: SurveyPlan) -> None:
 
 
 def draw_errors(axis: Axes, plan: SurveyPlan) -> None:
-    """Draws the expected error after each new place."""
+    """Draws the expected error after each new place, at least 5 % of it from end to end."""
     label = f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
-    axis.plot(plan.errors.numpy(), ".-", color=style.BLUE)
+    axis.plot(plan.errors.numpy(), color=style.BLUE)
+    first, last = plan.errors.max().item(), plan.errors.min().item()
+    # The axis begins at the data: a fall that matters is seen, and a flat line has its numbers.
+    rim = max(0.1 * (first - last), 0.025 * first)
+    axis.set(xlabel="new places", ylabel=label, ylim=(last - rim, first + rim))
     # No number of places lowers the error below this.
     scatter = f"labels at one place scatter by {plan.scatter:.3g} {plan.unit}".rstrip()
     axis.set_title(scatter, fontsize="medium")
-    axis.set(xlabel="new places", ylabel=label)
     axis.locator_params(axis="x", integer=True)
     axis.grid()
     axis.set_axisbelow(True)

@@ -21,7 +21,8 @@ from gaigs.commands.survey.processes import (
 )
 from gaigs.core.geometry import Frame, even_places
 from gaigs.core.query import Query, as_positions
-from gaigs.core.stages import track
+from gaigs.core.results import plot
+from gaigs.core.stages import track, with_progress
 from gaigs.io.tables import write_table
 from gaigs.kriging.kernel import Process
 from gaigs.kriging.links import coordinates
@@ -62,6 +63,7 @@ class SurveyPlan:
     frame: Frame | None = None
     known_error: float = math.nan
     scatter: float = math.nan
+    plot = plot
 
     def __repr__(self) -> str:
         return f"<{self}>"
@@ -114,6 +116,7 @@ class SurveyPlan:
         return [use, *(f"{number:.3f}" for number in numbers), error]
 
 
+@with_progress
 @torch.no_grad()
 def survey(
     model: Model | None = None,
@@ -122,6 +125,8 @@ def survey(
     candidates: object = None,
     frequency: float | None = None,
     stop: float = 0.1,
+    *,
+    progress: bool = True,
 ) -> SurveyPlan:
     """The next places to measure: each lowers the mean variance over a region most, at all
     receivers together.
@@ -144,6 +149,7 @@ def survey(
             Without a model it has no effect.
         stop: Share of the expected error: the plan ends where no number of further places can lower
             the error by more; 0 gives all places. Without a model it has no effect.
+        progress: False for no bars.
 
     Raises:
         ValueError: The model has no process over places, the count is less than 1, a place is

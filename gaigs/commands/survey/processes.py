@@ -54,7 +54,7 @@ def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process
     """The process with the coefficients of its trend, which readings have to determine too.
 
     They are a constant and, for labels of one number, a slope over the logarithm of the distance to
-    the receiver, with a standard deviation of twice that of the readings: as much as receivers of
+    the receiver, with a standard deviation of twice the readings': as much as receivers of
     one survey may differ.
     """
     first = process.places[:1]

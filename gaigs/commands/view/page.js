@@ -353,7 +353,7 @@ class Run {
   // --- legend, labels and frames ---
 
   drawLegend() {
-    const {facts} = this, gradient = name => `linear-gradient(90deg, ${[0, 51, 102, 153, 204, 255].map(k => `rgb(${this.colours[name][k]})`)})`;
+    const {facts} = this, gradient = (name, backwards) => `linear-gradient(${backwards ? 270 : 90}deg, ${[0, 51, 102, 153, 204, 255].map(k => `rgb(${this.colours[name][k]})`)})`;
     const layers = [];
     const add = (names, text, swatch, on, scale) => layers.push({names, text, swatch, on, scale});
     if (facts.edges.length) add(["edges"], "true walls and furniture", "height:2px;background:#8c8c8c", true);
@@ -366,9 +366,9 @@ class Run {
     }
     if (facts.places.length) add(["places"], "transmitters, train", "width:5px;height:5px;margin:auto;border-radius:5px;background:#737373", false);
     if (facts.tests) {
-      const [low, high] = this.ends, scale = facts.tests.rises ? [high, low] : [low, high];
+      const [low, high] = this.ends;
       add(["tests"], `test links by ${nameOf(facts.tests.title)}; click one`, "width:9px;height:9px;margin:auto;border-radius:5px;background:#fd8d3c;border:1px solid #555", true,
-        ["YlOrRd", minus(digits(scale[0])), withUnit(scale[1], facts.tests.title)]);
+        ["YlOrRd", minus(digits(low)), withUnit(high, facts.tests.title), facts.tests.rises]);
     }
     if (facts.map) add(["map"], `radio map: ${nameOf(facts.map)}${this.range ? ` at z = ${minus(digits(this.level))} m` : ""}`, `background:${gradient("viridis")}`, true,
       this.range ? ["viridis", minus(digits(this.range[0])), withUnit(this.range[1], facts.map)] : null);
@@ -384,7 +384,7 @@ class Run {
       const mark = element("span", {className: "swatch"}); mark.style.cssText = swatch;
       const row = element("label", {}, box, mark, text);
       if (scale) {
-        const bar = element("span", {className: "bar"}); bar.style.background = gradient(scale[0]);
+        const bar = element("span", {className: "bar"}); bar.style.background = gradient(scale[0], scale[3]);
         row.append(element("span", {className: "scale"}, scale[1], bar, scale[2]));
       }
       return row;

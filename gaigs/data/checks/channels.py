@@ -47,17 +47,6 @@ class Measure(NamedTuple):
     meaning: str
 
 
-OVER_LINKS = Measure(
-    coherence, 0.1, 0.8, "the direct wave explains {} of the channels", "in the mean over links"
-)
-WITHIN_LINKS = Measure(
-    likeness, 0.3, 0.8, "the direct wave explains {} of each channel", "of the power within a link"
-)
-BY_LEVEL = Measure(
-    level_share, 0.22, 0.3, "distance explains {} of the levels' spread", "of the spread of levels"
-)
-
-
 def check_channels(links: Any) -> Iterator[Finding]:
     """Findings about complex channels."""
     yield from check_constant_subcarriers(links)
@@ -97,10 +86,14 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
     waves = direct_waves(everywhere, links.query[train], task.frequencies)
     sign = phase_sign(labels, waves, receivers) if is_known else 0
-    finding = best_convention(few, OVER_LINKS) if is_known else None
+    explained = "the direct wave explains {} of the channels"
+    over_links = Measure(coherence, 0.1, 0.8, explained, "in the mean over links")
+    finding = best_convention(few, over_links) if is_known else None
     if finding is None and not sign:
-        measure = WITHIN_LINKS if has_gain else WITHIN_LINKS._replace(measure=aligned_likeness)
-        finding = best_convention(few, measure)
+        alike = likeness if has_gain else aligned_likeness
+        explained = "the direct wave explains {} of each channel"
+        within_links = Measure(alike, 0.3, 0.8, explained, "of the power within a link")
+        finding = best_convention(few, within_links)
     if finding is not None:
         yield finding
     if finding is not None or not has_gain:
@@ -108,7 +101,7 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     strange = strange_parts(labels, waves, receivers, task.frequencies, sign) if sign else {}
     if strange:
         # Another convention may explain as much with a calibrated array.
-        calibrated = OVER_LINKS._replace(measure=partial(coherence, is_calibrated=True))
+        calibrated = over_links._replace(measure=partial(coherence, is_calibrated=True))
         finding = best_convention(few, calibrated)
         if finding is not None and finding.fits > 0.7 * coherence(few):
             yield finding
@@ -134,7 +127,9 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
 
 def _without_sign(few: Sample, is_enough: bool) -> Iterator[Finding]:
     """A finding about channels whose phases follow the distance with neither sign."""
-    finding = best_convention(few, BY_LEVEL)
+    explained = "distance explains {} of the levels' spread"
+    by_level = Measure(level_share, 0.22, 0.3, explained, "of the spread of levels")
+    finding = best_convention(few, by_level)
     if finding is not None:
         yield finding
     elif is_enough:

@@ -66,7 +66,8 @@ def _linear_unit(known: tuple[Sample, list[str]] | None, text: str, middle: floa
     read = fits = slope = 0.0
     if known:
         sample = known[0]
-        decibels = _decibels(sample)
+        positive = sample.at((sample.labels > 0).nonzero()[:, 0])
+        decibels = replace(positive, labels=10 * positive.labels.log10())  # levels as powers
         read = explained(sample)
         fits = explained(decibels)
         slope = fit_law(decades(decibels), decibels).slopes.median().item()
@@ -200,9 +201,3 @@ def _scale(errors: Float[Tensor, " n"], sample: Sample) -> Float[Tensor, " r"]:
         if len(at_receiver) >= 10:
             scales[number] = 1.4826 * at_receiver.abs().median()
     return scales
-
-
-def _decibels(sample: Sample) -> Sample:
-    """The sample's positive levels as powers."""
-    positive = sample.at((sample.labels > 0).nonzero()[:, 0])
-    return replace(positive, labels=10 * positive.labels.log10())

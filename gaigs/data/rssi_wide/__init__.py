@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,26 +10,22 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
-from torch import Tensor
 
 from gaigs.core.geometry import Frame
 from gaigs.core.query import Query
 from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links
 from gaigs.data.maps import check_metres, is_utm, to_utm
-from gaigs.data.readings import and_list, carriers_of, gateway, loud_remark, match_names, suggested
-from gaigs.data.rssi_wide.columns import (
-    NAMES,
-    UNITS,
-    Axes,
-    find_axes,
-    find_gateways,
-    plain_name,
-    refuse_cells,
-    units_of,
+from gaigs.data.readings import and_list, carriers_of, gateway, loud_remark
+from gaigs.data.rssi_wide.columns import Axes, find_axes, find_gateways
+from gaigs.data.rssi_wide.places import (
+    name_of_gateways,
+    read_gateways,
+    read_points,
+    unit_of_gateways,
 )
+from gaigs.data.rssi_wide.readings import Survey, averaged, pivoted, refuse_readings
 from gaigs.io import FAR, tables
-from gaigs.io.yaml import read_mapping, to_vector
 from gaigs.registry import register
 
 
@@ -43,6 +40,8 @@ def read(
     storey: float = 3.0,
     epsg: int | None = None,
     frequency: float | None = None,
+    receiver: str | None = None,
+    level: str | None = None,
 ) -> Links:
     """A data set from a wide table: one link for each gateway that a place hears.
 
@@ -68,35 +67,66 @@ def read(
             for degrees, none for metres. Coordinates of another system than UTM are converted to
             it, which takes ``gaigs[maps]``.
         frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
+        receiver: Column of the gateways' names, for a table with a reading a line; needs ``level``.
+        level: Column of the readings of such a table [dBm].
 
     Raises:
         FileNotFoundError: The file does not exist.
         ImportError: Coordinates are to be converted, and pyproj is not installed.
         ValueError: A file has a defect; the message names file, line, column and value.
     """
-    table = _read_table(file)
+    options = coordinates, ignore, not_heard, height, storey, epsg, frequency, receiver, level
+    return from_table(_read_table(file), gateways, *options)
+
+
+def from_table(
+    table: tables.Table,
+    gateways: str | Path | Mapping | tables.Table | None = None,
+    coordinates: list[str] | None = None,
+    ignore: list[str] | None = None,
+    not_heard: float | list[float] | None = None,
+    height: float = 1.0,
+    storey: float = 3.0,
+    epsg: int | None = None,
+    frequency: float | None = None,
+    receiver: str | None = None,
+    level: str | None = None,
+    levels: Sequence[str] = (),
+) -> Links:
+    """A data set from a wide table in memory, as ``read`` makes it of a file.
+
+    Args:
+        table: One place a row and one gateway a column.
+        gateways: As for ``read``, or a mapping of names to [x, y, z], or a table in memory.
+        levels: Columns that are gateways whatever their numbers look like.
+    """
     axes = find_axes(table, coordinates)
-    points = _read_points(table, axes, height, storey, epsg)
-    placed, unused = _read_gateways(gateways, table, axes, height, storey, epsg)
-    columns = find_gateways(table, axes, placed, ignore or [], not_heard)
+    others: list[str] = []
+    if receiver is not None or level is not None:
+        table, axes, others = pivoted(table, axes, receiver, level)
+        levels = table.names[len(axes.columns) :]
+    points = read_points(table, axes, height, storey, epsg)
+    placed, unused = read_gateways(gateways, table, axes, height, storey, epsg)
+    columns = find_gateways(table, axes, {*placed, *levels}, ignore or [], not_heard)
+    refuse_readings(table, columns)
     is_placed = ~np.isnan(points).any(1)
     count = int(is_placed.sum())
     if not count:
         raise ValueError(f"{table.file}: expected rows with coordinates, got none")
     everything = np.array([*points[is_placed], *placed.values()])
-    world = _to_world(table, axes, everything, count, epsg, gateways)
+    world = _to_world(table, axes, everything, count, epsg, name_of_gateways(gateways))
     stands = dict(zip(placed, world.points[count:].tolist(), strict=True))
 
-    levels = table.numbers[is_placed][:, columns.gateways]  # (rows, gateways)
-    received = ~(np.isnan(levels) | np.isin(levels, columns.marks))
-    survey = _averaged(world.points[:count], levels, received)
+    readings = table.numbers[is_placed][:, columns.gateways]  # (rows, gateways)
+    received = ~(np.isnan(readings) | np.isin(readings, columns.marks))
+    survey = averaged(world.points[:count], readings, received)
     rows, receivers = survey.counts.nonzero()
     measured = _count_places(rows, table.file)
-    present, receivers = np.unique(receivers, return_inverse=True)
+    present = np.unique(receivers)
     names = [table.names[columns.gateways[k]] for k in present]
     unit = ""
     if placed and not world.remark:
-        unit = _unit_of_gateways(survey, dict(zip(names, present.tolist(), strict=True)), stands)
+        unit = unit_of_gateways(survey, dict(zip(names, present.tolist(), strict=True)), stands)
 
     silent = [table.names[k] for k in columns.gateways if table.names[k] not in names]
     remarks = [
@@ -104,25 +134,40 @@ def read(
         *_remarks_on_readings(survey, received, columns.marks, columns.silent + silent),
     ]
     if placed:
-        remarks += _remarks_on_gateways(Path(gateways).name, names, stands, unit, unused)
+        remarks += _remarks_on_gateways(name_of_gateways(gateways), names, stands, unit, unused)
     if count < len(points):
         remarks.append(f"{len(points) - count} rows without coordinates are left out")
     remarks += [*_remarks_on_heights(axes, placed, height, storey), world.remark]
-    if columns.ignored:
-        remarks.append(f"columns ignored: {tables.shortened(columns.ignored)}")
+    if columns.ignored or others:
+        remarks.append(f"columns ignored: {tables.shortened(columns.ignored + others)}")
 
-    labels = torch.from_numpy(survey.means[survey.counts > 0]).float()
+    positions = [stands.get(name) for name in names]
+    links = _to_links(survey, names, positions, frequency)
+    text = "; ".join(filter(None, remarks)) + loud_remark(links.labels.tolist())
+    return replace(links, frame=world.frame, remarks=text)
+
+
+def _to_links(
+    survey: Survey,
+    names: Sequence[str],
+    positions: Sequence[Sequence[float] | None],
+    frequency: float | None,
+) -> Links:
+    """Links of the gateways that have a reading, with their positions [m]; None if unknown."""
+    rows, columns = survey.counts.nonzero()
+    receivers = np.unique(columns, return_inverse=True)[1]
+    nowhere = [0.0, 0.0, 0.0]  # until the training links estimate it
+    uncertainties = [math.inf if position is None else 0.0 for position in positions]
     places = torch.from_numpy(survey.places).float()[rows]
+    pairs = zip(names, positions, strict=True)
     return Links(
         query=Query(places, torch.from_numpy(receivers), carriers_of(frequency, len(rows))),
-        receivers=tuple(gateway(name, stands.get(name, [0.0, 0.0, 0.0])) for name in names),
-        labels=labels,
+        receivers=tuple(gateway(name, position or nowhere) for name, position in pairs),
+        labels=torch.from_numpy(survey.means[survey.counts > 0]).float(),
         task=Rssi(),
         rows=torch.from_numpy(rows),
-        frame=world.frame,
-        uncertainties=torch.tensor([0.0 if name in stands else math.inf for name in names]),
+        uncertainties=torch.tensor(uncertainties),
         noises=survey.noises,
-        remarks="; ".join(filter(None, remarks)) + loud_remark(labels.tolist()),
     )
 
 
@@ -149,7 +194,7 @@ def _count_places(rows: Int[ndarray, " n"], file: Path) -> int:
 
 
 def _remarks_on_readings(
-    survey: "Survey",
+    survey: Survey,
     received: Bool[ndarray, "rows g"],
     marks: Sequence[float],
     silent: Sequence[str],
@@ -201,148 +246,6 @@ def _remarks_on_gateways(
     return remarks
 
 
-class Survey(NamedTuple):
-    """Readings averaged at each place.
-
-    Attributes:
-        places: Different places [m].
-        counts: Number of readings at each place and gateway.
-        means: Their means [dBm]; 0 without a reading.
-        repeats: Number of readings beyond the first of a place.
-        scatter: Standard deviation of repeated readings [dB].
-        noises: Standard deviation of each mean [dB]; None without repetitions.
-    """
-
-    places: Float[ndarray, "p 3"]
-    counts: Float[ndarray, "p g"]
-    means: Float[ndarray, "p g"]
-    repeats: int
-    scatter: float
-    noises: Float[Tensor, " n"] | None
-
-
-def _averaged(
-    points: Float[ndarray, "rows 3"],
-    levels: Float[ndarray, "rows g"],
-    received: Bool[ndarray, "rows g"],
-) -> Survey:
-    """Means of the received levels of each place."""
-    places, numbers = tables.number_places(points.tolist())
-    which = numbers.numpy()
-    counts = np.zeros((len(places), levels.shape[1]))
-    sums = np.zeros_like(counts)
-    np.add.at(counts, which, received)
-    np.add.at(sums, which, np.where(received, levels, 0))
-    means = sums / counts.clip(1)
-    repeats = int(received.sum()) - int((counts > 0).sum())
-    if not repeats:
-        return Survey(np.array(places), counts, means, 0, 0.0, None)
-    errors = np.where(received, levels - means[which], 0)
-    scatter = math.sqrt(np.square(errors).sum() / repeats)
-    noises = torch.from_numpy(scatter / np.sqrt(counts[counts > 0])).float()
-    return Survey(np.array(places), counts, means, repeats, scatter, noises)
-
-
-def _read_points(
-    table: tables.Table, axes: Axes, height: float, storey: float, epsg: int | None
-) -> Float[ndarray, "rows 3"]:
-    """Coordinates of all rows; NaN where they are empty."""
-    columns = [axes.x, axes.y, *([axes.z] if axes.z >= 0 else [])]
-    points = table.numbers[:, columns]
-    refuse_cells(table, columns, np.isinf(points), "a finite number")
-    points = points * units_of(table, axes, epsg)[: len(columns)]
-    if axes.z < 0:
-        return np.column_stack((points, np.full(len(points), height)))
-    if axes.is_floor:
-        points[:, 2] = height + storey * points[:, 2]
-    return points
-
-
-def _read_gateways(
-    given: str | Path | None,
-    table: tables.Table,
-    axes: Axes,
-    height: float,
-    storey: float,
-    epsg: int | None,
-) -> tuple[dict[str, list[float]], list[str]]:
-    """Coordinates of a file's gateways by the table's names, and its gateways without a column."""
-    if given is None:
-        return {}, []
-    file = tables.find_file(given, "a table of gateways")
-    if file.suffix.lower() in (".yml", ".yaml"):
-        places = {}
-        units = units_of(table, axes, epsg)
-        for name, value in read_mapping(file, "each gateway's name: [x, y, z]").items():
-            count = 2 if isinstance(value, list) and len(value) == 2 else 3
-            vector = to_vector(f"{file}: {name}", value, "xyz"[:count])
-            place = [unit * x for unit, x in zip(units, vector, strict=False)]
-            if axes.is_floor:
-                place[2:] = [height + storey * floor for floor in place[2:]]
-            places[name] = [*place, height][:3]
-    else:
-        other = tables.read_table(file, "a heading name,x,y,z and one gateway a line")
-        other_axes = find_axes(other)
-        if other_axes.is_global != axes.is_global:
-            raise ValueError(
-                f"{file}, line 1: expected the coordinates of {table.file.name}, got other ones"
-            )
-        plain = [plain_name(name)[0] for name in other.names]
-        column = next((k for k, name in enumerate(plain) if name in NAMES), None)
-        if column is None:
-            raise ValueError(
-                f"{file}, line 1: expected a column name, got "
-                f"{tables.quote(', '.join(other.names))}"
-            )
-        points = _read_points(other, other_axes, height, storey, epsg)
-        missing = {row + 2: "none" for row in np.isnan(points).any(1).nonzero()[0].tolist()}
-        tables.refuse(file, missing, "coordinates of each gateway")
-        names = [tables.split_cells(line, other.delimiter)[column] for line in other.lines[1:]]
-        repeated = {}
-        for row, name in enumerate(names):
-            if name in names[:row]:
-                repeated[row + 2] = tables.quote(name)
-        tables.refuse(file, repeated, "each gateway once")
-        places = dict(zip(names, points.tolist(), strict=True))
-    columns = [name for k, name in enumerate(table.names) if k not in axes[:3]]
-    matched = match_names(places, columns)
-    if not matched:
-        raise ValueError(
-            f"{file}: none of its gateways is a column of {table.file.name}: "
-            f"{tables.shortened([*places])}\nthe columns are {tables.shortened(columns)}"
-        )
-    placed = {column: places[name] for name, column in matched.items()}
-    others = [name for name in columns if name not in placed]
-    return placed, [suggested(name, others) for name in places if name not in matched]
-
-
-def _unit_of_gateways(
-    survey: "Survey", columns: Mapping[str, int], stands: Mapping[str, Sequence[float]]
-) -> str:
-    """The unit, cm or mm, in which far gateways explain the levels by distance; or ""."""
-    known = [name for name in columns if name in stands]
-    means = np.where(survey.counts > 0, survey.means, np.nan)
-    levels = means[:, [columns[name] for name in known]]  # (n, k)
-    positions = np.array([stands[name] for name in known])  # (k, 3)
-    places = survey.places
-    extent = np.ptp(places[:, :2], axis=0).max()
-    if np.ptp(positions[:, :2], axis=0).max() <= 30 * extent:
-        return ""
-    # Correlations of levels with log distances within gateways. A false unit puts gateways so far
-    # away that distances hardly differ.
-    falls = {"": 0.5}
-    for unit in ("cm", "mm"):
-        apart = np.linalg.norm(places[:, None] - UNITS[unit] * positions, axis=2).clip(
-            0.1
-        )  # (n, k)
-        x = np.where(np.isnan(levels), np.nan, np.log10(apart))
-        x = x - np.nanmean(x, 0)
-        y = levels - np.nanmean(levels, 0)
-        norms = np.sqrt(np.nansum(x**2) * np.nansum(y**2))
-        falls[unit] = -np.nansum(x * y) / max(norms, 1e-9)
-    return max(falls, key=falls.__getitem__)
-
-
 class World(NamedTuple):
     """Places and gateways in the world frame [m], the frame's place on a map, and a remark."""
 
@@ -357,7 +260,7 @@ def _to_world(
     points: Float[ndarray, "n 3"],
     count: int,
     epsg: int | None,
-    gateways: str | Path | None,
+    gateways: str,
 ) -> World:
     """Places (the first ``count``) and gateways in the world frame."""
     largest = np.abs(points[:count]).max(0)
@@ -382,7 +285,7 @@ def _to_world(
     if epsg is None or is_utm(epsg):
         mend = f"set data.epsg=4326 and data.coordinates=[{x},{y}], longitude first"
         check_metres(f"{table.file}: columns {x} and {y}", points[:count], mend)
-        check_metres(f"{gateways}", points[count:], "convert them to the coordinates of the places")
+        check_metres(gateways, points[count:], "convert them to the coordinates of the places")
     utm = None
     frame = None
     remark = ""

@@ -1,7 +1,7 @@
 """Columns of a wide table: coordinates with their units, gateways, marks of "not heard"."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -62,6 +62,11 @@ class Axes(NamedTuple):
     is_floor: bool
     is_global: bool
 
+    @property
+    def columns(self) -> list[int]:
+        """The columns that are there."""
+        return [column for column in self[:3] if column >= 0]
+
 
 def plain_name(name: str) -> tuple[str, float | None]:
     """Name of a column in small letters and digits, and its unit [m]; None if it has no unit."""
@@ -85,7 +90,7 @@ def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
         if metres is None or abs(unit - metres) > 1e-5:
             kind = "degrees" if metres is None else f"units of {metres:.6g} m"
             raise ValueError(
-                f"{table.file}, line 1: column {table.names[columns[k]]} is in units of {unit:g} "
+                f"{table.heading}: column {table.names[columns[k]]} is in units of {unit:g} "
                 f"m, and data.epsg={epsg} in {kind}\n"
                 "mend the heading, or name the system of these coordinates"
             )
@@ -115,7 +120,7 @@ def find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) -> 
     def columns_of(names):
         return [k for k, name in enumerate(plain) if name in names]
 
-    here = f"{table.file}, line 1"
+    here = table.heading
     for first, second in PAIRS:
         x, y = columns_of(first), columns_of(second)
         if not (x and y):
@@ -147,14 +152,14 @@ def refuse_cells(
     """Raises a ``ValueError`` that names the first wrong cell of each row."""
     cells = {}
     for row in np.flatnonzero(wrong.any(1)).tolist():
-        cells[row + 2] = table.cell(row, columns[int(wrong[row].argmax())])
-    tables.refuse(table.file, cells, expected)
+        cells[row] = table.cell(row, columns[int(wrong[row].argmax())])
+    table.refuse(cells, expected)
 
 
 def find_gateways(
     table: tables.Table,
     axes: Axes,
-    placed: Mapping,
+    placed: Collection[str],
     ignore: Sequence[str],
     not_heard: float | list[float] | None,
 ) -> Columns:
@@ -224,10 +229,8 @@ def _refuse_lists(table: tables.Table, columns: Sequence[int]) -> None:
         for row in np.flatnonzero(np.isinf(table.numbers[:, k]))[:1].tolist():
             levels = tables.numbers_in(table.text(row, k))
             if levels and QUIETEST <= min(levels) <= max(levels) <= WEAK:
-                raise ValueError(
-                    f"{table.file}, line {row + 2}: expected one level [dBm] a cell, got "
-                    f"{table.cell(row, k)}, or set data.ignore"
-                )
+                got = f"{table.cell(row, k)}, or set data.ignore"
+                table.refuse({row: got}, "one level [dBm] a cell")
 
 
 def _are_powers(column: Float[ndarray, " n"]) -> bool:

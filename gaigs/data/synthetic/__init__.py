@@ -83,7 +83,7 @@ def furnished_room(
         TypeError: A frequency is no number.
         ValueError: An option is out of range.
 
-    Source: the defaults for frequency and bandwidth are those of channel 5 of IEEE 802.15.4
+    Source: frequency and bandwidth are by default channel 5 of IEEE 802.15.4
     (ultra-wideband).
     """
     return simulate_spectra(default_room(order), spectrum, transmitters, frequency, bandwidth, seed)

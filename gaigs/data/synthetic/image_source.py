@@ -248,8 +248,8 @@ def respond(
 ) -> Complex[Tensor, "b elements f"]:
     """Field at each element of a receiver's array along paths from unit-power transmitters.
 
-    The phase is that of a spherical wave from each image to each element. Gains and the elements'
-    pattern are those of paths to the array's centre at the carrier; ``offsets`` are relative to it
+    The phase follows a spherical wave from each image to each element. Gains and the elements'
+    pattern belong to paths to the array's centre at the carrier; ``offsets`` are relative to it
     [Hz].
 
     Raises:

@@ -33,15 +33,21 @@ class Residuals(NamedTuple):
 class Deformation(nn.Module, ABC):
     """The contract of kind ``deformation``.
 
-    A constructor may take ``scene``, ``channels`` and ``tokenizer_widths``.
+    A constructor may take ``scene``, ``channels``, ``tokenizer_widths`` and ``count``, the number
+    of free Gaussians, or None where a placement adds others.
 
     Attributes:
         reads_tokens: True if it needs tokens; if False, no tokenizer is built.
         sees_receivers: True if the change depends on the receiver.
+        follows: Names of parameters with a row for each Gaussian; density control prunes and copies
+            their rows.
+        learning_rate: Of the group ``network``, in place of the model's default.
     """
 
     reads_tokens: bool = True
     sees_receivers: bool = False
+    follows: tuple[str, ...] = ()
+    learning_rate: float | None = None
 
     @abstractmethod
     def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:

@@ -83,7 +83,7 @@ def structural_similarity(
 ) -> Float[Tensor, ""]:
     """Mean SSIM over all windows within the images.
 
-    Weights are uniform, covariances those of a sample, and the data range is 1. A window of 7 on
+    Weights are uniform, covariances divide by n - 1, and the data range is 1. A window of 7 on
     the full grid gives the reported score, scikit-image's, with gradients.
 
     Args:

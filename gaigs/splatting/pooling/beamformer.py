@@ -214,8 +214,8 @@ def _scaled(amplitudes: Float[Tensor, "b k"], shown: Float[Tensor, "b j"]) -> Fl
     """Amplitudes between the least and the largest of those shown, from 0 to 1.
 
     Pixels are many, and each pass over them in memory costs as much as the beamformer itself.
-    Gradients of amin and amax take four passes, those of min and max hardly one; without gradients
-    amin and amax are faster.
+    Gradients of amin and amax take four passes, gradients of min and max hardly one; without
+    gradients amin and amax are faster.
     """
     if shown.requires_grad:
         low = shown.min(1, keepdim=True).values  # (b, 1)

@@ -26,7 +26,7 @@ class ElementSum(ChannelPooling):
     imaginary ones. x_e is an element's place, a its pattern, w the share of the direction's solid
     angle. F is the wave of free space over the direct distance d (without a common clock its
     amplitude), g the channels' ``strength`` over it. s is ``array_sign``. At other subcarriers than
-    the labels' the map is that of the nearest one.
+    the labels' it is the map of the nearest one.
 
     Args:
         scene: Its task has the subcarriers, its receivers the elements.
@@ -63,7 +63,7 @@ class ElementSum(ChannelPooling):
         direct = direct_waves(
             self.scene, query, self.frequencies, int(self.sign), at_elements=False
         )  # (b, 1, s)
-        return self.pad(channels * (self.strength.double() * direct).to(waves))
+        return self.received(query, channels * (self.strength.double() * direct).to(waves))
 
     def _steering(self, receiver: int, sign: int) -> Complex[Tensor, "s p e"]:
         """Contribution of a wave from each direction of the map to each element, float64."""

@@ -23,11 +23,11 @@ class Room:
     transmitters: np.ndarray  # (n, 3) [m]
     position: np.ndarray  # (3,) [m]
     quaternion: np.ndarray  # x, y, z, w
-    spectra: np.ndarray  # (n, 45, 90), rows 2..90 degrees, columns 0..356 degrees
+    spectra: np.ndarray  # (n, 30, 60), rows 3..90 degrees, columns 0..354 degrees
 
     def links(self, **options):
         pose = Pose.from_xyzw(self.position, self.quaternion)
-        grid = Grid.degrees(range(2, 91, 2), range(0, 360, 4))
+        grid = Grid.degrees(range(3, 91, 3), range(0, 360, 6))
         task = Spectrum(grid.elevations, grid.azimuths)
         return gaigs.links(
             task=task,
@@ -46,7 +46,7 @@ def room(count=100, seed=0, blocked=0.3, edge=4, noise=0.1) -> Room:
     local = Rotation.from_quat(QUATERNION)
     offsets = (np.arange(edge) - (edge - 1) / 2) / 2  # wavelengths
     elements = np.stack(np.meshgrid(offsets, offsets, indexing="ij"), -1).reshape(-1, 2)
-    el, az = np.deg2rad(np.meshgrid(range(2, 91, 2), range(0, 360, 4), indexing="ij"))
+    el, az = np.deg2rad(np.meshgrid(range(3, 91, 3), range(0, 360, 6), indexing="ij"))
     level = np.stack([np.cos(el) * np.cos(az), np.cos(el) * np.sin(az)], -1).reshape(-1, 2)
     steering = np.exp(-2j * np.pi * level @ elements.T)  # (pixels, e)
     spectra = []
@@ -67,6 +67,6 @@ def room(count=100, seed=0, blocked=0.3, edge=4, noise=0.1) -> Room:
             1,
             1j,
         ]
-        power = np.abs(steering @ fields).reshape(45, 90)
+        power = np.abs(steering @ fields).reshape(30, 60)
         spectra.append((power - power.min()) / np.ptp(power))
     return Room(places, position, QUATERNION.copy(), np.array(spectra, np.float32))

@@ -105,6 +105,7 @@ def test_the_convention_that_fits_is_named(fault, size):
     )
 
 
+@pytest.mark.usefixtures("checked_when_described")
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("phase", ["known", "conjugate", "per_link", "per_link_and_delay"])
 @pytest.mark.parametrize("reflection", [0.0, -0.9])

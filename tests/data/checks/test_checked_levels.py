@@ -217,7 +217,7 @@ def test_degrees_in_place_of_metres_are_named():
 @pytest.mark.parametrize("span", [10.0, 300.0, 10_000.0])
 @pytest.mark.parametrize("count", [1, 5])
 def test_sound_surveys_from_10_m_to_10_km_have_no_remark(kind, span, count):
-    for seed in range(3):
+    for seed in range(2):
         random = np.random.default_rng(seed)
         places = random.uniform(0, span, (150, 3)) * [1, 0.7, 0] + [0, 0, 1.5]
         gateways = random.uniform(0, span, (count, 3)) * [1, 0.7, 0] + [

@@ -48,7 +48,7 @@ class PathFields(MovablePlanes):
     with
 
     * F: the element's pattern towards the image, times a learnt power of the cosine;
-    * g_k: the gain of a path; except of channels, phi_k: its phase;
+    * g_k: the gain of a path; except of channels of many numbers, phi_k: its phase;
     * g_r: the gain of a receiver; of channels, phi_r: its phase;
     * g_w: the gain of a plane, which falls off as a Gaussian about the plane's middle;
     * Gamma_w: Fresnel's reflection with a learnt permittivity, of channels at a slab with a learnt
@@ -65,11 +65,14 @@ class PathFields(MovablePlanes):
         unknown_blur: The same for a path that adds as power, whose coherence is 0.
         faint: Largest share of a link's power, obstacles apart, of a path that skips the obstacles:
             two of three paths.
+        fewest_numbers: Numbers of a channel, elements times subcarriers, below which one path
+            explains any of them, so that only all places together locate planes.
     """
 
     known_blur = math.log(0.3)
     unknown_blur = math.log(50.0)
     faint = 1e-3
+    fewest_numbers = 8
     is_bare: Tensor
 
     def __init__(
@@ -84,6 +87,8 @@ class PathFields(MovablePlanes):
         super().__init__(scene, planes, order, walls, fixed)
         self._check_number("obstacles", obstacles, 0)
         self.is_complex = scene.task.dtype.is_complex
+        numbers = math.prod(scene.task.shape)
+        self.has_few_numbers = self.is_complex and numbers < self.fewest_numbers
         self._add_plane_parameters(planes)
         self._add_path_parameters(planes)
         self._add_receiver_parameters()
@@ -104,9 +109,10 @@ class PathFields(MovablePlanes):
     def _add_path_parameters(self, planes: int) -> None:
         paths = len(self.sequences)
         self.path_gains = _filled(0.0, paths)
-        # Channels have phases enough to locate planes: a free phase would only hide a plane half a
-        # wavelength off.
-        self.path_phases = None if self.is_complex else _filled(0.0, paths)
+        # Channels of many numbers locate planes by their phases: a free phase would only hide a
+        # plane half a wavelength off.
+        is_free = not self.is_complex or self.has_few_numbers
+        self.path_phases = _filled(0.0, paths) if is_free else None
         # [m]; a metre is a half-space.
         self.log_thicknesses = _filled(0.0, planes) if self.is_complex else None
         # [rad], far below the resolution of small arrays.
@@ -125,6 +131,11 @@ class PathFields(MovablePlanes):
         self.boresights = [torch.tensor([0.0, 0.0, 1.0])] * len(receivers)
         if self.is_complex:
             self.boresights = [boresight(receiver, self.middle) for receiver in receivers]
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        if self.path_phases is not None:  # channels of few numbers had none before
+            state_dict.setdefault(prefix + "path_phases", torch.zeros_like(self.path_phases))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @torch.no_grad()
     def place(

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 import torch
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Complex, Float, Int
 from scipy.constants import speed_of_light
 from torch import Tensor, distributed, nn
 
@@ -129,6 +129,30 @@ class Mirrored(PathFields):
         self.is_bare.fill_(True)
         self.receiver_gains.copy_(gains.abs().log())
         self.receiver_phases.copy_(gains.angle())
+
+    @torch.no_grad()
+    def start_strengths(
+        self,
+        gains: Complex[Tensor, " w"],
+        receivers: Int[Tensor, " r"],
+        receiver_gains: Complex[Tensor, " r"],
+    ) -> None:
+        """Starts paths of the first planes from these planes' gains over their slabs' reflections.
+
+        Args:
+            gains: Complex gains of the first planes.
+            receivers: Numbers of receivers.
+            receiver_gains: Their gains over the pooling's unit.
+        """
+        least = 1e-3  # a logarithm needs some gain
+        ones = gains.new_ones(len(self.origin) + 1 - len(gains))
+        factors = torch.cat((gains, ones))[self.sequences]  # (n, order); 1 for no plane
+        self.path_gains.copy_(factors.abs().clamp_min(least).log().sum(1))
+        if self.path_phases is not None:
+            self.path_phases.copy_(factors.angle().sum(1))
+        self.receiver_gains[receivers] = receiver_gains.abs().clamp_min(least).log().float()
+        if self.receiver_phases is not None:
+            self.receiver_phases[receivers] = receiver_gains.angle().float()
 
     @torch.no_grad()
     def enable_reflections(self) -> None:

@@ -1,0 +1,74 @@
+"""Results as plots and data sets, by libraries that are imported when they are asked for."""
+
+import importlib
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from gaigs.registry import call
+
+
+def plot(result: Any, /, ax: Any = None, **options: Any) -> Any:
+    """Draws a result as the run folders do; ``result.plot(...)`` is the same.
+
+    | result | the picture answers | options |
+    |---|---|---|
+    | ``gaigs.radio_map(...)`` | Where do receivers hear? | receiver, deviation, links |
+    | ``model.predict(..., interval=0.9)`` | What is predicted, how surely? | receiver, place |
+    | ``gaigs.evaluate(...)`` | How large are errors? | metric |
+    | ``gaigs.locate(...)`` | Where is the transmitter? | |
+    | ``gaigs.survey(...)`` | Where to measure next? | |
+    | ``model.learnt_room(links)`` | What is learnt of the room? | links, show_paths |
+
+    Args:
+        result: A result of the table.
+        ax: Axes of matplotlib to draw on; None: a figure of pyplot, with all panels.
+        options: See the table.
+
+    Returns:
+        The axes; an array of them if there are several panels.
+
+    Raises:
+        TypeError: The result has no plot.
+        ValueError: An option is unknown, or ``ax`` is one for several panels.
+        ImportError: Matplotlib is not installed.
+
+    Example:
+        >>> links = gaigs.links("synthetic_rssi", transmitters=60)
+        >>> floor = gaigs.radio_map(gaigs.train("knn", links), pitch=0.5)
+        >>> ax = floor.plot(receiver="west", links=links)
+        >>> ax.get_xlabel(), ax.figure.savefig("west.png")
+        ('x [m]', None)
+    """
+    functions = {
+        "RadioMap": "report.radio_maps.plot_radio_map",
+        "Estimate": "report.estimates.plot_estimate",
+        "Evaluation": "report.curves.plot_scores",
+        "Location": "commands.locate.figures.plot_location",
+        "SurveyPlan": "commands.survey.plot_plan",
+        "LearntRoom": "report.room.plot_room",
+    }
+    name = type(result).__name__
+    if name not in functions:
+        raise TypeError(f"plot takes one of {', '.join(functions)}, got {name}\nhelp(gaigs.plot)")
+    library("matplotlib", "a plot")
+    if ax is not None and not hasattr(ax, "plot"):
+        raise TypeError(f"ax must be one axes of matplotlib, got {type(ax).__name__}")
+    module, _, function = functions[name].rpartition(".")
+    draw = getattr(importlib.import_module(f"gaigs.{module}"), function)
+    style = importlib.import_module("gaigs.report.style")
+    with style.shown():
+        axes = call("plot", draw, options, result=result, ax=ax)
+    if not isinstance(axes, list):
+        return axes
+    return axes[0] if len(axes) == 1 else np.array(axes)
+
+
+def library(name: str, purpose: str) -> ModuleType:
+    """A library that ``purpose`` needs; an ``ImportError`` that says how to install it."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        problem = f"{purpose} needs {name}, which cannot be imported ({error})"
+        raise ImportError(f"{problem}\npip install {name}") from None

@@ -1,0 +1,482 @@
+"""Links of arrays in memory."""
+
+import inspect
+import logging
+import math
+import reprlib
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from gaigs import configuration
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Frame, Pose
+from gaigs.core.query import Query, as_numbers, as_positions, as_tensor, check_carrier
+from gaigs.core.task import Task, check_range
+from gaigs.data import Links, divide
+from gaigs.data.parts import check_parts
+from gaigs.data.readings import loud_remark, marks_of
+from gaigs.io.frames import is_frame, read_frame
+from gaigs.io.tables import number_places, shortened
+from gaigs.registry import check_instance, check_type, registry, suggest
+
+log = logging.getLogger(__name__)
+
+
+def from_arrays(
+    task: str | Task,
+    transmitters: Any,
+    labels: Any,
+    receivers: Any = None,
+    index: Any = None,
+    frequency: Any = None,
+    bandwidth: float | None = None,
+    split: str | Mapping | None = None,
+    test_rows: Any = None,
+    train_rows: Any = None,
+    frame: Frame | None = None,
+    height: float = 1.0,
+    **options: Any,
+) -> Links:
+    """Links of arrays in memory, or of values that torch converts, with their split.
+
+    Args:
+        task: Task of the labels: ``"rssi"`` (scalars [dBm]), or a task with its axes, e.g.
+            ``Spectrum(elevations, azimuths)`` or ``Csi(elements, frequencies)`` of
+            ``gaigs.core.task``.
+        transmitters: Positions, world frame (n, 3) [m], or (n, 2) of one ``height``.
+        labels: One a link, (n, ...) of the task's shape; or one for each transmitter and receiver,
+            (n, k, ...), of numbers also a data frame, whose columns name the receivers. Readings of
+            NaN or None and channels of zeros were not received: they are left out, and so are
+            receivers without training links.
+        receivers: ``Receiver`` or several, or positions (3,) or (k, 3) [m] of antennas that look
+            along the axes; all elements of a channel then stand there. A mapping has names for
+            them. For levels [dBm] a position may be None or NaN, and so may all of them: it is
+            estimated from the training links.
+        index: Receiver of each link (n,), or of all, from 0; not needed with one receiver, n
+            positions, or labels (n, k, ...).
+        frequency: Carrier, one or one a link [Hz]; None if unknown, for channels the middle of the
+            subcarriers.
+        bandwidth: Band around each carrier that powers are averaged over, 0 for a carrier alone
+            [Hz]; None if unknown.
+        split: Name of a registered split, ``options`` are its own; by default ``official`` with
+            ``test_rows``, else ``random``.
+        test_rows: Rows of ``transmitters`` to test on, as numbers or a mask (n,).
+        train_rows: Rows to train and validate on; by default all others.
+        frame: Place of the positions' origin on a map, such as ``gaigs.Frame(32632, 450000.0,
+            5400000.0)`` for UTM less that easting and northing; None if unknown.
+        height: Height of positions (n, 2) or (k, 2) [m].
+
+    Raises:
+        TypeError: An option has a wrong type.
+        ValueError: Shapes do not fit, a number is not finite or out of range, or there is nothing
+            to split.
+    """
+    _check_options(bandwidth, frame)
+    config = split_configuration("arrays", from_arrays, split, options, test_rows, train_rows)
+    task = registry("task").build(task)
+    remarks: list[str] = []
+    places = as_positions("transmitters", _with_height(transmitters, height, remarks)).detach()
+    if places.ndim != 2 or not len(places):
+        raise ValueError(
+            f"transmitters must be (n, 3) positions [m], got shape {tuple(places.shape)}"
+        )
+    names: list[str] = []
+    if task.is_scalar and is_frame(labels):
+        table = read_frame(labels, "labels")
+        names, labels = table.names, table.numbers
+    ends = _find_ends(receivers, names, labels, index, places, task, height, remarks)
+    receivers = ends.receivers
+    rows, index, labels = _one_a_link(
+        _as_labels(labels, task), ends.index, len(places), len(receivers), task
+    )
+    received = _received(labels, task, remarks)
+    check_range(task, labels, "labels")
+    if task.is_scalar and task.unit == "dBm":
+        _doubt_levels(labels, received, remarks)
+    row = rows[received]
+    sites = number_places(places.tolist())[1]
+    parts: Any = None
+    if test_rows is not None:
+        parts = _parts(row, len(places), test_rows, train_rows)
+        remarks += _shared_places(sites[row], *parts)
+    undivided = Links(
+        query=Query(places[row], index[received].long(), _carriers(frequency, task, row, places)),
+        receivers=receivers,
+        labels=labels[received],
+        task=task,
+        rows=sites[row],
+        bandwidth=bandwidth,
+        official=None if parts is None else (lambda: parts),
+        uncertainties=ends.uncertainties if task.is_scalar else None,
+        frame=frame,
+        remarks="; ".join(remarks),
+    )
+    links = _divided(undivided, config)
+    _warn_of_untrained(receivers, links.receivers)
+    return links
+
+
+def _check_options(bandwidth: Any, frame: Any) -> None:
+    """Raises an error unless a band is one and a frame is a ``Frame``."""
+    check_type("bandwidth", bandwidth, float | None)
+    if frame is not None:
+        check_instance("frame", frame, Frame)
+    if bandwidth is not None and not 0 <= bandwidth < math.inf:
+        raise ValueError(f"bandwidth must be 0 Hz or more, and finite, got {bandwidth}")
+
+
+def _warn_of_untrained(receivers: Sequence[Receiver], trained: Sequence[Receiver]) -> None:
+    """Warns of receivers without training links."""
+    names = {receiver.name for receiver in trained}
+    untrained = [receiver.name for receiver in receivers if receiver.name not in names]
+    if untrained:
+        log.warning(
+            "receivers without a training link are left out: %s\nname the others by name",
+            shortened(untrained),
+        )
+
+
+def _divided(links: Links, split: Mapping) -> Links:
+    """Links with their split; an error says if the ends of the links seem exchanged."""
+    try:
+        return divide(links, split)
+    except ValueError:
+        if len(links.receivers) == 1 or len(links.query.transmitters.unique(dim=0)) > 1:
+            raise
+        raise ValueError(
+            "transmitters all stand at one place; if receivers move, give their places as "
+            "transmitters, and the fixed end as receiver: a channel is the same both ways"
+        ) from None
+
+
+def _check_names(receivers: Sequence[Receiver]) -> None:
+    """Raises a ``ValueError`` if two receivers have one name."""
+    names = [receiver.name for receiver in receivers]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"receivers must have different names, got {name!r} more than once")
+
+
+def split_configuration(
+    data: str,
+    reader: Callable,
+    split: str | Mapping | None,
+    options: Mapping,
+    test_rows: Any = None,
+    train_rows: Any = None,
+) -> dict:
+    """The configuration of the split of data in memory, with the options of its constructor.
+
+    Args:
+        data: Word for the data in messages, in the plural.
+        reader: Function whose options they have.
+    """
+    has_rows = test_rows is not None or train_rows is not None
+    split = split or ("official" if has_rows else "random")
+    if split in registry("split").names():
+        of_arrays = [*inspect.signature(reader).parameters][:-1]
+        of_split = [*registry("split").options(split)]
+        for key in options:
+            if key.rpartition(".")[2] in of_split:
+                continue
+            near = suggest(key, [*of_arrays, *of_split])
+            raise ValueError(
+                f"{data} have no option {near}; they have: {', '.join(of_arrays)}; split "
+                f"{split!r}: {', '.join(of_split)}"
+            )
+    config = configuration.composed([], {"split": split, **options}, ("split",))["split"]
+    if has_rows and (test_rows is None or config["name"] != "official"):
+        raise ValueError(
+            "train_rows and test_rows are for split='official'; give test_rows, and no other split"
+        )
+    return config
+
+
+class _Ends(NamedTuple):
+    """Receivers, the receiver of each link if known, and deviations of their places [m]."""
+
+    receivers: tuple[Receiver, ...]
+    index: Any
+    uncertainties: Float[Tensor, " k"]
+
+
+def _find_ends(
+    receivers: Any,
+    names: Sequence[str],
+    labels: Any,
+    index: Any,
+    places: Float[Tensor, "n 3"],
+    task: Task,
+    height: float,
+    remarks: list[str],
+) -> _Ends:
+    """The receivers that are given, or made from positions or from the shape of labels."""
+    receivers = (receivers,) if isinstance(receivers, Receiver) else receivers
+    if isinstance(receivers, Sequence) and all(isinstance(one, Receiver) for one in receivers):
+        receivers = tuple(receivers)
+        ends = _Ends(receivers, index, torch.zeros(len(receivers)))
+    else:
+        stands = _find_stands(receivers, names, np.shape(labels), index, height, task)
+        is_one_a_place = index is None and np.ndim(labels) == 1 + len(task.shape)
+        ends = _make_receivers(stands, index, places, task, is_one_a_place, remarks)
+    _check_names(ends.receivers)
+    return ends
+
+
+class _Stands(NamedTuple):
+    """Names and positions of receivers [m], NaN where ``is_known`` is false."""
+
+    names: list[str]
+    positions: Float[Tensor, "k 3"]
+    is_known: Bool[Tensor, " k"]
+
+
+def _find_stands(
+    receivers: Any,
+    columns: Sequence[str],
+    shape: Sequence[int],
+    index: Any,
+    height: float,
+    task: Task,
+) -> _Stands:
+    """Receivers by their positions, or by labels of a ``shape``, whose ``columns`` may name them.
+
+    Raises:
+        ValueError: A position is neither given nor to be estimated, or no column has its name.
+    """
+    names = [*columns]
+    if isinstance(receivers, Mapping):
+        names = names or [*receivers]
+        others = [suggest(name, names) for name in receivers if name not in names]
+        if others:
+            raise ValueError(f"labels have no column {', '.join(others)} of receivers")
+        receivers = [receivers.get(name) for name in names]
+    elif receivers is None:
+        count = 1 if index is None else int(np.max(index)) + 1
+        count = shape[1] if index is None and len(shape) > 1 else count
+        receivers = [None] * count
+    if isinstance(receivers, Sequence) and any(position is None for position in receivers):
+        given = [position for position in receivers if position is not None]
+        nowhere = [math.nan] * (len(given[0]) if given else 3)
+        receivers = [nowhere if position is None else position for position in receivers]
+    positions = as_numbers("receivers", _with_height(receivers, height), "positions [m]")
+    is_known = ~positions[..., :2].isnan().all(-1)  # (k,)
+    positions = torch.where(is_known[..., None], positions, 0.0)
+    if not is_known.all() and task.unit != "dBm":
+        raise ValueError(
+            f"receivers must have positions for task {task.name!r}; only levels [dBm] tell where a "
+            "receiver stands"
+        )
+    positions = as_positions("receivers", positions).reshape(-1, 3)
+    return _Stands(names, positions, is_known.reshape(-1))
+
+
+def _with_height(positions: Any, height: float, remarks: list[str] | None = None) -> Any:
+    """Positions (n, 2) with a height [m]; all others as they are."""
+    try:
+        shape = np.shape(positions)
+    except ValueError:  # lists of different lengths, which have an error of their own
+        return positions
+    if len(shape) != 2 or shape[1] != 2:
+        return positions
+    if remarks is not None:
+        remarks.append(f"all places are {height:g} m high (height)")
+    numbers = as_numbers("positions", positions, "x and y [m]")
+    return torch.nn.functional.pad(numbers, (0, 1), value=height)
+
+
+def _make_receivers(
+    stands: _Stands,
+    index: Any,
+    places: Float[Tensor, "n 3"],
+    task: Task,
+    is_one_a_place: bool,
+    remarks: list[str],
+) -> _Ends:
+    """Receivers at positions, named rx0, rx1, ... without names, and the receiver of each link.
+
+    With ``is_one_a_place`` (one label for each place) and as many positions as places, position i
+    is the receiver of link i; equal positions are one receiver.
+    """
+    positions = stands.positions
+    uncertainties = torch.where(stands.is_known, 0.0, math.inf)
+    if is_one_a_place and stands.is_known.all() and len(positions) == len(places) > 1:
+        distinct, index = number_places(positions.tolist())
+        positions = torch.tensor(distinct)
+        uncertainties = torch.zeros(len(distinct))
+    elements = task.elements
+    if elements > 1:
+        remarks.append(
+            f"positions of the {elements} elements are unknown: all count as standing at their "
+            "receiver's"
+        )
+    antenna = Array(torch.zeros(elements, 3))
+    names = stands.names or [f"rx{number}" for number in range(len(positions))]
+    if len(names) != len(positions):
+        raise ValueError(
+            f"receivers must be one a column of labels, {shortened(names)}, got {len(positions)}"
+        )
+    poses = [Pose(position, torch.eye(3)) for position in positions]
+    pairs = zip(names, poses, strict=True)
+    return _Ends(tuple(Receiver(name, pose, antenna) for name, pose in pairs), index, uncertainties)
+
+
+def _as_labels(labels: Any, task: Task) -> Tensor:
+    """Labels as a tensor of the task's dtype."""
+    if np.ma.is_masked(labels):
+        raise ValueError(
+            "labels must be plain numbers, got a masked array; fill it with nan where nothing was "
+            "heard"
+        )
+    convert = as_tensor if task.dtype.is_complex else as_numbers
+    tensor = convert("labels", labels, f"those of task {task.name!r}").detach()
+    if task.dtype.is_complex and not tensor.is_complex():
+        raise ValueError(
+            f"labels of task {task.name!r} must be complex, got {tensor.dtype}; magnitudes have no "
+            "phase"
+        )
+    tensor = tensor.to(task.dtype)
+    if tensor.is_complex():
+        check_parts("labels", tensor.numpy())
+    return tensor
+
+
+class _LinkArrays(NamedTuple):
+    """Row of ``transmitters``, receiver and label of each link."""
+
+    rows: Int[Tensor, " m"]
+    receivers: Int[Tensor, " m"]
+    labels: Tensor
+
+
+def _one_a_link(labels: Tensor, index: Any, count: int, receivers: int, task: Task) -> _LinkArrays:
+    """Labels one a link, from (n, ...) with an index, or from (n, k, ...)."""
+    shape = tuple(task.shape)
+    rows = torch.arange(count)
+    if tuple(labels.shape) == (count, receivers, *shape) and index is None:
+        rows = rows.repeat_interleave(receivers)
+        index = torch.arange(receivers).repeat(count)
+        labels = labels.flatten(0, 1)  # (n x k, ...)
+    elif tuple(labels.shape) == (count, *shape) and (index is not None or receivers == 1):
+        index = as_tensor("index", 0 if index is None else index, "numbers of receivers")
+        index = index if index.ndim else index.expand(count)
+    else:
+        raise ValueError(
+            f"labels of task {task.name!r} must be {(count, *shape)} with the receiver of each "
+            f"link in index, or {(count, receivers, *shape)}, one for each transmitter and "
+            f"receiver, got {tuple(labels.shape)}"
+        )
+    is_whole = not (index.is_floating_point() or index.is_complex() or index.dtype == torch.bool)
+    is_fitting = is_whole and index.shape == (len(rows),)
+    if not is_fitting or not ((index >= 0) & (index < receivers)).all():
+        raise ValueError(
+            f"index must be {count} whole numbers from 0 to {receivers - 1}, got "
+            f"{index.tolist()[:5]} ..."
+        )
+    return _LinkArrays(rows, index, labels)
+
+
+def _received(labels: Tensor, task: Task, remarks: list[str]) -> Bool[Tensor, " m"]:
+    """True for links with a label; NaN, and channels of zeros, were not received."""
+    flat = labels.reshape(len(labels), -1)
+    received = ~flat.isnan().all(1)
+    if task.dtype.is_complex:
+        received &= (flat != 0).any(1)
+    broken = received & ~flat.isfinite().all(1)
+    if not received.any() or broken.any():
+        where = f"; link {int(broken.int().argmax())} is not" if broken.any() else ""
+        raise ValueError(
+            "labels must be finite where something was heard, and something must have been "
+            f"heard{where}"
+        )
+    if not received.all():
+        remarks.append(f"{int((~received).sum())} links were not heard and are left out")
+    return received
+
+
+def _doubt_levels(labels: Tensor, received: Tensor, remarks: list[str]) -> None:
+    """Remarks, with a warning, about levels that may mean "not heard"."""
+    doubts = [loud_remark(labels[received].tolist()).removeprefix("; ")]
+    for mark in marks_of(labels[:, None].numpy()):
+        readings = int((labels == mark).sum())
+        doubts.append(f"{readings} readings of {mark:g} dBm are taken for levels")
+    text = "; ".join(filter(None, doubts))
+    if text:
+        remarks.append(text)
+        log.warning("%s\ngive nan where nothing was heard, and levels in dBm", text)
+
+
+def _carriers(
+    frequency: Any, task: Task, row: Int[Tensor, " m"], places: Float[Tensor, "n 3"]
+) -> Float[Tensor, " m"] | None:
+    """Carrier of each link [Hz]; of channels by default the middle of the subcarriers."""
+    if frequency is None and task.frequencies is not None:
+        frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
+    if frequency is None:
+        return None
+    carriers = as_numbers("frequency", frequency, "a carrier in Hz")
+    count = len(places)
+    if carriers.ndim and carriers.shape != (count,):
+        raise ValueError(
+            f"frequency must be one number, or {count}, one for each transmitter, got "
+            f"{len(carriers)}"
+        )
+    carriers = carriers.expand(count)[row]
+    check_carrier("frequency", carriers.unique())
+    return carriers
+
+
+def _parts(
+    row: Int[Tensor, " m"], count: int, test_rows: Any, train_rows: Any
+) -> tuple[Int[Tensor, " k"], Int[Tensor, " l"]]:
+    """Training and test links, by the rows of ``transmitters`` that were given."""
+    testing = _rows("test_rows", test_rows, count)
+    everything = torch.arange(count)
+    training = everything[~torch.isin(everything, testing)]
+    if train_rows is not None:
+        training = _rows("train_rows", train_rows, count)
+    both = training[torch.isin(training, testing)]
+    if len(both):
+        raise ValueError(
+            f"train_rows and test_rows must have no row in common, got {both[0].item()} in both"
+        )
+    if not len(training):
+        raise ValueError(f"test_rows leave no row to train on, got all {count}")
+    return torch.isin(row, training).nonzero()[:, 0], torch.isin(row, testing).nonzero()[:, 0]
+
+
+def _shared_places(
+    sites: Int[Tensor, " m"], train: Int[Tensor, " k"], test: Int[Tensor, " l"]
+) -> list[str]:
+    """A remark if test links stand at places of training links."""
+    shared = torch.isin(sites[test], sites[train])
+    if not shared.any():
+        return []
+    return [f"{int(shared.sum())} test links stand at places of training links"]
+
+
+def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
+    """Ascending numbers of rows, given as such or as a mask of all ``count`` rows."""
+    rows = as_tensor(name, values, "numbers of rows")
+    if rows.dtype == torch.bool and rows.shape == (count,):
+        rows = rows.nonzero()[:, 0]
+    is_whole = not (rows.is_floating_point() or rows.is_complex() or rows.dtype == torch.bool)
+    numbers = rows.long()
+    given = reprlib.repr(values)
+    is_list = is_whole and rows.ndim == 1 and len(rows)
+    if not is_list or not ((numbers >= 0) & (numbers < count)).all():
+        raise ValueError(
+            f"{name} must be numbers of rows from 0 to {count - 1}, or a mask of {count}, got "
+            f"{given}"
+        )
+    if len(numbers.unique()) < len(numbers):
+        raise ValueError(
+            f"{name} must hold each row once, got {given}; a mask must be boolean, of True and "
+            "False"
+        )
+    return numbers.sort().values

@@ -1,0 +1,137 @@
+"""Links of a data frame of levels, by the reader of wide tables."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from gaigs.data import Links, divide
+from gaigs.data.arrays import split_configuration
+from gaigs.data.rssi_wide import from_table
+from gaigs.data.rssi_wide.columns import FLOORS, HEIGHTS, plain_name
+from gaigs.io.frames import is_frame, read_frame
+from gaigs.io.tables import Table
+
+
+def from_frame(
+    frame: Any,
+    x: str | None = None,
+    y: str | None = None,
+    z: str | None = None,
+    receivers: Any = None,
+    receiver: str | None = None,
+    level: str | None = None,
+    ignore: str | Sequence[str] = (),
+    not_heard: float | Sequence[float] | None = None,
+    height: float = 1.0,
+    storey: float = 3.0,
+    epsg: int | None = None,
+    frequency: float | None = None,
+    split: str | Mapping | None = None,
+    **options: Any,
+) -> Links:
+    """Links of a data frame of levels [dBm], with their split.
+
+    The frame is of pandas, polars, pyarrow, or of another library with the PyCapsule or the
+    interchange protocol; or a mapping of columns. It has a place a row and a receiver a column; or,
+    with ``receiver`` and ``level``, a reading a row. Columns and cells are understood, checked and
+    remarked on as by ``gaigs.data.rssi_wide.read``. NaN and None were not received.
+
+    Args:
+        frame: The data frame.
+        x, y: Columns of the coordinates, in metres unless their names say another unit; longitude
+            and latitude come in this order. None: found by their names.
+        z: Column of the height, or of the floor if its name says so. None: found by its name, else
+            all are ``height``.
+        receivers: Positions by name, as a mapping to [x, y, z] or [x, y], or a data frame with
+            columns ``name``, ``x``, ``y`` and optionally ``z``. A position of None and all others
+            are estimated from the training links. A list of names has the columns of receivers.
+            None: all columns that mostly hold low levels.
+        receiver: Column of the receivers' names, in a frame with a reading a row.
+        level: Column of the readings of such a frame [dBm].
+        ignore, not_heard, height, storey, epsg, frequency: As for ``gaigs.data.rssi_wide.read``.
+        split: Name of a registered split, ``options`` are its own; None: ``random``.
+
+    Raises:
+        ImportError: A package that the frame or its coordinates take is not installed.
+        ValueError: A column is missing, or a cell is wrong; the message names row, column and
+            value.
+
+    Example:
+        >>> survey = {"x": [1, 2, 1, 2], "y": [1, 1, 2, 2]}  # or a DataFrame
+        >>> survey |= {"door": [-40, -45, -50, -55], "hall": [-52, None, -41, -44]}  # [dBm]
+        >>> links = gaigs.links(survey, receivers={"door": [0, 0, 2], "hall": [3, 3, 2]})
+        >>> len(links), [receiver.name for receiver in links.receivers]
+        (7, ['door', 'hall'])
+    """
+    config = split_configuration("data frames", from_frame, split, options)
+    try:
+        table = read_frame(frame)
+        links = from_table(
+            table,
+            coordinates=_coordinates(table, x, y, z),
+            not_heard=[*not_heard] if isinstance(not_heard, Sequence) else not_heard,
+            height=height,
+            storey=storey,
+            epsg=epsg,
+            frequency=frequency,
+            receiver=receiver,
+            level=level,
+            **_columns(table, receivers, _listed(ignore), receiver is not None),
+        )
+        links = divide(links, config)
+    except ValueError as error:
+        raise ValueError(_in_python(str(error))) from None
+    return replace(links, remarks=_in_python(links.remarks))
+
+
+def _columns(table: Table, receivers: Any, ignore: list[str], is_long: bool) -> dict[str, Any]:
+    """Options of ``from_table`` for receivers by a mapping, a data frame or a list of columns.
+
+    Raises:
+        ValueError: A listed name is no column.
+    """
+    if isinstance(receivers, Mapping) and not {"name", "x", "y"} <= {*receivers}:
+        placed = {}
+        for name, position in receivers.items():
+            if position is not None:
+                placed[str(name)] = [str(one) for one in np.ravel(position).tolist()]
+        levels = [] if is_long else [str(name) for name in receivers if str(name) in table.names]
+        return {"gateways": placed or None, "levels": levels, "ignore": ignore}
+    if is_frame(receivers):
+        return {"gateways": read_frame(receivers, "receivers"), "ignore": ignore}
+    names = [] if receivers is None else _listed(receivers)
+    if names and is_long:
+        raise ValueError(
+            f"{table.heading}: receivers must be positions by name where column receiver names "
+            f"them, got {receivers!r}; choose rows in the frame"
+        )
+    for name in names:
+        table.column(name)
+    others = [name for name in table.names if names and name not in names]
+    return {"levels": names, "ignore": ignore + others}
+
+
+def _listed(names: str | Sequence) -> list[str]:
+    """One name or several as a list of texts."""
+    return [names] if isinstance(names, str) else [str(name) for name in names]
+
+
+def _coordinates(table: Table, x: str | None, y: str | None, z: str | None) -> list[str] | None:
+    """Columns of the coordinates; None if all are to be found by their names."""
+    if x is None and y is None and z is None:
+        return None
+    heights = [z] if z is not None else []
+    for kinds in (HEIGHTS, FLOORS):
+        if not heights:
+            heights = [name for name in table.names if plain_name(name)[0] in kinds][:1]
+    return [x or "x", y or "y", *heights]
+
+
+def _in_python(text: str) -> str:
+    """A message with options as keywords, in place of those of a reader."""
+    text = re.sub(r"data\.coordinates(=\[x,y\])?", "x=, y= and z=", text)
+    text = text.replace("data.gateways", "receivers")
+    return re.sub(r"data\.(\w+)=\[?(\w+)\]?", r"\1='\2'", text).replace("data.", "")

@@ -1,0 +1,155 @@
+"""Coordinates of a table's rows, and of gateways that a file, a mapping or a table gives."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from gaigs.data.readings import match_names, suggested
+from gaigs.data.rssi_wide.columns import (
+    NAMES,
+    UNITS,
+    Axes,
+    find_axes,
+    plain_name,
+    refuse_cells,
+    units_of,
+)
+from gaigs.data.rssi_wide.readings import Survey
+from gaigs.io import tables
+from gaigs.io.yaml import read_mapping, to_vector
+
+
+def name_of_gateways(gateways: str | Path | Mapping | tables.Table | None) -> str:
+    """The gateways' file for messages, or the option of gateways in memory."""
+    return Path(gateways).name if isinstance(gateways, str | Path) else "receivers"
+
+
+def read_points(
+    table: tables.Table, axes: Axes, height: float, storey: float, epsg: int | None
+) -> Float[ndarray, "rows 3"]:
+    """Coordinates of all rows; NaN where they are empty."""
+    columns = [axes.x, axes.y, *([axes.z] if axes.z >= 0 else [])]
+    points = table.numbers[:, columns]
+    refuse_cells(table, columns, np.isinf(points), "a finite number")
+    points = points * units_of(table, axes, epsg)[: len(columns)]
+    if axes.z < 0:
+        return np.column_stack((points, np.full(len(points), height)))
+    if axes.is_floor:
+        points[:, 2] = height + storey * points[:, 2]
+    return points
+
+
+def read_gateways(
+    given: str | Path | Mapping | tables.Table | None,
+    table: tables.Table,
+    axes: Axes,
+    height: float,
+    storey: float,
+    epsg: int | None,
+) -> tuple[dict[str, list[float]], list[str]]:
+    """Coordinates of a file's gateways by the table's names, and its gateways without a column."""
+    if given is None:
+        return {}, []
+    file: Path = Path(name_of_gateways(given))
+    if isinstance(given, str | Path):
+        file = tables.find_file(given, "a table of gateways")
+        if file.suffix.lower() in (".yml", ".yaml"):
+            given = read_mapping(file, "each gateway's name: [x, y, z]")
+        else:
+            given = tables.read_table(file, "a heading name,x,y,z and one gateway a line")
+    if isinstance(given, Mapping):
+        places = _mapped_gateways(file, given, units_of(table, axes, epsg), axes, height, storey)
+    else:
+        places = _listed_gateways(given, table, axes, height, storey, epsg)
+    columns = [name for k, name in enumerate(table.names) if k not in axes[:3]]
+    matched = match_names(places, columns)
+    if not matched:
+        raise ValueError(
+            f"{file}: none of its gateways is a column of {table.file.name}: "
+            f"{tables.shortened([*places])}\nthe columns are {tables.shortened(columns)}"
+        )
+    placed = {column: places[name] for name, column in matched.items()}
+    others = [name for name in columns if name not in placed]
+    return placed, [suggested(name, others) for name in places if name not in matched]
+
+
+def _mapped_gateways(
+    file: Path,
+    given: Mapping[str, object],
+    units: Sequence[float],
+    axes: Axes,
+    height: float,
+    storey: float,
+) -> dict[str, list[float]]:
+    """Coordinates of gateways by their names, from lists of x, y and optionally z."""
+    places = {}
+    for name, value in given.items():
+        count = 2 if isinstance(value, list) and len(value) == 2 else 3
+        vector = to_vector(f"{file}: {name}", value, "xyz"[:count])
+        place = [unit * x for unit, x in zip(units, vector, strict=False)]
+        if axes.is_floor:
+            place[2:] = [height + storey * floor for floor in place[2:]]
+        places[name] = [*place, height][:3]
+    return places
+
+
+def _listed_gateways(
+    given: tables.Table,
+    table: tables.Table,
+    axes: Axes,
+    height: float,
+    storey: float,
+    epsg: int | None,
+) -> dict[str, list[float]]:
+    """Coordinates of gateways by their names, from a table with a gateway a row."""
+    given_axes = find_axes(given)
+    if given_axes.is_global != axes.is_global:
+        raise ValueError(
+            f"{given.heading}: expected the coordinates of {table.file.name}, got other ones"
+        )
+    plain = [plain_name(name)[0] for name in given.names]
+    column = next((k for k, name in enumerate(plain) if name in NAMES), None)
+    if column is None:
+        raise ValueError(
+            f"{given.heading}: expected a column name, got {tables.quote(', '.join(given.names))}"
+        )
+    points = read_points(given, given_axes, height, storey, epsg)
+    missing = np.isnan(points).any(1).nonzero()[0].tolist()
+    given.refuse(dict.fromkeys(missing, "none"), "coordinates of each gateway")
+    names = [given.text(row, column) for row in range(len(points))]
+    repeated = {}
+    for row, name in enumerate(names):
+        if name in names[:row]:
+            repeated[row] = tables.quote(name)
+    given.refuse(repeated, "each gateway once")
+    return dict(zip(names, points.tolist(), strict=True))
+
+
+def unit_of_gateways(
+    survey: Survey, columns: Mapping[str, int], stands: Mapping[str, Sequence[float]]
+) -> str:
+    """The unit, cm or mm, in which far gateways explain the levels by distance; or ""."""
+    known = [name for name in columns if name in stands]
+    means = np.where(survey.counts > 0, survey.means, np.nan)
+    levels = means[:, [columns[name] for name in known]]  # (n, k)
+    positions = np.array([stands[name] for name in known])  # (k, 3)
+    places = survey.places
+    extent = np.ptp(places[:, :2], axis=0).max()
+    if np.ptp(positions[:, :2], axis=0).max() <= 30 * extent:
+        return ""
+    # Correlations of levels with log distances within gateways. A false unit puts gateways so far
+    # away that distances hardly differ.
+    falls = {"": 0.5}
+    for unit in ("cm", "mm"):
+        apart = np.linalg.norm(places[:, None] - UNITS[unit] * positions, axis=2).clip(
+            0.1
+        )  # (n, k)
+        x = np.where(np.isnan(levels), np.nan, np.log10(apart))
+        x = x - np.nanmean(x, 0)
+        y = levels - np.nanmean(levels, 0)
+        norms = np.sqrt(np.nansum(x**2) * np.nansum(y**2))
+        falls[unit] = -np.nansum(x * y) / max(norms, 1e-9)
+    return max(falls, key=falls.__getitem__)

@@ -1,0 +1,142 @@
+"""Readings of a table: from a row each to a gateway a column, and averaged at each place."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy import ndarray
+from torch import Tensor
+
+from gaigs.data.rssi_wide.columns import NAMES, Axes, Columns, plain_name
+from gaigs.io import tables
+
+
+class Pivoted(NamedTuple):
+    """A table with a place a row: coordinates first, then a gateway a column.
+
+    Attributes:
+        table: The table; a place with repeated readings of a gateway has several rows.
+        axes: Its columns of coordinates.
+        ignored: Names of other columns of the table with a reading a row.
+    """
+
+    table: tables.Table
+    axes: Axes
+    ignored: list[str]
+
+
+def pivoted(table: tables.Table, axes: Axes, receiver: str | None, level: str | None) -> Pivoted:
+    """A table with a gateway a column, of one with a reading a row.
+
+    Raises:
+        ValueError: One of the two columns is not named, or a reading has no gateway's name.
+    """
+    if receiver is None or level is None:
+        missing = "data.receiver" if receiver is None else "data.level"
+        raise ValueError(
+            f"{table.heading}: a reading a row takes data.receiver and data.level; set {missing}, "
+            f"one of {tables.shortened(table.names)}"
+        )
+    named = table.column(receiver)
+    column = table.column(level)
+    count = len(table.numbers)
+    texts = [table.text(row, named) for row in range(count)]
+    nameless = {row: f"none in column {receiver}" for row, text in enumerate(texts) if not text}
+    table.refuse(nameless, "a gateway's name")
+    points = table.numbers[:, axes.columns]  # (n, 2 or 3)
+    places = tables.number_places(points.tolist())[1].numpy()
+    names, gateways = np.unique(texts, return_inverse=True)
+
+    # Repeated readings of a gateway at a place go to rows of their own: the k-th to row k.
+    pairs = places * len(names) + gateways
+    order = np.argsort(pairs, kind="stable")
+    starts = np.searchsorted(pairs[order], pairs[order])
+    repeats = np.empty(count, int)
+    repeats[order] = np.arange(count) - starts
+    keys = places * (repeats.max() + 1) + repeats
+    _, first, rows = np.unique(keys, return_index=True, return_inverse=True)
+    source = np.full((len(first), len(names)), -1)  # number of the reading, -1 without one
+    source[rows, gateways] = np.arange(count)
+    levels = np.where(source >= 0, table.numbers[source, column], np.nan)
+
+    def text_of(row: int, k: int) -> str:
+        if k < len(axes.columns):
+            return table.text(first[row], axes.columns[k])
+        reading = source[row, k - len(axes.columns)]
+        return table.text(reading, column) if reading >= 0 else ""
+
+    headings = [table.names[k] for k in axes.columns]
+    used = {*headings, receiver, level}
+    return Pivoted(
+        tables.Table(
+            file=table.file,
+            names=[*headings, *names.tolist()],
+            numbers=np.column_stack((points[first], levels)),
+            text=text_of,
+            unit="place",
+            first=table.first,
+        ),
+        axes._replace(x=0, y=1, z=2 if axes.z >= 0 else -1),
+        [name for name in table.names if name not in used],
+    )
+
+
+def refuse_readings(table: tables.Table, columns: Columns) -> None:
+    """Raises a ``ValueError`` if the only level of each row seems to be of the gateway it names."""
+    if len(columns.gateways) > 1:
+        return
+    level = table.names[columns.gateways[0]]
+    for name in columns.ignored:
+        if name not in table.names or plain_name(name)[0] not in NAMES:
+            continue
+        column = table.names.index(name)
+        texts = {table.text(row, column) for row in range(len(table.numbers))}
+        if 1 < len(texts) < len(table.numbers):
+            raise ValueError(
+                f"{table.heading}: column {name} seems to name the gateway of each reading; set "
+                f"data.receiver={name} and data.level={level}, or data.ignore=[{name}]"
+            )
+
+
+class Survey(NamedTuple):
+    """Readings averaged at each place.
+
+    Attributes:
+        places: Different places [m].
+        counts: Number of readings at each place and gateway.
+        means: Their means [dBm]; 0 without a reading.
+        repeats: Number of readings beyond the first of a place.
+        scatter: Standard deviation of repeated readings [dB].
+        noises: Standard deviation of each mean [dB]; None without repetitions.
+    """
+
+    places: Float[ndarray, "p 3"]
+    counts: Float[ndarray, "p g"]
+    means: Float[ndarray, "p g"]
+    repeats: int
+    scatter: float
+    noises: Float[Tensor, " n"] | None
+
+
+def averaged(
+    points: Float[ndarray, "rows 3"],
+    levels: Float[ndarray, "rows g"],
+    received: Bool[ndarray, "rows g"],
+) -> Survey:
+    """Means of the received levels of each place."""
+    places, numbers = tables.number_places(points.tolist())
+    which = numbers.numpy()
+    counts = np.zeros((len(places), levels.shape[1]))
+    sums = np.zeros_like(counts)
+    np.add.at(counts, which, received)
+    np.add.at(sums, which, np.where(received, levels, 0))
+    means = sums / counts.clip(1)
+    repeats = int(received.sum()) - int((counts > 0).sum())
+    if not repeats:
+        return Survey(np.array(places), counts, means, 0, 0.0, None)
+    errors = np.where(received, levels - means[which], 0)
+    scatter = math.sqrt(np.square(errors).sum() / repeats)
+    noises = torch.from_numpy(scatter / np.sqrt(counts[counts > 0])).float()
+    return Survey(np.array(places), counts, means, repeats, scatter, noises)

@@ -1,0 +1,168 @@
+"""A regressor of scikit-learn as a model: transmitters' positions to labels."""
+
+import importlib
+import inspect
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+from torch import Tensor
+
+from gaigs.core.query import Batch, Query
+from gaigs.core.scene import Scene
+from gaigs.data import Links
+from gaigs.kriging.links import at_directions, coordinates, known_links
+from gaigs.model.base import Prediction
+from gaigs.model.look_up import LookUp
+from gaigs.registry import register, suggest
+
+
+@register("model", "sklearn")
+class SklearnRegressor(LookUp):
+    """A regressor of scikit-learn for each receiver, on x, y and z of the transmitter [m].
+
+    With several carriers there is a fourth input, the logarithm of the carrier from the middle of
+    the band. Labels of several numbers take a regressor with several outputs. Checkpoints hold the
+    links and the estimator's options: loading fits again, with ``random_state`` 0 where none is
+    given. Regressors whose ``predict`` has ``return_std`` give the deviations of intervals.
+
+    Args:
+        estimator: Name of a class, such as ``sklearn.ensemble.RandomForestRegressor``; or a mapping
+            of ``_target_``, the name, and its options, which may hold further estimators.
+
+    Raises:
+        ImportError: scikit-learn is not installed.
+        ValueError: The estimator is no regressor of scikit-learn, or an option is unknown.
+
+    Source: Pedregosa et al., Scikit-learn: Machine Learning in Python, JMLR 12, 2011.
+    """
+
+    def __init__(self, scene: Scene, estimator: str | dict | None = None):
+        super().__init__(scene)
+        if estimator is None:
+            raise ValueError(
+                "model 'sklearn' needs a regressor: set "
+                "model.estimator=sklearn.ensemble.RandomForestRegressor, or another one"
+            )
+        self.estimator = build_estimator(estimator)
+        from sklearn.base import BaseEstimator, is_regressor
+
+        if not isinstance(self.estimator, BaseEstimator) or not is_regressor(self.estimator):
+            raise ValueError(
+                "model.estimator must be a regressor of scikit-learn with its module, such as "
+                f"sklearn.svm.SVR, got {estimator!r}"
+            )
+        seeds = [name for name in self.estimator.get_params() if name.endswith("random_state")]
+        unset = [name for name in seeds if self.estimator.get_params()[name] is None]
+        self.estimator.set_params(**dict.fromkeys(unset, 0))
+        self.fitted: list[Any] = []
+
+    def set_extra_state(self, state: dict) -> None:
+        super().set_extra_state(state)
+        self._fit()
+
+    def fit(self, links: Links) -> None:
+        """Keeps the links, and fits the regressor of each receiver to its known ones."""
+        self.links, self.known = links, known_links(links)
+        self._fit()
+
+    def _fit(self) -> None:
+        from sklearn.base import clone
+
+        self.fitted = []
+        for index in self.known:
+            labels = self.links.labels[index]
+            if labels.is_complex():
+                labels = torch.view_as_real(labels)
+            numbers = labels.reshape(len(index), -1).double().numpy()  # (k, outputs)
+            if numbers.shape[1] == 1:
+                numbers = numbers[:, 0]
+            try:
+                self.fitted.append(clone(self.estimator).fit(self._inputs(index), numbers))
+            except ValueError as error:
+                cause = " ".join(str(error).split())
+                several = "; for several numbers a link, sklearn.multioutput.MultiOutputRegressor"
+                raise ValueError(
+                    f"model.estimator cannot be fitted to {len(numbers)} labels of "
+                    f"{numbers[0].size} numbers: {cause}{several if numbers.ndim > 1 else ''}"
+                ) from error
+
+    def _inputs(self, asked: Tensor | Query) -> Float[ndarray, "k d"]:
+        """Inputs of the regressors, of a query or of known links."""
+        query = asked if isinstance(asked, Query) else self.links.query[asked]
+        return coordinates(self.scene, query, 1.0).numpy()
+
+    def forward(self, batch: Batch) -> Prediction:
+        task, query = self.scene.task, batch.query
+        labels = torch.full((len(query), *task.shape), torch.nan, dtype=task.dtype)
+        for receiver in query.receivers.unique().tolist() if self.fitted else ():
+            is_asked = query.receivers == receiver
+            predicted = self.fitted[receiver].predict(self._inputs(query[is_asked]))
+            values = torch.from_numpy(predicted)
+            if task.dtype.is_complex:
+                values = torch.view_as_complex(values.reshape(-1, *task.shape, 2).contiguous())
+            labels[is_asked] = values.reshape(-1, *task.shape).to(task.dtype)
+        return Prediction(at_directions(labels, batch, self.scene), {})
+
+    def deviations(self, batch: Batch) -> Tensor | None:
+        has_std = "return_std" in inspect.signature(self.estimator.predict).parameters
+        if not has_std or not self.scene.task.is_scalar:
+            return None
+        query = batch.query
+        deviations = torch.ones(len(query))
+        for receiver in query.receivers.unique().tolist():
+            is_asked = query.receivers == receiver
+            regressor = self.fitted[receiver]
+            _, deviation = regressor.predict(self._inputs(query[is_asked]), return_std=True)
+            deviations[is_asked] = torch.from_numpy(deviation).float()
+        return deviations
+
+
+def build_estimator(given: Any) -> Any:
+    """Estimators of names and mappings, also inside of lists and options; other values stay.
+
+    Raises:
+        ImportError: scikit-learn is not installed.
+        ValueError: A name is none of scikit-learn, or an option is unknown.
+    """
+    if isinstance(given, list | tuple):
+        return [build_estimator(entry) for entry in given]
+    if isinstance(given, str) and given.startswith("sklearn."):
+        given = {"_target_": given}
+    if not isinstance(given, Mapping) or "_target_" not in given:
+        return given
+    made = find_class(str(given["_target_"]))
+    options = {key: build_estimator(value) for key, value in given.items() if key != "_target_"}
+    known = inspect.signature(made).parameters
+    for key in options:
+        if key not in known:
+            raise ValueError(f"{made.__name__} has no option {suggest(key, known)}; see its help")
+    return made(**options)
+
+
+def find_class(target: str) -> type:
+    """A class of scikit-learn. Others are refused: a stranger's checkpoint may name them."""
+    try:
+        from sklearn.base import BaseEstimator
+        from sklearn.gaussian_process.kernels import Kernel
+    except ImportError:
+        raise ImportError("scikit-learn is missing: pip install 'gaigs[sklearn]'") from None
+    path, _, name = target.rpartition(".")
+    found = None
+    near = ""
+    if path.partition(".")[0] == "sklearn":
+        try:
+            module = importlib.import_module(path)
+        except ImportError:
+            near = f"; there is no module {path}"
+        else:
+            found = getattr(module, name, None)
+            near = f"; {path} has no {suggest(name, vars(module))}"
+    if not (isinstance(found, type) and issubclass(found, BaseEstimator | Kernel)):
+        raise ValueError(
+            "an estimator must be a class of scikit-learn, such as sklearn.svm.SVR, got "
+            f"{target!r}{near if found is None else ''}"
+        )
+    return found

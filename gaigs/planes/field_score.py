@@ -1,0 +1,177 @@
+"""The score of planes by fields of few numbers a place: coherent over places."""
+
+import math
+from collections.abc import Iterator
+
+import torch
+from jaxtyping import Float
+from scipy.constants import speed_of_light
+from torch import Tensor
+from torch.nn import functional
+
+from gaigs.planes.channel_links import SLABS, ChannelData, ReceiverChannels
+from gaigs.planes.field_room import FieldFit, FieldRoom, group_places
+from gaigs.planes.search import Candidate, GridRatings, Score, descend
+from gaigs.splatting.placement.mirrored.reflections import reflect
+
+
+class FieldScore(Score[FieldRoom]):
+    """Planes by the power that an image explains with one gain for all places.
+
+    Any planes explain one number at each place, but not with the same gains at all places: there
+    a few hundred places are one large array, and a wrong plane's phases differ from place to place.
+    Receivers and groups of places, whose relative gains are unknown, add up as powers.
+
+    Args:
+        data: Training channels with a phase in common.
+        price: Least fall of the sum over all numbers of the logarithm of squared errors by a true
+            plane. The best of n false ones reaches about the logarithm of n.
+        chunk: Waves that are computed at a time.
+
+    Source: Mallat and Zhang, Matching pursuits with time-frequency dictionaries, 1993.
+    """
+
+    def __init__(self, data: ChannelData, price: float = 12.0, chunk: int = 4_000_000):
+        self.data = data
+        self.fit = FieldFit(data)
+        self.price = price / self.fit.count
+        self.chunk = chunk
+        self.groups = 1
+        # Metal, which reflects alike at all angles.
+        self.mirror = torch.tensor([0.0, math.log(1e6), 0.0], dtype=torch.float64)
+
+    def error(self, room: FieldRoom) -> float:
+        rest = self.fit.unseen(room)
+        return self.fit.mean_log(rest).item() + self.price * len(room.planes)
+
+    # --- ratings ---
+
+    def rate(self, room: FieldRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
+        """Ratings over those of noise; of the grid with places in ``groups``."""
+        ratings = self._explain(room, grid.flatten(0, 1), self.groups)
+        return GridRatings(
+            ratings.view(grid.shape[:2]), lambda planes: self._explain(room, planes, 1)
+        )
+
+    def _explain(
+        self, room: FieldRoom, planes: Float[Tensor, "c 4"], groups: int
+    ) -> Float[Tensor, " c"]:
+        rest = self.fit.unseen(room)
+        # The derivative of the logarithm: a place in shadow counts little.
+        power = rest.abs().square()
+        rest = rest / (power + power.mean())
+        total = torch.zeros(len(planes))
+        for number, receiver in enumerate(self.data.receivers):
+            own = self.fit.owner == number
+            power = rest[own].abs().square().mean()
+            shape = receiver.flat.shape
+            normalised = (rest[own] / power.sqrt()).to(torch.complex64).view(shape)
+            scale = self.fit.scale[own].float().view(shape)[:, :1]  # (b, 1)
+            member = functional.one_hot(group_places(receiver.places, groups)).float()  # (b, g)
+            step = max(1, self.chunk // len(receiver.places))
+            for rows in torch.arange(len(planes)).split(step):
+                part = planes[rows].float()
+                sums = torch.zeros((), dtype=torch.complex64)
+                size = torch.zeros(())
+                waves = self._waves(receiver, part)
+                for (cosine, sine, reach), values in zip(waves, normalised.mT, strict=True):
+                    weights = scale * member
+                    real = weights * values.real[:, None]
+                    imaginary = weights * values.imag[:, None]
+                    # conj(wave) rest: (cos + j sin) (real + j imaginary).
+                    along = cosine @ real - sine @ imaginary  # (c, g)
+                    across = cosine @ imaginary + sine @ real
+                    sums = sums + torch.complex(along, across)
+                    size = size + reach.square() @ (scale * weights)
+                explained = sums.abs().square() / size.clamp_min(1e-20)
+                total[rows] += explained.sum(1)
+        return total.to(planes)
+
+    @staticmethod
+    def _waves(
+        receiver: ReceiverChannels, planes: Float[Tensor, "c 4"]
+    ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+        """Real parts, negative imaginary parts and amplitudes (c, b) of images, by number."""
+        normals, offsets = planes[:, :3], planes[:, 3:]
+        places = receiver.places.float()
+        heights = normals @ places.mT - offsets  # (c, b)
+        for element in receiver.elements.float():
+            products = heights * (normals @ element[:, None] - offsets)
+            # The squared distance of an image is the place's, and four times the heights' product.
+            direct = (places - element).square().sum(1)
+            lengths = (direct + 4 * products).clamp_min(1e-4).sqrt()
+            reach = (products > 0) / lengths
+            for frequency in receiver.frequencies.tolist():
+                phases = lengths * (2 * math.pi * frequency / speed_of_light)
+                yield phases.cos() * reach, phases.sin() * reach, reach
+
+    # --- changes of a room ---
+
+    def add(self, room: FieldRoom, candidate: Candidate) -> FieldRoom | None:
+        before = self.error(room)
+        # Without a gain the new plane changes no covariance.
+        kriged = self.fit.krige(room, self.fit.waves(room.planes, room))
+        trials = []
+        for plane in self._readings(room, candidate.plane):
+            if self.data.frame.is_like(room.planes, plane).any():
+                continue
+            for slab in (SLABS[1], self.mirror):
+                larger = self.fit.fit_gains(room.with_plane(plane, slab), 5, kriged=kriged)
+                rest = kriged.unseen(self.fit.residual(larger))
+                trials.append((self.fit.mean_log(rest).item(), larger))
+        trials.sort(key=lambda trial: trial[0])
+        polished = [self.descend(larger, 12) for _, larger in trials[:2]]
+        best = min(polished, key=self.error, default=None)
+        return best if best is not None and self.error(best) < before else None
+
+    def _readings(self, room: FieldRoom, plane: Float[Tensor, "4"]) -> list[Float[Tensor, "4"]]:
+        """A plane, and planes by whose reflection after or before a known one it would be found.
+
+        An image of second order of a single receiver is as good as one in a plane of its own.
+        """
+        readings = [plane]
+        if len(self.data.receivers) > 1:
+            return readings
+        position = self.data.receivers[0].position
+        image = reflect(position, plane[:3], plane[3])
+        for known in room.planes:
+            normal, offset = known[:3], known[3]
+            readings.append(bisect(position, reflect(image, normal, offset)))
+            readings.append(bisect(reflect(position, normal, offset), image))
+        return [reading for reading in readings if reading.isfinite().all()]
+
+    def remove(self, room: FieldRoom, number: int) -> FieldRoom:
+        return self.fit.fit_gains(room.without_plane(number), 5)
+
+    def refine(self, room: FieldRoom) -> FieldRoom:
+        return self.descend(room, 40)
+
+    def descend(self, room: FieldRoom, steps: int) -> FieldRoom:
+        """The room after a descent of the planes, with gains projected out.
+
+        Source: Golub and Pereyra, 1973.
+        """
+        current = room
+        kriged = self.fit.krige(room, self.fit.waves(room.planes, room))
+        step = 0
+
+        def loss(planes: Float[Tensor, "w 4"]) -> Float[Tensor, ""]:
+            nonlocal current, kriged, step
+            waves = self.fit.waves(planes, room)
+            with torch.no_grad():
+                current = self.fit.fit_gains(current, 1, waves.detach(), kriged)
+            step += 1
+            if step % 5 == 0:  # it changes little
+                kriged = self.fit.krige(current, waves)
+            return self.fit.mean_log(kriged.whiten(self.fit.residual(current, waves)))
+
+        rate = 0.1 * self.data.wavelength
+        planes = descend(loss, self.data.receivers, room.planes, [], steps, rate)[0]
+        moved = self.fit.fit_gains(current._replace(planes=planes), 4)
+        return min(room, moved, key=self.error)
+
+
+def bisect(one: Float[Tensor, "3"], other: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
+    """The plane that mirrors two points to each other; NaN for equal ones."""
+    normal = (other - one) / (other - one).norm()
+    return torch.cat((normal, (normal @ (one + other) / 2)[None]))

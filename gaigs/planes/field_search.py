@@ -1,0 +1,174 @@
+"""Search for planes in fields of few numbers a place."""
+
+import logging
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.data import Links
+from gaigs.planes.axis_planes import room_axes
+from gaigs.planes.channel_links import ChannelData, ChannelOptions
+from gaigs.planes.field_room import FieldRoom
+from gaigs.planes.field_score import FieldScore
+from gaigs.planes.search import PlaneSearch
+from gaigs.splatting.gaussians import fibonacci_lattice
+from gaigs.splatting.placement.mirrored.movable_planes import upright_turn
+from gaigs.splatting.placement.mirrored.reflections import distinct
+
+log = logging.getLogger(__name__)
+
+
+class PlaneGrid(NamedTuple):
+    """Planes that are rated with places in groups.
+
+    Attributes:
+        title: For the log.
+        normals: Their normals.
+        offsets: Number of offsets of each normal.
+        groups: Number of groups of neighbouring places.
+        turn: Angle between neighbouring normals [rad].
+        shift: Distance of neighbouring offsets [m].
+    """
+
+    title: str
+    normals: Float[Tensor, "n 3"]
+    offsets: int
+    groups: int
+    turn: float
+    shift: float
+
+    @property
+    def size(self) -> int:
+        """Number of planes."""
+        return len(self.normals) * self.offsets
+
+
+class FieldSearch:
+    """Planes whose images explain fields of few numbers a place, coherent over places.
+
+    Planes along the axes of the room come first, then upright ones, then any: the more planes are
+    tried, the more chance explains. Where a grid of planes is too large for all places at once, a
+    coarser one is rated by groups of neighbouring places, whose relative phases do not count.
+    Planes about its maxima are then rated by all places.
+
+    Args:
+        links: Their training links count; of the task ``csi``, with a known phase.
+        sign: Sign of the channels' phases.
+        order: Largest number of reflections of a path.
+        most: Largest number of planes.
+        start: Planes known before (w, 4).
+        options: Options of the search.
+        smallest: Fewest places of a group.
+
+    Source: ours.
+    """
+
+    def __init__(
+        self,
+        links: Links,
+        sign: int,
+        order: int,
+        most: int,
+        start: Float[Tensor, "w 4"],
+        options: ChannelOptions | None = None,
+        smallest: int = 16,
+    ):
+        self.data = ChannelData(links, sign, True, order, options or ChannelOptions())
+        self.score = FieldScore(self.data)
+        self.frame = self.data.frame
+        self.most = most
+        self.start = self.frame.from_world(start)
+        self.smallest = smallest
+
+    @torch.no_grad()
+    def run(self) -> FieldRoom:
+        """The room in the frame, the start's planes first."""
+        fit = self.score.fit
+        room = fit.start(self.start)
+        fit.choose_variation(room)
+        grids = [grid for grid in (self._make_upright(), self._make_tilted()) if grid is not None]
+        largest = max([grid.size for grid in grids], default=0)
+        log.info(
+            "search of planes by %d numbers together: at most %d times %d planes",
+            fit.count,
+            self.most,
+            largest + self._make_axes(room).size,
+        )
+        search = PlaneSearch(self.frame, self.score)
+        room = search.grow(room, self.most, lambda room: self._extend(room, grids))
+        room = self.score.refine(search.prune(room, len(self.start)))
+        if not len(room.planes):
+            log.info("no plane explains more of %d numbers than chance would", fit.count)
+        return room
+
+    def _extend(self, room: FieldRoom, grids: list[PlaneGrid]) -> FieldRoom | None:
+        """The room with the best plane of the first grid that has one; None without any."""
+        score = self.score
+        for grid in [self._make_axes(room), *grids]:
+            score.groups = grid.groups
+            normals = grid.normals.to(self.frame.points)
+            lines = self.frame.grid(normals, grid.offsets, self.data.options.margin)
+            shift = grid.shift / self.frame.diagonal
+            search = PlaneSearch(self.frame, score, grid.turn / 2, shift / 2)
+            larger = search.extend(room, lines)
+            if larger is None:
+                continue
+            larger = score.refine(larger)
+            # The best of n false planes lowers the sum by the logarithm of n; the price has some.
+            doubt = max(0.0, math.log(grid.size / 3000)) / score.fit.count
+            if score.error(larger) + doubt < score.error(room):
+                words = self.frame.describe(larger.planes[-1])
+                log.info("%s, %s: error %.3f", words, grid.title, score.error(larger))
+                score.fit.choose_variation(larger)
+                return larger
+        return None
+
+    # --- grids ---
+
+    def _make_axes(self, room: FieldRoom) -> PlaneGrid:
+        """Planes along the axes of a room, of its places and of coordinates."""
+        turn = upright_turn(self.frame.points).to(self.frame.points)
+        axes = torch.cat((room_axes(room.planes), torch.eye(3).to(turn), turn.mT))
+        normals = torch.stack(distinct(axes, 2e-4))
+        return self._make_grid("along the axes", 1, lambda turn: normals)
+
+    def _make_upright(self) -> PlaneGrid | None:
+        def make(turn: float) -> Float[Tensor, "n 3"]:
+            angles = torch.arange(0, math.pi, turn)
+            return torch.stack((angles.cos(), angles.sin(), 0 * angles), 1)
+
+        return self._choose_grid("upright", make)
+
+    def _make_tilted(self) -> PlaneGrid | None:
+        def make(turn: float) -> Float[Tensor, "n 3"]:
+            count = math.ceil(2 * math.pi / turn**2)
+            return fibonacci_lattice(min(count, 1_000_000), 0.0, math.pi / 2)
+
+        return self._choose_grid("of any tilt", make)
+
+    def _choose_grid(
+        self, title: str, make: Callable[[float], Float[Tensor, "n 3"]]
+    ) -> PlaneGrid | None:
+        """The grid with fewest groups whose work is bounded; None without such a grid."""
+        groups = 1
+        places = max(len(receiver.places) for receiver in self.data.receivers)
+        while places >= groups * self.smallest:
+            grid = self._make_grid(title, groups, make)
+            if grid.size * self.score.fit.count <= self.data.options.most_waves:
+                return grid
+            groups *= 2
+        return None
+
+    def _make_grid(
+        self, title: str, groups: int, make: Callable[[float], Float[Tensor, "n 3"]]
+    ) -> PlaneGrid:
+        """A grid so fine that phases of a group of places differ by less than half a turn."""
+        part = groups ** (-1 / 3)  # of the diagonal
+        turn = self.data.wavelength / (part * self.frame.diagonal)
+        shift = self.data.wavelength / (8 * part)
+        extent = (1 + 2 * self.data.options.margin) * self.frame.diagonal
+        return PlaneGrid(title, make(turn), math.ceil(extent / shift), groups, turn, shift)

@@ -1,0 +1,79 @@
+"""Paired tests of scores: does a model differ from the best baseline by more than chance?"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gaigs.core.task import Task
+from gaigs.report.scores import headline
+
+
+class Paired(NamedTuple):
+    """Models against the best baseline.
+
+    Attributes:
+        baseline: Its name.
+        places: Number of the test links' places.
+        p: Probability of a difference as large by chance, by the names of model and metric.
+    """
+
+    baseline: str
+    places: int
+    p: dict[str, dict[str, float]]
+
+
+def paired(
+    task: Task,
+    scores: Mapping[str, dict[str, Tensor]],
+    places: Tensor,
+    resamples: int = 1000,
+    seed: int = 0,
+) -> Paired | None:
+    """A paired bootstrap over places, of each metric; None without baselines or with one place.
+
+    Links of one place depend on each other, so they are drawn together. A model and the baseline
+    are scored on the same drawn places.
+
+    Args:
+        task: Task of the labels.
+        scores: Scores of the task for every test link (k,), by the names of model and score; the
+            run's model first.
+        places: A number for the place of each link (k,).
+        resamples: Number of resamples; no probability is below 2 / (resamples + 1).
+        seed: Seed of the resamples.
+
+    Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapters 8 and 16.
+    """
+    values = {name: task.summarise(dict(parts)) for name, parts in scores.items()}
+    own, *others = values
+    names = [name for name in others if name != f"{own}_trend"]
+    numbers, groups = torch.unique(places, return_inverse=True)
+    if not names or len(numbers) < 2:
+        return None
+    metric, title = headline(task.name, values)
+    best = (max if title.higher_is_better else min)(names, key=lambda name: values[name][metric])
+    order = groups.argsort(stable=True)
+    members = order.split(groups.bincount().tolist())  # links of each place
+    random = np.random.default_rng(seed)
+    gaps: dict[tuple[str, str], list[float]] = {}
+    for _ in range(resamples):
+        drawn = random.integers(0, len(members), len(members)).tolist()
+        rows = torch.cat([members[place] for place in drawn])
+        summaries = {}
+        for name, parts in scores.items():
+            summaries[name] = task.summarise({key: part[rows] for key, part in parts.items()})
+        theirs = summaries.pop(best)
+        for name, summary in summaries.items():
+            for key, value in summary.items():
+                gaps.setdefault((name, key), []).append(value - theirs[key])
+    p: dict[str, dict[str, float]] = {}
+    for (name, key), differences in gaps.items():
+        if np.isnan(differences).any():  # a score is unknown, or both are infinite
+            continue
+        # Two-sided: the smaller tail of the differences, the observed one counted in.
+        tails = np.less_equal(differences, 0).sum(), np.greater_equal(differences, 0).sum()
+        p.setdefault(name, {})[key] = min(1.0, 2 * (int(min(tails)) + 1) / (resamples + 1))
+    return Paired(best, len(numbers), p)

@@ -1,0 +1,100 @@
+"""The search for planes in fields of one number a place, of an invented room made by numpy."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.constants import speed_of_light
+
+from gaigs.core.antenna import Array, Receiver
+from gaigs.core.geometry import Pose
+from gaigs.core.query import Query
+from gaigs.core.task.csi import Csi
+from gaigs.data import Links, Split
+from gaigs.planes.field_room import FieldFit, Variation
+from gaigs.planes.field_search import FieldSearch
+
+FREQUENCY = 2.4e9
+WALLS = np.array([[0.8, 0.6, 0, -0.9], [-0.6, 0.8, 0, 2.8], [0, 0, 1.0, -0.2]])
+"""Normals and offsets [m] of walls that stand at 37 degrees to the axes, and of the floor."""
+
+
+def field(places, receiver):
+    """Direct wave and images of the first order (b,), each reflected by half."""
+
+    def wave(points):
+        lengths = np.linalg.norm(points - receiver, axis=1)
+        return np.exp(-2j * np.pi * FREQUENCY / speed_of_light * lengths) / lengths
+
+    total = wave(places)
+    for *normal, offset in WALLS:
+        images = places - 2 * (places @ normal - offset)[:, None] * normal
+        total = total - 0.5 * wave(images)
+    return total
+
+
+def room(count=240, receivers=1, is_noise=False):
+    """Links of a room with one antenna and one carrier."""
+    generator = np.random.default_rng(0)
+    along = generator.uniform((-0.5, 0.3, 0.1), (2.4, 2.5, 1.8), (count, 3))
+    places = np.float32(along @ [[0.8, 0.6, 0], [-0.6, 0.8, 0], [0, 0, 1]])
+    poses = [Pose.from_xyzw(at, (0, 0, 0, 1)) for at in ((0.9, 1.2, 1.9), (-0.4, 1.5, 0.7))]
+    which = np.arange(count) % receivers
+    labels = np.zeros(count, complex)
+    for number in range(receivers):
+        own = which == number
+        labels[own] = field(np.float64(places[own]), poses[number].position.double().numpy())
+    if is_noise:
+        labels = generator.standard_normal((count, 2)) @ [1, 1j]
+    return Links(
+        query=Query(torch.from_numpy(places), torch.from_numpy(which)),
+        receivers=tuple(
+            Receiver(f"r{k}", poses[k], Array(torch.zeros(1, 3))) for k in range(receivers)
+        ),
+        labels=torch.from_numpy(labels)[:, None, None].to(torch.complex64),
+        task=Csi(1, torch.tensor([FREQUENCY]).double()),
+        split=Split("all", torch.arange(count), torch.arange(0), torch.arange(0)),
+    )
+
+
+@pytest.fixture(params=[1, 2], ids=["one receiver", "two"])
+def links(request):
+    return room(receivers=request.param)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_places_together_show_planes_of_a_turned_room(links):
+    torch.manual_seed(0)
+    search = FieldSearch(links, -1, 1, 4, torch.zeros(0, 4))
+    found = search.run()
+    planes = search.frame.to_world(found.planes).numpy()
+    for wall in WALLS:
+        gaps = np.abs(planes * np.sign(planes[:, :3] @ wall[:3])[:, None] - wall).max(1)
+        assert gaps.min() < 0.03
+    assert len(planes) == len(WALLS)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_noise_has_no_planes():
+    torch.manual_seed(0)
+    found = FieldSearch(room(100, is_noise=True), -1, 2, 4, torch.zeros(0, 4)).run()
+    assert not len(found.planes)
+
+
+def test_kriging_leaves_what_other_places_do_not_explain(links):
+    search = FieldSearch(links, -1, 1, 4, torch.from_numpy(WALLS))
+    fit = FieldFit(search.data, largest=1000)
+    fit.variation = Variation(0.5, 1.0, 0.3)
+    start = fit.start(search.start)
+    waves = fit.waves(start.planes, start)
+    rest = fit.residual(start, waves)
+    found = fit.krige(start, waves).unseen(rest)
+    # Without the first number, as kriging from the others of its receiver predicts it.
+    own = fit.owner == 0
+    gaps = torch.cdist(search.data.receivers[0].places, search.data.receivers[0].places)
+    gains = torch.cat((start.gains, torch.ones(1)))
+    order = torch.tensor([-1, 0, 1, 2])
+    fields = waves[own] * gains[order] * start.receivers[0]
+    covariance = 0.25 * (-gaps).exp() * (fields @ fields.mH) + 0.09 * torch.eye(int(own.sum()))
+    weights = torch.linalg.solve(covariance[1:, 1:], covariance[1:, :1]).mH
+    expected = rest[own][0] - weights[0] @ rest[own][1:]
+    torch.testing.assert_close(found[0], expected, rtol=1e-3, atol=1e-3)
