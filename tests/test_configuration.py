@@ -67,18 +67,18 @@ def test_the_command_line_wins_over_a_model_and_a_model_over_the_task(configure)
     assert (config["kriging"], config["threads"], config["trainer"]["max_steps"]) == (False, 2, 5)
 
 
-def test_an_experiment_wins_over_a_model_and_a_variant_leaves_its_deformation(configure):
+def test_an_experiment_wins_over_a_model_and_a_variant_brings_the_papers_network(configure):
     config = configure("+experiment=rssi", "model=mirrored", "+variant=paper")
     assert config["trainer"]["max_steps"] == 600
     assert config["model"]["gaussians"] is None
-    assert config["deformation"]["name"] == "none"
-    assert "heads" in config["deformation"], "which 'none' refuses, so that no run begins"
+    assert config["deformation"]["name"] == "two_branch"
+    assert len(config["deformation"]["heads"]) == 5
 
 
 # --- the width of the deformation network ---
 
 
-@pytest.mark.parametrize(("task", "width"), [("spectrum", 128), ("rssi", 32), ("csi", 64)])
+@pytest.mark.parametrize(("task", "width"), [("spectrum", None), ("rssi", 32), ("csi", 64)])
 def test_the_task_says_how_wide_the_network_is_and_the_command_line_wins(configure, task, width):
     for words, expected in (
         ((), width),

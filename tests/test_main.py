@@ -89,8 +89,7 @@ def test_a_run_prints_what_it_does_and_nothing_else(uninterrupted):
         r"data: training transmitters within \d\.\d\d x \d\.\d\d x \d\.\d\d m$", lines[1]
     )
     assert lines[2].startswith(
-        "model: gaigs, placement free, tokenizer euclidean, deformation two_branch, projection "
-        "mercator"
+        "model: gaigs, placement free, tokenizer euclidean, deformation basis, projection mercator"
     )
     assert re.match(
         r"training .* 40/40 [\d.]+ steps/s 0:00:00 loss \d\.\d{3} ssim \d\.\d{3}$", lines[3]

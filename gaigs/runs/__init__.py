@@ -151,6 +151,8 @@ def links_of(folder: str | Path, trust: bool) -> Links:
 def _check_options(config: dict) -> None:
     """Raises a ``ValueError`` for an unknown option of a part: data may take long to read."""
     parts = {kind: config[kind] for kind in ("data", "split", "loss", "model", "training")}
+    if config["model"]["name"] == "auto":
+        del parts["model"]  # no component: the choice checks its options
     for kind, part in (parts | config["model"]).items():
         if kind in KINDS and isinstance(part, Mapping) and "name" in part:
             registry(kind).check_options(part)

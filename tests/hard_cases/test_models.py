@@ -14,7 +14,7 @@ from gaigs.testing import example_links
 
 DATA = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
 OWN = {
-    "gaigs": ("gaussians.count=30", "deformation.width=16"),
+    "gaigs": ("gaussians.count=30", "deformation=two_branch", "deformation.width=16"),
     "mirrored": ("placement=mirrored", "deformation=none", "~projection", "~rasterizer"),
 }
 """Further options of a model."""
