@@ -259,14 +259,18 @@ def _latex(
     numbers = [name for name in metrics if name in known]
     first = known.index(numbers[0])
     texts = [name for name in known[:first] if name not in ("run", "status", "seed", "runs")]
-    columns = [[tex(name), *(tex(_text(row.get(name), "")) for row in shown)] for name in texts]
+    columns = []
+    for name in texts:
+        cells = [tex(_text(row.get(name), "")) for row in shown]
+        columns.append([tex(name), *cells])
     for name in numbers:
         values = [None if row.get(name) is None else row[name] for row in shown]
         bold = r"\textbf{{{}}}"
         cells = best_in_bold(values, metrics[name].higher_is_better, bold)
         if name == numbers[0]:
             for place, row in enumerate(shown):
-                cells[place] += "$^*$" if (row.get("p") or 1.0) < 0.05 else ""
+                is_known = row.get("p") is not None
+                cells[place] += "$^*$" if is_known and row["p"] < 0.05 else ""
         columns.append([tex(metrics[name].title), *(cell.replace("±", r"$\pm$") for cell in cells)])
     settings = ", ".join(f"{key}={value}" for key, value in shared.items())
     split = f" on split {tex(shared['split'])}" if "split" in shared else ""

@@ -1,5 +1,6 @@
 """Radio maps: predicted values, or their deviations, over a floor."""
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from math import ceil
@@ -221,7 +222,8 @@ def plot_radio_map(
             readings = dict(zip(gateways, parts, strict=True))
     if ax is None:
         figures = radio_maps(floor, gateways, readings, edges)
-        return [ax for figure in figures for ax in figure.axes if ax.get_label() != "<colorbar>"]
+        axes = itertools.chain.from_iterable(figure.axes for figure in figures)
+        return [ax for ax in axes if ax.get_label() != "<colorbar>"]
     if len(floor.receivers) > 1:
         names = ", ".join(floor.receivers[:5])
         raise ValueError(

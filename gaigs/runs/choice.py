@@ -6,6 +6,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -256,7 +257,9 @@ def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
     """
     # The time limit may have left out folds of some.
     shared = set.intersection(*(set(one.gains) for one in tried))
-    gains = torch.tensor([[one.gains[key] for key in sorted(shared)] for one in tried])  # (c, p)
+    keys = sorted(shared)
+    rows = [itemgetter(*keys)(one.gains) for one in tried]
+    gains = torch.tensor(rows).reshape(len(tried), len(keys))  # (c, p)
     means = gains.mean(1)
     best = int(means.argmax())
     gaps = gains[best] - gains  # (c, p)

@@ -1,5 +1,6 @@
 """Places within areas that were drawn on a map, as candidates of a survey."""
 
+import itertools
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -42,8 +43,10 @@ def read_area(file: Path, model: Model | None, count: int = 1000) -> Float[Tenso
     if not polygons:
         raise ValueError(f"{file} has no polygon\ndraw the area as Polygon or MultiPolygon")
     frame = None if model is None else model.scene.frame
-    polygons = [[_in_metres(file, ring, frame) for ring in rings] for rings in polygons]
-    corners = np.concatenate([ring for rings in polygons for ring in rings])  # (k, 3)
+    outlines = []
+    for rings in polygons:
+        outlines.append([_in_metres(file, ring, frame) for ring in rings])
+    corners = np.concatenate([*itertools.chain.from_iterable(outlines)])  # (k, 3)
     heights = corners[:1, 2]
     if model is not None and np.isnan(corners[:, 2]).any():
         floors = model.scene.floors
@@ -54,9 +57,9 @@ def read_area(file: Path, model: Model | None, count: int = 1000) -> Float[Tenso
             f"{file}: without a trained model each position needs a height, its third number [m]\n"
             "add it, or plan with folder=runs/..."
         )
-    inside = _places_inside(polygons, corners[:, :2], max(1, count // len(heights)))  # (g, 2)
-    floors = [np.insert(inside, 2, height, axis=1) for height in heights]
-    return torch.tensor(np.concatenate(floors), dtype=torch.float32)
+    inside = _places_inside(outlines, corners[:, :2], max(1, count // len(heights)))  # (g, 2)
+    places = [np.insert(inside, 2, height, axis=1) for height in heights]
+    return torch.tensor(np.concatenate(places), dtype=torch.float32)
 
 
 def polygons_of(content: Any) -> Iterator[Rings]:
