@@ -100,7 +100,8 @@ def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) ->
         for ax in axes[-1]:
             ax.set_xlabel(f"frequency [{unit}]")
         figure.legend(handles=axes[0, 0].lines[::-1], loc="outside lower center", ncols=2)
-        ask(figure, "Do predicted channels follow the labels over frequency?")
+        over = " over frequency" if len(frequencies) > 1 else ""
+        ask(figure, f"Do predicted channels follow the labels{over}?")
     return figure
 
 
