@@ -310,6 +310,7 @@ def _finish(chosen: Tried, links: Links, folder: Path, seconds: float) -> Fitted
     if (chosen.folder / "log").is_dir():
         shutil.copytree(chosen.folder / "log", folder / "log", dirs_exist_ok=True)
     name = chosen.config["model"]["name"]
-    models = {NAME if key == name else key: model for key, model in fitted.models.items()}
+    # The trend of a kriged model is named after the row, too.
+    models = {NAME + key.removeprefix(name): model for key, model in fitted.models.items()}
     unseen = {NAME: chosen.unseen[name]}
     return fitted._replace(models=models, unseen=unseen, seconds=seconds)
