@@ -259,6 +259,10 @@ def _latex(
     numbers = [name for name in metrics if name in known]
     first = known.index(numbers[0])
     texts = [name for name in known[:first] if name not in ("run", "status", "seed", "runs")]
+    if texts == ["model"]:  # a run of a baseline's model is this baseline
+        scored = {row["model"] for row in shown[: rule - 1]}
+        others = [row for row in shown[rule - 1 :] if row["model"] not in scored]
+        shown = shown[: rule - 1] + others
     columns = []
     for name in texts:
         cells = [tex(_text(row.get(name), "")) for row in shown]

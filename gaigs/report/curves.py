@@ -188,9 +188,11 @@ def speed_against_error(
 ) -> Figure:
     """Score of each run against each kind of time, one panel a kind; NaN if a time is unknown.
 
-    The baselines' scores are horizontal lines, named by their model first. Runs of several models,
-    one a run, have the models' colours.
+    A kind that no run has, as the training of look-ups, has no panel. The baselines' scores are
+    horizontal lines, named by their model first. Runs of several models, one a run, have the
+    models' colours.
     """
+    times = {label: values for label, values in times.items() if np.isfinite(values).any()} or times
     systems = looks(dict.fromkeys([*models, *(name.partition(" ")[0] for name in baselines)]))
     key_columns = 1 if max(map(len, names)) > 55 else 2  # letters that fit half a page
     key_rows = (len(names) + len(baselines) + 1) // key_columns

@@ -148,7 +148,7 @@ def test_a_diverged_loss_still_makes_a_figure():
 
 @pytest.mark.parametrize(("longest", "scale"), [(20.0, "linear"), (500.0, "log")])
 def test_speed_against_error(longest, scale):
-    times = {"inference": np.array([np.nan, 5, longest])}
+    times = {"inference": np.array([np.nan, 5, longest]), "training": np.full(3, np.nan)}
     figure = speed_against_error(
         ["a", "b", "c"], np.array([0.7, 0.8, 0.9]), times, "median SSIM", {"knn": 0.85}
     )

@@ -372,6 +372,16 @@ def test_models_may_vary_and_a_run_without_its_kriging_is_no_baseline(tmp_path):
     ]
 
 
+def test_a_run_of_a_baseline_comes_once_in_a_paper(tmp_path):
+    for name in ("gaigs", "knn"):
+        models = scores(0.9)
+        write_run(tmp_path / name, [f"model={name}"], {name: models[name]} | models)
+    report(tmp_path)
+    lines = (tmp_path / "ablation.tex").read_text().splitlines()
+    rows = [line.partition(" ")[0] for line in lines if line.endswith(r"\\")]
+    assert sorted(rows) == ["gaigs", "knn", "mean", "model"]
+
+
 def test_runs_lie_at_any_depth_and_are_named_by_their_folders(tmp_path):
     write_run(tmp_path / "first/width=16,seed=2", ["width=16", "seed=2"], scores(0.91))
     write_run(tmp_path / "first/width=8,seed=10", ["width=8", "seed=10"], scores(0.9))
