@@ -161,25 +161,21 @@ class Scene:
             responses = responses.unflatten(0, self.responses.shape[:2])  # (receivers, e, s)
         return replace(self, task=self.task.at_frequencies(frequencies), responses=responses)
 
-    def front_ends(self, query: Query) -> Complex[Tensor, "b e s"] | None:
-        """The response of each link's receiver; None if there is none."""
-        if self.responses is None:
-            return None
-        return self.responses.to(query.receivers.device)[query.receivers]
-
     def received(
         self, query: Query, channels: Complex[Tensor, "b e s"]
     ) -> Complex[Tensor, "b e s"]:
         """Channels behind the receivers' front ends."""
-        factors = self.front_ends(query)
-        return channels if factors is None else channels * factors.to(channels)
+        if self.responses is None:
+            return channels
+        return channels * self.responses.to(channels)[query.receivers]
 
     def equalised(
         self, query: Query, channels: Complex[Tensor, "b e s"]
     ) -> Complex[Tensor, "b e s"]:
         """Measured channels without the receivers' front ends; inverse of ``received``."""
-        factors = self.front_ends(query)
-        return channels if factors is None else channels / factors.to(channels)
+        if self.responses is None:
+            return channels
+        return channels / self.responses.to(channels)[query.receivers]
 
     def state(self) -> dict:
         """The scene in plain tensors, lists and strings, for a checkpoint."""
