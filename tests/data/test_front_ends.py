@@ -92,6 +92,7 @@ def test_the_response_is_found_and_explains_channels(phase, tmp_path):
     assert off.norm() / response.norm() < 0.1
     assert (off / errors).square().mean().sqrt() < 2
     assert "rx0 has a response of its front end" in links.remarks
+    assert gaigs.describe(links).findings == ()
 
     plain = score("friis", replace(links, front_ends=None))["snr_aligned_db_median"]
     own = score("friis", links)["snr_aligned_db_median"]
