@@ -2,9 +2,10 @@
 
 import functools
 import logging
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
@@ -58,6 +59,7 @@ class Scene:
         places: Number of training places; 0 if unknown.
         floors: Heights of separate floors of training transmitters, that with most places first
             (k,) [m]; empty of one.
+        responses: Factors of channels by each receiver's front end; None where none is learnt.
 
     Example:
         >>> scene = gaigs.links("synthetic_rssi", transmitters=50).scene
@@ -77,6 +79,7 @@ class Scene:
     frame: Frame | None = None
     floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
     places: int = 0
+    responses: Complex[Tensor, "receivers e s"] | None = None
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
         """Positions of the receivers [m], on the device and in the dtype of ``like``."""
@@ -142,6 +145,38 @@ class Scene:
         positions = (2 * query.frequencies.double().log() - low - high) / (high - low)
         return positions.to(query.transmitters.dtype)
 
+    def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Scene":
+        """The scene of channels at other subcarriers [Hz].
+
+        Responses are interpolated, and constant beyond the band.
+        """
+        responses = self.responses
+        if responses is not None:
+            known = self.task.frequencies.double().numpy()
+            order = np.argsort(known)
+            asked = frequencies.double().numpy()
+            rows = responses.flatten(0, 1).numpy()[:, order]
+            parts = [np.interp(asked, known[order], row) for row in rows]
+            responses = torch.tensor(np.array(parts)).to(responses)
+            responses = responses.unflatten(0, self.responses.shape[:2])  # (receivers, e, s)
+        return replace(self, task=self.task.at_frequencies(frequencies), responses=responses)
+
+    def received(
+        self, query: Query, channels: Complex[Tensor, "b e s"]
+    ) -> Complex[Tensor, "b e s"]:
+        """Channels behind the receivers' front ends."""
+        if self.responses is None:
+            return channels
+        return channels * self.responses.to(channels)[query.receivers]
+
+    def equalised(
+        self, query: Query, channels: Complex[Tensor, "b e s"]
+    ) -> Complex[Tensor, "b e s"]:
+        """Measured channels without the receivers' front ends; inverse of ``received``."""
+        if self.responses is None:
+            return channels
+        return channels / self.responses.to(channels)[query.receivers]
+
     def state(self) -> dict:
         """The scene in plain tensors, lists and strings, for a checkpoint."""
         receivers = []
@@ -158,6 +193,8 @@ class Scene:
         state = {"receivers": receivers, "task": self.task.state()}
         for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors", "places"):
             state[name] = getattr(self, name)
+        if self.responses is not None:
+            state["responses"] = self.responses
         state["frame"] = None
         if self.frame is not None:
             state["frame"] = int(self.frame.epsg), float(self.frame.x), float(self.frame.y)

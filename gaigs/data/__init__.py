@@ -19,6 +19,7 @@ from gaigs.core.task import Task
 from gaigs.core.task.csi import Csi
 from gaigs.data.checks import check
 from gaigs.data.checks.subcarriers import constant_sentence, constant_subcarriers
+from gaigs.data.front_ends import FrontEnds, learn_responses
 from gaigs.data.gateways import estimate_place
 from gaigs.data.maps import check_metres
 from gaigs.io.images import GreyImages
@@ -94,6 +95,7 @@ class Links:
         noises: Standard deviation of each label by the scatter of repeated readings, less the more
             of them it is the mean of (n,), in the label's unit; None without repetitions.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
+        front_ends: Responses of the receivers' front ends; None if none is learnt.
         remarks: Counts of links read and left out, with the reason.
         origin: Configurations of ``data`` and ``split``; empty for arrays in memory.
 
@@ -121,6 +123,7 @@ class Links:
     edges: Float[Tensor, "k 2 3"] = field(
         default_factory=lambda: torch.zeros(0, 2, 3, dtype=torch.float32)
     )
+    front_ends: FrontEnds | None = None
     remarks: str = ""
     origin: Mapping = field(default_factory=dict)
 
@@ -178,6 +181,7 @@ class Links:
             frequencies=frequencies,
             bandwidth=self.bandwidth,
             frame=self.frame,
+            responses=None if self.front_ends is None else self.front_ends.responses,
             floors=floors_of(train),
             places=len(train),
         )
@@ -257,6 +261,11 @@ def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
     if links.uncertainties is not None:
         links = with_places(only_trained(links))
     remarks = [links.remarks]
+    if links.task.name == "csi" and isinstance(links.labels, Tensor):
+        links = replace(links, front_ends=learn_responses(links))
+    if links.front_ends is not None:
+        log.info("%s", links.front_ends.remark)
+        remarks.append(links.front_ends.remark)
     phase = links.task.phase
     if phase != "known":
         unknown = {"per_link": "phase", "per_link_and_delay": "phase, delay and gain"}[phase]

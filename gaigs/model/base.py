@@ -283,7 +283,7 @@ class Model(nn.Module):
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Model":
         """A copy of a model with ``any_frequency`` whose labels have other subcarriers [Hz]."""
-        scene = replace(self.scene, task=self.scene.task.at_frequencies(frequencies))
+        scene = self.scene.at_frequencies(frequencies)
         other = copy.deepcopy(self)
         for part in other.modules():
             if hasattr(part, "scene"):

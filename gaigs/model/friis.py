@@ -55,6 +55,7 @@ class Friis(Model):
         index = torch.cat(known)
         labels, query = links.labels[index].to(torch.complex128), links.query[index]
         waves = direct_waves(self.scene, query, self.frequencies)
+        labels = self.scene.equalised(query, labels)
         sign = self.task.phase_sign(labels, waves, query.receivers)
         self.sign.fill_(sign or -1)
         self.gains.zero_()
@@ -68,6 +69,7 @@ class Friis(Model):
         return Prediction(self.gains[batch.query.receivers][:, None, None] * waves, {})
 
     def _waves(self, query: Query) -> Complex[Tensor, "b e s"]:
-        """The direct wave at each element, with a gain of 1."""
+        """The direct wave behind each element's front end, with a gain of 1."""
         waves = direct_waves(self.scene, query, self.frequencies, int(self.sign))
-        return direct_gains(self.scene, query)[:, None, None] * waves
+        waves = direct_gains(self.scene, query)[:, None, None] * waves
+        return self.scene.received(query, waves)

@@ -153,6 +153,7 @@ class MirroredSplatting(GaussianSplatting):
         Without a phase in common these have the faces of the box.
         """
         placement = self.placement
+        links = replace(links, labels=self.scene.equalised(links.query, links.labels))
         train = links.split.train
         sign = int(pooling.sign)
         query = links.query[train]

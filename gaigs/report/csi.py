@@ -2,7 +2,7 @@
 power.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,7 @@ class CsiFigures(TaskFigures):
         split = links.split.name
         frequencies = task.frequencies.numpy()
         scores = own_scores(file, task.compared_by)
-        errors = own_scores(file, "error_power")
+        powers_of_errors = own_scores(file, "error_power")
         powers = next(iter(own_scores(file, "label_power").values()))
         shown = read_examples(file, task.compared_by)
         predictions = torch.from_numpy(shown.predictions)
@@ -39,7 +39,13 @@ class CsiFigures(TaskFigures):
         figures = {"channels": magnitudes_and_phases(shown, frequencies)}
         if len(frequencies) > 1:
             figures["impulse_response"] = impulse_responses(shown, frequencies)
-        figures["error_power"] = error_against_power(powers, errors, split)
+        if links.front_ends is not None:
+            responses = links.front_ends.responses.numpy()
+            errors = links.front_ends.errors.numpy()
+            names = [receiver.name for receiver in links.receivers]
+            known: Any = links.task
+            figures["front_end"] = front_ends(responses, errors, known.frequencies.numpy(), names)
+        figures["error_power"] = error_against_power(powers, powers_of_errors, split)
         return figures | {
             "snr_cdf": cdf(scores, task.pair_score, "channels", split, (None, None), True)
         }
@@ -102,6 +108,47 @@ def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) ->
         figure.legend(handles=axes[0, 0].lines[::-1], loc="outside lower center", ncols=2)
         over = " over frequency" if len(frequencies) > 1 else ""
         ask(figure, f"Do predicted channels follow the labels{over}?")
+    return figure
+
+
+def front_ends(
+    responses: Complex[ndarray, "r e s"],
+    errors: Float[ndarray, "r e s"],
+    frequencies: Float[ndarray, " s"],
+    names: Sequence[str],
+) -> Figure:
+    """Level and phase of receivers' responses over frequency [Hz], a line for each element.
+
+    Bands are one standard error wide to either side. Receivers without a response have no row.
+    """
+    rows = [number for number, error in enumerate(errors) if error.any()]
+    order = np.argsort(frequencies)
+    across = frequencies[order] / 1e9
+    with rc_context(STYLE):
+        figure = Figure(figsize=(PAGE, 1 + 1.8 * len(rows)), layout="constrained")
+        axes = figure.subplots(len(rows), 2, sharex=True, squeeze=False)
+        for (level_axes, phase_axes), row in zip(axes, rows, strict=True):
+            for response, error in zip(
+                responses[row][:, order], errors[row][:, order], strict=True
+            ):
+                if not error.any():  # an element that the array lacks
+                    continue
+                relative = error / np.abs(response)
+                phase = np.unwrap(np.angle(response))
+                curves = (
+                    (level_axes, decibels(response), 20 / np.log(10) * relative),
+                    (phase_axes, np.rad2deg(phase), np.rad2deg(relative)),
+                )
+                for ax, curve, width in curves:
+                    (line,) = ax.plot(across, curve, linewidth=0.8)
+                    band = curve - width, curve + width
+                    ax.fill_between(across, *band, color=line.get_color(), alpha=0.2, linewidth=0)
+            level_axes.set(title=f"front end of {names[row]}", ylabel="|R| [dB]")
+            phase_axes.set(ylabel="phase of R [deg]")
+        for ax in axes.flat:
+            ax.grid()
+        for ax in axes[-1]:
+            ax.set_xlabel("frequency [GHz]")
     return figure
 
 

@@ -86,8 +86,8 @@ def test_random_delays_declared_as_phases_alone_are_noticed():
 @pytest.mark.parametrize(
     ("what", "words"),
     [
-        ("delay", "take a delay of 4.99 ns off h"),
-        ("elements", "the elements of gateway1 have phases that geometry does not explain"),
+        ("delay", "gateway1 has a response of its front end, 1 numbers over the band"),
+        ("elements", "gateway1 has a response of its front end"),
         ("order", "phases of the channels do not follow the direct distance"),
     ],
 )
@@ -102,8 +102,11 @@ def test_phases_that_geometry_does_not_explain_are_noticed(what, words, caplog):
         labels = labels.roll(1, 0)
     remarks = undeclared(links, labels).remarks
     assert words in remarks
-    assert words in caplog.text
-    assert remarks.count(";") == 2
+    if what == "order":  # a response explains the others
+        assert words in caplog.text
+        assert remarks.count(";") == 2
+    else:
+        assert remarks.count(";") == 1
 
 
 def test_places_in_one_direction_say_nothing_of_elements():

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gaigs.core.phases import array_sign
 from gaigs.core.propagation import strength
+from gaigs.core.query import Query
 from gaigs.core.scene import Scene, check_elements, direct_waves
 from gaigs.data import Links
 from gaigs.splatting.pooling import Pooling
@@ -51,16 +52,19 @@ class ChannelPooling(Pooling):
         task: Any = self.scene.task
         return task.frequencies
 
-    def pad(self, channels: Complex[Tensor, "b e s"]) -> Complex[Tensor, "b most s"]:
-        """Adds zeros for the elements that only other receivers' arrays have."""
+    def received(
+        self, query: Query, channels: Complex[Tensor, "b e s"]
+    ) -> Complex[Tensor, "b most s"]:
+        """Channels behind the front ends, 0 at the elements of other receivers' arrays alone."""
         missing = self.task.elements - channels.shape[1]
-        return torch.nn.functional.pad(channels, (0, 0, 0, missing))
+        return self.scene.received(query, torch.nn.functional.pad(channels, (0, 0, 0, missing)))
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
         train = links.split.train
         query = links.query[train]
         labels = links.labels[train].to(torch.complex128)  # (b, e, s)
+        labels = self.scene.equalised(query, labels)
         waves = direct_waves(self.scene, query, self.frequencies)  # (b, e, s)
         self.strength.fill_(strength(labels, waves, query.receivers))
         self.sign.fill_(self.task.phase_sign(labels, waves, query.receivers))

@@ -63,7 +63,7 @@ class ElementSum(ChannelPooling):
         direct = direct_waves(
             self.scene, query, self.frequencies, int(self.sign), at_elements=False
         )  # (b, 1, s)
-        return self.pad(channels * (self.strength.double() * direct).to(waves))
+        return self.received(query, channels * (self.strength.double() * direct).to(waves))
 
     def _steering(self, receiver: int, sign: int) -> Complex[Tensor, "s p e"]:
         """Contribution of a wave from each direction of the map to each element, float64."""

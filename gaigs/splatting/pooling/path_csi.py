@@ -39,4 +39,4 @@ class PathCsi(ChannelPooling, PathPooling):
         if self.sign == 0:  # no common clock: the phase of the direct path is taken off
             direct = direct_waves(self.scene, query, frequencies, 1, at_elements=False)  # (b, 1, s)
             value = value * direct.sgn().to(value)
-        return self.pad(value.conj() if self.array_sign > 0 else value)
+        return self.received(query, value.conj() if self.array_sign > 0 else value)

@@ -1,0 +1,248 @@
+"""Responses of front ends: factors of elements and subcarriers that a receiver's links share."""
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Complex, Float, Int
+from torch import Tensor
+
+from gaigs.core.phases import alignment
+from gaigs.core.propagation import fit_gain
+from gaigs.core.query import evenly
+
+
+class Shape(NamedTuple):
+    """Freedom of a response: ``count`` numbers over the band, for each element its own.
+
+    A separable one has the same numbers at all elements, but for a complex gain of each.
+    """
+
+    count: int
+    is_separable: bool
+
+    def __str__(self) -> str:
+        over = "common to" if self.is_separable else "of each of"
+        return f"{self.count} numbers over the band {over} the elements"
+
+
+class FrontEnd(NamedTuple):
+    """The response of a receiver's front end.
+
+    Attributes:
+        response: Factor of each element and subcarrier, of mean power 1. Its common phase is free,
+            and with links of unknown delay its delay.
+        errors: Standard deviation of its complex numbers, by the scatter of the links.
+        explained: Mean share of a link's power that response and direct wave explain.
+    """
+
+    response: Complex[Tensor, "e s"]
+    errors: Float[Tensor, "e s"]
+    explained: float
+
+
+class Chosen(NamedTuple):
+    """A front end, its shape, and scores of free space without and with it at places left out."""
+
+    front_end: FrontEnd
+    shape: Shape
+    before: float
+    after: float
+
+
+@dataclass(frozen=True)
+class FrontEndOptions:
+    """When a receiver gets a response.
+
+    Attributes:
+        fewest_places: Fewer places tell nothing beside their own reflections.
+        least_gain: Least gain of free space's mean score at places left out [dB]; without a front
+            end it is within 0.02 dB in the built-in room.
+        deviations: Least gain in its standard errors.
+        counts: Numbers over the band to choose from.
+        folds: Parts of the places, each left out once.
+        floor: Least error of a link relative to its power, so that none decides alone.
+        rounds: Turns of alignment and mean; the first ones suffice but for strong ripples.
+        most: Numbers of the links that choose, and of those that are fitted.
+    """
+
+    fewest_places: int = 12
+    least_gain: float = 0.2
+    deviations: float = 2.0
+    counts: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
+    folds: int = 4
+    floor: float = 1e-3
+    rounds: int = 6
+    most: tuple[int, int] = (2**17, 2**23)
+
+
+class FrontEndFit:
+    """Fit of a response to the links of one receiver, by what it adds to free space.
+
+    A link is h = g R w exp(j (phi + 2 pi f tau)) + error, with the response R, the direct wave w
+    and a positive gain g; phi and tau are 0 unless the task says that they are unknown. Reflections
+    are errors, whose mean over places vanishes. Turns of phi, tau, g and of R, the mean of h / w
+    weighted by the links' errors, maximise the likelihood.
+
+    Args:
+        labels: Channels of the links.
+        waves: ``direct_waves`` of the same links.
+        task: Of the labels; ``gaigs.core.task.csi.Csi``.
+
+    Source: ours; the turns are Gerchberg and Saxton's (1972) for unknown phases.
+    """
+
+    def __init__(
+        self,
+        labels: Complex[Tensor, "n e s"],
+        waves: Complex[Tensor, "n e s"],
+        task: Any,
+        options: FrontEndOptions,
+    ):
+        self.labels = _unit(labels)
+        self.waves = _unit(waves)
+        self.task = task
+        self.options = options
+
+    def some(self, index: Int[Tensor, " k"]) -> "FrontEndFit":
+        """The fit of some of the links."""
+        return FrontEndFit(self.labels[index], self.waves[index], self.task, self.options)
+
+    def start(self, shape: Shape) -> FrontEnd:
+        """The best of several starts: the mean over links, or single links of unknown phase."""
+        strengths = self.waves.abs()
+        relative = self.labels * self.waves.conj() / torch.where(strengths > 0, strengths, 1)
+        starts = [relative.mean(0)]
+        if self.task.phase != "known":
+            few = evenly(torch.arange(len(relative)), 4)
+            starts = [torch.ones_like(starts[0]), *relative[few]]
+        found = [self.run(shape, start) for start in starts]
+        return max(found, key=lambda one: one.explained)
+
+    def run(self, shape: Shape, response: Complex[Tensor, "e s"]) -> FrontEnd:
+        """Turns of alignment and weighted mean from a response on."""
+        response = self._normal(self._smooth(response, shape))
+        for _ in range(self.options.rounds):
+            model = response * self.waves  # (n, e, s)
+            aligned = _unit(self.task.align(self.labels, model))
+            sizes = model.abs().square().sum((1, 2))  # (n,)
+            products = (model.conj() * aligned).sum((1, 2)).real  # (n,)
+            gains = (products / sizes.clamp_min(1e-30)).clamp_min(0)
+            left = aligned - gains[:, None, None] * model  # (n, e, s)
+            errors = left.abs().square().sum((1, 2))  # (n,)
+            weights = (gains / errors.clamp_min(self.options.floor))[:, None, None]
+            power = (weights * gains[:, None, None] * self.waves.abs().square()).sum(0)  # (e, s)
+            scale = torch.where(power > 0, power, 1)
+            ratio = (weights * aligned * self.waves.conj()).sum(0) / scale  # (e, s)
+            ratio = torch.where(power > 0, ratio, 1)
+            response = self._normal(self._smooth(ratio, shape))
+        # The sandwich estimator: each link's part in the mean, smoothed as the mean.
+        parts = weights * left * self.waves.conj() / scale  # (n, e, s)
+        basis = self._basis(ratio, shape.count)
+        scatter = (parts @ basis.conj() @ basis.mT).abs().square().sum(0).sqrt()  # (e, s)
+        return FrontEnd(response, scatter, (1 - errors).mean().item())
+
+    def likeness(self) -> float:
+        """Share of a few links' power that a free response and the direct wave explain."""
+        few = self.some(evenly(torch.arange(len(self.labels)), 64))
+        return few.start(Shape(max(self.options.counts), True)).explained
+
+    def choose(self, places: Int[Tensor, " n"]) -> Chosen | None:
+        """The response of the best shape; None if none gains enough."""
+        options = self.options
+        several = self.labels.shape[1] > 1
+        last = self.labels.shape[2]
+        counts = sorted({min(count, last) for count in options.counts})
+        shapes = [Shape(count, True) for count in counts]
+        if several:
+            shapes += [Shape(count, False) for count in counts]
+        few = evenly(torch.arange(len(self.labels)), self._most(options.most[0]))
+        chooser = self.some(few)
+        places = places[few]
+        start = chooser.start(Shape(counts[-1], True)).response
+        plain = chooser.left_out(places, None, start)
+        best = None
+        # The largest shapes first: where none of them gains, the others need no look.
+        for number, shape in enumerate(sorted(shapes, key=lambda one: -one.count)):
+            score = chooser.left_out(places, shape, start)
+            gain = score - plain
+            error = gain.std() / math.sqrt(len(gain))
+            if gain.mean() > max(options.least_gain, options.deviations * error):
+                if best is None or score.mean() > best[0]:
+                    best = score.mean().item(), shape
+            elif number == 1 + several and best is None:
+                return None
+        if best is None:
+            return None
+        after, shape = best
+        every = self.some(evenly(torch.arange(len(self.labels)), self._most(options.most[1])))
+        return Chosen(every.run(shape, start), shape, plain.mean().item(), after)
+
+    def left_out(
+        self, places: Int[Tensor, " n"], shape: Shape | None, start: Complex[Tensor, "e s"]
+    ) -> Float[Tensor, " p"]:
+        """Mean score of free space at each place, of responses of the other places' links."""
+        groups, number = places.unique(return_inverse=True)
+        order = torch.randperm(len(groups), generator=torch.Generator().manual_seed(0))
+        fold = order[number] % self.options.folds  # (n,)
+        scores = self.labels.new_zeros(len(places)).real
+        for part in range(self.options.folds):
+            asked = (fold == part).nonzero()[:, 0]
+            rest = self.some((fold != part).nonzero()[:, 0])
+            response = torch.ones_like(start)
+            if shape is not None:
+                response = rest.run(shape, start).response
+            gain = fit_gain(rest.labels, response * rest.waves)
+            values = gain * response * self.waves[asked]
+            # The task's elements are those of the largest array; smaller ones have zeros.
+            both = [
+                torch.nn.functional.pad(part, (0, 0, 0, self.task.elements - part.shape[1]))
+                for part in (self.labels[asked], values)
+            ]
+            scores[asked] = self.task.scores(*both)[self.task.monitor]
+        totals = scores.new_zeros(len(groups)).index_add(0, number, scores)
+        return totals / number.bincount()
+
+    def _most(self, numbers: int) -> int:
+        return max(64, numbers // self.labels[0].numel())
+
+    def _smooth(self, response: Complex[Tensor, "e s"], shape: Shape) -> Complex[Tensor, "e s"]:
+        """The nearest response of a shape."""
+        basis = self._basis(response, shape.count)
+        smooth = response @ basis.conj() @ basis.mT
+        if shape.is_separable and len(response) > 1:
+            left, sizes, right = torch.linalg.svd(smooth, full_matrices=False)
+            smooth = sizes[0] * left[:, :1] * right[:1]
+        return smooth
+
+    def _basis(self, response: Complex[Tensor, "e s"], count: int) -> Complex[Tensor, "s k"]:
+        """Orthonormal polynomials over the band, times the common delay of a response."""
+        frequencies = self.task.frequencies
+        basis = _polynomials(frequencies, count).to(response)
+        if len(frequencies) > count:
+            turns = alignment(response, torch.ones_like(response), frequencies)  # (1, s)
+            basis = turns.conj().mT * basis
+        return basis
+
+    def _normal(self, response: Complex[Tensor, "e s"]) -> Complex[Tensor, "e s"]:
+        """The response of mean power 1, and without a delay that no link tells."""
+        if self.task.phase == "per_link_and_delay":
+            ones = torch.ones_like(response)
+            response = response * alignment(response, ones, self.task.frequencies)
+        return response / response.abs().square().mean().sqrt().clamp_min(1e-30)
+
+
+def _polynomials(frequencies: Float[Tensor, " s"], count: int) -> Float[Tensor, "s k"]:
+    """Orthonormal polynomials over the band of degrees below ``count``; Chebyshev's span them."""
+    middle = (frequencies.min() + frequencies.max()) / 2
+    half = (frequencies.max() - middle).clamp_min(1)
+    angles = ((frequencies - middle) / half).clamp(-1, 1).acos()
+    return torch.linalg.qr((angles[:, None] * torch.arange(count)).cos()).Q
+
+
+def _unit(channels: Complex[Tensor, "n e s"]) -> Complex[Tensor, "n e s"]:
+    """Channels of total power 1 in complex128; zeros stay 0."""
+    wide = channels.to(torch.complex128)
+    sizes = wide.flatten(1).norm(dim=1)[:, None, None]
+    return wide / torch.where(sizes > 0, sizes, 1)

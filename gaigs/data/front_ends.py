@@ -1,0 +1,79 @@
+"""Responses of front ends, learnt from the training links of a data set."""
+
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from gaigs.core.front_ends import FrontEnd, FrontEndFit, FrontEndOptions
+from gaigs.core.scene import Scene, direct_gains, direct_waves
+
+
+class FrontEnds(NamedTuple):
+    """Responses of receivers, and what was found.
+
+    Attributes:
+        responses: Factors of each receiver's channels, 1 where nothing was learnt.
+        errors: Standard deviations of their complex numbers, 0 where nothing was learnt.
+        remark: What was learnt.
+    """
+
+    responses: Complex[Tensor, "r e s"]
+    errors: Float[Tensor, "r e s"]
+    remark: str
+
+
+def learn_responses(links: Any, options: FrontEndOptions | None = None) -> FrontEnds | None:
+    """Responses of the receivers' front ends, by the training links; None where none gains.
+
+    Each receiver decides by the score of free space at training places that are left out.
+    """
+    options = options or FrontEndOptions()
+    task = links.task
+    train = links.split.train
+    shape = (len(links.receivers), *task.shape)
+    responses = torch.ones(shape, dtype=torch.complex64)
+    errors = torch.zeros(shape)
+    sentences = []
+    for receiver, antenna in enumerate(links.receivers):
+        rows = train[links.query.receivers[train] == receiver]
+        rows = rows[links.labels[rows].abs().amax((1, 2)) > 0]
+        places = links.query[rows].transmitters.unique(dim=0, return_inverse=True)[1]
+        count = len(antenna.array)
+        if len(places.unique()) < options.fewest_places or count * shape[2] < 2:
+            continue
+        fit = _better_sign(links, rows, count, options)
+        chosen = fit.choose(places)
+        if chosen is None:
+            continue
+        front_end, freedom, before, after = chosen
+        responses[receiver, :count] = front_end.response
+        errors[receiver, :count] = front_end.errors
+        sentences.append(
+            f"{antenna.name} has a response of its front end, {freedom}: "
+            f"{task.monitor} of free space at places left out {before:.1f} -> {after:.1f}, "
+            f"{_summary(front_end)}"
+        )
+    if not sentences:
+        return None
+    return FrontEnds(responses, errors, "; ".join(sentences))
+
+
+def _better_sign(links: Any, rows: Tensor, count: int, options: FrontEndOptions) -> FrontEndFit:
+    """The fit with the sign of the phases that explains more links."""
+    query = links.query[rows]
+    scene = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, links.task)
+    fits = []
+    for sign in (-1, 1):
+        waves = direct_waves(scene, query, links.task.frequencies, sign)
+        waves = direct_gains(scene, query)[:, None, None] * waves
+        fits.append(FrontEndFit(links.labels[rows, :count], waves[:, :count], links.task, options))
+    return max(fits, key=lambda fit: fit.likeness())
+
+
+def _summary(front_end: FrontEnd) -> str:
+    """Range of a response's level and its relative error."""
+    levels = 20 * front_end.response.abs().clamp_min(1e-6).log10()
+    error = 20 * (front_end.errors.norm() / front_end.response.norm()).log10()
+    return f"{levels.min():.1f} to {levels.max():.1f} dB, error {error:.0f} dB"
