@@ -23,7 +23,7 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-    "lines of gaigs/": 45_079,
+    "lines of gaigs/": 45_804,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
     "module constants": 108,
@@ -185,7 +185,7 @@ def test_the_package_keeps_its_size(imported):
     lines = [len(file.read_text().splitlines()) for file in (ROOT / "gaigs").rglob("*.py")]
     known = {}
     sizes = {
-        "lines of gaigs/": 45_079sum(lines),
+        "lines of gaigs/": sum(lines),
         "lines of a file": max(lines),
         "lines of a function, without its docstring": max(
             max(function_lines(tree), default=0) for tree in FILES.values()

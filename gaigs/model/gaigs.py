@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -241,7 +242,10 @@ class GaussianSplatting(Model):
         self.pooling.fit(links)
         if self.trend is None:
             return
-        self.trend.fit(links)
+        trained = links
+        if links.split.by_receivers:  # receivers that validate stay unknown
+            trained = replace(links, split=links.split.only(links.split.train))
+        self.trend.fit(trained)
         if self.scene.task.dtype.is_complex:
             return  # waves have no level: their phases differ from link to link
         count = len(links.split.train)
@@ -308,6 +312,14 @@ class GaussianSplatting(Model):
         return isinstance(self.pooling, ChannelPooling) and (
             self.trend is None or self.trend.any_frequency
         )
+
+    @property
+    def any_receiver(self) -> bool:  # type: ignore[override]
+        """True if parts that depend on receivers name what belongs to each."""
+        parts = self.placement, self.tokenizer, self.deformation
+        seeing = [part for part in parts if getattr(part, "sees_receivers", False)]
+        knows_all = all(hasattr(part, "take_receivers") for part in seeing)
+        return knows_all and (self.trend is None or self.trend.any_receiver)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups = {}

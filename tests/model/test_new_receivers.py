@@ -1,0 +1,185 @@
+"""Receivers that no measurement has."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+import gaigs
+from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Pose
+from gaigs.model.friis import Friis
+from gaigs.model.knn import KNearestNeighbours
+from gaigs.model.mirrored import MirroredSplatting
+from gaigs.model.path_loss import PathLoss
+
+PLACES = torch.tensor([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]])
+
+
+@pytest.fixture(scope="module")
+def links():
+    return gaigs.links("synthetic_rssi", transmitters=60)
+
+
+@pytest.fixture(scope="module")
+def path_loss(links):
+    model = PathLoss(links.scene)
+    model.fit(links)
+    return model
+
+
+def test_a_new_receiver_has_the_mean_law(path_loss):
+    distances = (PLACES - torch.tensor([3.0, 2.0, 2.0])).norm(dim=1)
+    law = path_loss.levels.mean() - 10 * path_loss.exponents.mean() * distances.log10()
+    for receiver in (
+        [3, 2, 2],
+        [3.0, 2.0, 2.0],
+        Pose.at([3.0, 2.0, 2.0]),
+        Receiver("door", Pose.at([3.0, 2.0, 2.0])),
+    ):
+        torch.testing.assert_close(path_loss.predict(PLACES, receiver=receiver), law)
+
+
+def test_whole_numbers_beside_as_many_transmitters_are_indices(path_loss):
+    places = PLACES[[0, 1, 0]]
+    indices = path_loss.predict(places, receiver=[3, 2, 2])
+    every = path_loss.predict(places)
+    torch.testing.assert_close(indices, torch.stack((every[0, 3], every[1, 2], every[2, 2])))
+
+
+def test_a_receiver_of_the_scene_is_known(path_loss, links):
+    own = path_loss.predict(PLACES, receiver=links.receivers[1])
+    assert torch.equal(own, path_loss.predict(PLACES, receiver="south"))
+
+
+def test_batches_and_models_at_receivers_agree(path_loss):
+    door = Receiver("door", Pose.at([3.0, 2.0, 2.0]))
+    moved = path_loss.at_receivers([door, path_loss.scene.receivers[0]])
+    values = moved.predict(PLACES)
+    assert values.shape == (2, 2)
+    assert torch.equal(values[:, 0], path_loss.predict(PLACES, receiver=door))
+    assert torch.equal(values[:, 0], torch.cat([*path_loss.predict_batches(PLACES, door)]))
+    own = path_loss.predict(PLACES, receiver=0)
+    assert not torch.allclose(values[:, 1], own)  # of a receiver in general
+
+
+def test_errors_say_what_to_do(path_loss, links):
+    with pytest.raises(ValueError, match="receiver must be"):
+        path_loss.predict(PLACES, receiver=[3.0, 2.0])
+    with pytest.raises(ValueError, match="finite"):
+        path_loss.predict(PLACES, receiver=[math.nan, 2.0, 2.0])
+    knn = KNearestNeighbours(links.scene)
+    knn.fit(links)
+    with pytest.raises(ValueError, match="own receivers alone; for others take"):
+        knn.predict(PLACES, receiver=[3.0, 2.0, 2.0])
+    channels = gaigs.links("synthetic_csi", transmitters=20, order=0)
+    friis = Friis(channels.scene)
+    friis.fit(channels)
+    with pytest.raises(ValueError, match="orientation"):
+        friis.predict(PLACES, receiver=[3.0, 2.0, 2.0])
+
+
+def test_free_space_reaches_a_new_array(links):
+    channels = gaigs.links("synthetic_csi", transmitters=30, order=0)
+    friis = Friis(channels.scene)
+    friis.fit(channels)
+    pose = channels.receivers[0].pose
+    moved = Pose(pose.position + 0.5, pose.rotation)
+    there = friis.predict(PLACES + 0.5, receiver=moved)
+    torch.testing.assert_close(there, friis.predict(PLACES, receiver=0), atol=1e-6, rtol=1e-3)
+
+
+def test_mirrored_gaussians_share_the_room(links, tmp_path):
+    model = MirroredSplatting(links.scene, trend="mean")
+    model.fit(links)
+    with torch.no_grad():
+        model.placement.receiver_gains.copy_(torch.tensor([0.0, 0.2, 0.4, 0.6]))
+    model.eval()
+    own = links.receivers[2]
+    other = model.at_receivers([own])
+    # The same room seen from the same place: gains differ alone.
+    gain = 20 / math.log(10) * (0.3 - 0.4) + model.trend.means.mean() - model.trend.means[2]
+    expected = model.predict(PLACES, receiver=2) + gain
+    torch.testing.assert_close(other.predict(PLACES)[:, 0], expected, atol=1e-3, rtol=0)
+    far = model.at_receivers([Receiver("far", Pose.at([20.0, 2.0, 2.0]))])
+    far.save(tmp_path / "far.ckpt")  # the room does not move with the receivers
+    assert torch.equal(gaigs.load(tmp_path / "far.ckpt").predict(PLACES), far.predict(PLACES))
+
+
+def readings(links, receiver, index):
+    """Some links of one receiver, which is their only one."""
+    query = links.query[index]
+    query.receivers = torch.zeros_like(query.receivers)
+    only = {
+        "query": query,
+        "labels": links.labels[index],
+        "receivers": (links.receivers[receiver],),
+    }
+    return replace(links, **only, split=None, rows=None)
+
+
+def test_held_out_receivers_have_the_prediction_of_a_new_one():
+    links = gaigs.links("synthetic_rssi", transmitters=60, split="receivers", hold=["west"])
+    assert links.split.by_receivers
+    assert set(links.query.receivers[links.split.test].tolist()) == {0}
+    for name in ("path_loss", "mean", "gaussian_process"):
+        model = gaigs.train(name, links, progress=False)
+        new = model.predict(PLACES, receiver=Receiver("new", links.receivers[0].pose))
+        torch.testing.assert_close(model.predict(PLACES, receiver="west"), new, msg=name)
+    result = gaigs.evaluate(model, links)
+    assert list(result.models) == ["gaussian_process", "mean", "path_loss"]  # knn has no neighbours
+    with pytest.raises(ValueError, match="receivers with links alone"):
+        gaigs.train("knn", links)
+
+
+def test_trained_models_learn_nothing_of_receivers_that_validate_or_test():
+    links = gaigs.links("synthetic_rssi", transmitters=40, receivers=6, split="receivers")
+    model = MirroredSplatting(links.scene, trend="mean")
+    model.fit(links)
+    heard = links.query.receivers[links.split.train].unique()
+    assert model.placement.is_heard.nonzero()[:, 0].tolist() == heard.tolist()
+    others = [number for number in range(6) if number not in heard]
+    assert torch.allclose(model.trend.means[others], model.trend.means[heard].mean())
+
+
+def test_intervals_at_new_receivers_count_receivers(tmp_path):
+    links = gaigs.links("synthetic_rssi", transmitters=80, receivers=9, split="receivers")
+    model = gaigs.train("path_loss", links, progress=False)
+    test = links.split.test
+    estimate = model.predict(links.query[test], interval=0.9)
+    at_known = model.predict(links.query[links.split.train], interval=0.9)
+    assert (estimate.upper - estimate.lower).min() > (at_known.upper - at_known.lower).max()
+    labels = links.labels[test]
+    share = ((estimate.lower <= labels) & (labels <= estimate.upper)).double().mean()
+    assert share > 0.8
+    model.save(tmp_path / "room.ckpt")
+    again = gaigs.load(tmp_path / "room.ckpt").predict(links.query[test], interval=0.9)
+    assert torch.equal(again.upper, estimate.upper)
+    moved = model.predict(PLACES, receiver=[3.0, 2.0, 2.0], interval=0.9)
+    assert torch.isfinite(moved.std).all()
+
+
+def test_readings_at_a_new_receiver_correct_its_level():
+    links = gaigs.links("synthetic_rssi", transmitters=80, receivers=9, split="receivers")
+    model = gaigs.train("path_loss", links, progress=False)
+    receiver = int(links.query.receivers[links.split.test[0]])
+    own = (links.query.receivers == receiver).nonzero()[:, 0]
+    far = readings(links, receiver, own[:60])
+    far.labels.add_(20.0)  # cables and front end
+    before = model.at_receivers(far.receivers)
+    errors = []
+    for count in (0, 3, 10, 60):
+        some = readings(far, 0, torch.arange(max(count, 1)))
+        moved = model.adapt(some) if count else before
+        rest = far.query
+        errors.append((moved.predict(rest) - far.labels).mean().abs().item())
+    assert errors[0] > errors[1] > errors[2] > errors[3]
+    wide, narrow = (one.predict(PLACES, 0, interval=0.9) for one in (before, moved))
+    assert (narrow.upper - narrow.lower < wide.upper - wide.lower).all()
+    between, within = before.calibration.scatter.tolist()
+    error = (far.labels - before.predict(far.query)).double().mean().item()
+    shift = (moved.levels - before.levels).item()
+    assert shift == pytest.approx(error * between / (between + within / 60), rel=1e-4)
+    with pytest.raises(ValueError, match="adapt takes a model of levels"):
+        gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0)).adapt(far)
