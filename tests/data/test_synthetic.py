@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+import gaigs
 from gaigs.core.geometry import Grid
 from gaigs.data import load
 from gaigs.data.synthetic import REGION, ROOM, meshes, spectra
@@ -118,3 +119,26 @@ def test_the_documented_room_is_simulated_and_written(tmp_path, monkeypatch):
     exec(code, {})
     links = read(tmp_path / "my_room")
     assert (len(links.split.train), len(links.split.test)) == (160, 40)
+
+
+def test_so_many_receivers_hang_on_the_walls():
+    from gaigs.data.synthetic import ROOM, wall_poses
+
+    poses = wall_poses(ROOM, 12)
+    places = torch.stack([pose.position for pose in poses])
+    size = torch.tensor(ROOM.size)
+    to_wall = torch.minimum(places, size - places)[:, :2].amin(1)
+    torch.testing.assert_close(to_wall, torch.full((12,), 0.1))
+    assert torch.cdist(places, places).add(10 * torch.eye(12)).min() > 0.8
+    for pose in poses:  # which face the room
+        assert pose.rotation[:, 2] @ (size / 2 - pose.position) > 0
+        torch.testing.assert_close(pose.rotation.det(), torch.tensor(1.0))
+    links = gaigs.links("synthetic", transmitters=4, receivers=3, order=0)
+    alone = gaigs.links("synthetic", transmitters=4, order=0)
+    assert len(links) == 12
+    assert len(alone.receivers) == 1
+    assert torch.equal(links.query.transmitters[::3], alone.query.transmitters)
+    channels = gaigs.links("synthetic_csi", transmitters=4, receivers=3, order=0)
+    assert channels.query.receivers.tolist() == 4 * [0, 1, 2]
+    with pytest.raises(ValueError, match="receivers must be at least 1"):
+        gaigs.links("synthetic_rssi", transmitters=4, receivers=0)

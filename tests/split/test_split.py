@@ -289,3 +289,43 @@ def test_a_configuration_has_every_option_with_its_default(file):
     assert mandatory == {name for name, p in parameters.items() if p.default is p.empty} - {"links"}
     defaults = {name: parameters[name].default for name in options}
     assert options == defaults | ({"length": 100} if file.stem == "official_runs" else {})
+
+
+def test_receivers_are_held_out_whole():
+    rng = torch.Generator().manual_seed(0)
+    places = torch.rand(40, 3, generator=rng)
+    base = links_at(places[torch.arange(40).repeat_interleave(6)])
+    pose = Pose(torch.zeros(3), torch.eye(3))
+    many = replace(
+        base,
+        query=replace(base.query, receivers=torch.arange(6).repeat(40)),
+        receivers=tuple(Receiver(f"ap{number}", pose) for number in range(6)),
+    )
+
+    def heard(part_of):
+        return set(many.query.receivers[part_of].tolist())
+
+    folds = [part(many, name="receivers", fold=f"{number}/3") for number in (1, 2, 3)]
+    assert sorted(receiver for split in folds for receiver in heard(split.test)) == [*range(6)]
+    for split in folds:
+        parts = [heard(one) for one in split.parts().values()]
+        assert len(parts[1]) == 1
+        assert not set.intersection(*parts)
+        assert sum(map(len, parts)) == 6
+        assert len(torch.cat([*split.parts().values()])) == 240
+        assert split.by_receivers
+    named = part(many, name="receivers", hold=["ap4", "ap1"])
+    assert heard(named.test) == {1, 4}
+    assert named.name.startswith("receivers ap4, ap1")
+    few = part(many, name="receivers", hold=["ap0", "ap1", "ap2", "ap3"])
+    assert heard(few.train) == heard(few.validation) == {4, 5}  # of two, places validate
+    assert not len(part(many, name="receivers", validation=0.0).validation)
+    for options, words in (
+        ({"hold": ["cellar"]}, "got 'cellar'"),
+        ({"fold": "4/3"}, "split.fold must be a fold such as 1/3"),
+        ({"fold": "x"}, "split.fold must be a fold"),
+        ({"test": 0.9}, "two receivers or more to train on"),
+        ({"test": 1.5}, "split.test must be"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            part(many, name="receivers", **options)
