@@ -4,7 +4,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -41,9 +40,9 @@ def figure(plan: SitePlan) -> Figure:
         drawn = style.new_figure(count * style.COLUMN, 0.46 * style.PAGE, "compressed")
         panels = drawn.subplots(1, count, sharey=True, squeeze=False)[0]
         if count == 2:
-            draw_map(panels[0], plan, plan.before)
+            draw_map(panels[0], plan, plan.qualities[0])
             panels[0].set_title(f"as it stands: mean {plan.scores[0]:.3g} {plan.score_unit}")
-        image = draw_map(panels[-1], plan, plan.after, plan.places)
+        image = draw_map(panels[-1], plan, plan.qualities[-1], plan.places)
         panels[-1].set_title(f"with the new ones: mean {plan.scores[-1]:.3g} {plan.score_unit}")
         names = {"coverage": f"chance of a reading above {plan.threshold:g} {plan.unit}"}
         names |= {"mean": "expected best reading", "locate": "error of a location"}
@@ -58,7 +57,7 @@ def plot_plan(result: SitePlan, ax: Any = None) -> Any:
     """Draws the map with the new places on ``ax``; without it a figure of its own."""
     if ax is None:
         return figure(result).axes[:-1]
-    draw_map(ax, result, result.after, result.places)
+    draw_map(ax, result, result.qualities[-1], result.places)
     ax.legend()
     return ax
 
@@ -71,7 +70,7 @@ def draw_map(
     y, rows = np.unique(plan.area[:, 1].numpy(), return_inverse=True)
     cells = rows * len(x) + columns  # of a grid, so each has as many heights
     means = np.bincount(cells, values.numpy()) / np.bincount(cells)
-    shown = torch.cat((plan.before, plan.after)) if len(plan.standing) else plan.after
+    shown = plan.qualities[[0, -1] if len(plan.standing) else [-1]]
     ends = (0, 100) if plan.objective == "coverage" else (float(shown.min()), float(shown.max()))
     colours = "viridis_r" if plan.objective == "locate" else "viridis"  # bright is good
     look = {"cmap": colours, "vmin": ends[0], "vmax": ends[1], "rasterized": True}

@@ -1,6 +1,8 @@
-"""What sets of receivers are worth at places, and the greedy choice of a set."""
+"""What sets of receivers are worth at places, and the greedy choice of a set.
 
-from typing import NamedTuple
+Readings of receivers are independent normal variables, so a set is worth what a product over its
+receivers tells.
+"""
 
 import torch
 from jaxtyping import Float, Int
@@ -9,68 +11,55 @@ from torch import Tensor
 from gaigs.core.stages import track
 
 
-class Objective:
-    """A quality of places that depends on a product over receivers, whose readings are independent
-    normal variables.
+class Coverage:
+    """Chance that the best receiver's reading is above a threshold [%].
+
+    All readings are below it with the product of their chances to be below.
 
     Args:
         values: Expected readings of receivers at places (r, g) [dBm].
         deviations: Standard deviations of the readings (r, g) [dB].
+        threshold: The threshold [dBm].
     """
 
-    higher_is_better = True
+    sign = 1  # higher is better
 
-    def __init__(self, values: Float[Tensor, "r g"], deviations: Float[Tensor, "r g"]):
+    def __init__(
+        self, values: Float[Tensor, "r g"], deviations: Float[Tensor, "r g"], threshold: float
+    ):
         self.values = values
         self.deviations = deviations
+        self.thresholds = values.new_tensor([threshold])  # (t,)
 
     def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g t"]:
-        """Factors of receivers."""
-        raise NotImplementedError
+        """Factors of some receivers."""
+        above = self.thresholds - self.values[index, :, None]  # (k, g, t)
+        return torch.special.ndtr(above / self.deviations[index, :, None])
 
     def quality(self, products: Float[Tensor, "*sets g t"]) -> Float[Tensor, "*sets g"]:
-        """The quality of each place, by the products of sets of receivers."""
-        raise NotImplementedError
+        """Quality of each place, by products of factors."""
+        return 100 * (1 - products[..., 0])
 
 
-class MeanLevel(Objective):
-    """Reading of the best receiver [dBm]: its least level, and the integral of the chance that it
-    is above a level; see ``Coverage``.
+class MeanLevel(Coverage):
+    """Expected reading of the best receiver [dBm].
+
+    It is a level below all readings, and the integral above it of the chance to be covered.
     """
 
     def __init__(
         self, values: Float[Tensor, "r g"], deviations: Float[Tensor, "r g"], steps: int = 64
     ):
-        super().__init__(values, deviations)
         low = (values - 4 * deviations).min().item()  # 3e-5 of a normal variable is lower
         high = (values + 4 * deviations).max().item()
-        self.thresholds = torch.linspace(low, high, steps, dtype=values.dtype)  # (t,)
-
-    def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g t"]:
-        above = self.thresholds - self.values[index, :, None]  # (k, g, t)
-        return torch.special.ndtr(above / self.deviations[index, :, None])
+        super().__init__(values, deviations, low)
+        self.thresholds = torch.linspace(low, high, steps, dtype=values.dtype)
 
     def quality(self, products: Float[Tensor, "*sets g t"]) -> Float[Tensor, "*sets g"]:
         return self.thresholds[0] + torch.trapezoid(1 - products, self.thresholds, dim=-1)
 
 
-class Coverage(MeanLevel):
-    """Chance that the best receiver's reading is above a threshold [%].
-
-    All are below it with the product of their chances to be below.
-    """
-
-    def __init__(
-        self, values: Float[Tensor, "r g"], deviations: Float[Tensor, "r g"], threshold: float
-    ):
-        super().__init__(values, deviations)
-        self.thresholds = values.new_tensor([threshold])
-
-    def quality(self, products: Float[Tensor, "*sets g 1"]) -> Float[Tensor, "*sets g"]:
-        return 100 * (1 - products[..., 0])
-
-
-class LocationError(Objective):
+class LocationError:
     """Root mean square error of a location by the readings of all receivers [m].
 
     Readings at a place y give a place y' an expected likelihood: a normal density of the difference
@@ -80,10 +69,11 @@ class LocationError(Objective):
     alike, which the bound does not know.
 
     Args:
+        values, deviations: As of ``Coverage``.
         places: Possible places, all alike (g, 3) [m].
     """
 
-    higher_is_better = False
+    sign = -1  # lower is better
 
     def __init__(
         self,
@@ -91,10 +81,12 @@ class LocationError(Objective):
         deviations: Float[Tensor, "r g"],
         places: Float[Tensor, "g 3"],
     ):
-        super().__init__(values, deviations)
+        self.values = values
+        self.deviations = deviations
         self.squares = torch.cdist(places, places).square().to(values)  # (g, g)
 
     def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g g"]:
+        """Factors of some receivers."""
         means, variances = self.values[index], self.deviations[index].square()
         variances = variances[:, :, None] + variances[:, None]  # (k, g, g)
         apart = means[:, :, None] - means[:, None]
@@ -103,42 +95,33 @@ class LocationError(Objective):
         return (scale / variances).sqrt() * torch.exp(-apart.square() / (2 * variances))
 
     def quality(self, products: Float[Tensor, "*sets g g"]) -> Float[Tensor, "*sets g"]:
+        """Quality of each place, by products of factors."""
         return ((products * self.squares).sum(-1) / products.sum(-1) / 2).sqrt()
 
 
-class Choice(NamedTuple):
-    """Chosen receivers (n,), and the quality of each place before and after each (n + 1, g)."""
-
-    chosen: Int[Tensor, " n"]
-    qualities: Float[Tensor, "n1 g"]
-
-
-def choose(objective: Objective, standing: int, count: int, most: int = 4_000_000) -> Choice:
-    """Receivers beside the first ones, which stand; each the best in the mean over the places.
+def choose(
+    rule: Coverage | LocationError, standing: int, count: int, most: int = 4_000_000
+) -> tuple[Int[Tensor, " n"], Float[Tensor, "n1 g"]]:
+    """Receivers, each the best in the mean over places beside the first ones, which stand; and the
+    quality of each place before and after each choice.
 
     Coverage and mean level are monotone and submodular, so they gain at least 1 - 1/e of what the
     best set gains (Nemhauser, Wolsey and Fisher, An analysis of approximations for maximizing
-    submodular set functions, 1978).
-
-    Args:
-        objective: The quality of places, by readings of all receivers.
-        standing: Number of receivers that stand.
-        count: Number of receivers to choose.
-        most: Largest number of numbers in a part of all factors.
+    submodular set functions, 1978). ``most`` factors are held at a time.
     """
-    rows = torch.arange(len(objective.values))
-    product = torch.ones_like(objective.factors(rows[:1])[0])  # (g, t)
+    rows = torch.arange(len(rule.values))
+    product = torch.ones_like(rule.factors(rows[:1])[0])  # (g, t)
     parts = rows.split(max(1, most // product.numel()))
     for receiver in rows[:standing, None]:
-        product = product * objective.factors(receiver)[0]
-    qualities = [objective.quality(product)]
+        product = product * rule.factors(receiver)[0]
+    qualities = [rule.quality(product)]
     is_free = rows >= standing
     chosen = []
     for _ in track(range(count), "receivers to place"):
-        means = [objective.quality(product * objective.factors(k)).mean(-1) for k in parts]
-        gains = torch.cat(means) * (1 if objective.higher_is_better else -1)
+        means = [rule.quality(product * rule.factors(part)).mean(-1) for part in parts]
+        gains = rule.sign * torch.cat(means)
         chosen.append(gains.masked_fill(~is_free, -torch.inf).argmax())
         is_free[chosen[-1]] = False
-        product = product * objective.factors(chosen[-1][None])[0]
-        qualities.append(objective.quality(product))
-    return Choice(torch.stack(chosen), torch.stack(qualities))
+        product = product * rule.factors(chosen[-1][None])[0]
+        qualities.append(rule.quality(product))
+    return torch.stack(chosen), torch.stack(qualities)

@@ -1,7 +1,9 @@
 """Where to put access points: candidates that are chosen one by one, by predicted levels."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,8 +23,6 @@ from gaigs.io.tables import write_table
 from gaigs.model import Model
 from gaigs.registry import check_type, suggest
 
-OBJECTIVES = {"coverage": Coverage, "mean": MeanLevel, "locate": LocationError}
-
 
 @dataclass(frozen=True, repr=False)
 class SitePlan:
@@ -30,11 +30,10 @@ class SitePlan:
 
     Attributes:
         places: Chosen candidates, the first choice first (n, 3) [m].
-        scores: Mean of the objective over the area, before and after each place (n + 1,). The mean
-            level before is NaN if no receiver stands.
         standing: Receivers that stand already (k, 3) [m].
         area: Places of transmitters (g, 3) [m].
-        before, after: The objective at each of them (g,).
+        qualities: The objective at each of them, before and after each choice (n + 1, g). The mean
+            level of no receivers is NaN.
         objective: ``coverage`` [%], ``mean`` in the unit of the labels, or ``locate`` [m].
         threshold: Level that ``coverage`` asks for.
         unit: Unit of the labels.
@@ -42,11 +41,9 @@ class SitePlan:
     """
 
     places: Float[Tensor, "n 3"]
-    scores: Float[Tensor, " n1"]
     standing: Float[Tensor, "k 3"]
     area: Float[Tensor, "g 3"]
-    before: Float[Tensor, " g"]
-    after: Float[Tensor, " g"]
+    qualities: Float[Tensor, "n1 g"]
     objective: str
     threshold: float
     unit: str
@@ -54,8 +51,12 @@ class SitePlan:
     plot = plot
 
     @property
+    def scores(self) -> Float[Tensor, " n1"]:
+        """Mean of the objective over the area, before and after each choice."""
+        return self.qualities.mean(1)
+
+    @property
     def score_unit(self) -> str:
-        """Unit of the scores."""
         return {"coverage": "%", "locate": "m"}.get(self.objective, self.unit)
 
     def __repr__(self) -> str:
@@ -69,7 +70,7 @@ class SitePlan:
         if self.objective == "coverage":
             return f"{subject} {first} to {last} % above {self.threshold:g} {self.unit}".rstrip()
         what = "mean best level" if self.objective == "mean" else "expected error of locations"
-        start = "" if math.isnan(self.scores[0]) else f"from {first} "
+        start = "" if first == "nan" else f"from {first} "
         return f"{subject} the {what} {start}to {last} {self.score_unit}".rstrip()
 
     def save(self, path: str | Path) -> None:
@@ -122,39 +123,37 @@ def place(
     """
     scene = scalar_scene(model, "a placement")
     check_type("count", count, int)
-    if objective not in OBJECTIVES:
-        got = suggest(objective, OBJECTIVES)
-        raise ValueError(f"objective must be one of {', '.join(OBJECTIVES)}, got {got}")
     if not math.isfinite(threshold):
         raise ValueError(f"threshold must be a finite level, got {threshold}")
     sites = candidate_places(scene, candidates)
     if not 1 <= count <= len(sites):
         raise ValueError(f"count must be 1 to {len(sites)}, the candidates, got {count}")
     area = survey_places(model, region, None).candidates  # (g, 3)
+    rules: dict[str, Callable[..., Coverage | LocationError]] = {
+        "coverage": partial(Coverage, threshold=float(threshold)),
+        "mean": MeanLevel,
+        "locate": partial(LocationError, places=area),
+    }
+    if objective not in rules:
+        got = suggest(objective, rules)
+        raise ValueError(f"objective must be one of {', '.join(rules)}, got {got}")
     standing = scene.positions(area) if known else area[:0]
     frequency = scene.middle_frequency if frequency is None else frequency
 
     parts = []
-    receivers = [*range(len(standing)), *sites]
-    for receiver in track(receivers, "predicted receivers"):
+    for receiver in track([*range(len(standing)), *sites], "predicted receivers"):
         # An interval brings the deviation, whatever its level.
         estimate = model.predict(area, receiver=receiver, frequency=frequency, interval=0.5)
         parts.append(torch.stack(estimate[:2]).double().cpu())  # (2, g)
     values, deviations = torch.stack(parts, 1)  # (k + c, g) each
-    options = {"coverage": {"threshold": float(threshold)}, "locate": {"places": area}}
-    rule = OBJECTIVES[objective](values, deviations, **options.get(objective, {}))
-    chosen, qualities = choose(rule, len(standing), count)
-
-    scores = qualities.mean(1)
+    chosen, qualities = choose(rules[objective](values, deviations), len(standing), count)
     if objective == "mean" and not len(standing):
-        scores[0] = math.nan
+        qualities[0] = math.nan
     return SitePlan(
         sites[chosen - len(standing)],
-        scores,
         standing,
         area,
-        qualities[0],
-        qualities[-1],
+        qualities,
         objective,
         float(threshold),
         scene.task.unit,
@@ -166,8 +165,7 @@ def candidate_places(scene: Scene, candidates: object, usual: int = 64) -> Float
     """Candidates of the argument of ``place``."""
     if candidates is not None and not isinstance(candidates, int | float):
         return as_positions("candidates", candidates).reshape(-1, 3)
-    lower, upper = scene.box
-    x, y = torch.stack((lower, upper))[:, :2].T.numpy()
+    x, y = torch.stack(scene.box)[:, :2].T.numpy()
     corners = np.stack((x[[0, 1, 1, 0, 0]], y[[0, 0, 1, 1, 0]]))  # (2, 5), once around
     lengths = np.append(0, np.hypot(*np.diff(corners)).cumsum())  # (5,) on the way
     spacing = lengths[-1] / usual if candidates is None else candidates
@@ -175,6 +173,6 @@ def candidate_places(scene: Scene, candidates: object, usual: int = 64) -> Float
         least = f"{lengths[-1] / 10_000:.2g}"
         raise ValueError(f"candidates must be {least} m apart or more, got {candidates} m")
     walk = np.arange(0, lengths[-1] - 1e-6, spacing)
-    height = np.full(len(walk), scene.positions(lower)[:, 2].median())
     rim = [np.interp(walk, lengths, corner) for corner in corners]
+    height = np.full(len(walk), scene.positions(scene.lower)[:, 2].median())
     return torch.from_numpy(np.stack((*rim, height), 1)).float()
