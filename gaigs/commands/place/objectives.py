@@ -100,28 +100,72 @@ class LocationError:
 
 
 def choose(
-    rule: Coverage | LocationError, standing: int, count: int, most: int = 4_000_000
+    rule: Coverage | LocationError, standing: int, count: int
 ) -> tuple[Int[Tensor, " n"], Float[Tensor, "n1 g"]]:
-    """Receivers, each the best in the mean over places beside the first ones, which stand; and the
-    quality of each place before and after each choice.
+    """Receivers that together are best beside the first ones, which stand; and the quality of each
+    place before and after each of them.
 
+    Each is the best beside those before it; then single ones are exchanged as long as that helps.
     Coverage and mean level are monotone and submodular, so they gain at least 1 - 1/e of what the
     best set gains (Nemhauser, Wolsey and Fisher, An analysis of approximations for maximizing
-    submodular set functions, 1978). ``most`` factors are held at a time.
+    submodular set functions, 1978, which has both steps).
     """
     rows = torch.arange(len(rule.values))
-    product = torch.ones_like(rule.factors(rows[:1])[0])  # (g, t)
-    parts = rows.split(max(1, most // product.numel()))
-    for receiver in rows[:standing, None]:
+    start = torch.ones_like(rule.factors(rows[:1])[0])  # (g, t)
+    start = product_of(rule, start, rows[:standing])
+    candidates = rows[standing:]
+    chosen = greedy(rule, start, candidates, count)
+    score = means(rule, product_of(rule, start, chosen[:-1]), chosen[-1:])[0]
+    kept = 0  # receivers tried since the last exchange
+    while 1 < count and kept < count:
+        others = chosen[1:]
+        gains = means(rule, product_of(rule, start, others), candidates)
+        gains[(candidates[:, None] == others).any(1)] = -torch.inf
+        is_better = gains.max() > score + 1e-9
+        kept = 1 if is_better else kept + 1
+        score = torch.maximum(score, gains.max())
+        last = candidates[gains.argmax()] if is_better else chosen[0]
+        chosen = torch.cat((others, last[None]))
+    chosen = greedy(rule, start, chosen, count)
+    products = [product_of(rule, start, chosen[:number]) for number in range(count + 1)]
+    return chosen, torch.stack([rule.quality(product) for product in products])
+
+
+def product_of(
+    rule: Coverage | LocationError, product: Float[Tensor, "g t"], index: Int[Tensor, " k"]
+) -> Float[Tensor, "g t"]:
+    """A product with the factors of further receivers."""
+    for receiver in index[:, None]:
         product = product * rule.factors(receiver)[0]
-    qualities = [rule.quality(product)]
-    is_free = rows >= standing
-    chosen = []
+    return product
+
+
+def means(
+    rule: Coverage | LocationError,
+    product: Float[Tensor, "g t"],
+    index: Int[Tensor, " k"],
+    most: int = 4_000_000,
+) -> Float[Tensor, " k"]:
+    """Mean quality over the places with each one of some receivers, negative where lower is better;
+    at most ``most`` factors are held.
+    """
+    parts = index.split(max(1, most // product.numel()))
+    return torch.cat(
+        [rule.sign * rule.quality(product * rule.factors(part)).mean(-1) for part in parts]
+    )
+
+
+def greedy(
+    rule: Coverage | LocationError,
+    product: Float[Tensor, "g t"],
+    index: Int[Tensor, " k"],
+    count: int,
+) -> Int[Tensor, " n"]:
+    """Some of the receivers, each the best beside those before it."""
+    chosen = index[:0]
     for _ in track(range(count), "receivers to place"):
-        means = [rule.quality(product * rule.factors(part)).mean(-1) for part in parts]
-        gains = rule.sign * torch.cat(means)
-        chosen.append(gains.masked_fill(~is_free, -torch.inf).argmax())
-        is_free[chosen[-1]] = False
-        product = product * rule.factors(chosen[-1][None])[0]
-        qualities.append(rule.quality(product))
-    return torch.stack(chosen), torch.stack(qualities)
+        best = index[means(rule, product, index).argmax()]
+        chosen = torch.cat((chosen, best[None]))
+        index = index[index != best]
+        product = product_of(rule, product, best[None])
+    return chosen

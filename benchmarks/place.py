@@ -1,0 +1,139 @@
+"""Two access points chosen by predicted levels, beside the best pair by the true levels: python
+benchmarks/place.py [--minutes 4] [--seed 0].
+
+Links are those of ``synthetic_rssi``. Candidates stand 10 cm off the walls of the built-in room,
+0.5 m apart at three heights, outside the furniture. The simulation gives the true level of each
+candidate at 600 further places; a reading scatters about it by 2 dB. A pair is judged by these:
+greedy by the models' predictions, greedy by the truth, the median of all pairs, and the best of all
+pairs. Gains are counted from no receiver, or from the four gateways of the room.
+"""
+
+import argparse
+
+import torch
+
+import gaigs
+from gaigs.commands.place.objectives import Coverage, LocationError, MeanLevel, choose
+from gaigs.data.readings import gateway
+from gaigs.data.simulation import rss_dbm
+from gaigs.data.synthetic import ROOM, default_room
+from gaigs.data.synthetic.image_source import is_free
+
+NOISE, CARRIER, BAND = 2.0, 2.441e9, 78e6
+
+
+def candidates(spacing=0.5, margin=0.1, heights=(1.2, 1.8, 2.4)):
+    """Places along the walls, (c, 3) [m]."""
+    width, depth, _ = ROOM.size
+    points = []
+    for height in heights:
+        for x in torch.arange(margin, width - margin + 1e-6, spacing).tolist():
+            points += [(x, margin, height), (x, depth - margin, height)]
+        for y in torch.arange(margin + spacing, depth - margin - 1e-6, spacing).tolist():
+            points += [(margin, y, height), (width - margin, y, height)]
+    places = torch.tensor(points)
+    return places[is_free(ROOM, places)]
+
+
+def true_levels(room, sites, places):
+    """Levels without noise (c, g) [dBm]."""
+    offsets = room.frequency_offsets(BAND)
+    levels = []
+    for site in sites.tolist():
+        responses = room.respond(places, gateway("site", tuple(site)), CARRIER, offsets)
+        levels.append(torch.cat([*map(rss_dbm, responses)]))
+    return torch.stack(levels)
+
+
+def rules(places, threshold):
+    """Objectives by name, each a function of levels and deviations."""
+    return {
+        "coverage": lambda *levels: Coverage(*levels, threshold),
+        "mean": MeanLevel,
+        "locate": lambda *levels: LocationError(*levels, places),
+    }
+
+
+def pair_scores(rule, standing):
+    """Mean quality of each pair of candidates beside the first ``standing`` receivers (pairs,)."""
+    rows = torch.arange(standing, len(rule.values))
+    product = torch.ones_like(rule.factors(rows[:1])[0])
+    for receiver in torch.arange(standing)[:, None]:
+        product = product * rule.factors(receiver)[0]
+    scores = []
+    for row in rows[:-1]:
+        first = product * rule.factors(row[None])[0]
+        for part in rows[rows > row].split(16):
+            scores.append(rule.quality(first * rule.factors(part)).mean(-1))
+    return torch.cat(scores)
+
+
+def score(rule, standing, chosen):
+    """Mean quality of chosen receivers beside those that stand."""
+    rows = torch.cat((torch.arange(standing), chosen))
+    product = torch.ones(())
+    for row in rows[:, None]:
+        product = product * rule.factors(row)[0]
+    return rule.quality(product).mean().item()
+
+
+def trained(links, minutes, seed):
+    """Models by name."""
+    seconds = round(60 * minutes)
+    time = f"00:{seconds // 3600:02}:{seconds // 60 % 60:02}:{seconds % 60:02}"
+    return {
+        "path_loss": gaigs.train("path_loss", links),
+        "mirrored": gaigs.train("mirrored", links, max_time=time, seed=seed),
+    }
+
+
+def main():
+    shape = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=shape)
+    parser.add_argument("--minutes", type=float, default=4, help="of the training of mirrored")
+    parser.add_argument("--seed", type=int, default=0, help="of the data and of the training")
+    parser.add_argument("--mirrored", help="a checkpoint, in place of the training")
+    parser.add_argument("--thresholds", nargs="+", type=float, default=[-65, -60, -55, -50])
+    options = parser.parse_args()
+    links = gaigs.links("synthetic_rssi", seed=options.seed)
+    room = default_room(2)
+    places = room.place(600, options.seed + 1000)
+    sites = candidates()
+    stands = links.scene.positions(sites)
+    truth = true_levels(room, torch.cat((stands, sites)), places)  # (k + c, g)
+    if options.mirrored:
+        models = {"path_loss": gaigs.train("path_loss", links)}
+        models["mirrored"] = gaigs.load(options.mirrored)
+    else:
+        models = trained(links, options.minutes, options.seed)
+    cases = [("coverage", threshold) for threshold in options.thresholds]
+    cases += [("mean", 0.0), ("locate", 0.0)]
+    names = [*models, "truth"]
+    print(f"{len(sites)} candidates, {len(sites) * (len(sites) - 1) // 2} pairs")
+    print(f"| objective | beside | {' | '.join(names)} | median pair | best pair |")
+    print("|---|---|" + "---|" * (len(names) + 2))
+    for known in (False, True):
+        levels = truth if known else truth[len(stands) :]
+        standing = len(stands) if known else 0
+        for objective, threshold in cases:
+            # Pairs of matrices of all places by all places take long.
+            part = slice(None, 150 if objective == "locate" else None)
+            make = rules(places[part], threshold)[objective]
+            rule = make(levels[:, part], torch.full_like(levels[:, part], NOISE))
+            pairs = pair_scores(rule, standing)
+            best = (pairs.max() if rule.sign > 0 else pairs.min()).item()
+            texts = []
+            for model in models.values():
+                plan = gaigs.place(model, sites, 2, objective, threshold, known=known)
+                chosen = (sites[:, None] == plan.places).all(-1).nonzero()
+                order = chosen[chosen[:, 1].argsort(), 0] + standing
+                texts.append(f"{score(rule, standing, order):.2f}")
+            order, _ = choose(rule, standing, 2)
+            texts += [f"{score(rule, standing, order):.2f}", f"{pairs.median():.2f}", f"{best:.2f}"]
+            title = f"above {threshold:g} dBm [%]" if objective == "coverage" else objective
+            beside = "4 gateways" if known else "none"
+            print(f"| {title} | {beside} | {' | '.join(texts)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
