@@ -44,22 +44,47 @@ def score(rule, numbers):
     return rule.quality(rule.factors(torch.tensor(numbers)).prod(0)).mean().item()
 
 
-@pytest.mark.parametrize("kind", [Coverage, MeanLevel])
-def test_first_choices_are_the_best_and_later_ones_nearly(kind):
-    for seed in range(5):
-        means, deviations = levels(seed=seed)
-        options = {"threshold": -65.0} if kind is Coverage else {}
-        rule = kind(means, deviations, **options)
-        known = [0, 1]
-        chosen, qualities = choose(rule, 2, 2, most=70)
-        best = max(range(2, 9), key=lambda number: score(rule, [*known, number]))
-        assert chosen[0] == best
-        start = score(rule, known)
-        pairs = itertools.combinations(range(2, 9), 2)
-        most = max(score(rule, [*known, *pair]) for pair in pairs)
-        got = score(rule, [*known, *chosen.tolist()])
-        assert got - start >= (1 - 1 / np.e) * (most - start)
-        torch.testing.assert_close(qualities.mean(1)[[0, 2]], torch.tensor([start, got]).double())
+def rules(seed, receivers=9, count=30):
+    """The objectives of receivers and places at random in a room."""
+    rng = np.random.default_rng(seed)
+    stands = torch.from_numpy(rng.uniform(0, (7, 5, 3), (receivers, 3)))
+    places = torch.from_numpy(rng.uniform(0, (7, 5, 2), (count, 3)))
+    means = -45 - 35 * torch.cdist(stands, places).log10()
+    deviations = torch.from_numpy(rng.uniform(2, 6, means.shape))
+    return (
+        Coverage(means, deviations, -60.0),
+        MeanLevel(means, deviations),
+        LocationError(means, deviations, places),
+    )
+
+
+@pytest.mark.parametrize("kind", range(3), ids=["coverage", "mean", "locate"])
+@pytest.mark.parametrize("standing", [0, 2])
+def test_chosen_receivers_are_the_best_beside_those_that_stand(kind, standing):
+    known = [*range(standing)]
+    for seed in range(4):
+        rule = rules(seed)[kind]
+        chosen, qualities = choose(rule, standing, 2)
+        scores = {
+            extra: rule.sign * score(rule, [*known, *extra])
+            for extra in itertools.combinations(range(standing, 9), 2)
+        }
+        assert tuple(sorted(chosen.tolist())) == max(scores, key=scores.__getitem__)
+        # Each is the best of the chosen ones beside those before it.
+        first = [rule.sign * score(rule, [*known, number]) for number in chosen]
+        assert first[0] == max(first)
+        assert rule.sign * qualities.mean(1)[1] == pytest.approx(first[0])
+
+
+def test_one_by_one_is_not_always_best():
+    # The first receiver covers two thirds; two others cover all together.
+    means = torch.full((3, 6), -90.0, dtype=torch.float64)
+    means[0, 1:5] = means[1, :3] = means[2, 3:] = -40.0
+    rule = Coverage(means, torch.ones_like(means), -65.0)
+    chosen, qualities = choose(rule, 0, 2)
+    assert sorted(chosen.tolist()) == [1, 2]
+    assert qualities.mean(1)[-1] == pytest.approx(100.0)
+    assert choose(rule, 0, 1)[0].tolist() == [0]
 
 
 def test_coverage_and_mean_level_are_those_of_the_best_of_independent_readings():
