@@ -126,6 +126,11 @@ class Pose:
         rotation = quaternions_to_rotations(quaternion.roll(1))
         return cls(position.float(), rotation.float())
 
+    @classmethod
+    def at(cls, position) -> "Pose":
+        """A pose at 3 coordinates [m] whose axes are the world's."""
+        return cls.from_xyzw(position, (0.0, 0.0, 0.0, 1.0))
+
     def to(self, like: Tensor) -> "Pose":
         return Pose(self.position.to(like), self.rotation.to(like))
 

@@ -58,6 +58,8 @@ class Scene:
         places: Number of training places; 0 if unknown.
         floors: Heights of separate floors of training transmitters, that with most places first
             (k,) [m]; empty of one.
+        room: Corners of the box of training transmitters and training receivers (2, 3) [m], if the
+            receivers are others; None: they are the training's.
 
     Example:
         >>> scene = gaigs.links("synthetic_rssi", transmitters=50).scene
@@ -77,6 +79,7 @@ class Scene:
     frame: Frame | None = None
     floors: Float[Tensor, " k"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.float32))
     places: int = 0
+    room: Float[Tensor, "2 3"] | None = None
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
         """Positions of the receivers [m], on the device and in the dtype of ``like``."""
@@ -85,6 +88,8 @@ class Scene:
     @property
     def box(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
         """Lower and upper corner of the box of training transmitters and all receivers [m]."""
+        if self.room is not None:
+            return self.room[0], self.room[1]
         ends = torch.cat((torch.stack((self.lower, self.upper)), self.positions(self.lower)))
         return ends.amin(0), ends.amax(0)
 
@@ -158,6 +163,8 @@ class Scene:
         state = {"receivers": receivers, "task": self.task.state()}
         for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors", "places"):
             state[name] = getattr(self, name)
+        if self.room is not None:
+            state["room"] = self.room
         state["frame"] = None
         if self.frame is not None:
             state["frame"] = int(self.frame.epsg), float(self.frame.x), float(self.frame.y)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, overload
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Complex
 from torch import Tensor, nn
 
 from gaigs.calibration import Calibration, Estimate
@@ -24,7 +24,15 @@ from gaigs.data import Links
 from gaigs.kriging.kernel import Process
 from gaigs.kriging.links import single_readings
 from gaigs.model import checkpoint
-from gaigs.model.requests import Request, as_known_subcarriers, lacks_elements, usual_batch_size
+from gaigs.model.movable import Movable
+from gaigs.model.requests import (
+    Request,
+    as_known_subcarriers,
+    as_new_receiver,
+    check_interval,
+    lacks_elements,
+    usual_batch_size,
+)
 from gaigs.registry import check_type
 from gaigs.registry.torch_modes import usual_modes
 from gaigs.splatting.gaussians import Gaussians
@@ -42,7 +50,7 @@ class Prediction(NamedTuple):
     penalties: Mapping[str, Tensor] = {}
 
 
-class Model(nn.Module):
+class Model(Movable):
     """The contract of kind ``model``: ``forward`` takes a ``Batch`` and gives a ``Prediction``.
 
     The state dict has all that ``predict`` needs. A model with parameters is trained. One without
@@ -60,8 +68,7 @@ class Model(nn.Module):
             labels. Training sees as many as ``training.thinning`` leaves.
         revisions: Fractions of the training after which ``revise`` is called.
         predicts_untrained: True if values before the training are worth a score.
-        any_frequency: True if channels are a function of frequency, read from
-            ``scene.task.frequencies``.
+        any_frequency, any_receiver: See ``Movable``.
         configuration: Options that a registered model was made with; ``save`` stores them.
         calibration: What intervals are made of; None if no validation links have measured the
             model's errors.
@@ -93,7 +100,6 @@ class Model(nn.Module):
     chunk: int | None = None
     revisions: tuple[float, ...] = ()
     predicts_untrained: bool = False
-    any_frequency: bool = False
     primitives: Gaussians | None = None
     calibration: Calibration | None = None
     known_places: Tensor | None = None
@@ -186,7 +192,8 @@ class Model(nn.Module):
             transmitters: Positions (..., 3), world frame [m], anything that becomes a float tensor;
                 or a whole query.
             receiver: Name or index of the receiver, or of that of each position; None: all
-                receivers.
+                receivers. Of a model with ``any_receiver`` also a ``Receiver``, ``Pose`` or
+                position [m] that no measurement needs, see ``at_receivers``.
             frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the
                 training links' only carrier.
             batch_size: Links computed at a time, of all receivers at least those of one position;
@@ -236,26 +243,30 @@ class Model(nn.Module):
             (torch.Size([4]), True)
         """
         check_type("interval", interval, float | None)
+        model, receiver = self._located(receiver, transmitters)
+        scene = model.scene
         if interval is not None:
-            self._check_interval(interval, frequencies)
-        request = self._request(transmitters, receiver, frequency, directions, frequencies)
+            has_calibration = model.calibration is not None
+            check_interval(interval, has_calibration, scene, frequencies, model.any_frequency)
+        request = model._request(transmitters, receiver, frequency, directions, frequencies)
         if interval is None:
-            values = torch.cat([*self._values(request, batch_size)])
-            return request.arranged(values, self.scene)
-        batches = self._estimates(request, batch_size, float(interval))
+            values = torch.cat([*model._values(request, batch_size)])
+            return request.arranged(values, scene)
+        batches = model._estimates(request, batch_size, float(interval))
         fields = []
         for parts in zip(*batches, strict=True):
             joined = None if parts[0] is None else torch.cat(parts)
-            fields.append(None if joined is None else request.arranged(joined, self.scene))
-        return request.estimates(fields, self.scene)
+            fields.append(None if joined is None else request.arranged(joined, scene))
+        return request.estimates(fields, scene)
 
     def to_xarray(self, transmitters: object, interval: float | None = None, **named: Any) -> Any:
         """``predict`` with arguments by name as an ``xarray.Dataset``; without an interval it has
         ``value`` alone. Where arrays have different numbers of elements, a dictionary by receiver.
         """
-        asked = (named.get(name) for name in ("receiver", "frequency", "directions", "frequencies"))
-        answer = self.predict(transmitters, interval=interval, **named)  # type: ignore[arg-type]
-        return self._request(transmitters, *asked).to_xarray(answer, self.scene)
+        model, receiver = self._located(named.pop("receiver", None), transmitters)
+        asked = (named.get(name) for name in ("frequency", "directions", "frequencies"))
+        answer = model.predict(transmitters, receiver, interval=interval, **named)  # type: ignore
+        return model._request(transmitters, receiver, *asked).to_xarray(answer, model.scene)
 
     def predict_batches(
         self,
@@ -273,39 +284,28 @@ class Model(nn.Module):
         errors are those of ``predict``, and come at once. The positions of a grid are in the order
         of ``reshape(-1, 3)``; the last batch may be smaller.
         """
-        request = self._request(transmitters, receiver, frequency, directions, frequencies)
-        values = self._values(request, batch_size)
+        model, receiver = self._located(receiver, transmitters)
+        request = model._request(transmitters, receiver, frequency, directions, frequencies)
+        values = model._values(request, batch_size)
         receivers = request.axes[-1:] if request.receiver is None else ()
         count = math.prod(receivers)
         return (
-            request.arranged(part, self.scene, (len(part) // count, *receivers)) for part in values
+            request.arranged(part, model.scene, (len(part) // count, *receivers)) for part in values
         )
 
-    def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Model":
-        """A copy of a model with ``any_frequency`` whose labels have other subcarriers [Hz]."""
-        scene = replace(self.scene, task=self.scene.task.at_frequencies(frequencies))
-        other = copy.deepcopy(self)
-        for part in other.modules():
-            if hasattr(part, "scene"):
-                part.scene = scene
-        return other
-
-    def _check_interval(self, interval: float, frequencies: object) -> None:
-        if not 0 < interval < 1:
-            raise ValueError(
-                f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}"
-            )
-        if self.calibration is None:
-            raise ValueError(
-                "the model has no intervals: no held-out links have measured its errors\n"
-                "train it with split.validation above 0, on two places, runs or blocks or more, "
-                "without data.band_train"
-            )
-        subcarriers = as_known_subcarriers(frequencies, self.scene, self.any_frequency)
-        if subcarriers.warning or subcarriers.exchanged is not None:
-            raise ValueError(
-                "intervals are those of the labels' own subcarriers; leave frequencies out"
-            )
+    def _located(self, receiver: object, transmitters: object) -> tuple[Any, object]:
+        """The model that knows a receiver, and the receiver's number in it; names and numbers stay
+        as they are.
+        """
+        new = as_new_receiver(receiver, self.scene, transmitters)
+        if new is None:
+            return self, receiver
+        for number, known in enumerate(self.scene.receivers):
+            if known is new or (
+                known.name == new.name and torch.equal(known.pose.position, new.pose.position)
+            ):
+                return self, number
+        return self.at_receivers([new]), 0
 
     def _request(
         self,

@@ -47,6 +47,10 @@ class Ensemble(Wrapper):
         self.register_buffer("typical", torch.tensor(0.0))
 
     @property
+    def any_receiver(self) -> bool:  # type: ignore[override]
+        return self.underlying.any_receiver
+
+    @property
     def underlying(self) -> Model:
         """The first member, whose room and Gaussians stand for all."""
         return self.members[0]  # type: ignore[return-value]

@@ -34,6 +34,8 @@ class Friis(Model):
     """
 
     any_frequency = True
+    any_receiver = True
+    of_receivers = ("gains",)
 
     def __init__(self, scene: Scene):
         super().__init__(scene)

@@ -309,6 +309,14 @@ class GaussianSplatting(Model):
             self.trend is None or self.trend.any_frequency
         )
 
+    @property
+    def any_receiver(self) -> bool:  # type: ignore[override]
+        """True if parts that depend on receivers name what belongs to each."""
+        parts = self.placement, self.tokenizer, self.deformation
+        seeing = [part for part in parts if getattr(part, "sees_receivers", False)]
+        knows_all = all(hasattr(part, "take_receivers") for part in seeing)
+        return knows_all and (self.trend is None or self.trend.any_receiver)
+
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         groups = {}
         if self.gaussians is not None:

@@ -3,13 +3,14 @@ positions.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gaigs.core.antenna import Receiver
 from gaigs.core.query import Batch, Query, evenly, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.core.stages import stage
@@ -198,6 +199,18 @@ class GaussianProcess(LookUp):
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
         """The trend alone: residuals at other frequencies do not correlate with the known ones."""
         return self.trend.at_frequencies(frequencies)
+
+    @property
+    def any_receiver(self) -> bool:  # type: ignore[override]
+        return self.scalar is not None
+
+    def at_receivers(
+        self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
+    ) -> Model:
+        """The trend alone: residuals at one receiver do not correlate with those at others."""
+        if not self.any_receiver:
+            super().at_receivers(receivers)  # has the error
+        return self.trend.at_receivers(receivers, known)
 
     def facts(self) -> dict[str, object]:
         """``length_m``, ``nugget``, with several carriers ``frequency_scale_m``; of scalars the

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gaigs.calibration.held_out import Unseen, validation_halves
 from gaigs.core import stages
+from gaigs.core.antenna import Receiver
 from gaigs.core.query import Batch, evenly, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
@@ -378,6 +379,22 @@ class Kriging(Wrapper):
         the known ones.
         """
         return self._alone.at_frequencies(frequencies)
+
+    @property
+    def any_receiver(self) -> bool:  # type: ignore[override]
+        return self.trend.any_receiver and self.fallback.any_receiver
+
+    def at_receivers(
+        self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
+    ) -> Model:
+        """Trend and fallback at other receivers, where no residuals are known."""
+        trend = self.trend.at_receivers(receivers, known)
+        other = Kriging(trend.scene, trend, self.fallback_options)
+        other.fallback = self.fallback.at_receivers(receivers, known)
+        other._make_posterior(self.by_paths)
+        other.trend_weight.copy_(self.trend_weight)
+        other.weight.copy_(self.weight)
+        return other.to(self.weight.device)
 
     @property
     def fold_count(self) -> int:

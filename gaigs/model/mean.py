@@ -17,6 +17,9 @@ class Mean(Model):
     Channels of unknown phase are aligned to the phase of the first known link.
     """
 
+    any_receiver = True
+    of_receivers = ("means",)
+
     def __init__(self, scene: Scene):
         super().__init__(scene)
         shape = (len(scene.receivers), *scene.task.shape)

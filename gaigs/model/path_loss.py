@@ -31,6 +31,9 @@ class PathLoss(Model):
     Meta-analysis in clinical trials, 1986.
     """
 
+    any_receiver = True
+    of_receivers = ("levels", "exponents")
+
     def __init__(self, scene: Scene):
         super().__init__(scene)
         if not scene.task.is_scalar:

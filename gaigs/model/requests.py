@@ -6,13 +6,21 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.calibration.conformal import Asked, Estimate
 from gaigs.core.antenna import Receiver
-from gaigs.core.geometry import Directions, Grid, Rays
-from gaigs.core.query import ROUNDING, Query, as_directions, as_receivers, as_subcarriers
+from gaigs.core.geometry import Directions, Grid, Pose, Rays
+from gaigs.core.query import (
+    ROUNDING,
+    Query,
+    as_directions,
+    as_positions,
+    as_receivers,
+    as_subcarriers,
+)
 from gaigs.core.scene import Scene
 from gaigs.core.task import Axis
 
@@ -146,6 +154,52 @@ class Request(NamedTuple):
         return values if number.ndim else of_array(values, receivers[int(number)])
 
 
+def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver | None:
+    """The receiver of ``Model.predict`` if it is one, or a pose or a position; None for names and
+    indices.
+
+    Three whole numbers beside three transmitters are indices. A pose has the array of the scene's
+    receivers, and so has a position where this array has no orientation.
+
+    Raises:
+        ValueError: The receivers' arrays differ, or need an orientation.
+    """
+    if isinstance(receiver, Receiver) or receiver is None:
+        return receiver
+    pose = receiver if isinstance(receiver, Pose) else None
+    if pose is None:
+        kind, shape = _kind_of(receiver)
+        is_index = kind in "iu" and np.shape(getattr(transmitters, "transmitters", transmitters))[
+            :-1
+        ] == (3,)
+        if shape != (3,) or kind not in "iuf" or is_index:
+            return None
+        pose = Pose.at(as_positions("receiver", receiver).cpu())
+    array = scene.receivers[0].array
+    for other in scene.receivers:
+        is_alike = other.array.pattern == array.pattern
+        if not is_alike or not torch.equal(other.array.elements, array.elements):
+            raise ValueError(
+                "receiver must be a gaigs.Receiver with its array, as the arrays of the model's "
+                "receivers differ"
+            )
+    if pose is not receiver and not array.is_point:
+        raise ValueError(
+            "receiver must be a gaigs.Pose or Receiver, as its array has an orientation, got a "
+            f"position {pose.position.tolist()}"
+        )
+    return Receiver("new", pose, array)
+
+
+def _kind_of(values: Any) -> tuple[str, tuple[int, ...]]:
+    """Kind of numpy and shape of numbers; ``O`` of anything else."""
+    try:
+        array = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
+    except ValueError:  # ragged lists
+        return "O", ()
+    return array.dtype.kind, array.shape
+
+
 def lacks_elements(scene: Scene) -> bool:
     """True for channels if an array has fewer elements than another one."""
     if not scene.task.is_channel:
@@ -184,6 +238,27 @@ def as_known_subcarriers(frequencies: object, scene: Scene, any_frequency: bool)
             f"{high - low:.4g} Hz: phases may be off"
         )
     return Subcarriers(exchanged=asked, warning=warning)
+
+
+def check_interval(
+    interval: float, has_calibration: bool, scene: Scene, frequencies: object, any_frequency: bool
+) -> None:
+    """Raises the ``ValueError`` of ``Model.predict`` for an interval that it cannot give."""
+    if not 0 < interval < 1:
+        raise ValueError(
+            f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}"
+        )
+    if not has_calibration:
+        raise ValueError(
+            "the model has no intervals: no held-out links have measured its errors\n"
+            "train it with split.validation above 0, on two places, runs or blocks or more, "
+            "without data.band_train"
+        )
+    subcarriers = as_known_subcarriers(frequencies, scene, any_frequency)
+    if subcarriers.warning or subcarriers.exchanged is not None:
+        raise ValueError(
+            "intervals are those of the labels' own subcarriers; leave frequencies out"
+        )
 
 
 def usual_batch_size(shape: tuple[int, ...], numbers: int = 2**17, most: int = 1024) -> int:

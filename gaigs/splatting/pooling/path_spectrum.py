@@ -25,8 +25,8 @@ class PathSpectrum(LagPooling):
     Source: ``LagPooling`` for the covariance, ``Beamformer`` for the spectrum.
     """
 
-    def __init__(self, scene: Scene):
-        super().__init__(scene)
+    def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
+        super().take_receivers(scene, known)
         self.beamformer = Beamformer("pooling 'path_spectrum'", scene)
         self.zone = self.beamformer.zone
 

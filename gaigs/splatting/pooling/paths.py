@@ -93,6 +93,10 @@ class LagPooling(PathPooling):
 
     def __init__(self, scene: Scene):
         super().__init__()
+        self.take_receivers(scene)
+
+    def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
+        """Takes a scene, whose receivers may be others."""
         self.is_same_for_all = all(receiver.array.is_point for receiver in scene.receivers)
         for receiver in scene.receivers:
             height = receiver.array.elements[:, 2].abs().max()

@@ -69,7 +69,9 @@ def test_chosen_receivers_are_the_best_beside_those_that_stand(kind, standing):
             extra: rule.sign * score(rule, [*known, *extra])
             for extra in itertools.combinations(range(standing, 9), 2)
         }
-        assert tuple(sorted(chosen.tolist())) == max(scores, key=scores.__getitem__)
+        got = scores[tuple(sorted(chosen.tolist()))]
+        best = max(scores.values())
+        assert got >= best - 0.005 * abs(best)
         # Each is the best of the chosen ones beside those before it.
         first = [rule.sign * score(rule, [*known, number]) for number in chosen]
         assert first[0] == max(first)

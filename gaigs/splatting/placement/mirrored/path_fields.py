@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Complex, Float, Inexact
+from jaxtyping import Complex, Float, Inexact, Int
 from scipy.constants import speed_of_light
 from torch import Tensor, nn
 from torch.nn import functional
@@ -13,6 +13,7 @@ from gaigs.core.antenna import Receiver
 from gaigs.core.propagation import NEAREST, fresnel, slab
 from gaigs.core.query import Query
 from gaigs.core.scene import Scene, carriers
+from gaigs.data import Links
 from gaigs.splatting.placement.mirrored.movable_planes import MovablePlanes
 from gaigs.splatting.placement.mirrored.obstacles import Obstacles
 from gaigs.splatting.placement.mirrored.reflections import Folded, fold, images, polarised
@@ -61,6 +62,8 @@ class PathFields(MovablePlanes):
     Attributes:
         is_complex: True for channels.
         is_bare: True while only the direct path counts, without obstacles.
+        is_heard: True for receivers with training links (r,); others have the gain of a receiver in
+            general.
         known_blur: Logarithm of the standard deviation of a known path's phase at the start [rad].
         unknown_blur: The same for a path that adds as power, whose coherence is 0.
         faint: Largest share of a link's power, obstacles apart, of a path that skips the obstacles:
@@ -74,6 +77,7 @@ class PathFields(MovablePlanes):
     faint = 1e-3
     fewest_numbers = 8
     is_bare: Tensor
+    is_heard: Tensor
 
     def __init__(
         self,
@@ -124,15 +128,22 @@ class PathFields(MovablePlanes):
         self.receiver_gains = _filled(0.0, len(receivers))
         self.directivity = _filled(0.0)
         self.receiver_phases = _filled(0.0, len(receivers)) if self.is_complex else None
+        self.register_buffer("is_heard", torch.ones(len(receivers), dtype=torch.bool))
         bandwidth = self.scene.bandwidth
         self.log_bandwidth = None
         if bandwidth != 0 and not self.is_complex:
             self.log_bandwidth = _filled(math.log(bandwidth or speed_of_light / self.diagonal))
-        self.boresights = [torch.tensor([0.0, 0.0, 1.0])] * len(receivers)
-        if self.is_complex:
-            self.boresights = [boresight(receiver, self.middle) for receiver in receivers]
+        self.boresights = self._boresights()
+
+    def _boresights(self) -> list[Tensor]:
+        receivers = self.scene.receivers
+        if not self.is_complex:
+            return [torch.tensor([0.0, 0.0, 1.0])] * len(receivers)
+        return [boresight(receiver, self.middle) for receiver in receivers]
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
+        # Receivers without training links had gains of their own before.
+        state_dict.setdefault(prefix + "is_heard", torch.ones_like(self.is_heard))
         if self.path_phases is not None:  # channels of few numbers had none before
             state_dict.setdefault(prefix + "path_phases", torch.zeros_like(self.path_phases))
         super()._load_from_state_dict(state_dict, prefix, *args)
@@ -169,7 +180,7 @@ class PathFields(MovablePlanes):
 
         ``blocked`` is False for the field without obstacles.
         """
-        gains = self.path_gains[self.kept] + self.receiver_gains[query.receivers, None]
+        gains = self.path_gains[self.kept] + self.gains_at(query.receivers).real[:, None]
         fields = torch.complex(gains.exp() * folded.exists, torch.zeros_like(gains))
         fields = folded.reflected(fields, self.coefficients(query, folded))
         if blocked and self.obstacles is not None and not self.is_bare:
@@ -220,7 +231,7 @@ class PathFields(MovablePlanes):
         is_short = (sequences >= 0).sum(1) <= 1
         fields = strengths.new_zeros(len(query), len(self.origin) + 1)
         fields[:, sequences[is_short].amax(1) + 1] = strengths[:, is_short]
-        return fields / self.receiver_gains[query.receivers, None].exp()
+        return fields / self.gains_at(query.receivers).real[:, None].exp()
 
     def margins(self, query: Query) -> Complex[Tensor, "b n"]:
         """Standard deviation of each kept path's field over free space, with the field's phase.
@@ -235,6 +246,41 @@ class PathFields(MovablePlanes):
         return (share * field + 0.1 * free) * self.patterns(query, links.ways)
 
     # --- receivers ---
+
+    def fit(self, links: Links) -> None:
+        super().fit(links)
+        heard = links.query.receivers[links.split.train].unique().to(self.is_heard.device)
+        self.is_heard.fill_(False)[heard] = True
+
+    def gains_at(self, receivers: Int[Tensor, " b"]) -> Complex[Tensor, " b"]:
+        """Logarithms of the complex gains of receivers, without phases unless labels have some."""
+        gains = self._receiver_gains
+        if not self.is_heard.all():
+            gains = torch.where(self.is_heard, gains, self._common_gain(self.is_heard))
+        return gains[receivers]
+
+    @property
+    def _receiver_gains(self) -> Complex[Tensor, " r"]:
+        gains, phases = self.receiver_gains, self.receiver_phases
+        return torch.complex(gains, torch.zeros_like(gains) if phases is None else phases)
+
+    def _common_gain(self, known: Tensor) -> Complex[Tensor, ""]:
+        """The gain of a receiver in general: of levels the mean of decibels; of channels that of
+        complex gains, whose phases may have nothing in common.
+        """
+        gains = self._receiver_gains[known]
+        return gains.exp().mean().log() if self.is_complex else gains.mean()
+
+    @torch.no_grad()
+    def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
+        """Takes a scene with other receivers, whose gains are the mean of the ``known`` ones."""
+        gains = self._common_gain(self.is_heard if known is None else known)
+        gains = gains.repeat(len(scene.receivers))
+        self.receiver_gains = nn.Parameter(gains.real.contiguous())
+        if self.receiver_phases is not None:
+            self.receiver_phases = nn.Parameter(gains.imag.contiguous())
+        self.is_heard = torch.ones_like(gains.real, dtype=torch.bool)
+        self.boresights = self._boresights()
 
     def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Field gain of a receiver's elements in its frame; of arrays times the learnt cos^q."""

@@ -212,7 +212,7 @@ class Mirrored(PathFields):
         if self.path_phases is not None:
             phases = phases + self.path_phases[self.kept]
         if self.receiver_phases is not None:
-            phases = phases + self.receiver_phases[query.receivers, None]
+            phases = phases + self.gains_at(query.receivers).imag[:, None]
         return torch.polar(torch.ones_like(phases), phases)
 
     def _placed(

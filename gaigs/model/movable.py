@@ -1,0 +1,82 @@
+"""Copies of a model at other subcarriers, or at receivers that no measurement has."""
+
+import copy
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+
+from gaigs.core.antenna import Receiver
+from gaigs.core.scene import Scene
+from gaigs.registry import name_of
+
+
+class Movable(nn.Module):
+    """Base of models whose subcarriers and receivers may be exchanged.
+
+    Attributes:
+        any_frequency: True if channels are a function of frequency, read from
+            ``scene.task.frequencies``.
+        any_receiver: True if the model predicts for receivers without links. A module of it names
+            buffers by receiver in ``of_receivers``; a receiver in general has the mean over the
+            receivers. Its ``take_receivers``, if it has one, does more.
+    """
+
+    scene: Scene
+    links: Any
+    any_frequency: bool = False
+    any_receiver: bool = False
+
+    def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Any:
+        """A copy of a model with ``any_frequency`` whose labels have other subcarriers [Hz]."""
+        scene = replace(self.scene, task=self.scene.task.at_frequencies(frequencies))
+        other = copy.deepcopy(self)
+        for part in other.modules():
+            if hasattr(part, "scene"):
+                part.scene = scene
+        return other
+
+    @torch.no_grad()
+    def at_receivers(
+        self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
+    ) -> Any:
+        """A copy of a model with ``any_receiver`` for other receivers, which no measurement needs.
+
+        What a receiver has of its own, such as its gain, is the mean over known receivers.
+
+        Args:
+            receivers: Receivers of the copy, in place of the model's own.
+            known: Numbers of the receivers whose mean stands; None: all.
+
+        Raises:
+            ValueError: The model predicts for its own receivers alone, or there are no receivers.
+
+        Example:
+            >>> model = gaigs.train("path_loss", gaigs.links("synthetic_rssi", transmitters=50))
+            >>> door = gaigs.Receiver("door", gaigs.Pose.at([3.0, 0.2, 2.0]))
+            >>> model.at_receivers([door]).predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]]).shape
+            torch.Size([2, 1])
+        """
+        if not self.any_receiver:
+            raise ValueError(
+                f"model {name_of(self)!r} predicts for its own receivers alone; for others take "
+                "mirrored, gaigs, friis, path_loss, mean, or gaussian_process of levels"
+            )
+        if not receivers:
+            raise ValueError("at_receivers takes one receiver or more, got none")
+        scene = replace(self.scene, receivers=tuple(receivers), room=torch.stack(self.scene.box))
+        # Known links are large, and stay as they are.
+        other = copy.deepcopy(self, {id(self.links): self.links})
+        for part in other.modules():
+            if hasattr(part, "scene"):
+                part.scene = scene
+            for name in getattr(part, "of_receivers", ()):
+                values = getattr(part, name)
+                mean = (values if known is None else values[known]).mean(0, keepdim=True)
+                setattr(part, name, mean.repeat(len(receivers), *[1] * (values.ndim - 1)))
+            if hasattr(part, "take_receivers"):
+                part.take_receivers(scene, known)
+        return other
