@@ -13,7 +13,7 @@ import argparse
 import torch
 
 import gaigs
-from gaigs.commands.place.objectives import Coverage, LocationError, MeanLevel, choose
+from gaigs.commands.place.objectives import Coverage, LocationError, MeanLevel, choose, product_of
 from gaigs.data.readings import gateway
 from gaigs.data.simulation import rss_dbm
 from gaigs.data.synthetic import ROOM, default_room
@@ -56,25 +56,19 @@ def rules(places, threshold):
 
 def pair_scores(rule, standing):
     """Mean quality of each pair of candidates beside the first ``standing`` receivers (pairs,)."""
-    rows = torch.arange(standing, len(rule.values))
-    product = torch.ones_like(rule.factors(rows[:1])[0])
-    for receiver in torch.arange(standing)[:, None]:
-        product = product * rule.factors(receiver)[0]
+    rows = torch.arange(len(rule.values))
     scores = []
-    for row in rows[:-1]:
-        first = product * rule.factors(row[None])[0]
-        for part in rows[rows > row].split(16):
+    for row in rows[standing:-1]:
+        first = product_of(rule, torch.cat((rows[:standing], row[None])))
+        for part in rows[row + 1 :].split(16):
             scores.append(rule.quality(first * rule.factors(part)).mean(-1))
     return torch.cat(scores)
 
 
 def score(rule, standing, chosen):
     """Mean quality of chosen receivers beside those that stand."""
-    rows = torch.cat((torch.arange(standing), chosen))
-    product = torch.ones(())
-    for row in rows[:, None]:
-        product = product * rule.factors(row)[0]
-    return rule.quality(product).mean().item()
+    members = torch.cat((torch.arange(standing), chosen))
+    return rule.quality(product_of(rule, members)).mean().item()
 
 
 def trained(links, minutes, seed):

@@ -111,61 +111,45 @@ def choose(
     submodular set functions, 1978, which has both steps).
     """
     rows = torch.arange(len(rule.values))
-    start = torch.ones_like(rule.factors(rows[:1])[0])  # (g, t)
-    start = product_of(rule, start, rows[:standing])
-    candidates = rows[standing:]
-    chosen = greedy(rule, start, candidates, count)
-    score = means(rule, product_of(rule, start, chosen[:-1]), chosen[-1:])[0]
-    kept = 0  # receivers tried since the last exchange
-    while 1 < count and kept < count:
-        others = chosen[1:]
-        gains = means(rule, product_of(rule, start, others), candidates)
-        gains[(candidates[:, None] == others).any(1)] = -torch.inf
-        is_better = gains.max() > score + 1e-9
-        kept = 1 if is_better else kept + 1
-        score = torch.maximum(score, gains.max())
-        last = candidates[gains.argmax()] if is_better else chosen[0]
-        chosen = torch.cat((others, last[None]))
-    chosen = greedy(rule, start, chosen, count)
-    products = [product_of(rule, start, chosen[:number]) for number in range(count + 1)]
-    return chosen, torch.stack([rule.quality(product) for product in products])
+    before, candidates = rows[:standing], rows[standing:]
+    members, score = extend(rule, before, candidates, count)
+    unchanged = 0  # receivers that stayed since the last exchange
+    while unchanged < count:
+        others = torch.cat((before, members[standing + 1 :]))
+        members, new_score = extend(rule, others, candidates, 1)
+        unchanged = 0 if new_score > score + 1e-9 else unchanged + 1
+        score = max(score, new_score)
+    members, _ = extend(rule, before, members[standing:], count)
+    products = [product_of(rule, members[:end]) for end in range(standing, len(members) + 1)]
+    return members[standing:], torch.stack([rule.quality(product) for product in products])
 
 
-def product_of(
-    rule: Coverage | LocationError, product: Float[Tensor, "g t"], index: Int[Tensor, " k"]
-) -> Float[Tensor, "g t"]:
-    """A product with the factors of further receivers."""
-    for receiver in index[:, None]:
+def extend(
+    rule: Coverage | LocationError,
+    members: Int[Tensor, " k"],
+    candidates: Int[Tensor, " c"],
+    count: int,
+    most: int = 4_000_000,
+) -> tuple[Int[Tensor, " n"], float]:
+    """A set with so many candidates more, each the best beside those before it, and its mean
+    quality, negative where lower is better; ``most`` factors are held at a time.
+    """
+    score = -torch.inf
+    for _ in track(range(count), "receivers to place"):
+        free = candidates[~torch.isin(candidates, members)]
+        product = product_of(rule, members)
+        means = []
+        for part in free.split(max(1, most // product.numel())):
+            means.append(rule.sign * rule.quality(product * rule.factors(part)).mean(-1))
+        ranked = torch.cat(means)
+        members = torch.cat((members, free[ranked.argmax()][None]))
+        score = ranked.max().item()
+    return members, score
+
+
+def product_of(rule: Coverage | LocationError, members: Int[Tensor, " k"]) -> Float[Tensor, "g t"]:
+    """The product of the factors of a set."""
+    product = torch.ones_like(rule.factors(torch.zeros(1, dtype=torch.int64))[0])
+    for receiver in members[:, None]:
         product = product * rule.factors(receiver)[0]
     return product
-
-
-def means(
-    rule: Coverage | LocationError,
-    product: Float[Tensor, "g t"],
-    index: Int[Tensor, " k"],
-    most: int = 4_000_000,
-) -> Float[Tensor, " k"]:
-    """Mean quality over the places with each one of some receivers, negative where lower is better;
-    at most ``most`` factors are held.
-    """
-    parts = index.split(max(1, most // product.numel()))
-    return torch.cat(
-        [rule.sign * rule.quality(product * rule.factors(part)).mean(-1) for part in parts]
-    )
-
-
-def greedy(
-    rule: Coverage | LocationError,
-    product: Float[Tensor, "g t"],
-    index: Int[Tensor, " k"],
-    count: int,
-) -> Int[Tensor, " n"]:
-    """Some of the receivers, each the best beside those before it."""
-    chosen = index[:0]
-    for _ in track(range(count), "receivers to place"):
-        best = index[means(rule, product, index).argmax()]
-        chosen = torch.cat((chosen, best[None]))
-        index = index[index != best]
-        product = product_of(rule, product, best[None])
-    return chosen

@@ -68,7 +68,8 @@ class SitePlan:
         digits = 2 if self.objective == "locate" else 1
         first, last = (f"{score:.{digits}f}" for score in self.scores[[0, -1]].tolist())
         if self.objective == "coverage":
-            return f"{subject} {first} to {last} % above {self.threshold:g} {self.unit}".rstrip()
+            start = f"{first} to " * (len(self.standing) > 0)
+            return f"{subject} {start}{last} % above {self.threshold:g} {self.unit}".rstrip()
         what = "mean best level" if self.objective == "mean" else "expected error of locations"
         start = "" if first == "nan" else f"from {first} "
         return f"{subject} the {what} {start}to {last} {self.score_unit}".rstrip()

@@ -143,8 +143,10 @@ def test_known_receivers_count():
     assert alone.scores[0] == 0
     assert len(alone.standing) == 0
     assert alone.places.unique(dim=0).shape == (5, 3)
-    assert plan.scores[0] == pytest.approx(alone.scores[-1].item(), abs=40)
     assert (alone.scores.diff() > 0).all()
+    assert re.fullmatch(r"5 bring \d+\.\d % above -50 dBm", str(alone))
+    mean = gaigs.place(room, candidates, 1, "mean", known=False)
+    assert re.fullmatch(r"1 brings the mean best level to -\d+\.\d dBm", str(mean))
 
 
 @pytest.mark.parametrize(
