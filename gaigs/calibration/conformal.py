@@ -2,122 +2,18 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Inexact, Int
-from numpy import ndarray
 from torch import Tensor
 
+from gaigs.calibration.estimate import Estimate
 from gaigs.core.query import Query, evenly, thin_labels
-from gaigs.core.results import library, plot
-from gaigs.core.task import Axis, Task
+from gaigs.core.task import Task
 from gaigs.io import FAR
 from gaigs.kriging.links import distances
-
-
-class Asked(NamedTuple):
-    """Names and coordinates of the axes of a prediction.
-
-    Attributes:
-        positions: Positions of the transmitters (..., 3) [m].
-        receivers: Names (k,) of the receivers of an axis of their own; or, without that axis, of
-            the receiver of each position (...).
-        axes: Axes of a label.
-        quantity, unit: Name and unit of a value.
-    """
-
-    positions: Float[Tensor, "*places 3"]
-    receivers: ndarray
-    has_axis: bool
-    axes: Mapping[str, Axis]
-    quantity: str
-    unit: str
-
-    @property
-    def dimensions(self) -> tuple[str, ...]:
-        """Names of the axes of a value; places of a grid are ``place_0``, ``place_1``."""
-        count = self.positions.ndim - 1
-        places = ["place"] if count == 1 else [f"place_{axis}" for axis in range(count)]
-        return (*places, *["receiver"] * self.has_axis, *self.axes)
-
-
-class EstimateParts(NamedTuple):
-    """Tensors of an ``Estimate``."""
-
-    value: Tensor
-    std: Tensor
-    lower: Tensor | None
-    upper: Tensor | None
-    radius: Tensor | None = None
-    snr_db: Tensor | None = None
-
-
-class Estimate(EstimateParts):
-    """A prediction with its uncertainty, from ``model.predict(x, interval=0.9)``; a tuple of
-    tensors shaped as the value.
-
-    Attributes:
-        value: The prediction of ``predict`` without an interval.
-        std: Standard deviation of the label about it, in the label's unit; a channel has the
-            complex error's. All but the value is NaN at elements that an array lacks.
-        lower, upper: Ends of the interval, which holds the label with the asked probability; None
-            for channels.
-        radius: Radius of a disc about the value which holds the channel with this probability, in
-            the label's unit; None for other labels.
-        snr_db: Expected signal-to-noise ratio of each link's channel [dB], without the axes of
-            elements and subcarriers; None for other labels.
-        asked: Names and coordinates of the axes, no part of the tuple; None if unknown.
-
-    Example:
-        >>> model = gaigs.train("knn", gaigs.links("synthetic_rssi", transmitters=100))
-        >>> found = model.predict([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]], interval=0.9)
-        >>> found.upper.shape, bool((found.lower < found.value).all())  # places, receivers
-        (torch.Size([2, 4]), True)
-    """
-
-    asked: Asked | None = None
-
-    def about(self, asked: Asked) -> "Estimate":
-        """The estimate, with the names of its axes."""
-        self.asked = asked
-        return self
-
-    def plot(self, ax: Any = None, **options: Any) -> Any:
-        """Draws it as ``gaigs.plot`` does, which lists the options."""
-        return plot(self, ax, **options)
-
-    def to_xarray(self) -> Any:
-        """An ``xarray.Dataset`` with ``value``, ``std``, ... by places, receivers and axes of a
-        label, with their coordinates.
-
-        Raises:
-            ImportError: Xarray is not installed.
-            ValueError: The estimate is not from ``model.predict``.
-        """
-        if self.asked is None:
-            raise ValueError("only estimates of model.predict know their places")
-        asked = self.asked
-        dimensions = asked.dimensions
-        places = dimensions[: asked.positions.ndim - 1]
-        coordinates = {}
-        for number, name in enumerate("xyz"):
-            values = asked.positions[..., number].cpu().numpy()
-            coordinates[name] = (places, values, {"units": "m"})
-        own = ("receiver",) if asked.has_axis else places
-        coordinates["receiver"] = (own, asked.receivers)
-        sizes = dict(zip(dimensions, self.value.shape, strict=True))
-        for name, axis in asked.axes.items():  # an array may have fewer elements than another
-            coordinates[name] = ((name,), axis.values[: sizes[name]], {"units": axis.unit})
-        variables = {}
-        for name in self._fields:
-            part = getattr(self, name)
-            if part is not None:
-                unit = {"units": "dB" if name == "snr_db" else asked.unit}
-                variables[name] = (dimensions[: part.ndim], part.cpu().numpy(), unit)
-        title = {"title": f"{asked.quantity} predicted by gaigs"}
-        return library("xarray", "to_xarray").Dataset(variables, coordinates, title)
 
 
 @dataclass(frozen=True)
@@ -142,6 +38,12 @@ class Calibration:
         sizes: Root mean square of the errors (groups, bins).
         places, receivers: Known links, for the distance; empty with one group of distances.
         lowest: Least possible label.
+        widths: Relative width of intervals at each receiver without links, 0 at others (w,); None:
+            every receiver has links.
+        elsewhere: Calibration of receivers without links, by errors at each receiver of models that
+            have the mean of the others in its place; None if there are too few.
+        scatter: Variances of the errors between receivers and within them (2,), for labels of one
+            number.
 
     Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; by groups of
     links: Dunn, Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical
@@ -156,6 +58,9 @@ class Calibration:
     places: Float[Tensor, "k 3"]
     receivers: Int[Tensor, " k"]
     lowest: Float[Tensor, ""]
+    widths: Float[Tensor, " w"] | None = None
+    elsewhere: "Calibration | None" = None
+    scatter: Float[Tensor, "2"] | None = None
 
     @classmethod
     def of(
@@ -167,6 +72,7 @@ class Calibration:
         query: Query,
         near: Float[Tensor, " n"] | None,
         known: Query,
+        clusters: Int[Tensor, " n"] | None = None,
         steps: int = 200,
     ) -> "Calibration":
         """From links that were predicted by models that do not know them.
@@ -179,6 +85,7 @@ class Calibration:
             near: Distance of each link to the nearest place that its predicting model knows [m];
                 None if the model states deviations, which need no groups of distances.
             known: Links that the calibrated model knows.
+            clusters: Numbers of links that err together; None: each for itself.
             steps: Levels of the stored quantiles of errors; one in between has the next higher.
         """
         labels, values, deviations = thinned(task, labels, values, deviations)
@@ -201,7 +108,7 @@ class Calibration:
                 inside = inside if inside.any() else exists
                 ordered = errors[inside].double().sort().values
                 sizes[group, number] = ordered.square().mean().sqrt()
-                quantiles[group, number] = link_quantiles(ordered, errors, inside, levels)
+                quantiles[group, number] = link_quantiles(ordered, errors, inside, levels, clusters)
         if not groups.edges.shape[1]:
             known = known[:0]
         lowest = torch.tensor(task.lowest, dtype=torch.float64)
@@ -216,8 +123,43 @@ class Calibration:
             lowest,
         )
 
+    def at_receivers(self, widths: Float[Tensor, " w"]) -> "Calibration | None":
+        """The calibration of receivers without links, of which some may have other ``widths``."""
+        new = self.elsewhere
+        return None if new is None else replace(new, widths=widths, elsewhere=new)
+
     def estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
         """The interval of some predictions; raises a ``ValueError`` where it needs more links."""
+        widths = query.receivers.new_zeros(len(query)).to(value.real)
+        if self.widths is not None:
+            widths = self.widths.to(widths)[query.receivers]  # (b,)
+        is_new = widths > 0
+        if not is_new.any():
+            return self._estimate(value, deviations, query, level)
+        if self.elsewhere is None:
+            raise ValueError(
+                "no intervals at receivers without links: three receivers with held-out links "
+                "calibrate them"
+            )
+        shape = -1, *[1] * (value.ndim - 1)
+        # The model's own deviations are of receivers with links; NaN where an array lacks elements.
+        usual = _shaped(usual_deviations(value) * widths, value)
+        usual = usual.masked_fill(_shaped(deviations, value).isnan(), math.nan)
+        new = self.elsewhere._estimate(value, usual, query, level)
+        if is_new.all():
+            return new
+        own = self._estimate(value, deviations, query, level)
+        fields: list[Any] = []
+        for one, other in zip(new, own, strict=True):
+            if one is None:
+                fields.append(None)
+                continue
+            rows = is_new if one.ndim == 1 else is_new.reshape(shape)
+            fields.append(torch.where(rows, one, other))
+        return Estimate(*fields)
+
+    def _estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
+        """``estimate`` at receivers with links."""
         groups = self._groups_of(query)
         self._check_counts(groups, level)
         cells = groups.reshape(-1, *[1] * (value.ndim - 1))
@@ -273,11 +215,24 @@ class Calibration:
 
     def gives(self, level: float) -> bool:
         """True if every group has enough links for intervals of a level."""
-        return fewest(level) <= int(self.counts.min())
+        is_new = self.widths is not None and bool((self.widths > 0).any())
+        gives_new = not is_new or (self.elsewhere is not None and self.elsewhere.gives(level))
+        return gives_new and fewest(level) <= int(self.counts.min())
 
-    def state(self) -> dict[str, Tensor]:
-        """Plain tensors for a checkpoint; ``Calibration(**state)`` makes it anew."""
-        return {name: getattr(self, name).cpu() for name in self.__dataclass_fields__}
+    def state(self) -> dict[str, Any]:
+        """Plain tensors for a checkpoint."""
+        state = {}
+        for name in self.__dataclass_fields__:
+            part = getattr(self, name)
+            if part is not None:
+                state[name] = part.cpu() if isinstance(part, Tensor) else part.state()
+        return state
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> "Calibration":
+        """The inverse of ``state``."""
+        new = state.get("elsewhere")
+        return cls(**{**state, "elsewhere": None if new is None else cls.from_state(new)})
 
 
 class Groups(NamedTuple):
@@ -374,14 +329,20 @@ def link_quantiles(
     errors: Float[Tensor, "n m"],
     inside: Bool[Tensor, "n m"],
     levels: Float[Tensor, " q"],
+    clusters: Int[Tensor, " n"] | None = None,
     level: float = 0.9,
 ) -> Float[Tensor, " q"]:
     """Quantiles of errors for intervals of new links, from sorted numbers ``inside`` of a group.
 
+    Links of one of the ``clusters`` err together, and a new link is one of a new cluster.
     Shares of links scatter at ``level``, which stands for all levels.
     """
     held = (errors <= quantile(ordered, levels.new_tensor(level))) & inside
-    count = effective_count(held.sum(1), inside.sum(1))
+    both = torch.stack((held.sum(1), inside.sum(1)))  # (2, n)
+    if clusters is not None:
+        numbers = clusters.unique(return_inverse=True)[1]
+        both = both.new_zeros(2, int(numbers.max()) + 1).index_add(1, numbers, both)
+    count = effective_count(*both)
     # Quantile p (n + 1) / n: the new link is one of n + 1 exchangeable ones.
     return quantile(ordered, levels * (1 + 1 / count))
 
@@ -411,6 +372,13 @@ def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float
 def fewest(level: float) -> int:
     """Fewest links that give an interval of a level; 0.9 / (1 - 0.9) is above 9 by rounding."""
     return math.ceil(level / (1 - level) - 1e-9)
+
+
+def usual_deviations(value: Tensor) -> Float[Tensor, " b"]:
+    """Deviations that stand for unknown ones: 1, of channels the root mean square of each value."""
+    if value.is_complex():
+        return value.abs().square().flatten(1).mean(1).sqrt()
+    return torch.ones(len(value), device=value.device)
 
 
 def nearest(

@@ -36,7 +36,8 @@ class Split:
     """Links to train, validate and test on; ``name`` is the protocol with its numbers.
 
     ``groups`` has the group of each link of the data, a row, a run or a cube: each is held out
-    whole. None: places are.
+    whole. None: places are. ``by_receivers`` is true if whole receivers are held out: models then
+    predict for receivers without training links.
     """
 
     name: str
@@ -44,6 +45,7 @@ class Split:
     validation: Int[Tensor, " validation"]
     test: Int[Tensor, " test"]
     groups: Int[Tensor, " n"] | None = None
+    by_receivers: bool = False
 
     def parts(self) -> dict[str, Int[Tensor, " k"]]:
         """The three parts by name."""
@@ -371,7 +373,10 @@ def kept_links(links: Links, kept: Bool[Tensor, " n"]) -> Links:
 
 def only_trained(links: Links) -> Links:
     """Links to receivers that have training links; a remark names the other receivers."""
-    trained = links.query.receivers[links.split.train].unique()
+    split: Any = links.split
+    trained = links.query.receivers[split.train].unique()
+    if split.by_receivers:  # which has places for all that it holds out
+        trained = links.query.receivers.unique()
     if len(trained) == len(links.receivers):
         return links
     number = torch.full((len(links.receivers),), -1)
@@ -403,7 +408,7 @@ def only_trained(links: Links) -> Links:
         labels=links.labels[index],
         rows=at_index(links.rows),
         official=None,
-        split=Split(links.split.name, **parts, groups=at_index(links.split.groups)),
+        split=replace(split, **parts, groups=at_index(links.split.groups)),
         uncertainties=links.uncertainties[trained],
         noises=at_index(links.noises),
         remarks="; ".join(filter(None, (links.remarks, remark))),

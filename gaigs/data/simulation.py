@@ -32,7 +32,7 @@ class SimulatedRoom:
     """A room with its receivers, and the responses of their antennas.
 
     Attributes:
-        pose: Position and orientation of the receiver with an array.
+        poses: Positions and orientations of the receivers with an array.
         gateways: Receivers with a single antenna.
         edges: Line segments to draw in figures (k, 2, 3) [m].
         place: From a count and a seed, random places of transmitters (count, 3) [m].
@@ -43,7 +43,7 @@ class SimulatedRoom:
             (part, elements, f).
     """
 
-    pose: Pose
+    poses: tuple[Pose, ...]
     gateways: tuple[Receiver, ...]
     edges: Float[Tensor, "k 2 3"]
     place: Callable[[int, int], Tensor]
@@ -66,21 +66,22 @@ def simulate_spectra(
     carriers = _to_carriers(frequency)
     offsets = spectrum_offsets(spectrum, room.frequency_offsets, bandwidth)
     places = room.place(transmitters, seed)
-    receiver = patch_array(room.pose, max(carriers))
+    receivers = patch_arrays(room.poses, max(carriers))
     grid = Grid.degrees()
     labels = []
-    for carrier in carriers:
+    for receiver, carrier in itertools.product(receivers, carriers):
         responses = room.respond(places, receiver, carrier, offsets)
         labels.append(to_spectra(responses, grid, receiver.array, carrier))
-    rows = torch.arange(transmitters).repeat_interleave(len(carriers))
+    rows = torch.arange(transmitters).repeat_interleave(len(labels))
+    numbers = torch.arange(len(receivers)).repeat_interleave(len(carriers))
     links = Links(
         query=Query(
             places[rows],
-            torch.zeros_like(rows),
-            torch.tensor(carriers).float().repeat(transmitters),
+            numbers.repeat(transmitters),
+            torch.tensor(carriers).float().repeat(transmitters * len(receivers)),
         ),
-        receivers=(receiver,),
-        labels=torch.stack(labels, 1).flatten(0, 1),  # (places * carriers, rows, columns)
+        receivers=receivers,
+        labels=torch.stack(labels, 1).flatten(0, 1),  # (places * links, rows, columns)
         task=Spectrum(grid.elevations, grid.azimuths),
         rows=rows,
         official=partial(last_fifth, transmitters, rows),
@@ -125,16 +126,20 @@ def simulate_channels(
     edge = bandwidth / 2 if subcarriers > 1 else 0.0
     offsets = torch.linspace(-edge, edge, subcarriers, dtype=torch.float64)
     places = room.place(transmitters, seed)
-    receiver = patch_array(room.pose, frequency)
-    task = Csi(len(receiver.array), frequency + offsets, phase)
-    labels = torch.cat([*room.respond(places, receiver, frequency, offsets)])
+    receivers = patch_arrays(room.poses, frequency)
+    task = Csi(len(receivers[0].array), frequency + offsets, phase)
+    channels = []
+    for receiver in receivers:
+        channels.append(torch.cat([*room.respond(places, receiver, frequency, offsets)]))
+    labels = torch.stack(channels, 1).flatten(0, 1)  # (places * receivers, elements, f)
     if phase != "known":
         has_delays = phase == "per_link_and_delay"
         labels = _distort(labels, offsets, bandwidth if has_delays else None, seed)
-    rows = torch.arange(transmitters)
+    rows = torch.arange(transmitters).repeat_interleave(len(receivers))
+    numbers = torch.arange(len(receivers)).repeat(transmitters)
     links = Links(
-        query=Query(places, torch.zeros_like(rows), torch.full((transmitters,), float(frequency))),
-        receivers=(receiver,),
+        query=Query(places[rows], numbers, torch.full((len(rows),), float(frequency))),
+        receivers=receivers,
         labels=labels.to(torch.complex64),
         task=task,
         rows=rows,
@@ -249,13 +254,14 @@ def spectrum_offsets(
     return sample(bandwidth) if spectrum == "band" else torch.zeros(1)
 
 
-def patch_array(pose: Pose, frequency: float) -> Receiver:
-    """A receiver with 4 x 4 patches half a wavelength of the frequency [Hz] apart.
+def patch_arrays(poses: Sequence[Pose], frequency: float) -> tuple[Receiver, ...]:
+    """Receivers with 4 x 4 patches half a wavelength of the frequency [Hz] apart.
 
     The NeRF² spectra have such an array.
     """
     check_carrier("frequency", frequency)
-    return Receiver("gateway1", pose, Array.planar(4, 4, speed_of_light / frequency / 2, "cosine"))
+    array = Array.planar(4, 4, speed_of_light / frequency / 2, "cosine")
+    return tuple(Receiver(f"gateway{number}", pose, array) for number, pose in enumerate(poses, 1))
 
 
 def last_fifth(transmitters: int, rows: Int[Tensor, " n"]) -> Parts:

@@ -20,6 +20,7 @@ def furnished_room_csi(
     phase: str = "known",
     band_train: Sequence[float] | None = None,
     band_test: Sequence[float] | None = None,
+    receivers: int | None = None,
 ) -> Links:
     """Channels of transmitters at random places in the default room, at its array of 4 x 4.
 
@@ -33,11 +34,18 @@ def furnished_room_csi(
         phase: See ``gaigs.core.task.csi.Csi``; other than ``known``, links get random phases.
         band_train, band_test: Subcarriers to train and to test on, as for
             ``gaigs.data.bands.hold_out_band`` [Hz].
+        receivers: Arrays on the walls, as of ``synthetic``; None: one in a corner.
 
     Raises:
         ValueError: An option is out of range.
     """
     links = simulate_channels(
-        default_room(order), transmitters, frequency, bandwidth, subcarriers, seed, phase
+        default_room(order, receivers),
+        transmitters,
+        frequency,
+        bandwidth,
+        subcarriers,
+        seed,
+        phase,
     )
     return hold_out_band(links, band_train, band_test)

@@ -13,6 +13,7 @@ def furnished_room_rssi(
     sensitivity: float = -95.0,
     order: int = 2,
     seed: int = 0,
+    receivers: int | None = None,
 ) -> Links:
     """Signal strength of transmitters of 0 dBm at random places in the default room.
 
@@ -22,8 +23,10 @@ def furnished_room_rssi(
     Args:
         noise: Standard deviation of the Gaussian error of each reading [dB].
         sensitivity: Readings below it are not received, and left out [dBm].
+        receivers: Gateways along the walls, as of ``synthetic``; None: the four.
 
     Raises:
         ValueError: An option is out of range, or a gateway hears nothing.
     """
-    return simulate_readings(default_room(order), transmitters, noise, sensitivity, seed)
+    room = default_room(order, receivers)
+    return simulate_readings(room, transmitters, noise, sensitivity, seed)

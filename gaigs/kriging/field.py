@@ -166,6 +166,8 @@ class FieldPosterior(Posterior):
         query, process = links.query[index], self.process
         for receiver, field in enumerate(stages.track(self.fields, "kriging")):
             rows = (query.receivers == receiver).nonzero()[:, 0]
+            if not len(rows):
+                continue
             values = residuals(rows)  # (k, *shape)
             if values.is_complex():
                 labels = links.labels[index[rows]]
@@ -187,6 +189,8 @@ class FieldPosterior(Posterior):
         for receiver in query.receivers.unique().tolist():
             is_asked = query.receivers == receiver
             field: Any = self.fields[receiver]
+            if not len(field.places):
+                continue
             squares[is_asked] = field.deviations(places[is_asked], process).square()
         return squares.sqrt()
 

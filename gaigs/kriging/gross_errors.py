@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gaigs.data import Links, Split
+from gaigs.data import Links
 from gaigs.kriging.links import distances
 
 
@@ -45,8 +46,8 @@ def without_gross_errors(links: Links, size: float = 6.0) -> Links:
     train, validation = (
         parts[name][torch.isin(parts[name], index[is_kept])] for name in ("train", "validation")
     )
-    split = Split(links.split.name, train, validation, parts["test"], links.split.groups)
-    return replace(links, split=split)
+    split: Any = links.split
+    return replace(links, split=replace(split, train=train, validation=validation))
 
 
 def are_alone(

@@ -4,6 +4,7 @@ batch.
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -12,24 +13,26 @@ from torch import Tensor
 from gaigs.core.geometry import Grid
 from gaigs.core.query import Batch, Query, evenly
 from gaigs.core.scene import Scene
-from gaigs.data import Links, Split
+from gaigs.data import Links
 
 PART = 256
 """Labels held in memory at a time: a spectrum takes 130 KB."""
 
 
-def known_links(links: Links) -> list[Int[Tensor, " k"]]:
+def known_links(links: Links, any_receiver: bool = False) -> list[Int[Tensor, " k"]]:
     """Training and validation links of each receiver; raises a ``ValueError`` for a receiver
-    without.
+    without, unless the split holds out receivers for a model of ``any_receiver``.
     """
     known = [links.known(receiver) for receiver in range(len(links.receivers))]
     pairs = zip(links.receivers, known, strict=True)
     without = [receiver.name for receiver, index in pairs if not len(index)]
-    if without:
+    if without and not (any_receiver and links.split.by_receivers):
         kind = "known" if len(links.split.validation) else "training"
         raise ValueError(
             f"split {links.split.name!r} has no {kind} links of {', '.join(without)}; "
             "choose another split"
+            + ", or a model for receivers without links"
+            * links.split.by_receivers
         )
     return known
 
@@ -38,16 +41,16 @@ def check_known(links: Links) -> None:
     """Raises the ``ValueError`` of ``known_links`` for all known links, and for the links of a
     validation.
     """
-    known_links(links)
-    known_links(replace(links, split=links.split.validating()))
+    known_links(links, any_receiver=True)
+    known_links(replace(links, split=links.split.validating()), any_receiver=True)
 
 
 def limit_known(links: Links, most: int) -> Links:
     """The same links with at most ``most`` known links of each receiver, evenly spread."""
-    chosen = torch.cat([evenly(index, most) for index in known_links(links)])
-    split = links.split
+    chosen = torch.cat([evenly(index, most) for index in known_links(links, any_receiver=True)])
+    split: Any = links.split
     train, validation = (part[torch.isin(part, chosen)] for part in (split.train, split.validation))
-    return replace(links, split=Split(split.name, train, validation, split.test, split.groups))
+    return replace(links, split=replace(split, train=train, validation=validation))
 
 
 def folds_of(links: Links, index: Int[Tensor, " k"], count: int = 10) -> Int[Tensor, " k"]:

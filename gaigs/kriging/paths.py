@@ -233,12 +233,15 @@ class PathPosterior(Posterior):
         """Takes the known links of all receivers."""
         device = self.hyperparameters.device
         for field, known in zip(self.fields, equations, strict=True):
-            field.solve(known, self.process)
+            if len(known.places):
+                field.solve(known, self.process)
         self.fields.to(device)
 
     def mean_at(self, query: Query, device: torch.device) -> Complex[Tensor, "e s"]:
         """Mean residual of a single link, on the CPU; margins are computed on the device."""
-        field = self.fields[int(query.receivers)]
+        field: Any = self.fields[int(query.receivers)]
+        if not len(field.places):
+            return torch.zeros(self.scene.task.shape, dtype=self.scene.task.dtype)
         strengths = field(query.transmitters.double(), self.process)[0]  # (n,)
         margins = self.margins(query.to(device)).cpu()[0]  # (n, e, s)
         return torch.tensordot(strengths.to(margins), margins, 1)
@@ -247,6 +250,8 @@ class PathPosterior(Posterior):
         query, mean = batch.query, torch.zeros_like(like)
         for receiver in query.receivers.unique().tolist():
             is_asked = query.receivers == receiver
+            if not len(self.fields[receiver].places):  # type: ignore[arg-type]
+                continue
             strengths = self.fields[receiver](query.transmitters[is_asked].double(), self.process)
             margins = self.margins(query[is_asked])  # (b, n, e, s)
             mean[is_asked] = (strengths.to(like)[..., None, None] * margins).sum(1)
@@ -260,6 +265,8 @@ class PathPosterior(Posterior):
         for receiver in query.receivers.unique().tolist():
             is_asked = query.receivers == receiver
             field: Any = self.fields[receiver]
+            if not len(field.places):
+                continue
             variances = field.variances(places[is_asked].double(), self.process)  # (b, n)
             powers = self.margins(query[is_asked]).abs().square()  # (b, n, e, s)
             parts = variances.to(powers)[..., None, None] * powers

@@ -1,13 +1,20 @@
 """Predictions, deviations and calibrations of models on some of the links of a data set."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.calibration import Calibration
+from gaigs.calibration.conformal import usual_deviations
 from gaigs.calibration.held_out import Answers, calibrate
-from gaigs.core.query import Batch
+from gaigs.core import stages
+from gaigs.core.query import Batch, evenly
 from gaigs.data import Links
+from gaigs.kriging.links import single_readings
 from gaigs.model.base import Model
 from gaigs.registry import name_of
 
@@ -52,4 +59,82 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
         batch = Batch(links.query[index[:1]], links.task.directions).to(one.device)
         return Answers(values, deviations, one.deviations(batch) is not None)
 
-    return calibrate(links, name_of(model), model.fold_count, model.unseen(links), answer)
+    unseen = model.unseen(links)
+    calibration = calibrate(links, name_of(model), model.fold_count, unseen, answer)
+    if calibration is None or not model.any_receiver or stages.is_up():
+        return calibration
+    known = links.query.receivers[links.split.known].bincount(minlength=len(links.receivers))
+    return replace(
+        calibration, widths=(known == 0).double(), elsewhere=at_new_receivers(model, links)
+    )
+
+
+def at_new_receivers(
+    model: Model, links: Links, most: int = 1000, receivers: int = 40
+) -> Calibration | None:
+    """The calibration of a model at receivers without links; None with fewer than three to learn
+    from.
+
+    Each receiver with links in turn has the mean of the others in place of what it has of its own.
+    Receivers err as a whole: the errors of one are a cluster.
+
+    Args:
+        model: A model with ``any_receiver``.
+        links: Links with the split of the model.
+        most: Largest number of links that calibrate.
+        receivers: Largest number of receivers that calibrate.
+
+    Source: Dunn, Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical
+    models, 2022.
+    """
+    split: Any = links.split
+    of_links = links.query.receivers
+    heard = of_links[split.train if model.is_trained else split.known].unique()
+    asked = split.known
+    # The room has learnt from the training links: validation links show its errors.
+    if model.is_trained and not split.by_receivers:
+        asked = split.validation
+    asked = single_readings(links, asked)
+    chosen = evenly(of_links[asked].unique(), receivers)
+    rows, values = [], []
+    for receiver in chosen.tolist():
+        others = heard[heard != receiver]
+        if len(others) < 2:
+            return None
+        index = evenly(asked[of_links[asked] == receiver], most // len(chosen))
+        moved = model.at_receivers([links.receivers[receiver]], others)
+        first = replace(links.query, receivers=torch.zeros_like(of_links))
+        rows.append(index)
+        values.append(predicted(moved, replace(links, query=first), index))
+    if len(rows) < 3:
+        return None
+    index, answers = torch.cat(rows), torch.cat(values)
+    query = links.query[index]
+    alike = replace(query, receivers=torch.zeros_like(query.receivers))
+    calibration = Calibration.of(
+        links.task,
+        links.labels[index],
+        answers,
+        usual_deviations(answers),
+        alike,
+        None,
+        alike,
+        clusters=query.receivers,
+    )
+    if not links.task.is_scalar:
+        return calibration
+    errors = [
+        (links.labels[part] - value).double() for part, value in zip(rows, values, strict=True)
+    ]
+    return replace(calibration, scatter=random_effects(errors))
+
+
+def random_effects(errors: Sequence[Tensor]) -> Float[Tensor, "2"]:
+    """Variances of errors between receivers and within one, of the errors of each receiver."""
+    squares = torch.stack([(part - part.mean()).square().sum() for part in errors])
+    counts = torch.tensor([*map(len, errors)]).to(squares)
+    within = squares.sum() / (counts - 1).sum().clamp_min(1)
+    # The mean error of a receiver scatters by the links that it is the mean of, too.
+    means = torch.stack([part.mean() for part in errors])
+    between = means.square().mean() - (within / counts).mean()
+    return torch.stack((between.clamp_min(0), within))

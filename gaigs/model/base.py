@@ -14,6 +14,7 @@ from jaxtyping import Complex
 from torch import Tensor, nn
 
 from gaigs.calibration import Calibration, Estimate
+from gaigs.calibration.conformal import usual_deviations
 from gaigs.calibration.held_out import LOOK_UP_FOLDS, Unseen, held_out_folds
 from gaigs.core.antenna import lacking
 from gaigs.core.geometry import Directions, ExtrapolationWarning
@@ -149,7 +150,7 @@ class Model(Movable):
 
     def calibrate(self, state: Mapping[str, Tensor] | None) -> None:
         """Takes the state of a calibration from a checkpoint; None if it has none."""
-        self.calibration = None if state is None else Calibration(**state)
+        self.calibration = None if state is None else Calibration.from_state(state)
 
     @torch.no_grad()
     def evaluate(self, batch: Batch) -> Tensor:
@@ -385,10 +386,8 @@ class Model(Movable):
         NaN at elements that a receiver's array lacks, which have no error.
         """
         deviations = self.deviations(batch)
-        if deviations is None and value.is_complex():
-            deviations = value.abs().square().flatten(1).mean(1).sqrt()  # (b,)
         if deviations is None:
-            deviations = torch.ones(len(value), device=value.device)
+            deviations = usual_deviations(value)
         if not lacks_elements(self.scene):
             return deviations
         receivers = batch.query.receivers

@@ -53,7 +53,7 @@ class Friis(Model):
     @torch.no_grad()
     def fit(self, links: Links) -> None:
         """Fits the sign and the gains."""
-        known = known_links(links)
+        known = known_links(links, any_receiver=True)
         index = torch.cat(known)
         labels, query = links.labels[index].to(torch.complex128), links.query[index]
         waves = direct_waves(self.scene, query, self.frequencies)
@@ -64,6 +64,8 @@ class Friis(Model):
         for receiver, rows in enumerate(known if has_gain else ()):
             gain = fit_gain(links.labels[rows], self._waves(links.query[rows]))
             self.gains[receiver] = gain.to(self.gains)
+        is_known = torch.tensor([*map(len, known)]) > 0
+        self.gains[~is_known] = self.gains[is_known].mean()
 
     def forward(self, batch: Batch) -> Prediction:
         waves = self._waves(batch.query).to(self.gains)

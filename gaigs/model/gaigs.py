@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -241,7 +242,10 @@ class GaussianSplatting(Model):
         self.pooling.fit(links)
         if self.trend is None:
             return
-        self.trend.fit(links)
+        trained = links
+        if links.split.by_receivers:  # receivers that validate stay unknown
+            trained = replace(links, split=links.split.only(links.split.train))
+        self.trend.fit(trained)
         if self.scene.task.dtype.is_complex:
             return  # waves have no level: their phases differ from link to link
         count = len(links.split.train)

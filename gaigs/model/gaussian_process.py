@@ -134,7 +134,7 @@ class GaussianProcess(LookUp):
     def _fit(self, links: Links, chooses: bool) -> None:
         if self.scalar is not None:
             links = without_gross_errors(links)
-        self.links, self.known = links, known_links(links)
+        self.links, self.known = links, known_links(links, self.any_receiver)
         for trend in self.trends if chooses else (self.trend,):
             trend.fit(links)
         if self.scalar is not None:
@@ -171,7 +171,7 @@ class GaussianProcess(LookUp):
             self.signals.append(white.abs().square().mean().sqrt().item())
 
     def _fit_scalar(self, process: ScalarProcess, links: Links, chooses: bool) -> None:
-        index = torch.cat(known_links(links))
+        index = torch.cat(known_links(links, any_receiver=True))
         query = links.query[index]
         known = coordinates(self.scene, query, 1.0), query.receivers
         folds = folds_of(links, index)
@@ -210,7 +210,9 @@ class GaussianProcess(LookUp):
         """The trend alone: residuals at one receiver do not correlate with those at others."""
         if not self.any_receiver:
             super().at_receivers(receivers)  # has the error
-        return self.trend.at_receivers(receivers, known)
+        trend = self.trend.at_receivers(receivers, known)
+        trend.take_calibration(self)
+        return trend
 
     def facts(self) -> dict[str, object]:
         """``length_m``, ``nugget``, with several carriers ``frequency_scale_m``; of scalars the

@@ -394,6 +394,7 @@ class Kriging(Wrapper):
         other._make_posterior(self.by_paths)
         other.trend_weight.copy_(self.trend_weight)
         other.weight.copy_(self.weight)
+        other.take_calibration(self)
         return other.to(self.weight.device)
 
     @property

@@ -19,6 +19,7 @@ class Mean(Model):
 
     any_receiver = True
     of_receivers = ("means",)
+    of_level = "means"
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
@@ -26,14 +27,19 @@ class Mean(Model):
         self.register_buffer("means", torch.full(shape, torch.nan, dtype=scene.task.dtype))
 
     def fit(self, links: Links) -> None:
-        """Computes the means."""
-        for receiver, index in enumerate(known_links(links)):
+        """Computes the means; a receiver without links has their mean."""
+        known = known_links(links, any_receiver=True)
+        for receiver, index in enumerate(known):
+            if not len(index):
+                continue
             wide = torch.promote_types(self.scene.task.dtype, torch.float64)
             first, align = links.labels[index[:1]], self.scene.task.align
             total = sum(
                 align(links.labels[part], first).sum(0).to(wide) for part in index.split(256)
             )
             self.means[receiver] = (total / len(index)).to(self.means)
+        is_known = torch.tensor([*map(len, known)]) > 0
+        self.means[~is_known] = self.means[is_known].mean(0)
 
     def forward(self, batch: Batch) -> Prediction:
         return Prediction(at_directions(self.means[batch.query.receivers], batch, self.scene), {})

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from gaigs.core.antenna import Receiver
 from gaigs.core.scene import Scene
+from gaigs.data import Links
 from gaigs.registry import name_of
 
 
@@ -22,11 +23,13 @@ class Movable(nn.Module):
             ``scene.task.frequencies``.
         any_receiver: True if the model predicts for receivers without links. A module of it names
             buffers by receiver in ``of_receivers``; a receiver in general has the mean over the
-            receivers. Its ``take_receivers``, if it has one, does more.
+            receivers. Its ``take_receivers``, if it has one, does more. ``of_level`` names what
+            ``adapt`` moves.
     """
 
     scene: Scene
     links: Any
+    calibration: Any
     any_frequency: bool = False
     any_receiver: bool = False
 
@@ -79,4 +82,56 @@ class Movable(nn.Module):
                 setattr(part, name, mean.repeat(len(receivers), *[1] * (values.ndim - 1)))
             if hasattr(part, "take_receivers"):
                 part.take_receivers(scene, known)
+        other.take_calibration(self)
         return other
+
+    @torch.no_grad()
+    def adapt(self, links: Links) -> Any:
+        """A copy at the receivers of a few links, whose levels these correct; the room stays.
+
+        With n links of mean error e, the level of a receiver moves by e s / (s + w / n): s is the
+        variance of errors between receivers, w the one within them. Intervals shrink accordingly.
+
+        Args:
+            links: Readings at one or several receivers without training links; a split is not used.
+
+        Raises:
+            ValueError: The labels are no levels, or too few receivers have told how they differ.
+
+        Source: Robinson, That BLUP is a good thing: the estimation of random effects, 1991.
+
+        Example:
+            >>> levels = gaigs.links("synthetic_rssi", transmitters=100)
+            >>> model = gaigs.train("path_loss", levels)
+            >>> door = gaigs.Receiver("door", gaigs.Pose.at([3.0, 0.2, 2.0]))
+            >>> places = [[1.0, 2.0, 1.5], [2.0, 1.0, 1.5], [4.0, 2.5, 1.0]]
+            >>> few = {"transmitters": places, "receivers": [door], "labels": [-50.0, -43.0, -47.0]}
+            >>> model.adapt(gaigs.links(task="rssi", **few)).predict([1.0, 1.0, 1.0]).shape
+            torch.Size([1])
+        """
+        moved = self.at_receivers(links.receivers)
+        new = moved.calibration
+        parts = [part for part in moved.modules() if hasattr(part, "of_level")]
+        if new is None or new.scatter is None or not parts:
+            raise ValueError(
+                "adapt takes a model of levels, calibrated with links of three receivers or more, "
+                "such as path_loss or mirrored"
+            )
+        between, within = new.scatter
+        receivers = links.query.receivers
+        errors = (links.labels - moved.predict(links.query).cpu()).double()
+        counts = receivers.bincount(minlength=len(links.receivers)).double()  # (r,)
+        sums = torch.zeros_like(counts).index_add(0, receivers, errors)
+        variances = 1 / (1 / between.clamp_min(1e-9) + counts / within)  # of what is left
+        for part in parts:
+            level = getattr(part, part.of_level)
+            level += (variances * sums / within).to(level)
+        widths = ((variances + within) / (between + within)).sqrt()
+        moved.calibration = new.at_receivers(widths.float())
+        return moved
+
+    def take_calibration(self, other: "Movable") -> None:
+        """Takes another model's calibration of receivers without links."""
+        if other.calibration is not None:
+            widths = torch.ones(len(self.scene.receivers))
+            self.calibration = other.calibration.at_receivers(widths)

@@ -33,6 +33,7 @@ class PathLoss(Model):
 
     any_receiver = True
     of_receivers = ("levels", "exponents")
+    of_level = "levels"
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
@@ -46,11 +47,12 @@ class PathLoss(Model):
 
     def fit(self, links: Links) -> None:
         """Fits level and exponent of each receiver; see ``without_gross_errors`` for levels that do
-        not count.
+        not count. A receiver without links has the mean of both.
         """
         lines = []
         links = without_gross_errors(links)
-        for index in known_links(links):
+        known = known_links(links, any_receiver=True)
+        for index in filter(len, known):
             query, labels = links.query[index], links.labels[index].double()
             decades = self._decades(query.transmitters.double(), query.receivers)
             level, centre = labels.mean(), decades.mean()
@@ -67,8 +69,11 @@ class PathLoss(Model):
         levels, centres, exponents, weights, errors, freedom = torch.stack(lines, 1)
         noise = errors.sum() / freedom.sum() if freedom.sum() else errors.new_tensor(torch.nan)
         exponents = shrunk(exponents, weights, noise)
-        self.exponents.copy_(exponents)
-        self.levels.copy_(levels + 10 * exponents * centres)
+        levels = levels + 10 * exponents * centres
+        is_known = torch.tensor([*map(len, known)]) > 0
+        for own, fitted in ((self.levels, levels), (self.exponents, exponents)):
+            own[is_known] = fitted.to(own)
+            own[~is_known] = fitted.mean().to(own)
 
     def forward(self, batch: Batch) -> Prediction:
         receivers = batch.query.receivers

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gaigs.calibration.conformal import Asked, Estimate
+from gaigs.calibration.estimate import Asked, Estimate
 from gaigs.core.antenna import Receiver
 from gaigs.core.geometry import Directions, Grid, Pose, Rays
 from gaigs.core.query import (

@@ -249,6 +249,7 @@ def score(
     uplink is taken for a downlink.
     """
     test = LinkScores(links)
+    look_ups = able_look_ups(look_ups, links)
     frequencies = None if links.held_out is None else test.task.frequencies
     states_intervals = has_intervals and frequencies is None
     first = next(iter([*models, *look_ups]), None)
@@ -292,6 +293,12 @@ def score(
         with atomic_write(folder / "predictions.npz") as part_file:
             np.savez_compressed(part_file, **test.content)
     return test.scores
+
+
+def able_look_ups(look_ups: Mapping[str, Model], links: Links) -> dict[str, Model]:
+    """Look-ups that predict for all receivers of the test, also for ones without known links."""
+    new = links.split.by_receivers
+    return {key: model for key, model in look_ups.items() if model.any_receiver or not new}
 
 
 class LinkScores:

@@ -107,6 +107,11 @@ def _checked(model: Model | None, links: Links, config: dict) -> Model:
         raise ValueError(
             "model=kriging has no training of its own; choose a trained model, and set kriging=true"
         )
+    if links.split.by_receivers and not model.any_receiver:
+        raise ValueError(
+            f"model {config['model']['name']!r} predicts for receivers with links alone\n"
+            "take another split, or mirrored, gaigs, friis, path_loss, mean or gaussian_process"
+        )
     if config["kriging"]:
         check_known(links)  # a training comes before
     return model

@@ -1,6 +1,7 @@
 """Receivers that no measurement has."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -104,3 +105,81 @@ def test_mirrored_gaussians_share_the_room(links, tmp_path):
     far = model.at_receivers([Receiver("far", Pose.at([20.0, 2.0, 2.0]))])
     far.save(tmp_path / "far.ckpt")  # the room does not move with the receivers
     assert torch.equal(gaigs.load(tmp_path / "far.ckpt").predict(PLACES), far.predict(PLACES))
+
+
+def readings(links, receiver, index):
+    """Some links of one receiver, which is their only one."""
+    query = links.query[index]
+    query.receivers = torch.zeros_like(query.receivers)
+    only = {
+        "query": query,
+        "labels": links.labels[index],
+        "receivers": (links.receivers[receiver],),
+    }
+    return replace(links, **only, split=None, rows=None)
+
+
+def test_held_out_receivers_have_the_prediction_of_a_new_one():
+    links = gaigs.links("synthetic_rssi", transmitters=60, split="receivers", hold=["west"])
+    assert links.split.by_receivers
+    assert set(links.query.receivers[links.split.test].tolist()) == {0}
+    for name in ("path_loss", "mean", "gaussian_process"):
+        model = gaigs.train(name, links, progress=False)
+        new = model.predict(PLACES, receiver=Receiver("new", links.receivers[0].pose))
+        torch.testing.assert_close(model.predict(PLACES, receiver="west"), new, msg=name)
+    result = gaigs.evaluate(model, links)
+    assert list(result.models) == ["gaussian_process", "mean", "path_loss"]  # knn has no neighbours
+    with pytest.raises(ValueError, match="receivers with links alone"):
+        gaigs.train("knn", links)
+
+
+def test_trained_models_learn_nothing_of_receivers_that_validate_or_test():
+    links = gaigs.links("synthetic_rssi", transmitters=40, receivers=6, split="receivers")
+    model = MirroredSplatting(links.scene, trend="mean")
+    model.fit(links)
+    heard = links.query.receivers[links.split.train].unique()
+    assert model.placement.is_heard.nonzero()[:, 0].tolist() == heard.tolist()
+    others = [number for number in range(6) if number not in heard]
+    assert torch.allclose(model.trend.means[others], model.trend.means[heard].mean())
+
+
+def test_intervals_at_new_receivers_count_receivers(tmp_path):
+    links = gaigs.links("synthetic_rssi", transmitters=80, receivers=9, split="receivers")
+    model = gaigs.train("path_loss", links, progress=False)
+    test = links.split.test
+    estimate = model.predict(links.query[test], interval=0.9)
+    at_known = model.predict(links.query[links.split.train], interval=0.9)
+    assert (estimate.upper - estimate.lower).min() > (at_known.upper - at_known.lower).max()
+    labels = links.labels[test]
+    share = ((estimate.lower <= labels) & (labels <= estimate.upper)).double().mean()
+    assert share > 0.8
+    model.save(tmp_path / "room.ckpt")
+    again = gaigs.load(tmp_path / "room.ckpt").predict(links.query[test], interval=0.9)
+    assert torch.equal(again.upper, estimate.upper)
+    moved = model.predict(PLACES, receiver=[3.0, 2.0, 2.0], interval=0.9)
+    assert torch.isfinite(moved.std).all()
+
+
+def test_readings_at_a_new_receiver_correct_its_level():
+    links = gaigs.links("synthetic_rssi", transmitters=80, receivers=9, split="receivers")
+    model = gaigs.train("path_loss", links, progress=False)
+    receiver = int(links.query.receivers[links.split.test[0]])
+    own = (links.query.receivers == receiver).nonzero()[:, 0]
+    far = readings(links, receiver, own[:60])
+    far.labels.add_(20.0)  # cables and front end
+    before = model.at_receivers(far.receivers)
+    errors = []
+    for count in (0, 3, 10, 60):
+        some = readings(far, 0, torch.arange(max(count, 1)))
+        moved = model.adapt(some) if count else before
+        rest = far.query
+        errors.append((moved.predict(rest) - far.labels).mean().abs().item())
+    assert errors[0] > errors[1] > errors[2] > errors[3]
+    wide, narrow = (one.predict(PLACES, 0, interval=0.9) for one in (before, moved))
+    assert (narrow.upper - narrow.lower < wide.upper - wide.lower).all()
+    between, within = before.calibration.scatter.tolist()
+    error = (far.labels - before.predict(far.query)).double().mean().item()
+    shift = (moved.levels - before.levels).item()
+    assert shift == pytest.approx(error * between / (between + within / 60), rel=1e-4)
+    with pytest.raises(ValueError, match="adapt takes a model of levels"):
+        gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0)).adapt(far)

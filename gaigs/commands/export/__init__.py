@@ -3,9 +3,12 @@
 from pathlib import Path
 
 from gaigs.commands.export import maps, predictions, rooms, scenarios
+from gaigs.core.query import Query
 from gaigs.core.radio_maps import radio_map
+from gaigs.data import Links
 from gaigs.io.tables import read_points
 from gaigs.model import Model
+from gaigs.model.requests import as_new_receiver
 from gaigs.registry import call, check_instance, check_type
 from gaigs.runs import links_of, load
 
@@ -31,6 +34,7 @@ def export(
     height: float | None = None,
     frequency: float | None = None,
     interval: float = 0.9,
+    receiver: object = None,
 ) -> list[Path]:
     """Writes what a model knows into a file for other programs; the suffix chooses what, and how.
 
@@ -47,6 +51,8 @@ def export(
         frequency: Carrier of radio map, places and materials of the room [Hz]; None: the training
             links' carrier.
         interval: Probability with which the intervals of predictions hold the label.
+        receiver: A receiver in place of the model's own: a position [m], ``Pose`` or ``Receiver``,
+            as for ``Model.predict``; None: the model's own.
 
     Returns:
         The files: the figures of many receivers, and a scene with its meshes, are several.
@@ -70,6 +76,13 @@ def export(
     check_type("file", file, str | Path)
     file = Path(file)
     suffix = check_suffix(file)
+    if receiver is not None:
+        new = as_new_receiver(receiver, model.scene, places)
+        if new is None or isinstance(places, Links | Query):
+            raise ValueError(
+                f"export takes a receiver [x, y, z] with places, or a radio map, got {receiver!r}"
+            )
+        model = model.at_receivers([new])
     if suffix in ROOM_FILES:
         return rooms.write_room(model, file, frequency)
     if suffix == SCENARIO:

@@ -62,6 +62,7 @@ def furnished_room(
     bandwidth: float = 499.2e6,
     order: int = 2,
     seed: int = 0,
+    receivers: int | None = None,
 ) -> Links:
     """Spectra of transmitters at random places in the default room.
 
@@ -78,6 +79,7 @@ def furnished_room(
         bandwidth: Width of the band around each carrier [Hz].
         order: Largest number of reflections of a path.
         seed: Seed of the places.
+        receivers: Arrays on the walls, see ``wall_poses``; None: one in a corner.
 
     Raises:
         TypeError: A frequency is no number.
@@ -86,19 +88,63 @@ def furnished_room(
     Source: frequency and bandwidth are by default channel 5 of IEEE 802.15.4
     (ultra-wideband).
     """
-    return simulate_spectra(default_room(order), spectrum, transmitters, frequency, bandwidth, seed)
+    room = default_room(order, receivers)
+    return simulate_spectra(room, spectrum, transmitters, frequency, bandwidth, seed)
 
 
-def default_room(order: int) -> SimulatedRoom:
-    """The default room with paths of at most ``order`` reflections."""
+def default_room(order: int, receivers: int | None = None) -> SimulatedRoom:
+    """The default room with paths of at most ``order`` reflections, and so many receivers; None:
+    one array, four gateways.
+    """
+    poses: tuple[Pose, ...] = (POSE,)
+    gateways = [gateway(name, position) for name, position in GATEWAYS.items()]
+    if receivers is not None:
+        poses = wall_poses(ROOM, receivers)
+        gateways = [gateway(f"gateway{k}", pose.position) for k, pose in enumerate(poses, 1)]
     return SimulatedRoom(
-        pose=POSE,
-        gateways=tuple(gateway(name, position) for name, position in GATEWAYS.items()),
+        poses=poses,
+        gateways=tuple(gateways),
         edges=edges(ROOM),
         place=place,
         frequency_offsets=lambda bandwidth: frequency_offsets(ROOM, bandwidth, order),
         respond=partial(respond_in_parts, ROOM, order=order),
     )
+
+
+def wall_poses(room: Room, count: int) -> tuple[Pose, ...]:
+    """Poses along the walls, 0.1 m off them and outside furniture, that face the room's middle.
+
+    They divide the walls evenly; heights are the multiples of the golden ratio, modulo 1, from 1.2
+    to 2.6 m.
+    """
+    if count < 1:
+        raise ValueError(f"receivers must be at least 1, got {count}")
+    size = torch.tensor(room.size, dtype=torch.float64)
+    gap = 0.1  # [m]
+    corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=torch.float64)
+    corners = gap + corners * (size[:2] - 2 * gap)  # (4, 2) [m]
+    sides = (corners.roll(-1, 0) - corners).norm(dim=1)
+    ends = sides.cumsum(0)
+    middle = torch.cat((size[:2] / 2, torch.ones(1, dtype=torch.float64)))
+    poses = []
+    for number in range(count):
+        share = (number + 0.5) / count
+        height = 1.2 + 1.4 * (0.618034 * number % 1)
+        while True:  # furniture moves a receiver along its wall
+            along = share % 1 * ends[-1]
+            side = int(torch.searchsorted(ends, along))
+            part = 1 - (ends[side] - along) / sides[side]
+            place = torch.lerp(corners[side], corners[(side + 1) % 4], part)
+            position = torch.cat((place, place.new_tensor([height])))
+            if is_free(room, position[None]).all():
+                break
+            share += 0.005
+        normal = torch.nn.functional.normalize(middle - position, dim=0)
+        across = torch.linalg.cross(normal.new_tensor([0.0, 0.0, 1.0]), normal)
+        across = torch.nn.functional.normalize(across, dim=0)
+        axes = torch.stack((across, torch.linalg.cross(normal, across), normal), 1)  # (3, 3)
+        poses.append(Pose(position.float(), axes.float()))
+    return tuple(poses)
 
 
 def respond_in_parts(

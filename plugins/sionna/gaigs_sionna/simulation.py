@@ -51,7 +51,7 @@ def find_room(
     room = ROOMS[name]
 
     return SimulatedRoom(
-        pose=room.pose(),
+        poses=(room.pose(),),
         gateways=tuple(gateway(name, position) for name, position in room.gateways.items()),
         edges=edges(room.meshes()),
         place=lambda count, seed: place(room, count, seed),
@@ -82,7 +82,7 @@ def _find_scene(
     diagonal = float(np.linalg.norm(space.upper - space.lower))
 
     return SimulatedRoom(
-        pose=facing(positions[0].tolist(), faced),
+        poses=(facing(positions[0].tolist(), faced),),
         gateways=tuple(gateway(f"rx{k}", position) for k, position in enumerate(positions)),
         edges=room.edges(),
         place=room.place,

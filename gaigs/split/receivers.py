@@ -1,0 +1,102 @@
+"""Whole receivers are held out."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Int
+from torch import Tensor
+
+from gaigs.data import Links, Split
+from gaigs.registry import register
+from gaigs.split import check, check_validation, generator_of, hold_out, places_of, rows_of
+
+
+@register("split", "receivers")
+def receivers(
+    links: Links,
+    hold: Sequence[str] | None = None,
+    test: float = 0.25,
+    fold: str | None = None,
+    validation: float | None = None,
+    seed: int = 0,
+) -> Split:
+    """Whole receivers test: the error where no receiver has stood.
+
+    Where three receivers or more are left, whole receivers validate, too; of two, random places.
+
+    Args:
+        hold: Names of the receivers that test; None: random ones.
+        test: Fraction of the receivers that test, at least one; for random ones.
+        fold: Fold of the receivers that tests, such as ``1/3`` for the first of three folds, in
+            place of a fraction.
+        validation: Fraction of the other receivers, or their places, that validates; 0 for none.
+            None: 0.2 of receivers, 0.1 of places.
+        seed: Seed of all random numbers.
+
+    Raises:
+        ValueError: An option is out of range, a name is unknown, or fewer than two receivers are
+            left to train on.
+    """
+    check_validation(validation)
+    check("test", test, 0 < test < 1, "in (0, 1)")
+    generator = generator_of(seed)
+    order = torch.randperm(len(links.receivers), generator=generator)
+    if links.uncertainties is not None:  # a receiver without a place is located by its links
+        order = order[links.uncertainties[order].isfinite()]
+    held, name = _held(links, order, hold, test, fold)
+    of_links = links.query.receivers
+    rest = of_links[~torch.isin(of_links, held)].unique()
+    if len(rest) < 2:
+        raise ValueError(
+            f"split=receivers leaves two receivers or more to train on, got {len(rest)} of "
+            f"{len(links.receivers)}; hold fewer, or take split=random"
+        )
+    order = order[torch.isin(order, rest)]
+    is_test = torch.isin(of_links, held)
+    training = (~is_test).nonzero()[:, 0]
+    if len(rest) > 2 and validation != 0:
+        share = 0.2 if validation is None else validation
+        validating = order[: max(1, round(share * len(order)))]
+        is_validating = torch.isin(of_links[training], validating)
+        train, validated = training[~is_validating], training[is_validating]
+        name += f", validation {len(validating)}"
+    else:
+        train, validated, share = hold_out(
+            "validation",
+            training,
+            places_of(links),
+            links.query.votes,
+            validation,
+            generator,
+            rows=rows_of(links),
+        )
+        name += f", validation {share:g} of places" if share else ""
+    name += f", seed {seed}"
+    return Split(name, train, validated, is_test.nonzero()[:, 0], by_receivers=True)
+
+
+def _held(
+    links: Links,
+    order: Int[Tensor, " r"],
+    hold: Sequence[str] | None,
+    test: float,
+    fold: str | None,
+) -> tuple[Int[Tensor, " h"], str]:
+    """Numbers of the receivers that test, from a random ``order``, and the protocol's name."""
+    names = [receiver.name for receiver in links.receivers]
+    if hold is not None:
+        hold = [hold] if isinstance(hold, str) else [*hold]
+        for name in hold:
+            if name not in names:
+                raise ValueError(f"split.hold must name receivers of the data, got {name!r}")
+        held = torch.tensor([names.index(name) for name in hold])
+        return held, f"receivers {', '.join(hold)}"
+    if fold is None:
+        return order[: max(1, round(test * len(order)))], f"receivers, test {test:g}"
+    number, _, count = fold.partition("/")
+    is_fold = number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)
+    if not is_fold or not 2 <= int(count) <= len(order):
+        raise ValueError(
+            f"split.fold must be a fold such as 1/3, of 2 to {len(order)} folds, got {fold!r}"
+        )
+    return order[int(number) - 1 :: int(count)], f"receivers, fold {fold}"
