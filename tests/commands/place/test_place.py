@@ -174,6 +174,15 @@ def test_a_plan_is_a_sentence_a_table_and_a_picture(objective, text, tmp_path):
     assert len(figure(gaigs.place(room, 4.0, 1, objective, region=region, known=False)).axes) == 2
 
 
+def test_trained_models_place_receivers_or_say_that_they_cannot():
+    links = gaigs.links("synthetic_rssi", transmitters=60, order=0)
+    plan = gaigs.place(gaigs.train("path_loss", links), 2.0, 1, "mean")
+    assert plan.scores[1] > plan.scores[0]
+    assert len(plan.standing) == 4
+    with pytest.raises(ValueError, match="predicts for its own receivers alone"):
+        gaigs.place(gaigs.train("knn", links), 2.0)
+
+
 def test_candidates_stand_along_the_walls():
     scene = Room().scene
     lower, upper = scene.box
