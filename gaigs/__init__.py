@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from gaigs.commands.locate.location import Location
     from gaigs.commands.locate.posterior import locate
     from gaigs.commands.locate.prediction_map import fingerprints
+    from gaigs.commands.place.plan import SitePlan, place
     from gaigs.commands.survey.plan import SurveyPlan, survey
     from gaigs.commands.view import View, view
     from gaigs.configuration import compose
@@ -56,6 +57,8 @@ PLACES = {
     "Location": "commands.locate.location",
     "fingerprints": "commands.locate.prediction_map",
     "Fingerprints": "commands.locate.fingerprints",
+    "place": "commands.place.plan",
+    "SitePlan": "commands.place.plan",
     "survey": "commands.survey.plan",
     "SurveyPlan": "commands.survey.plan",
     "view": "commands.view",
@@ -86,10 +89,10 @@ PLACES = {
 
 __all__ = [
     "Array", "Description", "Estimate", "Fingerprints", "Frame", "Grid", "Links", "Location",
-    "Metric", "Model", "Pose", "Query", "Rays", "Receiver", "Scene", "SurveyPlan", "View",
-    "__version__", "compose", "describe", "evaluate", "export", "fingerprints", "links", "load",
-    "locate", "plot", "radio_map", "rasterize", "register", "registries", "run", "survey",
-    "train", "view",
+    "Metric", "Model", "Pose", "Query", "Rays", "Receiver", "Scene", "SitePlan", "SurveyPlan",
+    "View", "__version__", "compose", "describe", "evaluate", "export", "fingerprints", "links",
+    "load", "locate", "place", "plot", "radio_map", "rasterize", "register", "registries", "run",
+    "survey", "train", "view",
 ]  # fmt: skip
 
 

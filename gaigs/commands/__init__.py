@@ -11,7 +11,7 @@ from gaigs.registry import call, suggest
 from gaigs.registry.torch_modes import usual_modes
 from gaigs.report.formats import figure_formats
 
-COMMANDS = ("agreement", "describe", "survey", "locate", "export", "view")
+COMMANDS = ("agreement", "describe", "survey", "place", "locate", "export", "view")
 """Commands beside the training, each a module of its name."""
 
 

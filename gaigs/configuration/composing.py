@@ -159,7 +159,7 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
     if is_key or name.partition(".")[0] in sections:
         _check_parent(config, name, is_new)
         return name
-    commands = {"survey", "locate", "export", "view", "figures"}
+    commands = {"survey", "place", "locate", "export", "view", "figures"}
     searched = sections or plain.keys() - {*READ_BY_LINKS} - commands
     names = {key: key.rpartition(".")[2] for key in option_keys(plain, searched)}
     keys = sorted(key for key, last in names.items() if last == name)

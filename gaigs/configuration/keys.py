@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from gaigs.registry import KINDS, check_type, listed, suggest
 
 HARMLESS = (
-    "command", "folder", "survey", "locate", "export", "view", "figures", "save_every",
-    "tensorboard", "threads", "trust", "trainer.enable_progress_bar",
+    "command", "folder", "survey", "place", "locate", "export", "view", "figures",
+    "save_every", "tensorboard", "threads", "trust", "trainer.enable_progress_bar",
     "trainer.enable_model_summary",
 )  # fmt: skip
 """Keys that change no result: a run may be resumed with other values."""
@@ -30,6 +30,7 @@ KEYS = {
     "trust": bool,
     "folder": str | None,
     "survey": dict,
+    "place": dict,
     "locate": dict,
     "export": dict,
     "view": dict,

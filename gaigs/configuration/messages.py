@@ -95,7 +95,7 @@ def nearest(word: str, config: Mapping) -> str:
 
     It is empty if no name is similar.
     """
-    parts = config.keys() - {"hydra", "survey", "locate", "export", "view"}
+    parts = config.keys() - {"hydra", "survey", "place", "locate", "export", "view"}
     names = {key: key.rpartition(".")[2] for key in (*parts, *option_keys(config, parts))}
     near = similar(word, {*names.values()} - {"name"})
     keys = [key for key in near if key in config]

@@ -173,7 +173,7 @@ def radio_map(
         >>> floor.values.shape == (len(floor.receivers), len(floor.y), len(floor.x)), floor.unit
         (True, 'dBm')
     """
-    scene = _scene_of(model)
+    scene = scalar_scene(model, "a radio map")
     known = [receiver.name for receiver in scene.receivers]
     chosen = np.arange(len(known))
     if receivers is not None:
@@ -208,8 +208,8 @@ def radio_map(
     )
 
 
-def _scene_of(model) -> Scene:
-    """The scene of a model whose labels are one real number each."""
+def scalar_scene(model, owner: str) -> Scene:
+    """The scene of a model of one real number a link; ``owner`` names its use in errors."""
     if not hasattr(model, "scene"):
         raise TypeError(
             f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint "
@@ -218,7 +218,7 @@ def _scene_of(model) -> Scene:
     task = model.scene.task
     if not task.is_scalar:
         raise ValueError(
-            f"a radio map takes a model of one real number a link, got one of task {task.name!r}, "
+            f"{owner} takes a model of one real number a link, got one of task {task.name!r}, "
             f"whose labels are {tuple(task.shape)} of {task.dtype}; use model.predict"
         )
     return model.scene

@@ -19,6 +19,7 @@ def plot(result: Any, /, ax: Any = None, **options: Any) -> Any:
     | ``gaigs.evaluate(...)`` | How large are errors? | metric |
     | ``gaigs.locate(...)`` | Where is the transmitter? | |
     | ``gaigs.survey(...)`` | Where to measure next? | |
+    | ``gaigs.place(...)`` | Where to put access points? | |
     | ``model.learnt_room(links)`` | What is learnt of the room? | links, show_paths |
 
     Args:
@@ -47,6 +48,7 @@ def plot(result: Any, /, ax: Any = None, **options: Any) -> Any:
         "Evaluation": "report.curves.plot_scores",
         "Location": "commands.locate.figures.plot_location",
         "SurveyPlan": "commands.survey.plot_plan",
+        "SitePlan": "commands.place.plot_plan",
         "LearntRoom": "report.room.plot_room",
     }
     name = type(result).__name__

@@ -7,9 +7,8 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from gaigs.commands.survey.area import read_area
+from gaigs.commands.survey.area import read_candidates
 from gaigs.commands.survey.plan import SurveyPlan, survey
-from gaigs.io.tables import read_points
 from gaigs.registry import call
 from gaigs.report import style
 from gaigs.runs import load
@@ -23,12 +22,7 @@ def run(config: dict, folder: Path) -> None:
     model = None if config["folder"] is None else load(config["folder"], config["trust"])
     options = dict(config["survey"])
     if isinstance(options["candidates"], str):
-        file = Path(options["candidates"])
-        if file.suffix.lower() in (".geojson", ".json"):
-            options["candidates"] = read_area(file, model)
-        else:
-            content = "x,y,z [m] of one candidate a line"
-            options["candidates"] = read_points(file, "xyz", content)
+        options["candidates"] = read_candidates(Path(options["candidates"]), model)
     plan = call("survey", survey, options, model=model)
     folder.mkdir(parents=True, exist_ok=True)
     plan.save(folder / "survey.csv")

@@ -15,10 +15,18 @@ from torch import Tensor
 
 from gaigs.core.geometry import Frame, even_places
 from gaigs.data.maps import check_metres, find_pyproj
+from gaigs.io.tables import read_points
 from gaigs.model import Model
 
 Rings = list[Float[ndarray, "_ d"]]
 """Outline of a polygon and its holes, as positions."""
+
+
+def read_candidates(file: Path, model: Model | None) -> object:
+    """Candidates of a file: a table of x,y,z [m], or places within the areas of ``.geojson``."""
+    if file.suffix.lower() in (".geojson", ".json"):
+        return read_area(file, model)
+    return read_points(file, "xyz", "x,y,z [m] of one candidate a line")
 
 
 def read_area(file: Path, model: Model | None, count: int = 1000) -> Float[Tensor, "c 3"]:

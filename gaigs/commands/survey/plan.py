@@ -103,17 +103,20 @@ class SurveyPlan:
         if self.errors is not None:
             errors = [f"{error:.6g}" for error in self.errors[1:].tolist()]
         for place, error in zip(self.places.tolist(), errors, strict=True):
-            rows.append(self._row("measure", place, error))
+            rows.append(table_row("measure", place, self.frame, error))
         losses = self.losses[self.superfluous].tolist()
         for place, loss in zip(self.known[self.superfluous].tolist(), losses, strict=True):
-            rows.append(self._row("leave out", place, f"{self.known_error + loss:.6g}"))
+            without = f"{self.known_error + loss:.6g}"
+            rows.append(table_row("leave out", place, self.frame, without))
         write_table(Path(path), rows)
 
-    def _row(self, use: str, place: Sequence[float], error: str) -> list[str]:
-        numbers = [*place]
-        if self.frame is not None:
-            numbers += [self.frame.x + place[0], self.frame.y + place[1]]
-        return [use, *(f"{number:.3f}" for number in numbers), error]
+
+def table_row(use: str, place: Sequence[float], frame: Frame | None, value: str) -> list[str]:
+    """A row of a table of places, with easting and northing if there is a frame."""
+    numbers = [*place]
+    if frame is not None:
+        numbers += [frame.x + place[0], frame.y + place[1]]
+    return [use, *(f"{number:.3f}" for number in numbers), value]
 
 
 @with_progress

@@ -1,0 +1,155 @@
+"""What sets of receivers are worth at places, and the greedy choice of a set.
+
+Readings of receivers are independent normal variables, so a set is worth what a product over its
+receivers tells.
+"""
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from gaigs.core.stages import track
+
+
+class Coverage:
+    """Chance that the best receiver's reading is above a threshold [%].
+
+    All readings are below it with the product of their chances to be below.
+
+    Args:
+        values: Expected readings of receivers at places (r, g) [dBm].
+        deviations: Standard deviations of the readings (r, g) [dB].
+        threshold: The threshold [dBm].
+    """
+
+    sign = 1  # higher is better
+
+    def __init__(
+        self, values: Float[Tensor, "r g"], deviations: Float[Tensor, "r g"], threshold: float
+    ):
+        self.values = values
+        self.deviations = deviations
+        self.thresholds = values.new_tensor([threshold])  # (t,)
+
+    def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g t"]:
+        """Factors of some receivers."""
+        above = self.thresholds - self.values[index, :, None]  # (k, g, t)
+        return torch.special.ndtr(above / self.deviations[index, :, None])
+
+    def quality(self, products: Float[Tensor, "*sets g t"]) -> Float[Tensor, "*sets g"]:
+        """Quality of each place, by products of factors."""
+        return 100 * (1 - products[..., 0])
+
+
+class MeanLevel(Coverage):
+    """Expected reading of the best receiver [dBm].
+
+    It is a level below all readings, and the integral above it of the chance to be covered.
+    """
+
+    def __init__(
+        self, values: Float[Tensor, "r g"], deviations: Float[Tensor, "r g"], steps: int = 64
+    ):
+        low = (values - 4 * deviations).min().item()  # 3e-5 of a normal variable is lower
+        high = (values + 4 * deviations).max().item()
+        super().__init__(values, deviations, low)
+        self.thresholds = torch.linspace(low, high, steps, dtype=values.dtype)
+
+    def quality(self, products: Float[Tensor, "*sets g t"]) -> Float[Tensor, "*sets g"]:
+        return self.thresholds[0] + torch.trapezoid(1 - products, self.thresholds, dim=-1)
+
+
+class LocationError:
+    """Root mean square error of a location by the readings of all receivers [m].
+
+    Readings at a place y give a place y' an expected likelihood: a normal density of the difference
+    of the means, a product over receivers (Jebara, Kondor and Howard, Probability product kernels,
+    2004). Half the mean square distance by these weights is the variance of the location. It is
+    the Cramér-Rao bound where readings are linear in the place, and counts distant places that look
+    alike, which the bound does not know.
+
+    Args:
+        values, deviations: As of ``Coverage``.
+        places: Possible places, all alike (g, 3) [m].
+    """
+
+    sign = -1  # lower is better
+
+    def __init__(
+        self,
+        values: Float[Tensor, "r g"],
+        deviations: Float[Tensor, "r g"],
+        places: Float[Tensor, "g 3"],
+    ):
+        self.values = values
+        self.deviations = deviations
+        self.squares = torch.cdist(places, places).square().to(values)  # (g, g)
+
+    def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g g"]:
+        """Factors of some receivers."""
+        means, variances = self.values[index], self.deviations[index].square()
+        variances = variances[:, :, None] + variances[:, None]  # (k, g, g)
+        apart = means[:, :, None] - means[:, None]
+        # A constant of each receiver has no effect; with this one no factor is above 1.
+        scale = variances.amin((1, 2), keepdim=True)
+        return (scale / variances).sqrt() * torch.exp(-apart.square() / (2 * variances))
+
+    def quality(self, products: Float[Tensor, "*sets g g"]) -> Float[Tensor, "*sets g"]:
+        """Quality of each place, by products of factors."""
+        return ((products * self.squares).sum(-1) / products.sum(-1) / 2).sqrt()
+
+
+def choose(
+    rule: Coverage | LocationError, standing: int, count: int
+) -> tuple[Int[Tensor, " n"], Float[Tensor, "n1 g"]]:
+    """Receivers that together are best beside the first ones, which stand; and the quality of each
+    place before and after each of them.
+
+    Each is the best beside those before it; then single ones are exchanged as long as that helps.
+    Coverage and mean level are monotone and submodular, so they gain at least 1 - 1/e of what the
+    best set gains (Nemhauser, Wolsey and Fisher, An analysis of approximations for maximizing
+    submodular set functions, 1978, which has both steps).
+    """
+    rows = torch.arange(len(rule.values))
+    before, candidates = rows[:standing], rows[standing:]
+    members, score = extend(rule, before, candidates, count)
+    unchanged = 0  # receivers that stayed since the last exchange
+    while unchanged < count:
+        others = torch.cat((before, members[standing + 1 :]))
+        members, new_score = extend(rule, others, candidates, 1)
+        unchanged = 0 if new_score > score + 1e-9 else unchanged + 1
+        score = max(score, new_score)
+    members, _ = extend(rule, before, members[standing:], count)
+    products = [product_of(rule, members[:end]) for end in range(standing, len(members) + 1)]
+    return members[standing:], torch.stack([rule.quality(product) for product in products])
+
+
+def extend(
+    rule: Coverage | LocationError,
+    members: Int[Tensor, " k"],
+    candidates: Int[Tensor, " c"],
+    count: int,
+    most: int = 4_000_000,
+) -> tuple[Int[Tensor, " n"], float]:
+    """A set with so many candidates more, each the best beside those before it, and its mean
+    quality, negative where lower is better; ``most`` factors are held at a time.
+    """
+    score = -torch.inf
+    for _ in track(range(count), "receivers to place"):
+        free = candidates[~torch.isin(candidates, members)]
+        product = product_of(rule, members)
+        means = []
+        for part in free.split(max(1, most // product.numel())):
+            means.append(rule.sign * rule.quality(product * rule.factors(part)).mean(-1))
+        ranked = torch.cat(means)
+        members = torch.cat((members, free[ranked.argmax()][None]))
+        score = ranked.max().item()
+    return members, score
+
+
+def product_of(rule: Coverage | LocationError, members: Int[Tensor, " k"]) -> Float[Tensor, "g t"]:
+    """The product of the factors of a set."""
+    product = torch.ones_like(rule.factors(torch.zeros(1, dtype=torch.int64))[0])
+    for receiver in members[:, None]:
+        product = product * rule.factors(receiver)[0]
+    return product

@@ -1,0 +1,179 @@
+"""Where to put access points: candidates that are chosen one by one, by predicted levels."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gaigs.commands.place.objectives import Coverage, LocationError, MeanLevel, choose
+from gaigs.commands.survey.plan import survey_places, table_row
+from gaigs.core.geometry import Frame
+from gaigs.core.query import as_positions
+from gaigs.core.radio_maps import scalar_scene
+from gaigs.core.results import plot
+from gaigs.core.scene import Scene
+from gaigs.core.stages import track, with_progress
+from gaigs.io.tables import write_table
+from gaigs.model import Model
+from gaigs.registry import check_type, suggest
+
+
+@dataclass(frozen=True, repr=False)
+class SitePlan:
+    """Places for access points, and what is expected of each.
+
+    Attributes:
+        places: Chosen candidates, the first choice first (n, 3) [m].
+        standing: Receivers that stand already (k, 3) [m].
+        area: Places of transmitters (g, 3) [m].
+        qualities: The objective at each of them, before and after each choice (n + 1, g). The mean
+            level of no receivers is NaN.
+        objective: ``coverage`` [%], ``mean`` in the unit of the labels, or ``locate`` [m].
+        threshold: Level that ``coverage`` asks for.
+        unit: Unit of the labels.
+        frame: Place of x and y on a map; None if unknown.
+    """
+
+    places: Float[Tensor, "n 3"]
+    standing: Float[Tensor, "k 3"]
+    area: Float[Tensor, "g 3"]
+    qualities: Float[Tensor, "n1 g"]
+    objective: str
+    threshold: float
+    unit: str
+    frame: Frame | None = None
+    plot = plot
+
+    @property
+    def scores(self) -> Float[Tensor, " n1"]:
+        """Mean of the objective over the area, before and after each choice."""
+        return self.qualities.mean(1)
+
+    @property
+    def score_unit(self) -> str:
+        return {"coverage": "%", "locate": "m"}.get(self.objective, self.unit)
+
+    def __repr__(self) -> str:
+        return f"<{self}>"
+
+    def __str__(self) -> str:
+        more = " more" if len(self.standing) else ""
+        subject = f"{len(self.places)}{more} bring{'s' * (len(self.places) == 1)}"
+        digits = 2 if self.objective == "locate" else 1
+        first, last = (f"{score:.{digits}f}" for score in self.scores[[0, -1]].tolist())
+        if self.objective == "coverage":
+            start = f"{first} to " * (len(self.standing) > 0)
+            return f"{subject} {start}{last} % above {self.threshold:g} {self.unit}".rstrip()
+        what = "mean best level" if self.objective == "mean" else "expected error of locations"
+        start = "" if first == "nan" else f"from {first} "
+        return f"{subject} the {what} {start}to {last} {self.score_unit}".rstrip()
+
+    def save(self, path: str | Path) -> None:
+        """Writes a CSV table: receivers that stand, then places, with the score after each place;
+        with a ``frame`` easting and northing too.
+        """
+        on_map = [] if self.frame is None else ["easting", "northing"]
+        rows = [["use", "x", "y", "z", *on_map, self.objective]]
+        for place in self.standing.tolist():
+            rows.append(table_row("stands", place, self.frame, ""))
+        for place, score in zip(self.places.tolist(), self.scores[1:].tolist(), strict=True):
+            rows.append(table_row("place", place, self.frame, f"{score:.6g}"))
+        write_table(Path(path), rows)
+
+
+@with_progress
+@torch.no_grad()
+def place(
+    model: Model,
+    candidates: object = None,
+    count: int = 1,
+    objective: str = "coverage",
+    threshold: float = -75.0,
+    region: object = None,
+    known: bool = True,
+    frequency: float | None = None,
+    *,
+    progress: bool = True,
+) -> SitePlan:
+    """Places for new access points, each the best beside those that stand or were chosen before.
+
+    Args:
+        model: A trained model of levels with intervals, which predicts receivers at any place.
+        candidates: Possible places (c, 3) [m]; or their distance [m] along the walls, the sides of
+            the box of training transmitters and receivers, at the receivers' median height; None:
+            64 along the walls.
+        count: Number of access points.
+        objective: ``coverage``: chance of a reading above the threshold at one receiver or more;
+            ``mean``: reading of the best receiver; ``locate``: error of a location by all readings.
+        threshold: Level that ``coverage`` asks for, in the unit of the labels.
+        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the objective is the
+            mean; None: the box of the training transmitters, of several floors these.
+        known: True: the model's receivers stand already; False: they are ignored.
+        frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
+        progress: False for no bars.
+
+    Raises:
+        ValueError: The model has no levels, no intervals or no new receivers; an option is out of
+            range, or a place is impossible.
+    """
+    scene = scalar_scene(model, "a placement")
+    check_type("count", count, int)
+    if not math.isfinite(threshold):
+        raise ValueError(f"threshold must be a finite level, got {threshold}")
+    sites = candidate_places(scene, candidates)
+    if not 1 <= count <= len(sites):
+        raise ValueError(f"count must be 1 to {len(sites)}, the candidates, got {count}")
+    area = survey_places(model, region, None).candidates  # (g, 3)
+    rules: dict[str, Callable[..., Coverage | LocationError]] = {
+        "coverage": partial(Coverage, threshold=float(threshold)),
+        "mean": MeanLevel,
+        "locate": partial(LocationError, places=area),
+    }
+    if objective not in rules:
+        got = suggest(objective, rules)
+        raise ValueError(f"objective must be one of {', '.join(rules)}, got {got}")
+    standing = scene.positions(area) if known else area[:0]
+    frequency = scene.middle_frequency if frequency is None else frequency
+
+    parts = []
+    for receiver in track([*range(len(standing)), *sites], "predicted receivers"):
+        # An interval brings the deviation, whatever its level.
+        estimate = model.predict(area, receiver=receiver, frequency=frequency, interval=0.5)
+        parts.append(torch.stack(estimate[:2]).double().cpu())  # (2, g)
+    values, deviations = torch.stack(parts, 1)  # (k + c, g) each
+    chosen, qualities = choose(rules[objective](values, deviations), len(standing), count)
+    if objective == "mean" and not len(standing):
+        qualities[0] = math.nan
+    return SitePlan(
+        sites[chosen - len(standing)],
+        standing,
+        area,
+        qualities,
+        objective,
+        float(threshold),
+        scene.task.unit,
+        scene.frame,
+    )
+
+
+def candidate_places(scene: Scene, candidates: object, usual: int = 64) -> Float[Tensor, "c 3"]:
+    """Candidates of the argument of ``place``."""
+    if candidates is not None and not isinstance(candidates, int | float):
+        return as_positions("candidates", candidates).reshape(-1, 3)
+    x, y = torch.stack(scene.box)[:, :2].T.numpy()
+    corners = np.stack((x[[0, 1, 1, 0, 0]], y[[0, 0, 1, 1, 0]]))  # (2, 5), once around
+    lengths = np.append(0, np.hypot(*np.diff(corners)).cumsum())  # (5,) on the way
+    spacing = lengths[-1] / usual if candidates is None else candidates
+    if not lengths[-1] / 10_000 <= spacing < np.inf:
+        least = f"{lengths[-1] / 10_000:.2g}"
+        raise ValueError(f"candidates must be {least} m apart or more, got {candidates} m")
+    walk = np.arange(0, lengths[-1] - 1e-6, spacing)
+    rim = [np.interp(walk, lengths, corner) for corner in corners]
+    height = np.full(len(walk), scene.positions(scene.lower)[:, 2].median())
+    return torch.from_numpy(np.stack((*rim, height), 1)).float()
