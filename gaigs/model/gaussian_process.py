@@ -28,6 +28,7 @@ from gaigs.kriging.links import (
 )
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, build_trend
+from gaigs.model.shaped_path_loss import ShapedPathLoss
 from gaigs.registry import name_of, register
 
 
@@ -69,7 +70,7 @@ class GaussianProcess(LookUp):
     Args:
         trend: Configuration of the model whose residuals the process describes. None: ``friis`` for
             channels, else each receiver's mean label; for labels of one real number this or
-            ``path_loss``.
+            ``shaped_path_loss``.
 
     Raises:
         ValueError: The trend is a trained model.
@@ -134,8 +135,10 @@ class GaussianProcess(LookUp):
         if self.scalar is not None:
             links = without_gross_errors(links)
         self.links, self.known = links, known_links(links)
-        for trend in self.trends if chooses else (self.trend,):
+        for trend in self.trends if chooses else ():
             trend.fit(links)
+        if not chooses:
+            self.trend.refit(links)
         if self.scalar is not None:
             self._fit_scalar(self.scalar, limit_known(links, self.limit), chooses)
         else:
@@ -180,7 +183,11 @@ class GaussianProcess(LookUp):
 
         with stage("gaussian_process", process.fit_count(len(self.trends)) if chooses else 1):
             if chooses:
-                candidates = [residuals(trend) for trend in self.trends]
+                candidates = []
+                for trend in self.trends:
+                    is_shaped = isinstance(trend, ShapedPathLoss)
+                    errors = trend.unseen_errors(links, index) if is_shaped else residuals(trend)
+                    candidates.append(errors)
                 self.chosen = process.fit(*known, candidates, folds)
             else:
                 process.refit(*known, residuals(self.trend), folds)
@@ -204,7 +211,7 @@ class GaussianProcess(LookUp):
         other choices.
         """
         if self.scalar is not None:
-            return {**self.scalar.facts(), "trend": name_of(self.trend)}
+            return {**self.scalar.facts(), "trend": name_of(self.trend)} | self.trend.facts()
         return {**self.process.facts()}
 
     def forward(self, batch: Batch) -> Prediction:
