@@ -28,7 +28,7 @@ from gaigs.kriging.links import (
 )
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, build_trend
-from gaigs.model.shaped_path_loss import ShapedPathLoss
+from gaigs.model.shaped_path_loss import ShapedPathLoss, report_terms
 from gaigs.registry import name_of, register
 
 
@@ -120,6 +120,7 @@ class GaussianProcess(LookUp):
     def fit(self, links: Links) -> None:
         """Fits trend and hyperparameters, and factorises the covariances."""
         self._fit(links, chooses=True)
+        report_terms(self.trend)
 
     def refit(self, links: Links) -> None:
         """As ``fit``, for some of the known links: hyperparameters stay; of labels of one number

@@ -26,6 +26,7 @@ from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar import ScalarPosterior
 from gaigs.model import LookUp, Model, Prediction, Wrapper
 from gaigs.model.answers import predicted
+from gaigs.model.shaped_path_loss import report_terms
 from gaigs.registry import name_of, register, registry
 
 log = logging.getLogger(__name__)
@@ -141,6 +142,8 @@ class Kriging(Wrapper):
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
         values = predicted(self.trend, links, links.split.known)
         self.fallback.fit(links)
+        if is_final:
+            report_terms(self.fallback)
         if by_paths is None and self.trend.has_margins:
             is_few = len(single_readings(links, links.split.validation)) < FEWEST
             return self._krige_better(links, values, is_final, is_few)

@@ -12,7 +12,7 @@ from gaigs.data import Links
 from gaigs.kriging.gross_errors import without_gross_errors
 from gaigs.kriging.links import folds_of
 from gaigs.kriging.path_terms import PathTerms
-from gaigs.model import Prediction
+from gaigs.model import Model, Prediction
 from gaigs.model.path_loss import PathLoss
 from gaigs.registry import register
 
@@ -33,6 +33,7 @@ class ShapedPathLoss(PathLoss):
         super().__init__(scene)
         self.terms = PathTerms(scene)
         self.unseen: Tensor | None = None  # errors of the links of ``fit``, see unseen_errors
+        self.added: str | None = None  # what ``fit`` has added, for ``report_terms``
 
     def fit(self, links: Links) -> None:
         self._fit_terms(links, chooses=True)
@@ -51,9 +52,8 @@ class ShapedPathLoss(PathLoss):
         folds = folds_of(links, index)
         added = self.terms.fit(query.transmitters, query.receivers, errors, folds, chooses)
         if chooses:
+            self.added = added
             self.unseen = errors.new_zeros(len(links)).index_copy(0, index, self.terms.unseen)
-        if added:
-            log.info("beyond path loss: %s %s", added, self.scene.task.error_unit)
 
     def unseen_errors(self, links: Links, index: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
         """Labels of some of the links of ``fit`` less the trend, its terms fitted without a link's
@@ -76,3 +76,9 @@ class ShapedPathLoss(PathLoss):
         for name, buffer in self.terms.state_dict().items():
             state_dict.setdefault(f"{prefix}terms.{name}", torch.zeros_like(buffer))
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def report_terms(trend: Model) -> None:
+    """Logs the terms that a ``ShapedPathLoss`` has added: folds, which fit it again, do not."""
+    if isinstance(trend, ShapedPathLoss) and trend.added:
+        log.info("trend beyond path loss: %s %s", trend.added, trend.scene.task.error_unit)
