@@ -26,9 +26,9 @@ from gaigs.kriging.links import (
     known_links,
     limit_known,
 )
+from gaigs.kriging.path_terms import report_terms
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, build_trend
-from gaigs.model.shaped_path_loss import ShapedPathLoss, report_terms
 from gaigs.registry import name_of, register
 
 
@@ -186,8 +186,9 @@ class GaussianProcess(LookUp):
             if chooses:
                 candidates = []
                 for trend in self.trends:
-                    is_shaped = isinstance(trend, ShapedPathLoss)
-                    errors = trend.unseen_errors(links, index) if is_shaped else residuals(trend)
+                    terms = getattr(trend, "terms", None)
+                    # Errors of readings that terms have seen are too small.
+                    errors = residuals(trend) if terms is None else terms.unseen[index]
                     candidates.append(errors)
                 self.chosen = process.fit(*known, candidates, folds)
             else:

@@ -22,12 +22,12 @@ from gaigs.kriging.field import FieldPosterior
 from gaigs.kriging.fit import FEWEST
 from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import PART, limit_known, single_readings
+from gaigs.kriging.path_terms import report_terms
 from gaigs.kriging.paths import PathPosterior
 from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar import ScalarPosterior
 from gaigs.model import LookUp, Model, Prediction, Wrapper
 from gaigs.model.answers import predicted
-from gaigs.model.shaped_path_loss import report_terms
 from gaigs.registry import name_of, register, registry
 
 log = logging.getLogger(__name__)
