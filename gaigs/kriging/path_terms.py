@@ -65,6 +65,7 @@ class PathTerms(nn.Module):
     Attributes:
         used: True for terms in use, in the order of ``options.names`` (3,).
         breaks: log10 of the distance d0 of each receiver (r,).
+        regions: Deviation of each receiver's place (r,) [m], as of ``path_loss``.
         coefficients: c0, c1, a_1, b_1, a_2 .. c5 of each receiver (r, n).
         deviations: Their standard errors (r, n).
         unseen: Errors of the links of ``fit``, without the terms that saw their fold (n,); None
@@ -77,6 +78,7 @@ class PathTerms(nn.Module):
 
     used: Tensor
     breaks: Tensor
+    regions: Tensor
     coefficients: Tensor
     deviations: Tensor
     unseen: Tensor | None = None
@@ -89,6 +91,7 @@ class PathTerms(nn.Module):
         self.register_buffer("used", torch.zeros(3, dtype=torch.bool))
         breaks = torch.zeros(len(scene.receivers), dtype=torch.float64)
         self.register_buffer("breaks", breaks)
+        self.register_buffer("regions", breaks.clone())
         for name in ("coefficients", "deviations"):
             self.register_buffer(
                 name, breaks.new_zeros(len(breaks), self.options.harmonics * 2 + 6)
@@ -105,6 +108,8 @@ class PathTerms(nn.Module):
         """Fits the coefficients to errors of a law at the known links; ``chooses`` the terms
         first.
         """
+        if links.uncertainties is not None:
+            self.regions.copy_(links.uncertainties)
         index = links.split.known
         query = links.query[index]
         known = query.transmitters, query.receivers, errors
@@ -242,7 +247,8 @@ class PathTerms(nn.Module):
         positions = self.scene.positions(transmitters)[receivers]
         steps = (transmitters - positions).double()  # (b, 3)
         # As of the law, distances below 0.1 m count as 0.1 m.
-        lengths = steps.norm(dim=1).clamp_min(0.1)
+        regions = 0.56 * self.regions[receivers].square()
+        lengths = (steps.square().sum(1) + regions).sqrt().clamp_min(0.1)
         decades = lengths.log10()[:, None]
         orders = torch.arange(1, self.options.harmonics + 1).to(steps)
         turns = torch.atan2(steps[:, 1], steps[:, 0])[:, None] * orders  # (b, harmonics)
