@@ -63,6 +63,7 @@ MADE_FOR = {
     # The last three are made from trained models, and from a regressor.
     "model": {
         "path_loss": ["rssi"],
+        "shaped_path_loss": ["rssi"],
         "friis": ["csi"],
         "kriging": [],
         "ensemble": [],

@@ -22,7 +22,9 @@ class Prior:
         slope_deviation: Its standard deviation [dB per decade].
         shadowing: Standard deviation of shadowing [dB].
         correlations: Correlation lengths [m] to average over, each with the share of the variance
-            that is correlated; the rest is noise.
+            that is correlated; the rest is noise. They grow with a site that is larger than
+            ``site``: houses in place of furniture.
+        site: Extent of the readings [m].
         above: Greatest height above the highest place [m].
         nearest: Least distance; shorter ones count as this [m].
         noise: Least standard deviation of the noise [dB].
@@ -40,6 +42,7 @@ class Prior:
         (6.0, 0.9),
         (20.0, 0.9),
     )
+    site: float = 100.0
     above: float = 2.0
     nearest: float = 0.5
     noise: float = 0.5
@@ -72,10 +75,12 @@ def estimate_place(
     places = places[index].double()
     levels = levels[index].double()
     low, high = places.amin(0), places.amax(0)
-    margin = max(5.0, (high - low).max().item() / 2)
+    extent = (high - low).max().item()
+    margin = max(5.0, extent / 2)
     low = low - low.new_tensor([margin, margin, 0])
     high = high + low.new_tensor([margin, margin, prior.above])
     apart = torch.cdist(places, places)
+    apart = apart / max(1.0, extent / prior.site)
     parts = [share * (-apart / length).exp() for length, share in prior.correlations]
     shadowing = torch.stack(parts)  # (c, n, n)
     shadowing.diagonal(dim1=1, dim2=2).fill_(1)

@@ -27,6 +27,7 @@ from gaigs.kriging.links import (
     known_links,
     limit_known,
 )
+from gaigs.kriging.path_terms import report_terms
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.model import LookUp, Model, Prediction, build_trend
 from gaigs.registry import name_of, register
@@ -70,7 +71,7 @@ class GaussianProcess(LookUp):
     Args:
         trend: Configuration of the model whose residuals the process describes. None: ``friis`` for
             channels, else each receiver's mean label; for labels of one real number this or
-            ``path_loss``.
+            ``shaped_path_loss``.
 
     Raises:
         ValueError: The trend is a trained model.
@@ -120,6 +121,7 @@ class GaussianProcess(LookUp):
     def fit(self, links: Links) -> None:
         """Fits trend and hyperparameters, and factorises the covariances."""
         self._fit(links, chooses=True)
+        report_terms(self.trend)
 
     def refit(self, links: Links) -> None:
         """As ``fit``, for some of the known links: hyperparameters stay; of labels of one number
@@ -135,8 +137,10 @@ class GaussianProcess(LookUp):
         if self.scalar is not None:
             links = without_gross_errors(links)
         self.links, self.known = links, known_links(links, self.any_receiver)
-        for trend in self.trends if chooses else (self.trend,):
+        for trend in self.trends if chooses else ():
             trend.fit(links)
+        if not chooses:
+            self.trend.refit(links)
         if self.scalar is not None:
             self._fit_scalar(self.scalar, limit_known(links, self.limit), chooses)
         else:
@@ -181,7 +185,12 @@ class GaussianProcess(LookUp):
 
         with stage("gaussian_process", process.fit_count(len(self.trends)) if chooses else 1):
             if chooses:
-                candidates = [residuals(trend) for trend in self.trends]
+                candidates = []
+                for trend in self.trends:
+                    terms = getattr(trend, "terms", None)
+                    # Errors of readings that terms have seen are too small.
+                    errors = residuals(trend) if terms is None else terms.unseen[index]
+                    candidates.append(errors)
                 self.chosen = process.fit(*known, candidates, folds)
             else:
                 process.refit(*known, residuals(self.trend), folds)
@@ -207,10 +216,12 @@ class GaussianProcess(LookUp):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """The trend alone: residuals at one receiver do not correlate with those at others."""
+        """The last trend alone, of levels a law of distance: residuals at one receiver do not
+        correlate with those at others.
+        """
         if not self.any_receiver:
             super().at_receivers(receivers)  # has the error
-        trend = self.trend.at_receivers(receivers, known)
+        trend = self.trends[-1].at_receivers(receivers, known)
         trend.take_calibration(self)
         return trend
 
@@ -219,13 +230,18 @@ class GaussianProcess(LookUp):
         other choices.
         """
         if self.scalar is not None:
-            return {**self.scalar.facts(), "trend": name_of(self.trend)}
+            return {**self.scalar.facts(), "trend": name_of(self.trend)} | self.trend.facts()
         return {**self.process.facts()}
 
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query
         trend = self.trend(Batch(query, self.scene.task.directions)).value
         if self.scalar is not None:
+            # A receiver without links has the law of distance, as in ``at_receivers``.
+            is_new = torch.tensor([not len(index) for index in self.known], device=trend.device)
+            if is_new.any():
+                law = self.trends[-1](Batch(query)).value
+                trend = torch.where(is_new[query.receivers], law, trend)
             levels = self.scalar(coordinates(self.scene, query, 1.0), query.receivers)
             return Prediction(trend + levels.to(trend), {})
         added = torch.zeros_like(trend)

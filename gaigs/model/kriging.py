@@ -5,6 +5,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 from gaigs.calibration.held_out import Unseen, validation_halves
 from gaigs.core import stages
 from gaigs.core.antenna import Receiver
-from gaigs.core.query import Batch, evenly, thin_labels
+from gaigs.core.query import Batch, Query, evenly, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.data import Links
@@ -22,6 +23,7 @@ from gaigs.kriging.field import FieldPosterior
 from gaigs.kriging.fit import FEWEST
 from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import PART, limit_known, single_readings
+from gaigs.kriging.path_terms import report_terms
 from gaigs.kriging.paths import PathPosterior
 from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar import ScalarPosterior
@@ -142,6 +144,8 @@ class Kriging(Wrapper):
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
         values = predicted(self.trend, links, links.split.known)
         self.fallback.fit(links)
+        if is_final:
+            report_terms(self.fallback)
         if by_paths is None and self.trend.has_margins:
             is_few = len(single_readings(links, links.split.validation)) < FEWEST
             return self._krige_better(links, values, is_final, is_few)
@@ -192,12 +196,16 @@ class Kriging(Wrapper):
         """``krige`` of labels; ``values`` are the trend's predictions of known links."""
         self._make_posterior(False)
         held = links.split.validation
-        model = self._validation_model(links, values)
         is_unlearnt = False
         if len(held):
+            alone = registry("model").build(self.fallback_options, scene=self.scene)
+            alone.fit(replace(links, split=links.split.validating()))
             trend = validation_scores(links, values[len(links.split.train) :])
-            fallback = validation_scores(links, predicted(model.fallback, links, held))
+            fallback = validation_scores(links, predicted(alone, links, held))
             is_unlearnt = is_surely_better(fallback, trend)
+        # A law of distance that is surely better than the learnt room: levels show no room.
+        has_room = not (is_unlearnt and self.scene.task.is_scalar)
+        model = self._validation_model(links, values, self.weights if has_room else (0.0,))
         if is_unlearnt and self.posterior.chooses_weight:
             # The likelihood may still give the trend weight: without it if the score is higher so.
             without = self._validation_model(links, values, (0.0,))
@@ -426,6 +434,21 @@ class Kriging(Wrapper):
     @property
     def underlying(self) -> Model:
         return self.trend
+
+    @property
+    def has_room(self) -> bool:
+        """True if predictions have a part of the trend: else its room is none, and not shown."""
+        return bool(self.trend_weight > 0 or self.weight < 1)
+
+    def learnt_room(self, links: Links | None = None) -> Any:
+        return super().learnt_room(links) if self.has_room else None
+
+    def learnt_paths(self, query: Query) -> list:
+        return super().learnt_paths(query) if self.has_room else []
+
+    def export(self, folder: Path) -> None:
+        if self.has_room:
+            super().export(folder)
 
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""

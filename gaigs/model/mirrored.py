@@ -60,6 +60,11 @@ class MirroredSplatting(GaussianSplatting):
     name, own_placement = "mirrored", "mirrored"
     revisions = (0.0, 0.06, 0.25, 0.5, 0.75)
 
+    # Box whose levels are searched for phases [wavelengths]. A phase takes places and walls to a
+    # tenth of a wavelength; surveys know both to about a ten-thousandth of the site.
+    widest = 1000.0
+    is_wide = False  # set by fit
+
     places: Query | None = None  # set by fit
     levels: LevelSearch | None = None
 
@@ -107,7 +112,10 @@ class MirroredSplatting(GaussianSplatting):
         if searches and isinstance(self.pooling, PathSpectrum):
             self._search_spectra(links, self.pooling)
         if searches and isinstance(self.pooling, PathRssi):
-            self._prepare_levels(links)
+            wavelength = speed_of_light / carriers(self.scene, links.query).max().item()
+            self.is_wide = self.placement.diagonal > self.widest * wavelength
+            if not self.is_wide:
+                self._prepare_levels(links)
         task = self.scene.task
         if task.is_channel and isinstance(self.pooling, ChannelPooling) and self.trend is None:
             self._fit_channels(links, task, self.pooling)
@@ -246,6 +254,8 @@ class MirroredSplatting(GaussianSplatting):
             return prune(placement, [train] if validation is None else [train, validation], loss)
         if number < 2 and not adds_waves:
             return "planes stay where they are"
+        if self.is_wide:
+            return "the box is too wide for phases, so powers add to the end"
         try:
             wavelength = speed_of_light / carriers(self.scene, train.query).mean().item()
         except ValueError:

@@ -22,7 +22,8 @@ class PathLoss(Model):
     their scatter: a few readings alone give wild slopes. Negative exponents are kept: there
     distance explains nothing. If all links of a receiver are equally long, gamma is that mean;
     without any other receiver 2, as in free space. Distances below 0.1 m count as 0.1 m: within
-    about a wavelength the field does not follow the law.
+    about a wavelength the field does not follow the law. From a receiver whose place is estimated
+    the logarithm is the mean over the region in which it may stand, so no peak is at its middle.
 
     Raises:
         ValueError: A label is more than one real number.
@@ -34,6 +35,7 @@ class PathLoss(Model):
     any_receiver = True
     of_receivers = ("levels", "exponents")
     of_level = "levels"
+    regions: Tensor
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
@@ -44,12 +46,16 @@ class PathLoss(Model):
             )
         self.register_buffer("levels", torch.full((len(scene.receivers),), torch.nan))  # T [dBm]
         self.register_buffer("exponents", torch.full((len(scene.receivers),), torch.nan))  # gamma
+        # Deviations of estimated places [m].
+        self.register_buffer("regions", torch.zeros(len(scene.receivers)))
 
     def fit(self, links: Links) -> None:
         """Fits level and exponent of each receiver; see ``without_gross_errors`` for levels that do
         not count. A receiver without links has the mean of both.
         """
         lines = []
+        if links.uncertainties is not None:
+            self.regions.copy_(links.uncertainties)
         links = without_gross_errors(links)
         known = known_links(links, any_receiver=True)
         for index in filter(len, known):
@@ -80,12 +86,25 @@ class PathLoss(Model):
         decades = self._decades(batch.query.transmitters, receivers)
         return Prediction(self.levels[receivers] - 10 * self.exponents[receivers] * decades, {})
 
+    def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
+        """New receivers stand at known places."""
+        self.regions = self.regions.new_zeros(len(scene.receivers))
+
     def _decades(
         self, transmitters: Float[Tensor, "b 3"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
         """log10 of the distances in [m]."""
         positions = self.scene.positions(transmitters)[receivers]  # (b, 3)
-        return (transmitters - positions).norm(dim=-1).clamp_min(0.1).log10()
+        lengths = (transmitters - positions).norm(dim=-1).clamp_min(0.1)
+        # The mean of ln r² over a normal region is ln(0.56 deviation²) in its middle, where 0.56 is
+        # exp(-Euler's constant), and ln d² far away.
+        regions = self.regions[receivers].to(lengths)
+        return (lengths.square() + 0.56 * regions.square()).log10() / 2
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        # Checkpoints of before have places alone.
+        state_dict.setdefault(f"{prefix}regions", torch.zeros_like(self.regions))
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
 
 def shrunk(

@@ -198,6 +198,49 @@ def test_an_estimated_place_is_as_far_off_as_it_says():
     assert 0.5 < np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(deviations))) < 2
 
 
+def test_the_region_of_a_mast_holds_it_in_ninety_of_a_hundred_draws():
+    draw = torch.Generator().manual_seed(1)
+    held = 0
+    for number in range(100):
+        # A city, and a drone above a field; shadows are as wide as houses or trees.
+        size, shadow = (
+            ((2000.0, 1500.0, 0.0), 60.0) if number % 2 else ((600.0, 400.0, 130.0), 40.0)
+        )
+        edges = torch.tensor(size)
+        places = torch.rand(150, 3, generator=draw) * edges + torch.tensor([0, 0, 1.5])
+        mast = (2 * torch.rand(3, generator=draw) - 0.5) * edges
+        mast[2] = 30.0
+        between = 28.8 * (-torch.cdist(places, places).double() / shadow).exp()
+        between.diagonal().fill_(36.0)
+        white = torch.randn(150, generator=draw, dtype=torch.float64)
+        slope = -30 + 8 * torch.randn(1, generator=draw)
+        decades = (places - mast).norm(dim=1).clamp_min(1.0).log10()
+        levels = slope * decades + torch.linalg.cholesky(between).float() @ white.float()
+        place, deviation = estimate_place(places, levels)
+        # 90 % of a normal region lie within 1.52 of its deviations in the plane.
+        held += int((place - mast)[:2].norm() < 1.52 * deviation)
+    assert 85 <= held <= 95
+
+
+def test_a_mast_that_may_stand_anywhere_has_no_peak(survey):
+    draw = np.random.default_rng(0)
+    places = draw.uniform(0, 1000, (120, 2))
+    own = -20 - 30 * np.log10(np.linalg.norm(places - [1200, 500], axis=1)) + draw.normal(0, 6, 120)
+    table = np.column_stack((places, own)).round(1)
+    rows = ["x,y,mast", *(",".join(map(str, row)) for row in table)]
+    links = divide(survey("\n".join(rows)), {"name": "random"})
+    assert links.uncertainties.min() > 50
+    for name in ("path_loss", "shaped_path_loss"):
+        model = gaigs.train(name, links)
+        mast = links.receivers[0].pose.position
+        levels = model.predict(mast + torch.tensor([[0.0, 0, 0], [20, 0, 0], [0, -20, 0]]), 0)
+        assert levels.max() - levels.min() < 1
+        state = model.state_dict()
+        del state["regions"]  # a checkpoint of before
+        model.load_state_dict(state)
+        assert not model.regions.any()
+
+
 def test_marks_are_found_and_levels_are_not():
     draw = np.random.default_rng(0)
     own = np.round(draw.normal(-75, 9, (100, 5))).clip(-104, -40)

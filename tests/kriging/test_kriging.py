@@ -297,7 +297,7 @@ def test_few_validation_places_shrink_the_trend_weight_to_a_half(places, least, 
     links = make("rssi", places, smooth=1.0, noise=0.1)
     model = Kriging(links.scene, Trained(links.scene), {"name": "path_loss"})
     model.krige(links)
-    assert least < model.trend_weight < most
+    assert least <= model.trend_weight < most
 
 
 @TASKS
@@ -310,6 +310,22 @@ def test_a_trend_that_scores_worse_than_its_fallback_is_reported(task, trained, 
         [] if trained else ["the room was not learnt"]
     )
     assert trained or "falls back on kriging of mean" in said[0]
+
+
+@pytest.mark.parametrize("trained", [0.0, 1.0])
+def test_a_room_that_levels_do_not_show_is_no_part_of_the_model(trained, tmp_path, monkeypatch):
+    links = make("rssi", 400, smooth=1.0 - trained, trained=trained, noise=0.1)
+    model = Kriging(links.scene, Trained(links.scene), {"name": "path_loss"})
+    model.fit(links)
+    monkeypatch.setattr(Trained, "learnt_room", lambda *_: "a room")
+    monkeypatch.setattr(Trained, "learnt_paths", lambda *_: ["a path"])
+    monkeypatch.setattr(Trained, "export", lambda _, folder: (folder / "planes.obj").touch())
+    model.export(tmp_path)
+    assert model.has_room == trained
+    assert (model.trend_weight > 0) == trained
+    assert model.learnt_room(links) == ("a room" if trained else None)
+    assert model.learnt_paths(links.query) == (["a path"] if trained else [])
+    assert [*tmp_path.iterdir()] == ([tmp_path / "planes.obj"] if trained else [])
 
 
 def test_a_trend_that_was_not_learnt_is_left_out_where_scores_are_higher_without_it(monkeypatch):

@@ -236,7 +236,7 @@ def test_the_trend_is_that_of_the_labels(law):
             links.query.transmitters - links.scene.positions(links.labels)[links.query.receivers]
         ).norm(dim=1)
         links.labels.add_(-40 * apart.clamp_min(0.1).log10())
-    assert fitted(links).facts()["trend"] == ("path_loss" if law else "mean")
+    assert fitted(links).facts()["trend"] == ("shaped_path_loss" if law else "mean")
 
 
 def test_a_few_readings_that_are_far_out_hardly_count():

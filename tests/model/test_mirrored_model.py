@@ -392,6 +392,20 @@ def test_fixed_planes_do_not_move_and_unknown_carriers_have_no_phases():
     assert line == "frequencies are unknown, so powers add to the end"
 
 
+@pytest.mark.parametrize("widest", [1000.0, 1.0])
+def test_levels_of_a_wide_site_are_not_searched_for_phases(widest, monkeypatch):
+    monkeypatch.setattr(MirroredSplatting, "widest", widest)
+    links = example_links("rssi")
+    carriers = torch.full((len(links),), CARRIER)
+    links = replace(links, query=replace(links.query, frequencies=carriers))
+    model = build(links, pooling={"name": "path_rssi", "floor_db": -60.0})
+    model.fit(links)
+    assert (model.levels is None) == model.is_wide == (widest == 1.0)
+    if model.is_wide:
+        line = model.revise(2, links.batch(torch.arange(4)), None, lambda batch: 1.0)
+        assert line == "the box is too wide for phases, so powers add to the end"
+
+
 def test_a_loaded_model_exports_its_planes(tmp_path):
     links = room_spectra("band")
     model = build(links)

@@ -99,7 +99,7 @@ class Task(ABC):
     @property
     def trends(self) -> tuple[str, ...]:
         """Look-ups among which a Gaussian process of labels chooses its trend."""
-        return ("mean", "path_loss") if self.is_scalar else ("mean",)
+        return ("mean", "shaped_path_loss") if self.is_scalar else ("mean",)
 
     @property
     @abstractmethod

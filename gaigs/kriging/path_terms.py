@@ -1,0 +1,278 @@
+"""Levels beyond the logarithm of the distance: a break point, an antenna's lobes, and heights."""
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor, nn
+
+from gaigs.core.scene import Scene
+from gaigs.data import Links
+from gaigs.kriging.links import folds_of
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TermOptions:
+    """Options of ``PathTerms``.
+
+    Attributes:
+        names: Of the terms.
+        harmonics: Largest harmonic of the azimuth: lobes of 60 degrees and wider, as of sectors.
+        breaks: Candidates of a break point, quantiles of a receiver's distances.
+        slope: Prior deviation of the change of slope at a break point, over the deviation of the
+            levels about their law [1 / decade].
+        alike: Readings that count as one: neighbours share their shadows.
+        errors: Least fall of the held-out error by a term [standard errors].
+        least: Least fall over the error itself: a smaller one is not worth a term.
+    """
+
+    names: tuple[str, ...] = ("break point", "lobes", "height")
+    harmonics: int = 6
+    breaks: int = 15
+    slope: float = 5.0
+    alike: float = 10.0
+    errors: float = 3.0
+    least: float = 0.01
+
+
+class Solution(NamedTuple):
+    """Coefficients without each fold (f, n), their squared errors over the variance of a reading
+    (f, n), and the numbers of the break points among their candidates (f,).
+    """
+
+    coefficients: Float[Tensor, "f n"]
+    variances: Float[Tensor, "f n"]
+    numbers: Int[Tensor, " f"]
+
+
+class PathTerms(nn.Module):
+    """Corrections of a path-loss law at each receiver, of the terms that held-out readings want.
+
+    With azimuth a and elevation e of the transmitter, seen from the receiver in the world's frame,
+    and its height h from -1 to 1 in the box of the links, a level is corrected by
+
+        c0 + c1 log10 d + sum over q of (a_q cos q a + b_q sin q a)
+        + c2 h + c3 sin e + c4 (3 sin² e - 1) / 2 + c5 max(0, log10 d - log10 d0).
+
+    Coefficients have a normal prior; that of a lobe falls with its harmonic. Terms (lobes, height,
+    break point) are added one by one, the same for all receivers.
+
+    Attributes:
+        used: True for terms in use, in the order of ``options.names`` (3,).
+        breaks: log10 of the distance d0 of each receiver (r,).
+        regions: Deviation of each receiver's place (r,) [m], as of ``path_loss``.
+        coefficients: c0, c1, a_1, b_1, a_2 .. c5 of each receiver (r, n).
+        deviations: Their standard errors (r, n).
+        unseen: Errors of the links of ``fit``, without the terms that saw their fold (n,); None
+            before.
+        added: What ``fit`` added, with held-out errors; None: nothing.
+
+    Source: Feuerstein et al., Path loss, delay spread, and outage models as functions of antenna
+    height, 1994 (break point); Hoerl and Kennard, Ridge regression, 1970.
+    """
+
+    used: Tensor
+    breaks: Tensor
+    regions: Tensor
+    coefficients: Tensor
+    deviations: Tensor
+    unseen: Tensor | None = None
+    added: str | None = None
+    options = TermOptions()
+    of_receivers = ("breaks", "coefficients", "deviations")
+
+    def __init__(self, scene: Scene):
+        super().__init__()
+        self.scene = scene
+        self.register_buffer("used", torch.zeros(3, dtype=torch.bool))
+        breaks = torch.zeros(len(scene.receivers), dtype=torch.float64)
+        self.register_buffer("breaks", breaks)
+        self.register_buffer("regions", breaks.clone())
+        for name in ("coefficients", "deviations"):
+            self.register_buffer(
+                name, breaks.new_zeros(len(breaks), self.options.harmonics * 2 + 6)
+            )
+
+    def forward(
+        self, transmitters: Float[Tensor, "b 3"], receivers: Int[Tensor, " b"]
+    ) -> Float[Tensor, " b"]:
+        """Corrections in the label's unit."""
+        columns = self._columns(transmitters, receivers, self.breaks[receivers, None])  # (b, n)
+        return (columns * self.coefficients[receivers]).sum(1).to(transmitters)
+
+    def fit(self, links: Links, errors: Float[Tensor, " k"], chooses: bool) -> None:
+        """Fits the coefficients to errors of a law at the known links; ``chooses`` the terms
+        first. A receiver without links has the means over the others.
+        """
+        if links.uncertainties is not None:
+            self.regions.copy_(links.uncertainties)
+        index = links.split.known
+        query = links.query[index]
+        known = query.transmitters, query.receivers, errors
+        if chooses:
+            self._choose(*known, folds_of(links, index))
+            self.unseen = errors.new_zeros(len(links)).index_copy(0, index, self.unseen)
+        for receiver in known[1].unique().tolist():
+            rows = known[1] == receiver
+            columns, candidates = self._candidates(*(part[rows] for part in known[:2]))
+            solution = self._solve(columns, errors[rows], 0 * known[1][rows], self.used)
+            self.breaks[receiver] = candidates[solution.numbers[0]]
+            self.coefficients[receiver] = solution.coefficients[0] * self.used.any()
+            variances = solution.variances[0] * errors[rows].square().mean()
+            self.deviations[receiver] = variances.sqrt()
+        is_new = known[1].bincount(minlength=len(self.breaks)) == 0
+        for values in (self.breaks, self.coefficients, self.deviations):
+            values[is_new] = values[~is_new].mean(0)
+
+    def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
+        """New receivers stand at known places."""
+        self.regions = self.regions.new_zeros(len(scene.receivers))
+
+    def facts(self) -> Mapping[str, object]:
+        """Terms in use, and the median distance of the break points [m]."""
+        pairs = zip(self.options.names, self.used.tolist(), strict=True)
+        terms = ", ".join(name for name, used in pairs if used)
+        facts: dict[str, object] = {"terms": terms or "none"}
+        return facts | ({"break_m": 10 ** self.breaks.median().item()} if self.used[0] else {})
+
+    def _choose(
+        self,
+        transmitters: Float[Tensor, "k 3"],
+        receivers: Int[Tensor, " k"],
+        errors: Float[Tensor, " k"],
+        folds: Int[Tensor, " k"],
+    ) -> None:
+        """Adds terms one by one, while the error of held-out places falls clearly."""
+        self.used.zero_()
+        self.added = None
+        _, places, counts = transmitters.unique(dim=0, return_inverse=True, return_counts=True)
+        # The law was fitted to all readings: an advantage that terms have to make up for.
+        self.unseen = errors
+        while not self.used.all():
+            trials = []
+            for number in (~self.used).nonzero()[:, 0].tolist():
+                used = self.used.index_fill(0, torch.tensor(number), True)
+                trials.append((self._held_out(transmitters, receivers, errors, folds, used), used))
+            left, used = min(trials, key=lambda trial: trial[0].abs().mean().item())
+            falls = self.unseen.abs() - left.abs()
+            # Readings at one place err together: their mean counts.
+            of_places = falls.new_zeros(len(counts)).index_add(0, places, falls) / counts
+            chance = of_places.std() / len(counts) ** 0.5
+            is_clear = of_places.mean() > self.options.errors * chance
+            if not is_clear or falls.mean() < self.options.least * self.unseen.abs().mean():
+                return
+            self.used.copy_(used)
+            self.unseen = left
+            held_out = f"{errors.abs().mean():.2f} -> {left.abs().mean():.2f}"
+            self.added = f"{self.facts()['terms']}; held-out error {held_out}"
+
+    def _held_out(
+        self,
+        transmitters: Float[Tensor, "k 3"],
+        receivers: Int[Tensor, " k"],
+        errors: Float[Tensor, " k"],
+        folds: Int[Tensor, " k"],
+        used: Bool[Tensor, " t"],
+    ) -> Float[Tensor, " k"]:
+        """Errors that terms leave over, fitted without the reading's fold."""
+        left = errors.clone()
+        for receiver in receivers.unique().tolist():
+            rows = receivers == receiver
+            columns, _ = self._candidates(transmitters[rows], receivers[rows])
+            _, fold = folds[rows].unique(return_inverse=True)
+            if not fold.any():
+                continue  # no other fold
+            solution = self._solve(columns, errors[rows], fold, used)
+            shown = self._shown(solution.numbers[fold])  # (k, n)
+            left[rows] -= (columns.gather(1, shown) * solution.coefficients[fold]).sum(1)
+        return left
+
+    def _solve(
+        self,
+        columns: Float[Tensor, "k m"],
+        levels: Float[Tensor, " k"],
+        folds: Int[Tensor, " k"],
+        used: Bool[Tensor, " t"],
+    ) -> Solution:
+        """Most likely coefficients without each fold, with the break point of the least cost; one
+        fold is not left out.
+        """
+        both = torch.cat((columns, levels[:, None]), 1)
+        parts = [both[folds == fold] for fold in range(int(folds.max()) + 1)]
+        own = torch.stack([part.T @ part for part in parts])  # (f, m + 1, m + 1)
+        sums = own.sum(0) - own if len(own) > 1 else own
+        options = self.options
+        orders = torch.arange(1, options.harmonics + 1).double().repeat_interleave(2)
+        # Precisions of the prior, in units of a reading's; level and slope are nearly free.
+        free, one = orders.new_full((2,), 1e-3), orders.new_full((3,), options.alike)
+        prior = torch.cat((free, options.alike * orders.square(), one, one[:1] / options.slope**2))
+        widths = torch.tensor([len(orders), 3, 1])
+        is_used = torch.cat((used.new_ones(2), used[[1, 2, 0]].repeat_interleave(widths)))
+        kept = is_used.nonzero()[:, 0]
+        trials = []
+        for number in range(options.breaks if used[0] else 1):
+            shown = self._shown(torch.tensor([number]))[0, kept]
+            products = sums[:, shown, -1]  # (f, p)
+            gram = sums[:, shown][:, :, shown] + prior[kept].diag()  # (f, p, p)
+            inverse = torch.linalg.inv(gram)
+            solved = (inverse @ products[..., None])[..., 0]  # (f, p)
+            trials.append(((solved * products).sum(1), solved, inverse.diagonal(dim1=1, dim2=2)))
+        explained, solved, variances = (torch.stack(part) for part in zip(*trials, strict=True))
+        numbers = explained.argmax(0)  # (f,)
+        folds = torch.arange(len(numbers))
+        zeros = solved.new_zeros(len(numbers), len(prior))
+        coefficients = zeros.index_copy(1, kept, solved[numbers, folds])
+        errors = zeros.index_copy(1, kept, options.alike * variances[numbers, folds])
+        return Solution(coefficients, errors, numbers)
+
+    def _shown(self, numbers: Int[Tensor, " f"]) -> Int[Tensor, "f n"]:
+        """Columns of ``_candidates`` with one break point each."""
+        first = torch.arange(self.coefficients.shape[1] - 1).expand(len(numbers), -1)
+        return torch.cat((first, first[:, -1:] + 1 + numbers[:, None]), 1)
+
+    def _candidates(
+        self, transmitters: Float[Tensor, "k 3"], receivers: Int[Tensor, " k"]
+    ) -> tuple[Float[Tensor, "k m"], Float[Tensor, " j"]]:
+        """Columns with all candidates of the break point of one receiver, and these candidates."""
+        none = self.breaks.new_zeros(len(receivers), 0)
+        shares = torch.linspace(0.05, 0.95, self.options.breaks).double()
+        candidates = self._columns(transmitters, receivers, none)[:, 1].quantile(shares)
+        beyond = candidates.expand(len(receivers), -1)
+        return self._columns(transmitters, receivers, beyond), candidates
+
+    def _columns(
+        self,
+        transmitters: Float[Tensor, "b 3"],
+        receivers: Int[Tensor, " b"],
+        breaks: Float[Tensor, "b j"],
+    ) -> Float[Tensor, "b m"]:
+        """What coefficients multiply: 1, decades, lobes, heights, decades beyond each break."""
+        positions = self.scene.positions(transmitters)[receivers]
+        steps = (transmitters - positions).double()  # (b, 3)
+        # As of the law, distances below 0.1 m count as 0.1 m.
+        regions = 0.56 * self.regions[receivers].square()
+        lengths = (steps.square().sum(1) + regions).sqrt().clamp_min(0.1)
+        decades = lengths.log10()[:, None]
+        orders = torch.arange(1, self.options.harmonics + 1).to(steps)
+        turns = torch.atan2(steps[:, 1], steps[:, 0])[:, None] * orders  # (b, harmonics)
+        lobes = torch.stack((turns.cos(), turns.sin()), 2).flatten(1)
+        # Heights end with the box: a law of them is not known beyond.
+        low, high = self.scene.lower[2].to(steps), self.scene.upper[2].to(steps)
+        height = transmitters[:, 2].to(steps).clamp(low, high) - (low + high) / 2
+        height = height / ((high - low) / 2).clamp_min(1e-3)
+        sine = steps[:, 2] / lengths
+        heights = torch.stack((height, sine, (3 * sine.square() - 1) / 2), 1)
+        beyond = (decades - breaks).clamp_min(0)
+        return torch.cat((torch.ones_like(decades), decades, lobes, heights, beyond), 1)
+
+
+def report_terms(trend: nn.Module) -> None:
+    """Logs what the ``PathTerms`` of a trend have added; folds, which fit it again, do not."""
+    terms = getattr(trend, "terms", None)
+    if isinstance(terms, PathTerms) and terms.added:
+        log.info("trend beyond path loss: %s %s", terms.added, terms.scene.task.error_unit)
