@@ -15,7 +15,7 @@ from gaigs.core.task.csi import Csi
 from gaigs.core.task.rssi import Rssi
 from gaigs.core.task.spectrum import Spectrum
 from gaigs.data import Links, Split
-from gaigs.data.simulation import patch_array, rss_dbm
+from gaigs.data.simulation import patch_arrays, rss_dbm
 from gaigs.data.synthetic import POSE, ROOM, place, respond_in_parts, spectra
 from gaigs.data.synthetic.image_source import permittivity
 from gaigs.model.friis import Friis
@@ -83,7 +83,10 @@ def simulated(places, receiver, offsets, order):
 
 
 def room_spectra(spectrum, count=12):
-    grid, receiver = Grid.degrees(range(1, 91, 3), range(0, 360, 6)), patch_array(POSE, CARRIER)
+    grid, receiver = (
+        Grid.degrees(range(1, 91, 3), range(0, 360, 6)),
+        patch_arrays([POSE], CARRIER)[0],
+    )
     labels = spectra(EMPTY, place(count, 0), receiver, grid, spectrum, CARRIER, BANDWIDTH, 2)
     task = Spectrum(grid.elevations, grid.azimuths)
     return links_of(labels, task, receiver, BANDWIDTH if spectrum == "band" else 0.0)
