@@ -77,6 +77,9 @@ class Equations:
             residuals: Labels minus predictions.
             least: Least noise power of a link as a share of its power.
         """
+        if not len(places):  # a receiver without links
+            empty = torch.zeros(0, 0, 0, dtype=torch.complex128)
+            return cls(places.double(), empty, empty.sum(2))
         grams, sides = [], []
         size = max(1, min(64, 300_000 // labels[0].numel()))
         for start in track(range(0, len(places), size), "kriging"):

@@ -4,7 +4,8 @@ from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from jaxtyping import Int
+import torch
+from jaxtyping import Bool, Int
 from torch import Tensor, nn
 
 from gaigs.core.query import Batch
@@ -47,6 +48,11 @@ class Posterior(nn.Module):
     @abstractmethod
     def mean(self, batch: Batch, like: Tensor) -> Tensor:
         """Mean of the residuals, shaped as the values ``like`` of the batch."""
+
+    def knows(self, receivers: Int[Tensor, " b"]) -> Bool[Tensor, " b"]:
+        """True for receivers with known links."""
+        counts = [len(field.places) for field in self.fields]  # type: ignore[union-attr, arg-type]
+        return (torch.tensor(counts, device=receivers.device) > 0)[receivers]
 
     @abstractmethod
     def deviations(self, batch: Batch) -> Tensor:

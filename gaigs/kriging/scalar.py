@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from gaigs.core import stages
@@ -383,6 +383,9 @@ class ScalarPosterior(Posterior):
 
     def mean(self, batch: Batch, like: Tensor) -> Tensor:
         return self.process(*self._coordinates(batch.query)).to(like)
+
+    def knows(self, receivers: Int[Tensor, " b"]) -> Bool[Tensor, " b"]:
+        return torch.isin(receivers, self.process.receivers)
 
     def deviations(self, batch: Batch) -> Tensor:
         return self.process.deviations(*self._coordinates(batch.query))

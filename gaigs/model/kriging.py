@@ -376,7 +376,11 @@ class Kriging(Wrapper):
         fallback = self.fallback(batch).value if trend_weight < 1 else None
         value = blend(task, trend, fallback, trend_weight)
         value = value + self.posterior.mean(batch, value)
-        return Prediction(blend(task, value, trend, weight), {})
+        value = blend(task, value, trend, weight)
+        is_new = ~self.posterior.knows(batch.query.receivers)
+        if is_new.any():  # receivers without links, as ``at_receivers`` has them
+            value[is_new] = self._alone(replace(batch, query=batch.query[is_new])).value
+        return Prediction(value, {})
 
     @property
     def any_frequency(self) -> bool:  # type: ignore[override]
@@ -395,15 +399,10 @@ class Kriging(Wrapper):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """Trend and fallback at other receivers, where no residuals are known."""
-        trend = self.trend.at_receivers(receivers, known)
-        other = Kriging(trend.scene, trend, self.fallback_options)
-        other.fallback = self.fallback.at_receivers(receivers, known)
-        other._make_posterior(self.by_paths)
-        other.trend_weight.copy_(self.trend_weight)
-        other.weight.copy_(self.weight)
-        other.take_calibration(self)
-        return other.to(self.weight.device)
+        """The trend alone, or the fallback: no residuals are known at other receivers."""
+        alone = self._alone.at_receivers(receivers, known)
+        alone.take_calibration(self)
+        return alone
 
     @property
     def fold_count(self) -> int:

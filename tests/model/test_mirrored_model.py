@@ -83,8 +83,10 @@ def simulated(places, receiver, offsets, order):
 
 
 def room_spectra(spectrum, count=12):
-    grid = Grid.degrees(range(1, 91, 3), range(0, 360, 6))
-    (receiver,) = patch_arrays([POSE], CARRIER)
+    grid, receiver = (
+        Grid.degrees(range(1, 91, 3), range(0, 360, 6)),
+        patch_arrays([POSE], CARRIER)[0],
+    )
     labels = spectra(EMPTY, place(count, 0), receiver, grid, spectrum, CARRIER, BANDWIDTH, 2)
     task = Spectrum(grid.elevations, grid.azimuths)
     return links_of(labels, task, receiver, BANDWIDTH if spectrum == "band" else 0.0)

@@ -1,0 +1,59 @@
+"""Errors and 90 % intervals at held-out receivers, with 0, 1, 3 and 10 readings there.
+
+    python benchmarks/receivers.py FOLDER    a run of signal strength with split=receivers
+
+Readings are five random draws of each receiver's links; the score is of every third link of the rest. Prints
+a table in Markdown: mean absolute error [dB], share of links in intervals, and their width [dB]. docs/results.md
+has the numbers.
+"""
+
+import sys
+from dataclasses import replace
+
+import torch
+
+import gaigs
+from gaigs import runs
+from gaigs.model.answers import at_new_receivers
+from gaigs.report.table import markdown
+
+DRAWS = 5
+
+
+def main(folder: str) -> None:
+    links = runs.links_of(folder, True)
+    model = gaigs.load(folder)
+    if model.calibration is None or model.calibration.elsewhere is None:  # left out by max_time
+        new = at_new_receivers(model, links)
+        model.calibration = replace(new, widths=torch.zeros(len(links.receivers)), elsewhere=new)
+    generator = torch.Generator().manual_seed(0)
+    test = links.split.test
+    scores = {count: [] for count in (0, 1, 3, 10)}
+    for receiver in links.query.receivers[test].unique().tolist():
+        index = test[links.query.receivers[test] == receiver]
+        for count, parts in scores.items():
+            for _ in range(DRAWS if count else 1):
+                order = torch.randperm(len(index), generator=generator)
+                few = index[order[: max(count, 1)]]
+                query = links.query[few]
+                query.receivers = torch.zeros_like(query.receivers)
+                receivers = (links.receivers[receiver],)
+                labels = links.labels[few]
+                some = replace(links, query=query, receivers=receivers, labels=labels, split=None)
+                moved = model.adapt(some) if count else model.at_receivers(receivers)
+                rest = index[~torch.isin(index, few)][::3]
+                found = moved.predict(links.query.transmitters[rest], receiver=0, interval=0.9)
+                asked = links.labels[rest]
+                holds = (found.lower <= asked) & (asked <= found.upper)
+                error = (found.value - asked).abs().mean()
+                width = (found.upper - found.lower).mean()
+                parts.append(torch.stack((error, holds.float().mean(), width)))
+    rows = [["readings", "MAE [dB]", "share", "width [dB]"]]
+    for count, parts in scores.items():
+        means = torch.stack(parts).mean(0).tolist()
+        rows.append([str(count), *[f"{mean:.2f}" for mean in means]])
+    print(markdown(rows))
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
