@@ -183,7 +183,7 @@ class GaussianProcess(LookUp):
                 candidates = [residuals(trend) for trend in self.trends]
                 self.chosen = process.fit(*known, candidates, folds)
             else:
-                process.refit(*known, residuals(self.trend), folds)
+                process.refit(residuals(self.trend), process.hold_out(*known, folds))
         process.solve(*known, residuals(self.trend))
 
     @property

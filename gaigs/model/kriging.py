@@ -95,6 +95,7 @@ class Kriging(Wrapper):
         posterior: Posterior
         if self.scene.task.is_scalar:
             posterior = ScalarPosterior(self.scene)
+            posterior.start = getattr(getattr(self, "posterior", None), "start", None)
         elif by_paths:
             posterior = PathPosterior(self.scene, self.trend.margins)
         else:
@@ -218,14 +219,14 @@ class Kriging(Wrapper):
         return model
 
     def _validation_model(
-        self, links: Links, values: Tensor, weights: Sequence[float] = weights
+        self, links: Links, values: Tensor, weights: Sequence[float] | None = None
     ) -> "Kriging":
         """Fits weights and hyperparameters; returns a model that knows the training links alone.
 
-        The trend weight is chosen among ``weights``.
+        The trend weight is chosen among some; None: among ``weights``.
         """
         split = links.split
-        candidates = self._candidates(links, values, weights)
+        candidates = self._candidates(links, values, weights or self.weights)
         self.trend_weight.fill_(self.posterior.fit(links, candidates))
         training = replace(links, split=split.validating())
         model = Kriging(self.scene, self.trend, self.fallback_options)
@@ -393,9 +394,16 @@ class Kriging(Wrapper):
             if stages.is_up():
                 return
             kriged = Kriging(links.scene, self.trend, self.fallback_options).to(self.device)
+            kriged.posterior.start_from(self.posterior)
+            if links.task.is_scalar and len(chooses) >= 300:
+                # A half of so many would choose the same weight as all of them.
+                kriged.weights = (self.trend_weight.item(),)
             half = replace(links, split=links.split.choosing(chooses))
             kriged = kriged.krige(half, is_final=False, by_paths=self.by_paths)
-            yield Unseen(kriged, single_readings(links, asked), links.split.train)
+            asked = single_readings(links, asked)
+            if links.task.is_scalar:  # more readings of one number tell no more of quantiles
+                asked = evenly(asked, 4000)
+            yield Unseen(kriged, asked, links.split.train)
 
     def take_hyperparameters(self, other: Model) -> None:
         if isinstance(other, Kriging):
