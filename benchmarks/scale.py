@@ -5,6 +5,8 @@ Each size is an invented floor of 60 m x 40 m: path loss with exponent 3, shadow
 3 m, noise of 2 dB, seed 0. It is written as a wide CSV, which a run of ``+experiment=mirrored_rssi``
 reads in a process of its own. The last column is the exponent of time over places between the
 smallest and the largest size.
+
+``--dense DIR``, the folder of ble-flat, prints the error of tiled processes instead.
 """
 
 import argparse
@@ -15,11 +17,16 @@ import subprocess
 import sys
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import common
 import numpy as np
 
+import gaigs
+from gaigs.core.query import Batch
+from gaigs.kriging.scalar import ScalarProcess
+from gaigs.registry import registry
 from gaigs.report.table import markdown
 
 FLOOR = (60.0, 40.0)
@@ -55,16 +62,40 @@ def write_survey(folder, places, gateways, seed=0):
 
 
 def measure(folder, overrides):
-    """Seconds of a run by stage, of the whole process as ``all``, and its memory as ``GB``."""
+    """Seconds of a run by stage, of the whole process as ``all``, of the processor, which other
+    programs hardly change, and memory as ``GB``.
+    """
     words = ["+experiment=mirrored_rssi", "data=rssi_wide", f"data.file={folder / 'survey.csv'}"]
     words += [f"data.gateways={folder / 'gateways.csv'}", f"hydra.run.dir={folder / 'run'}"]
     start = time.perf_counter()
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([sys.executable, "-m", "gaigs", *words, *overrides], check=True)
     seconds = time.perf_counter() - start
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    processor = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     stages = json.loads((folder / "run" / "metrics.json").read_text())["seconds"]
     stages["start and rest"] = seconds - sum(stages.values())
-    memory = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1e6
-    return stages | {"all": seconds, "GB": memory}
+    return stages | {"all": seconds, "processor": processor, "GB": after.ru_maxrss / 1e6}
+
+
+def compare_tiles(root):
+    """Prints differences of tiled solutions of a Gaussian process from the dense one."""
+    links = gaigs.links("nerf2_rssi", root=root)
+    model = registry("model").build({"name": "gaussian_process", "trend": None}, scene=links.scene)
+    model.fit(links)
+    process, test = model.scalar, links.split.test
+    known = process.places, process.receivers, process.values
+    query, labels = links.query[test], links.labels[test]
+    dense = None
+    for core, size in ((0, 0), (128, 512), (64, 256), (32, 128)):
+        together = 1500 if size else 10**9
+        process.options = replace(ScalarProcess.options, together=together)
+        process.tiles.core, process.tiles.size = core, size
+        process.solve(*known)
+        values = model(Batch(query)).value
+        dense = values if dense is None else dense
+        apart = (values - dense).square().mean().sqrt()
+        print(f"{size} {core}: {apart:.3f} dB, MAE {(values - labels).abs().mean():.4f} dB")
 
 
 def main():
@@ -73,7 +104,11 @@ def main():
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="of a run")
     parser.add_argument("--places", nargs="+", type=common.positive, default=[1000, 4000])
     parser.add_argument("--gateways", type=common.positive, default=30)
+    parser.add_argument("--dense", metavar="DIR", help="folder of ble-flat")
     options = parser.parse_args()
+    if options.dense:
+        compare_tiles(options.dense)
+        return
     found = {}
     for places in sorted(options.places):  # the largest last: memory is the most of all so far
         with tempfile.TemporaryDirectory() as name:

@@ -48,8 +48,9 @@ class Tiles(nn.Module):
 
     def clear(self) -> None:
         """Takes all tiles away."""
-        for name in ("centres", "receivers", "rows", "weights"):
-            setattr(self, name, getattr(self, name)[:0])
+        self.centres, self.receivers = self.centres[:0], self.receivers[:0]
+        self.rows = self.rows.new_zeros(0, self.size)
+        self.weights = self.weights.new_zeros(0, self.size)
 
     def add(self, places: Float[Tensor, "k d"], rows: Int[Tensor, " k"], receiver: int) -> None:
         """Divides the readings of a receiver, whose rows among all readings are given."""

@@ -53,7 +53,8 @@ class Kriging(Wrapper):
     kriged paths by more than chance, as of places closer than half a wavelength, labels are kriged.
 
     A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal
-    components. Of a receiver with more than ``LIMIT`` known links an even part is used.
+    components. Of a receiver with more than ``LIMIT`` known links an even part is used, except of
+    labels of one number.
 
     Args:
         trend: The trained model, or its configuration if a state is to be loaded.
@@ -123,7 +124,7 @@ class Kriging(Wrapper):
         links: Links,
         is_final: bool = True,
         by_paths: bool | None = None,
-        most: int = LIMIT,
+        most: int | None = None,
     ) -> "Kriging":
         """Fits, and gives the validation model: the same weights and hyperparameters on the
         training links alone.
@@ -133,10 +134,12 @@ class Kriging(Wrapper):
             is_final: False if only the validation model is fitted, without a word.
             by_paths: True if strengths of paths are kriged, False if labels are; None: ``FEWEST``
                 validation links or more choose.
-            most: Most known links of a receiver.
+            most: Most known links of a receiver; None: ``LIMIT``, of labels of one number all.
         """
         links = self.posterior.cleaned(links)
         count = len(links.split.known)
+        if most is None:
+            most = max(1, count) if links.task.is_scalar else LIMIT
         links = limit_known(links, self._most(links, most))
         if is_final and math.isfinite(stages.left()) and len(links.split.known) < count:
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
