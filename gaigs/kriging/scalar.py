@@ -108,18 +108,20 @@ class ScalarProcess(nn.Module):
         """Standard deviations of new readings at some places: z given the known readings, plus
         noise.
         """
-        deviations = places.new_zeros(len(places))
+        variances = places.new_zeros(len(places))
+        is_many = self.receivers.bincount(minlength=len(self.logarithms)) > self.options.many
         for receiver in receivers.unique().tolist():
+            rows = (receivers == receiver).nonzero()[:, 0]
             process = self.at(receiver)
-            for part in (receivers == receiver).nonzero()[:, 0].split(self.options.size):
-                if len(process.places) <= self.options.many:
-                    whitened, _ = process.whitened(places[part])
-                    signal = (2 * self.logarithms[receiver, 1]).exp()
-                    variances = signal - whitened.square().sum(0)
-                else:
-                    variances = self._local_variances(places[part], receivers[part])
-                deviations[part] = (variances.clamp_min(0) + process.noise).sqrt()
-        return deviations
+            variances[rows] = process.noise
+            for part in rows.split(self.options.size) if not is_many[receiver] else ():
+                whitened, _ = process.whitened(places[part])
+                signal = (2 * self.logarithms[receiver, 1]).exp()
+                variances[part] += (signal - whitened.square().sum(0)).clamp_min(0)
+        # All receivers together: those that hear the same places share a search.
+        for part in is_many[receivers].nonzero()[:, 0].split(4 * self.options.size):
+            variances[part] += self._local_variances(places[part], receivers[part]).clamp_min(0)
+        return variances.sqrt()
 
     def _local_variances(
         self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
