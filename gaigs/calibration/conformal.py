@@ -13,7 +13,7 @@ from gaigs.calibration.estimate import Estimate
 from gaigs.core.query import Query, evenly, thin_labels
 from gaigs.core.task import Task
 from gaigs.io import FAR
-from gaigs.kriging.links import distances
+from gaigs.kriging.links import nearest_places
 
 
 @dataclass(frozen=True)
@@ -389,8 +389,8 @@ def nearest(
     for receiver in query.receivers.unique().tolist():
         asked = (query.receivers == receiver).nonzero()[:, 0]
         known = places[receivers == receiver].double()  # (k, 3)
-        for part in asked.split(1024) if len(known) else ():
-            near[part] = distances(query.transmitters[part].double(), known).amin(1)
+        if len(known):
+            near[asked] = nearest_places(query.transmitters[asked], known, 1).apart[:, 0]
     return near
 
 

@@ -324,10 +324,12 @@ def _affordable_pitch(
     seconds: float = 60.0,
     points: int = 128,
     fewest: int = 200,
+    predictions: int = 150_000,
 ) -> float:
     """A pitch [m] with which the map takes about ``seconds``, or has at most ``fewest`` points.
 
-    The longer side has about ``points`` points, unless the model is slow.
+    The longer side has about ``points`` points, unless the model is slow or maps of all receivers
+    would have more than so many ``predictions``.
     """
     pitch = max(0.1, float((upper - lower).max()) / points)
     line = np.linspace(lower, upper, points)
@@ -340,6 +342,7 @@ def _affordable_pitch(
         elapsed = time.perf_counter() - start
     # Half of the time left at most: figures follow.
     most = points * min(seconds, stages.left() / 2) / elapsed
+    most = min(most, predictions / len(predict.receivers))
     while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, fewest):
         pitch *= 2
     return pitch

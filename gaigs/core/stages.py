@@ -20,7 +20,10 @@ log = logging.getLogger(__name__)
 
 
 class Timekeeper:
-    """The clock of a run with a ``limit`` [s]; its stages have bars if ``shown``."""
+    """The clock of a run with a ``limit`` [s]; its stages have bars if ``shown``.
+
+    ``seconds`` has the time of each ``timed`` part, without the parts inside it.
+    """
 
     def __init__(self, limit: float = math.inf, shown: bool = True):
         self.limit = limit
@@ -28,6 +31,7 @@ class Timekeeper:
         self.began = time.monotonic()
         self.stages: list[Stage] = []
         self.left_out: list[str] = []
+        self.seconds: dict[str, float] = {}
         self.bars: Progress | None = None
         self.lock = threading.RLock()  # bars appear in a thread of their own
 
@@ -135,6 +139,19 @@ def stage(
     finally:
         timer.cancel()
         opened.close()
+
+
+@contextlib.contextmanager
+def timed(name: str) -> Iterator[None]:
+    """A part of the current run whose time counts under a name; a part inside it counts alone."""
+    seconds = current().seconds
+    inside = sum(seconds.values())
+    began = time.monotonic()
+    try:
+        yield
+    finally:
+        inside = sum(seconds.values()) - inside
+        seconds[name] = seconds.get(name, 0.0) + time.monotonic() - began - inside
 
 
 def track(

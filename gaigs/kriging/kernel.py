@@ -73,6 +73,15 @@ def matern(apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
     return steps.exp() if smoothness == 0.5 else (1 - steps) * steps.exp()
 
 
+def matern_slope(correlation: Tensor, apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
+    """Derivative of ``matern``, whose value is ``correlation``, by the logarithm of the length."""
+    steps = apart * (math.sqrt(2 * smoothness) / length)  # s
+    if smoothness == 0.5:  # d exp(-s) / d ln l = s exp(-s)
+        return steps * correlation
+    # d (1 + s) exp(-s) / d ln l = s^2 exp(-s)
+    return correlation * steps.square() / (1 + steps)
+
+
 def kernel(
     a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"], length: float | Tensor
 ) -> Float[Tensor, "*c m n"]:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gaigs.kriging.kernel import matern
+from gaigs.kriging.kernel import matern, matern_slope
 from gaigs.kriging.neighbours import Around
 
 
@@ -22,10 +22,17 @@ class Choice(NamedTuple):
 
 
 class Conditional(NamedTuple):
-    """Means and variances of the process at places (m,), given the readings around."""
+    """Means and variances of the process at places (m,), given the readings around.
+
+    Attributes:
+        errors: Weights of the readings, and -1 of the place (m, j + 1).
+        solved: Readings over their covariances, and 0 of the place (m, j + 1).
+    """
 
     means: Float[Tensor, " m"]
     variances: Float[Tensor, " m"]
+    errors: Float[Tensor, "m i"]
+    solved: Float[Tensor, "m i"]
 
 
 def covariances(
@@ -37,10 +44,14 @@ def covariances(
     """
     of_places = hyperparameters[around.receivers][..., None, None]  # (m, 3, 1, 1)
     length, signal, _ = of_places.unbind(1)
-    apart = around.apart
-    if around.bands is not None:  # below 1e-12 m the root has no finite gradient
-        apart = (apart.square() + choice.scale**2 * around.bands).clamp_min(1e-24).sqrt()
-    return signal.square() * matern(apart, length, choice.smoothness)
+    return signal.square() * matern(separations(around, choice), length, choice.smoothness)
+
+
+def separations(around: Around, choice: Choice) -> Float[Tensor, "m i i"]:
+    """Distances in place and carrier, see ``coordinates``."""
+    if around.bands is None:
+        return around.apart
+    return (around.apart.square() + choice.scale**2 * around.bands).sqrt()
 
 
 def conditional(
@@ -49,19 +60,51 @@ def conditional(
     """Means and variances of z at places, from ``covariances``, the readings around, and the
     variances of their noise.
 
-    Mean w'y and variance k - 2 w'c + w'(C + N) w have weights w that minimise the variance. So
-    gradients, of the mean too, need no derivative of weights or factor.
+    Mean w'y and variance k - 2 w'c + w'(C + N) w have weights w = (C + N)^-1 c that minimise the
+    variance.
     """
-    noisy = between + torch.diag_embed(torch.nn.functional.pad(variances, (0, 1)))
-    with torch.no_grad():
-        factor = torch.linalg.cholesky(noisy[:, :-1, :-1])
-        right = torch.stack((-noisy[:, :-1, -1], values), 2)  # (m, j, 2)
-        solved = torch.cholesky_solve(right, factor)
-        both = torch.nn.functional.pad(solved, (0, 0, 0, 1))  # (m, j + 1, 2)
-        both[:, -1, 0] = 1
-    products = (both[:, None, :, 0] @ noisy @ both)[:, 0]  # (m, 2)
-    means = products[:, 1] - (solved[..., 0] * values).sum(1)
-    return Conditional(means, products[:, 0])
+    noisy = between[:, :-1, :-1] + torch.diag_embed(variances)
+    towards = between[:, :-1, -1]  # c (m, j)
+    factor = torch.linalg.cholesky(noisy)
+    solved = torch.cholesky_solve(torch.stack((towards, values), 2), factor)  # (m, j, 2)
+    weights, readings = solved.unbind(2)
+    means = (weights * values).sum(1)
+    of_place = between[:, -1, -1] - (weights * towards).sum(1)
+    errors = torch.nn.functional.pad(weights, (0, 1), value=-1.0)
+    return Conditional(means, of_place, errors, torch.nn.functional.pad(readings, (0, 1)))
+
+
+def slopes(
+    around: Around,
+    hyperparameters: Float[Tensor, "r 3"],
+    choice: Choice,
+    between: Float[Tensor, "m i i"],
+    variances: Float[Tensor, "m j"],
+    solution: Conditional,
+    of_mean: Float[Tensor, " m"],
+    of_variance: Float[Tensor, " m"],
+) -> Float[Tensor, "m 4"]:
+    """Derivatives by logarithms of length, signal, noise of the readings and scale of carriers,
+    from those by means and variances of ``conditional``.
+
+    As the weights minimise the variance, a change dC of all covariances changes it by e' dC e, and
+    the mean by -e' dC s, with ``errors`` e and ``solved`` s.
+    """
+    errors, solved = solution.errors, solution.solved
+    right = of_variance[:, None] * errors - of_mean[:, None] * solved  # (m, j + 1)
+
+    def along(change: Float[Tensor, "m i i"]) -> Float[Tensor, " m"]:
+        return (errors * (change @ right[..., None])[..., 0]).sum(1)
+
+    length = hyperparameters[around.receivers, 0][:, None, None]
+    apart = separations(around, choice)
+    slope = matern_slope(between, apart, length, choice.smoothness)
+    scale = torch.zeros_like(of_mean)
+    if around.bands is not None:
+        # d apart / d ln c = c^2 bands / apart, and d apart / d ln l acts as -apart.
+        scale = -along(slope * choice.scale**2 * around.bands / apart.square().clamp_min(1e-24))
+    noise = (errors[:, :-1] * right[:, :-1] * variances).sum(1)
+    return torch.stack((along(slope), 2 * along(between), 2 * noise, scale), 1)
 
 
 def expected_factors(

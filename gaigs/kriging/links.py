@@ -4,10 +4,11 @@ batch.
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gaigs.core.geometry import Grid
@@ -59,10 +60,18 @@ def folds_of(links: Links, index: Int[Tensor, " k"], count: int = 10) -> Int[Ten
     """
     groups = links.split.groups
     if groups is None:
-        _, groups = links.query.transmitters.unique(dim=0, return_inverse=True)
-    numbers, group = groups[index].unique(return_inverse=True)
+        groups = place_numbers(links.query.transmitters[index])
+    else:
+        groups = groups[index]
+    numbers, group = groups.unique(return_inverse=True)
     order = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(0))
     return (order % count)[group]
+
+
+def place_numbers(places: Float[Tensor, "k 3"]) -> Int[Tensor, " k"]:
+    """Number of each place, in the order of their coordinates; the same for the same place."""
+    which = torch.zeros(len(places), dtype=torch.long)
+    return Query(places, which).unique(with_receivers=False)[1]
 
 
 def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]:
@@ -104,6 +113,26 @@ def distances(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"]) -> Float[T
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
+class Near(NamedTuple):
+    """The nearest known places of some asked ones, nearest first."""
+
+    apart: Float[Tensor, "m j"]  # [m]
+    rows: Int[Tensor, "m j"]  # of known places
+
+
+def nearest_places(asked: Float[Tensor, "m d"], known: Float[Tensor, "k d"], count: int) -> Near:
+    """The ``count`` nearest known places, fewer if there are not as many; by a tree, whose time
+    grows with the logarithm of the known places.
+    """
+    count = min(count, len(known))
+    # Splits in the middle of a box stay fast where a place is measured often.
+    tree = cKDTree(known.double().cpu().numpy(), balanced_tree=False)
+    apart, rows = tree.query(
+        asked.double().cpu().numpy().reshape(-1, known.shape[1]), k=[*range(1, count + 1)]
+    )
+    return Near(torch.from_numpy(apart).to(known.device), torch.from_numpy(rows).to(known.device))
+
+
 def reception_probability(
     asked: Float[Tensor, "g d"],
     known: Float[Tensor, "k 3"],
@@ -123,8 +152,8 @@ def reception_probability(
     """
     count = min(neighbours, len(known))
     parts = []
-    for part in asked.split(PART):
-        near = distances(part[:, :3], known).topk(count, largest=False).indices
+    for part in asked.split(16 * PART):
+        near = nearest_places(part[:, :3], known, count).rows
         parts.append((receives[near].sum(1) + prior) / (count + 1))
     return torch.cat(parts)
 

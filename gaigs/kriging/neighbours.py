@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gaigs.core.query import evenly
 from gaigs.core.scene import Scene
-from gaigs.kriging.links import distances, scale_bounds, scaled
+from gaigs.kriging.links import Near, distances, nearest_places, scale_bounds, scaled
 
 
 class Nearest(NamedTuple):
@@ -76,6 +76,7 @@ class Readings(NamedTuple):
         folds: Int[Tensor, " k"] | None = None,
         reach: bool = False,
         size: int = 2048,
+        most: int = 6000,
     ) -> Nearest:
         """The nearest known readings, see ``Around``.
 
@@ -86,6 +87,8 @@ class Readings(NamedTuple):
             reach: True if half of the readings lie farther and farther away: near ones alone say
                 little on lengths.
             size: Places whose neighbours are held in memory at a time.
+            most: Known readings of a receiver among which those of other folds are sought, evenly
+                chosen.
 
         Source: Stein, Chi and Welty, Approximating likelihoods for large spatial data sets, 2004.
         """
@@ -96,15 +99,26 @@ class Readings(NamedTuple):
         scale = math.nan
         if self.scene.has_band:
             scale = math.sqrt(math.prod(scale_bounds(self.scene)))
+        last: tuple[Tensor, Tensor, Near] | None = None
         for receiver in receivers.unique().tolist():
             known = (self.receivers == receiver).nonzero()[:, 0]
+            asked_rows = (receivers == receiver).nonzero()[:, 0]
+            if own is None or folds is None:
+                ends = scaled(places[asked_rows], scale), scaled(self.places[known], scale)
+                # One search for all receivers that hear the same places.
+                if last is None or not all(map(torch.equal, ends, last)):
+                    last = (*ends, nearest_places(*ends, self.count))
+                found = last[2].rows.shape[1]
+                rows[asked_rows, :found] = known[last[2].rows]
+                exists[asked_rows, :found] = True
+                continue
+            known = evenly(known, most)
             known_places = scaled(self.places[known], scale)
             count = min(self.count, len(known))
-            for asked in (receivers == receiver).nonzero()[:, 0].split(size):
+            for asked in asked_rows.split(size):
                 apart = distances(scaled(places[asked], scale), known_places)
-                if own is not None and folds is not None:
-                    is_own = own[asked, None] == folds[known]
-                    apart = apart.masked_fill(is_own, math.inf)
+                is_own = own[asked, None] == folds[known]
+                apart = apart.masked_fill(is_own, math.inf)
                 farthest = int(apart.isfinite().sum(1).min())
                 if reach and farthest > self.count:
                     ranks = self._far_ranks(farthest)

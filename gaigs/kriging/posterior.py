@@ -22,10 +22,13 @@ class Posterior(nn.Module):
     Attributes:
         chooses_weight: True if validation links choose the weight of kriging, else 1.
         by_paths: True if strengths of paths are kriged, not labels.
+        start: Choices of a fit to nearly the same links, from which the next one starts; None: no
+            fit before.
     """
 
     chooses_weight = False
     by_paths = False
+    start: Any = None
 
     def cleaned(self, links: Links) -> Links:
         """The links without those that would move the whole fit; by default all."""
@@ -44,6 +47,11 @@ class Posterior(nn.Module):
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
         """Takes the known links; ``residuals`` gives residuals of some rows (j, *shape)."""
         raise NotImplementedError
+
+    def start_from(self, other: Any) -> None:
+        """Starts the next fit from that of another posterior, which saves time; by default does
+        nothing.
+        """
 
     @abstractmethod
     def mean(self, batch: Batch, like: Tensor) -> Tensor:

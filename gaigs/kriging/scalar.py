@@ -19,9 +19,10 @@ from gaigs.kriging.gross_errors import without_gross_errors
 from gaigs.kriging.kernel import SMOOTHNESSES, Process, matern, resize
 from gaigs.kriging.likelihood import Choice, conditional, covariances
 from gaigs.kriging.links import coordinates, distances, folds_of, scaled
-from gaigs.kriging.neighbours import HeldOutReadings, Readings
+from gaigs.kriging.neighbours import HeldOutReadings, Nearest, Readings
 from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar_fit import HeldOutCost, ScalarFit, ScalarOptions, maximise
+from gaigs.kriging.tiles import Tiles
 
 
 class ScalarProcess(nn.Module):
@@ -44,7 +45,9 @@ class ScalarProcess(nn.Module):
         places: Places of the known readings (k, d), see ``coordinates`` of scale 1.
         receivers, values: Receivers and residuals of the known readings (k,).
         variances: Variance of the noise of each known reading (k,).
-        weights: Values over the covariances of their receiver's readings (k,).
+        weights: Values over the covariances of their receiver's readings (k,); 0 at receivers with
+            ``tiles``.
+        tiles: Parts of the readings of receivers with more than ``options.together``.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2 and
     5.4.2; Lange, Little and Taylor, Robust statistical modeling using the t distribution, 1989.
@@ -69,6 +72,7 @@ class ScalarProcess(nn.Module):
         self.register_buffer("receivers", empty.long())
         for name in ("values", "variances", "weights"):
             self.register_buffer(name, empty.clone())
+        self.tiles = Tiles(self.places.shape[1])
 
     # --- predictions ---
 
@@ -79,9 +83,24 @@ class ScalarProcess(nn.Module):
         means = places.new_zeros(len(places))
         for receiver in receivers.unique().tolist():
             asked, known = receivers == receiver, self.receivers == receiver
-            towards = self._covariances(places[asked], self.places[known], receiver)
-            means[asked] = towards @ self.weights[known]
+            of_receiver = partial(self._covariances, receiver=receiver)
+            tiles = self.tiles.numbers(scaled(places[asked], self._choice.scale), receiver)
+            if len(tiles):
+                solve = partial(self._solved, receiver=receiver)
+                means[asked] = self.tiles.mean(
+                    places[asked], tiles, self.places, of_receiver, solve
+                )
+            else:
+                towards = of_receiver(places[asked], self.places[known])
+                means[asked] = towards @ self.weights[known]
         return means
+
+    def _solved(self, rows: Int[Tensor, " j"], receiver: int) -> Float[Tensor, " j"]:
+        """Values over the covariances of some readings of a receiver."""
+        between = self._covariances(self.places[rows], self.places[rows], receiver)
+        between.diagonal().add_(self.variances[rows])
+        factor = torch.linalg.cholesky(between)
+        return torch.cholesky_solve(self.values[rows, None], factor)[:, 0]
 
     def deviations(
         self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
@@ -89,24 +108,26 @@ class ScalarProcess(nn.Module):
         """Standard deviations of new readings at some places: z given the known readings, plus
         noise.
         """
-        deviations = places.new_zeros(len(places))
+        variances = places.new_zeros(len(places))
+        is_many = self.receivers.bincount(minlength=len(self.logarithms)) > self.options.many
         for receiver in receivers.unique().tolist():
+            rows = (receivers == receiver).nonzero()[:, 0]
             process = self.at(receiver)
-            for part in (receivers == receiver).nonzero()[:, 0].split(self.options.size):
-                if len(process.places) <= self.options.many:
-                    whitened, _ = process.whitened(places[part])
-                    signal = (2 * self.logarithms[receiver, 1]).exp()
-                    variances = signal - whitened.square().sum(0)
-                else:
-                    variances = self._local_variances(places[part], receivers[part])
-                deviations[part] = (variances.clamp_min(0) + process.noise).sqrt()
-        return deviations
+            variances[rows] = process.noise
+            for part in rows.split(self.options.size) if not is_many[receiver] else ():
+                whitened, _ = process.whitened(places[part])
+                signal = (2 * self.logarithms[receiver, 1]).exp()
+                variances[part] += (signal - whitened.square().sum(0)).clamp_min(0)
+        # All receivers together: those that hear the same places share a search.
+        for part in is_many[receivers].nonzero()[:, 0].split(4 * self.options.size):
+            variances[part] += self._local_variances(places[part], receivers[part]).clamp_min(0)
+        return variances.sqrt()
 
     def _local_variances(
         self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
         """Variances of z given the nearest readings."""
-        readings = self._readings
+        readings = self._readings._replace(count=self.options.around)
         around = readings.around(places, receivers, readings.nearest(places, receivers))
         between = covariances(around, self.logarithms.exp(), self._choice)
         return conditional(between, self.values[around.rows], self.variances[around.rows])[1]
@@ -183,44 +204,49 @@ class ScalarProcess(nn.Module):
         """Number of maximisations of a ``fit`` to this many candidates of residuals."""
         return candidates + len(self._choices())
 
-    def refit(
+    def hold_out(
         self,
         places: Float[Tensor, "k d"],
         receivers: Int[Tensor, " k"],
-        values: Float[Tensor, " k"],
         folds: Int[Tensor, " k"],
         held: Int[Tensor, " h"] | None = None,
         most: int = 300,
-    ) -> float:
-        """Fits lengths and deviations anew, from their present values; kernel and noise stay.
-
-        The first fit holds out readings of all folds. With ``held`` a second fit follows, of these
-        readings given all others. Few readings alone would overfit, so the mean of the first fit
-        over the receivers is the second fit's prior.
+    ) -> list[HeldOutReadings]:
+        """Readings that fits of ``refit`` hold out.
 
         Args:
-            places, receivers, values: Known readings, as for ``fit``.
-            folds: Readings are held out with all of their fold.
-            held: Rows of the readings that the second fit holds out, such as the validation links;
-                None for one fit.
+            places, receivers: Known readings, as for ``fit``.
+            folds: Readings of the first fit are held out with all of their fold.
+            held: Rows of the readings that a second fit holds out, given all others, such as the
+                validation links; None for one fit.
             most: Largest number of held-out readings of a fit.
+        """
+        self.places, self.receivers = places, receivers
+        every = torch.arange(len(places))
+        groups = [self._readings.held_out(every, folds, most)]
+        if held is not None:
+            is_held = torch.isin(every, held).long()
+            groups.append(self._readings.held_out(held, is_held, most))
+        return groups
+
+    def refit(self, values: Float[Tensor, " k"], groups: Sequence[HeldOutReadings]) -> float:
+        """Fits lengths and deviations anew, from their present values; kernel and noise stay.
+
+        Few readings alone would overfit, so the mean of the first fit over the receivers is the
+        second fit's prior.
+
+        Args:
+            values: Residuals of the known readings.
+            groups: Readings that each fit holds out, from ``hold_out``.
 
         Returns:
             Negative log posterior of the last fit.
         """
-        self.places, self.receivers = places, receivers
-        every = torch.arange(len(values))
-        groups = self._readings.held_out(every, folds, most)
-        fit = self._maximise(values, groups, self._choice, self.logarithms, has_deviations=True)
-        self._take(fit)
-        if held is not None:
-            is_held = torch.isin(every, held).long()
-            groups = self._readings.held_out(held, is_held, most)
-            prior = fit.logarithms.mean(0)
-            fit = self._maximise(
-                values, groups, self._choice, fit.logarithms, has_deviations=True, prior=prior
-            )
+        prior = None
+        for held in groups:
+            fit = self._maximise(values, held, self._choice, self.logarithms, True, prior)
             self._take(fit)
+            prior = fit.logarithms.mean(0)
         return fit.cost
 
     def solve(
@@ -237,12 +263,13 @@ class ScalarProcess(nn.Module):
         noises = (2 * self.logarithms[receivers, 2]).exp()
         self.variances = noises * self._factors(values)
         self.weights = torch.zeros_like(values)
+        self.tiles.clear()
         for receiver in receivers.unique().tolist():
-            known = receivers == receiver
-            between = self._covariances(places[known], places[known], receiver)
-            between.diagonal().add_(self.variances[known])
-            factor = torch.linalg.cholesky(between)
-            self.weights[known] = torch.cholesky_solve(values[known, None], factor)[:, 0]
+            known = (receivers == receiver).nonzero()[:, 0]
+            if len(known) > self.options.together:
+                self.tiles.add(scaled(places[known], self._choice.scale), known, receiver)
+            else:
+                self.weights[known] = self._solved(known, receiver)
 
     def take(self, other: "ScalarProcess") -> None:
         """Takes the hyperparameters of another process.
@@ -291,12 +318,13 @@ class ScalarProcess(nn.Module):
         factors = torch.ones_like(values)
         if math.isinf(choice.degrees):
             return factors
-        readings = self._readings
+        readings = self._readings._replace(count=self.options.neighbours + 1)
         rows = torch.arange(len(values), device=values.device)
+        every = readings.nearest(self.places, self.receivers)
+        every.exists.logical_and_(every.rows != rows[:, None])  # not itself
         parts = []
         for part in rows.split(self.options.size):
-            places, receivers = self.places[part], self.receivers[part]
-            parts.append((part, readings.nearest(places, receivers, part, rows)))
+            parts.append((part, Nearest(every.rows[part], every.exists[part])))
         noises = (2 * self.logarithms[self.receivers, 2]).exp()
         for _ in range(self.options.rounds):
             expected = []
@@ -304,7 +332,7 @@ class ScalarProcess(nn.Module):
                 around = readings.around(self.places[part], self.receivers[part], nearest)
                 between = covariances(around, self.logarithms.exp(), choice)
                 variances = noises * factors
-                means, of_process = conditional(
+                means, of_process, *_ = conditional(
                     between, values[around.rows], variances[around.rows]
                 )
                 # The reading's deviation from its neighbours is shared between process and noise.
@@ -356,25 +384,33 @@ class ScalarPosterior(Posterior):
         held = torch.arange(count, len(index)) if len(links.split.validation) else None
         process = self.process.cpu()
         # A refit has two maximisations, or one without validation links.
-        refits = 1 if held is None else 2 * (len(weights) + 1)
-        with stages.stage("kriging", process.fit_count(1) + refits):
-            process.fit(*known, residuals[-1:], folds)
-            start = process.logarithms, process.choice
+        refits = 1 if held is None else 2 * (len(weights) + (len(weights) > 1))
+        fits = process.fit_count(1) if self.start is None else 0
+        with stages.stage("kriging", fits + refits):
+            if self.start is None:
+                process.fit(*known, residuals[-1:], folds)
+                logarithms, choice = process.logarithms, process.choice
+            else:
+                logarithms, choice = self.start
+            groups = process.hold_out(*known, folds, held)
 
             def refit(values: Tensor) -> float:
-                process.logarithms, process.choice = start
-                return process.refit(*known, values, folds, held)
+                process.logarithms, process.choice = logarithms, choice
+                return process.refit(values, groups)
 
             shares = torch.full((len(weights),), 1 / len(weights), dtype=torch.float64)
-            if held is not None:
+            if held is not None and len(weights) > 1:
                 # Readings at one place err together: they count as one.
-                places = links.query[index[held]].transmitters.unique(dim=0)
+                places = links.query[index[held]].place_keys.unique()
                 each = len(held) / len(places)
                 costs = torch.tensor([refit(values) for values in residuals], dtype=torch.float64)
                 # -inf if a trend explains all
                 shares = torch.softmax(-costs.clamp_min(-1e300) / each, 0)
             refit(shares @ torch.stack(residuals))
         return (shares @ weights).item()
+
+    def start_from(self, other: Any) -> None:
+        self.start = other.process.logarithms, other.process.choice
 
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
         index = links.split.known

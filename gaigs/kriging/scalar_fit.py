@@ -18,6 +18,7 @@ from gaigs.kriging.likelihood import (
     covariances,
     expected_factors,
     log_density,
+    slopes,
 )
 from gaigs.kriging.links import scale_bounds
 from gaigs.kriging.neighbours import HeldOutReadings
@@ -28,16 +29,20 @@ class ScalarOptions:
     """Options of a process of one number.
 
     Attributes:
-        neighbours: Readings around a held-out one while a process is fitted, and around a place
-            whose variance is asked of many.
+        neighbours: Readings around a held-out one while a process is fitted.
+        around: Readings around a place whose variance is asked of many: those behind them lower it
+            by a hundredth.
         many: Readings of a receiver that all enter a variance; of more the nearest, which then take
             less time.
+        together: Readings of a receiver that enter one covariance matrix; of more see ``Tiles``.
         scatter: Scatter between receivers of the logarithms of length, signal and noise: the prior
             of each receiver's.
         degrees: Degrees of freedom of Student's t: of the scatter, and of the noise where it is not
             normal.
         rounds: Repetitions of expectation and maximisation for the variances of single readings.
         iterations: Most iterations of a maximisation.
+        tolerance: Relative change of the negative log likelihood that ends a maximisation, far
+            below what distinguishes hyperparameters.
         size: Places whose covariances are held in memory at a time.
         edges: Longest correlation length, in longest edges of the box of places: beyond it the
             kernel is a line in the box.
@@ -50,11 +55,14 @@ class ScalarOptions:
     """
 
     neighbours: int = 32
+    around: int = 16
     many: int = 300
+    together: int = 1500
     scatter: tuple[float, float, float] = (0.25, 0.15, 0.15)
     degrees: float = 4.0
     rounds: int = 3
     iterations: int = 50
+    tolerance: float = 1e-6
     size: int = 2048
     edges: float = 8.0
     widest: float = 2.0
@@ -139,21 +147,44 @@ class HeldOutCost:
     def __call__(self, point: np.ndarray) -> tuple[float, np.ndarray]:
         """The cost at a point, and its gradient."""
         degrees = self.options.degrees
+        likelihood, by_logarithms, by_scale = self._likelihood(point)
         with torch.enable_grad():
             leaf = torch.tensor(point, requires_grad=True)
-            logarithms, choice = self.unpacked(leaf)
-            noises = (2 * logarithms[self.around.receivers, 2]).exp()  # (m,)
-            between = covariances(self.around, logarithms.exp(), choice)
-            means, variances = conditional(between, self.readings, noises[:, None] * self.factors)
-            total = -log_density(self.asked - means, variances, noises, choice.degrees).sum()
+            logarithms, _ = self.unpacked(leaf)
             # Student's t: one receiver may be far noisier than the others.
             squares = leaf[self.shared :].square() / degrees
-            total = total + ((degrees + 1) / 2 * squares.log1p()).sum()
+            prior = ((degrees + 1) / 2 * squares.log1p()).sum()
             if self.prior is not None:
                 steps = (leaf[:3] - self.prior) / self.spread
-                total = total + steps.square().sum() / 2
+                prior = prior + steps.square().sum() / 2
+            total = prior + (by_logarithms * logarithms).sum()
+            if self.shared > 3:
+                total = total + by_scale * leaf[3]
             (gradient,) = torch.autograd.grad(total, leaf)
-        return total.item(), gradient.numpy()
+        return likelihood + prior.item(), gradient.numpy()
+
+    def _likelihood(self, point: np.ndarray) -> tuple[float, Float[Tensor, "r 3"], float]:
+        """Negative log likelihood; its gradient by all logarithms, and by that of the scale.
+
+        The gradient of the matrices is written out: autograd takes several times as long.
+        """
+        logarithms, choice = self.unpacked(torch.from_numpy(point))
+        receivers, hyperparameters = self.around.receivers, logarithms.exp()
+        noises = hyperparameters[receivers, 2].square()  # (m,)
+        between = covariances(self.around, hyperparameters, choice)
+        of_readings = noises[:, None] * self.factors  # (m, j)
+        solution = conditional(between, self.readings, of_readings)
+        with torch.enable_grad():
+            leaves = [solution.means, solution.variances, noises]
+            leaves = [leaf.detach().requires_grad_() for leaf in leaves]
+            means, variances, noise = leaves
+            total = -log_density(self.asked - means, variances, noise, choice.degrees).sum()
+            of_mean, of_variance, of_noise = torch.autograd.grad(total, leaves)
+        arguments = between, of_readings, solution, of_mean, of_variance
+        found = slopes(self.around, hyperparameters, choice, *arguments)
+        found[:, 2] += 2 * of_noise * noises
+        gradient = torch.zeros_like(logarithms).index_add(0, receivers, found[:, :3])
+        return total.item(), gradient, found[:, 3].sum().item()
 
     def start(self, logarithms: Float[Tensor, "r 3"] | None) -> np.ndarray:
         """The point to start from: of earlier hyperparameters, or the best of a coarse grid."""
@@ -208,7 +239,7 @@ def maximise(cost: HeldOutCost, start: Float[Tensor, "r 3"] | None = None) -> Sc
             jac=True,
             method="L-BFGS-B",
             bounds=cost.bounds,
-            options={"maxiter": cost.options.iterations, "ftol": 1e-8},
+            options={"maxiter": cost.options.iterations, "ftol": cost.options.tolerance},
             callback=stages.end_in_time,
         )
         point, least = result.x, float(result.fun)

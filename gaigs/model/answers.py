@@ -12,10 +12,16 @@ from gaigs.calibration import Calibration
 from gaigs.calibration.conformal import usual_deviations
 from gaigs.calibration.held_out import Answers, calibrate
 from gaigs.core.query import Batch, evenly
+from gaigs.core.stages import timed
 from gaigs.data import Links
 from gaigs.kriging.links import single_readings
 from gaigs.model.base import Model
 from gaigs.registry import name_of
+
+
+def batch_size(links: Links) -> int:
+    """Links predicted at a time; of labels of one number more, which take little memory."""
+    return 4096 if links.task.is_scalar else 64
 
 
 def predicted(
@@ -27,15 +33,15 @@ def predicted(
     """Predictions of a model for some links, on the CPU; of channels at other subcarriers, if they
     are given [Hz].
     """
-    values = model.predict_batches(links.query[index], batch_size=64, frequencies=frequencies)
+    size = batch_size(links)
+    values = model.predict_batches(links.query[index], batch_size=size, frequencies=frequencies)
     return torch.cat([part.cpu() for part in values])
 
 
-def spreads(
-    model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor, size: int = 64
-) -> Tensor:
+def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor) -> Tensor:
     """Deviations of some links, ``Model.spread``, on the CPU; ``values`` are their predictions."""
     directions, device = links.task.directions, model.device
+    size = batch_size(links)
     parts = []
     for query, part in zip(links.query[index].parts(size), values.split(size), strict=True):
         batch = Batch(query, directions).to(device)
@@ -58,14 +64,14 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
         batch = Batch(links.query[index[:1]], links.task.directions).to(one.device)
         return Answers(values, deviations, one.deviations(batch) is not None)
 
-    unseen = model.unseen(links)
-    calibration = calibrate(links, name_of(model), model.fold_count, unseen, answer)
-    if calibration is None or not model.any_receiver:
-        return calibration
-    known = links.query.receivers[links.split.known].bincount(minlength=len(links.receivers))
-    return replace(
-        calibration, widths=(known == 0).double(), elsewhere=at_new_receivers(model, links)
-    )
+    with timed("intervals"):
+        unseen = model.unseen(links)
+        calibration = calibrate(links, name_of(model), model.fold_count, unseen, answer)
+        if calibration is None or not model.any_receiver:
+            return calibration
+        known = links.query.receivers[links.split.known].bincount(minlength=len(links.receivers))
+        elsewhere = at_new_receivers(model, links)
+        return replace(calibration, widths=(known == 0).double(), elsewhere=elsewhere)
 
 
 def at_new_receivers(

@@ -25,7 +25,6 @@ from gaigs.kriging.links import (
     distances,
     folds_of,
     known_links,
-    limit_known,
 )
 from gaigs.kriging.path_terms import report_terms
 from gaigs.kriging.scalar import ScalarProcess
@@ -61,12 +60,11 @@ class GaussianProcess(LookUp):
 
     Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` instead: kernel, noise and
     trend are those with which folds of the known links are most likely, and each receiver has
-    hyperparameters of its own. Of a receiver with more than ``LIMIT`` known links an even part is
-    used.
+    hyperparameters of its own. Many readings are solved in parts, see ``gaigs.kriging.tiles``.
 
-    A receiver with more than ``LIMIT`` known links is predicted from the 300 nearest to each query
-    (local kriging): with this kernel near links screen those behind them. Residuals of channels are
-    limited, see ``gaigs.kriging.fit.damping``.
+    Of other labels a receiver with more than ``LIMIT`` known links is predicted from the 300
+    nearest to each query (local kriging): with this kernel near links screen those behind them.
+    Residuals of channels are limited, see ``gaigs.kriging.fit.damping``.
 
     Args:
         trend: Configuration of the model whose residuals the process describes. None: ``friis`` for
@@ -142,7 +140,7 @@ class GaussianProcess(LookUp):
         if not chooses:
             self.trend.refit(links)
         if self.scalar is not None:
-            self._fit_scalar(self.scalar, limit_known(links, self.limit), chooses)
+            self._fit_scalar(self.scalar, links, chooses)
         else:
             self._solve_known(chooses)
 
@@ -193,7 +191,7 @@ class GaussianProcess(LookUp):
                     candidates.append(errors)
                 self.chosen = process.fit(*known, candidates, folds)
             else:
-                process.refit(*known, residuals(self.trend), folds)
+                process.refit(residuals(self.trend), process.hold_out(*known, folds))
         process.solve(*known, residuals(self.trend))
 
     @property

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -11,11 +12,13 @@ from gaigs.core.query import Batch, Query, evenly
 from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.kriging.links import (
+    Near,
     at_directions,
     coordinates,
     distances,
     folds_of,
     known_links,
+    nearest_places,
     scale_bounds,
 )
 from gaigs.model import LookUp, Prediction
@@ -23,6 +26,20 @@ from gaigs.registry import register
 
 COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 """Numbers of neighbours to choose from."""
+
+
+class HeldOutLinks(NamedTuple):
+    """Held-out links of one receiver.
+
+    Attributes:
+        rows: Their rows among the known links (h,).
+        apart: Distances of the known links [m], infinite for those that are held out, too (h, k).
+        index: The known links (k,).
+    """
+
+    rows: Int[Tensor, " h"]
+    apart: Float[Tensor, "h k"]
+    index: Int[Tensor, " k"]
 
 
 @register("model", "knn")
@@ -75,7 +92,8 @@ class KNearestNeighbours(LookUp):
             self.scale = min(scales, key=self._squared_error)
         if self.k is None:
             folds = [folds_of(links, index) for index in self.known]
-            self.chosen = min(COUNTS, key=lambda count: self._rank(count, folds))
+            held = [*self._held_out(folds)]
+            self.chosen = min(COUNTS, key=lambda count: self._rank(count, held))
 
     def facts(self) -> dict[str, float]:
         """``neighbours`` if they were chosen, and with several carriers ``frequency_scale_m``."""
@@ -87,8 +105,13 @@ class KNearestNeighbours(LookUp):
         labels = torch.empty(len(query), *self.scene.task.shape, dtype=self.scene.task.dtype)
         for receiver in query.receivers.unique():
             is_asked = query.receivers == receiver
-            apart = self._distances(query[is_asked], self.known[receiver], self.scale)
-            labels[is_asked] = self._look_up(apart, self.known[receiver])
+            index = self.known[receiver]
+            if not self.scene.task.shape:
+                near = self._nearest(query[is_asked], index)
+                labels[is_asked] = self._mean(near, index)
+                continue
+            apart = self._distances(query[is_asked], index, self.scale)
+            labels[is_asked] = self._look_up(apart, index)
         return Prediction(at_directions(labels, batch, self.scene), {})
 
     def _distances(
@@ -98,20 +121,37 @@ class KNearestNeighbours(LookUp):
         known = coordinates(self.scene, self.links.query[index], scale)
         return distances(asked, known)
 
-    def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, " k"]) -> Tensor:
-        """Labels from those of known links and their distances; links at an infinite distance are
-        left out.
-        """
-        farthest = apart.topk(min(self.chosen, len(index)), largest=False).values[:, -1:]
+    def _nearest(self, query: Query, index: Int[Tensor, " k"]) -> Near:
+        """The nearest known links of each asked one, and all that are as near as the last."""
+        asked = coordinates(self.scene, query, self.scale)
+        known = coordinates(self.scene, self.links.query[index], self.scale)
+        count = self.chosen + 1
+        while True:
+            near = nearest_places(asked, known, count)
+            is_tied = near.apart[:, -1] <= near.apart[:, min(self.chosen, len(index)) - 1]
+            if count >= len(index) or not is_tied.any():
+                return near
+            count *= 4  # links at one place
+
+    def _weights(self, apart: Float[Tensor, "b j"]) -> Float[Tensor, "b j"]:
+        """Weights of known links by their distances; of links at an infinite distance 0."""
+        farthest = apart.topk(min(self.chosen, apart.shape[1]), largest=False).values[:, -1:]
         near = (apart <= farthest) & apart.isfinite()
         # A transmitter within a micrometre of a measured one gets that label.
         apart = apart.clamp_min(1e-6)
         weights = near * (apart.amin(1, keepdim=True) / apart) ** self.power  # ratios stay finite
-        weights = weights / weights.sum(1, keepdim=True)
-        used = near.any(0)
+        return weights / weights.sum(1, keepdim=True)
+
+    def _mean(self, near: Near, index: Int[Tensor, " k"]) -> Float[Tensor, " b"]:
+        """Labels of one number from those of the nearest known links."""
+        labels = self.links.labels[index]
+        return (self._weights(near.apart).to(labels) * labels[near.rows]).sum(1)
+
+    def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, " k"]) -> Tensor:
+        """Labels from those of known links and their distances."""
+        weights = self._weights(apart)
+        used = weights.any(0)
         labels, align = self.links.labels[index[used]], self.scene.task.align
-        if not self.scene.task.shape:  # a radio map of many receivers asks for millions of numbers
-            return weights[:, used].to(labels) @ labels
         rows = []
         for row, first in zip(weights[:, used], apart[:, used].argmin(1).tolist(), strict=True):
             near = row.nonzero()[:, 0]
@@ -119,11 +159,9 @@ class KNearestNeighbours(LookUp):
             rows.append(torch.tensordot(row[near].to(labels), aligned, 1))
         return torch.stack(rows)
 
-    def _held_out(
-        self, folds: Sequence[Int[Tensor, " _"]] | None = None
-    ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Labels of known links, and what links of other folds predict for them, or for None those
-        at other places.
+    def _held_out(self, folds: Sequence[Int[Tensor, " _"]] | None = None) -> Iterator[HeldOutLinks]:
+        """Some known links of each receiver, held out with their fold, or for None with their
+        place.
         """
         for receiver, index in enumerate(self.known):
             for rows in evenly(torch.arange(len(index)), max(1, 256 // len(self.known))).split(32):
@@ -134,22 +172,32 @@ class KNearestNeighbours(LookUp):
                 apart = self._distances(asked, index, self.scale).masked_fill(here, math.inf)
                 has_others = apart.isfinite().any(1)  # a place may be the only one
                 if has_others.any():
-                    values = self._look_up(apart[has_others], index)
-                    labels = self.links.labels[index[rows[has_others]]]
-                    yield self.scene.task.align(labels, values), values
+                    yield HeldOutLinks(rows[has_others], apart[has_others], index)
+
+    def _predicted(self, held: HeldOutLinks) -> tuple[Tensor, Tensor]:
+        """Labels of held-out links, and what the others predict."""
+        if self.scene.task.shape:
+            values = self._look_up(held.apart, held.index)
+        else:
+            # Far more than the largest number of neighbours, for those that are as near.
+            count = min(4 * max(COUNTS), len(held.index))
+            values = self._mean(Near(*held.apart.topk(count, largest=False)), held.index)
+        labels = self.links.labels[held.index[held.rows]]
+        return self.scene.task.align(labels, values), values
 
     def _squared_error(self, scale: float) -> float:
         self.scale = scale
         errors = []
-        for labels, values in self._held_out():
+        for held in self._held_out():
+            labels, values = self._predicted(held)
             errors.append((values - labels).abs().double().square().flatten())
         return torch.cat(errors).mean().item() if errors else 0.0
 
-    def _rank(self, count: int, folds: Sequence[Int[Tensor, " _"]]) -> float:
+    def _rank(self, count: int, held: Sequence[HeldOutLinks]) -> float:
         """Mean score of known links by some neighbours, an error or a negative similarity."""
         self.chosen = count
         task = self.scene.task
-        held = self._held_out(folds)
-        scores = [task.scores(labels, values)[task.monitor] for labels, values in held]
+        pairs = map(self._predicted, held)
+        scores = [task.scores(labels, values)[task.monitor] for labels, values in pairs]
         mean = torch.cat(scores).mean().item() if scores else 0.0
         return -mean if task.higher_is_better else mean

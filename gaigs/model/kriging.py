@@ -56,7 +56,8 @@ class Kriging(Wrapper):
     kriged paths by more than chance, as of places closer than half a wavelength, labels are kriged.
 
     A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal
-    components. Of a receiver with more than ``LIMIT`` known links an even part is used.
+    components. Of a receiver with more than ``LIMIT`` known links an even part is used, except of
+    labels of one number.
 
     Args:
         trend: The trained model, or its configuration if a state is to be loaded.
@@ -98,6 +99,7 @@ class Kriging(Wrapper):
         posterior: Posterior
         if self.scene.task.is_scalar:
             posterior = ScalarPosterior(self.scene)
+            posterior.start = getattr(getattr(self, "posterior", None), "start", None)
         elif by_paths:
             posterior = PathPosterior(self.scene, self.trend.margins)
         else:
@@ -125,7 +127,7 @@ class Kriging(Wrapper):
         links: Links,
         is_final: bool = True,
         by_paths: bool | None = None,
-        most: int = LIMIT,
+        most: int | None = None,
     ) -> "Kriging":
         """Fits, and gives the validation model: the same weights and hyperparameters on the
         training links alone.
@@ -135,10 +137,12 @@ class Kriging(Wrapper):
             is_final: False if only the validation model is fitted, without a word.
             by_paths: True if strengths of paths are kriged, False if labels are; None: ``FEWEST``
                 validation links or more choose.
-            most: Most known links of a receiver.
+            most: Most known links of a receiver; None: ``LIMIT``, of labels of one number all.
         """
         links = self.posterior.cleaned(links)
         count = len(links.split.known)
+        if most is None:
+            most = max(1, count) if links.task.is_scalar else LIMIT
         links = limit_known(links, self._most(links, most))
         if is_final and math.isfinite(stages.left()) and len(links.split.known) < count:
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
@@ -227,14 +231,14 @@ class Kriging(Wrapper):
         return model
 
     def _validation_model(
-        self, links: Links, values: Tensor, weights: Sequence[float] = weights
+        self, links: Links, values: Tensor, weights: Sequence[float] | None = None
     ) -> "Kriging":
         """Fits weights and hyperparameters; returns a model that knows the training links alone.
 
-        The trend weight is chosen among ``weights``.
+        The trend weight is chosen among some; None: among ``weights``.
         """
         split = links.split
-        candidates = self._candidates(links, values, weights)
+        candidates = self._candidates(links, values, weights or self.weights)
         self.trend_weight.fill_(self.posterior.fit(links, candidates))
         training = replace(links, split=split.validating())
         model = Kriging(self.scene, self.trend, self.fallback_options)
@@ -418,9 +422,16 @@ class Kriging(Wrapper):
             if stages.is_up():
                 return
             kriged = Kriging(links.scene, self.trend, self.fallback_options).to(self.device)
+            kriged.posterior.start_from(self.posterior)
+            if links.task.is_scalar and len(chooses) >= 300:
+                # A half of so many would choose the same weight as all of them.
+                kriged.weights = (self.trend_weight.item(),)
             half = replace(links, split=links.split.choosing(chooses))
             kriged = kriged.krige(half, is_final=False, by_paths=self.by_paths)
-            yield Unseen(kriged, single_readings(links, asked), links.split.train)
+            asked = single_readings(links, asked)
+            if links.task.is_scalar:  # more readings of one number tell no more of quantiles
+                asked = evenly(asked, 4000)
+            yield Unseen(kriged, asked, links.split.train)
 
     def take_hyperparameters(self, other: Model) -> None:
         if isinstance(other, Kriging):

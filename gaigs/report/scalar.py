@@ -28,7 +28,7 @@ class ScalarFigures(TaskFigures):
     """Predicted against measured values, the radio map and the distribution of errors."""
 
     def of_run(
-        self, task: Scalar, folder: Path, links: Links, max_receivers: int = 12
+        self, task: Scalar, folder: Path, links: Links, max_receivers: int = 9
     ) -> dict[str, Figure]:
         file = folder / "predictions.npz"
         errors = {name: abs(values) for name, values in own_scores(file, "error").items()}

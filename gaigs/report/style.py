@@ -127,6 +127,7 @@ def save(figure: Figure, file: Path) -> list[Path]:
     for file in files:
         with atomic_write(file) as part, rc_context(STYLE):
             figure.savefig(part, dpi=DPI)
+            figure.set_layout_engine("none")  # the next format has the same layout
     return files
 
 

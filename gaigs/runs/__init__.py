@@ -13,7 +13,7 @@ from rich.console import Console
 
 from gaigs import data
 from gaigs.core.radio_maps import radio_map
-from gaigs.core.stages import stage
+from gaigs.core.stages import current, stage, timed
 from gaigs.data import Links
 from gaigs.io.files import write_text
 from gaigs.kriging.links import check_known
@@ -167,7 +167,8 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
 
     _check_options(config)
     lightning.seed_everything(config["seed"], verbose=False)
-    links = data.load(config["data"], config["split"], config["task"]["name"])
+    with timed("reading"):
+        links = data.load(config["data"], config["split"], config["task"]["name"])
     if not len(links.split.test):
         raise ValueError(
             "a run takes links to test on; set split.test above 0, or use gaigs.train in Python"
@@ -194,7 +195,7 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         model = registry("model").build(config["model"], scene=links.scene)
         look_ups = {name: model} | baselines
     # Shares of the run's limit; maps and figures have the rest.
-    with stage(until=0.86):
+    with stage(until=0.86), timed("validation"):
         validation = evaluation.validate(fitted.unseen, look_ups, links)
     with stage(until=0.92):
         scores = evaluation.score(fitted.models, baselines, links, folder)
@@ -217,12 +218,22 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
     if config["kriging"]:
         metrics["kriging"]["seconds"] = fitted.kriging_seconds
     model.export(folder)
-    if links.task.is_scalar:
-        radio_map(model).save(folder / "radio_map.npz")
-    from gaigs.report.run_figures import write_figures  # matplotlib is slow to import
-
-    write_figures(folder, links, model)
+    _draw(folder, links, model)
+    metrics["seconds"] = dict(current().seconds)
+    parts = [f"{name} {spent:.1f}" for name, spent in metrics["seconds"].items()]
+    log.info("seconds: %s", ", ".join(parts))
     return metrics
+
+
+def _draw(folder: Path, links: Links, model: Model) -> None:
+    """Writes the radio map and the figures."""
+    if links.task.is_scalar:
+        with timed("radio map"):
+            radio_map(model).save(folder / "radio_map.npz")
+    with timed("figures"):
+        from gaigs.report.run_figures import write_figures  # matplotlib is slow to import
+
+        write_figures(folder, links, model)
 
 
 def _log_links(links: Links, name: str) -> None:

@@ -31,7 +31,7 @@ from gaigs.data import Links
 from gaigs.data.compatibility import check_fit
 from gaigs.io.files import atomic_write
 from gaigs.model import Model
-from gaigs.model.answers import calibrated, predicted, spreads
+from gaigs.model.answers import batch_size, calibrated, predicted, spreads
 from gaigs.model.kriging import Kriging
 from gaigs.registry import name_of, registry
 from gaigs.report.paired import Paired, paired
@@ -260,11 +260,13 @@ def score(
         if is_baseline and stages.is_up():
             left_out.append(key)
             continue
-        model = models[key] if key in models else fitted(look_ups[key], links)
+        with stages.timed(key):
+            model = models[key] if key in models else fitted(look_ups[key], links)
         if is_baseline and stages.is_up():
             left_out.append(key)
             continue
-        values = predicted(model, links, test.index, frequencies)
+        with stages.timed(key):
+            values = predicted(model, links, test.index, frequencies)
         test.add(key, values)
         calibration = model.calibration
         if key not in models and has_intervals:
@@ -280,8 +282,9 @@ def score(
                 fewest(0.9),
             )
         if states_intervals and calibration is not None and has_enough:
-            deviations = spreads(model, links, test.index, values)
-            test.add_intervals(key, calibration, values, deviations, is_main)
+            with stages.timed("intervals"):
+                deviations = spreads(model, links, test.index, values)
+                test.add_intervals(key, calibration, values, deviations, is_main)
     if left_out:
         part = "test" if has_intervals else "validation"
         stages.leave_out(f"no {part} scores of {', '.join(left_out)}")
@@ -305,6 +308,7 @@ class LinkScores:
     """Scores of the test links, and the content of ``predictions.npz``.
 
     Attributes:
+        size: Links predicted at a time.
         index: Numbers of the test links (k,).
         task: Task of the labels that are predicted.
         labels: Labels of the test links (k, *shape).
@@ -314,10 +318,11 @@ class LinkScores:
 
     def __init__(self, links: Links):
         asked = links.held_out or links
+        self.size = batch_size(links)
         self.index = links.split.test
         self.task: Any = asked.task
         self.query = links.query[self.index]
-        self.labels = torch.cat([asked.labels[part] for part in self.index.split(BATCH)])
+        self.labels = torch.cat([asked.labels[part] for part in self.index.split(self.size)])
         self.scores: Scores = {}
         self.content: dict[str, Any] = {
             "link": self.index.numpy(),
@@ -349,14 +354,14 @@ class LinkScores:
         """Scores the intervals of a model; the main one's deviations are stored."""
         if is_main:
             parts = []
-            for rows in torch.arange(len(self.index)).split(BATCH):
+            for rows in torch.arange(len(self.index)).split(self.size):
                 estimate = calibration.estimate(
                     values[rows], deviations[rows], self.query[rows], 0.9
                 )
                 parts.append(self.task.packed(estimate.std))
             self.content["deviation"] = np.concatenate(parts)
         few = thinned(self.task, self.labels, values, deviations)
-        scores = scores_of_links(calibration, few, self.query)
+        scores = scores_of_links(calibration, few, self.query, self.size)
         self.scores[key] |= {f"{INTERVALS}{name}": score for name, score in scores.items()}
         self.content[f"shares_{key}"] = shares_within(calibration, few, self.query)
 

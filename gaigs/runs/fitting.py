@@ -67,7 +67,7 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         if is_first() and model.state_dict():
             checkpoint.save(model, best)
         return Fitted({name: model}, {}, start)
-    with stages.stage(until=0.5 / config["ensemble"]):
+    with stages.stage(until=0.5 / config["ensemble"]), stages.timed("training"):
         model, seconds = descend(model, loss, links, config, folder, searched)
     if not is_first():
         return None
@@ -84,7 +84,7 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         checkpoint.update(best, model)
         return Fitted({name: model}, {name: model}, start, seconds)
     began = time.monotonic()
-    with stages.stage(until=0.8):
+    with stages.stage(until=0.8), stages.timed("kriging"):
         validation_model = kriged.to(model.device).krige(links)
         kriging_seconds = time.monotonic() - began
         if stages.is_up():
@@ -146,7 +146,7 @@ def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float
     """
     began = time.monotonic()
     places = links.query[links.split.known].place_keys.unique()
-    with stages.stage(until=until):
+    with stages.stage(until=until), stages.timed("fit"):
         model.fit(links)
         if stages.is_up():
             stages.leave_out(f"the time for the fit of {name} was up")

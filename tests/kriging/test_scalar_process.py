@@ -10,16 +10,17 @@ import pytest
 import torch
 from scipy import stats
 from scipy.integrate import quad
+from scipy.optimize import approx_fprime
 from scipy.spatial.distance import cdist
 
 import gaigs
 from gaigs.core.query import Query
 from gaigs.data import Split
-from gaigs.kriging.likelihood import Choice, conditional, covariances, log_density
+from gaigs.kriging.likelihood import Choice, log_density
 from gaigs.kriging.links import coordinates, folds_of
 from gaigs.kriging.neighbours import Readings
 from gaigs.kriging.scalar import ScalarProcess
-from gaigs.kriging.scalar_fit import ScalarOptions
+from gaigs.kriging.scalar_fit import HeldOutCost, ScalarOptions
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.testing import example_links
 
@@ -144,35 +145,53 @@ def test_means_and_deviations_are_the_formula(smoothness, carriers):
     )
 
 
-def test_the_gradient_is_finite_where_places_coincide():
-    links = drawn(count=40, carriers=(1e9, 2e9))
-    links.query.transmitters[1::2] = links.query.transmitters[::2]
-    *readings, values = known(links)
-    around = first(Readings(links.scene, *readings, 16), 10)
-    logarithms = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
-    scale = torch.ones((), dtype=torch.float64, requires_grad=True)
-    between = covariances(around, logarithms.exp(), Choice(0.5, math.inf, scale))
-    parts = conditional(
-        between, values[around.rows], torch.ones_like(around.exists, dtype=torch.float64)
-    )
-    sum(part.sum() for part in parts).backward()
-    assert logarithms.grad.isfinite().all()
-    assert scale.grad.isfinite()
+@pytest.mark.parametrize("smoothness", [0.5, 1.5])
+@pytest.mark.parametrize("degrees", [math.inf, 4.0])
+@pytest.mark.parametrize("carriers", [(), (1e9, 2e9)])
+def test_gradients_are_those_of_finite_differences(smoothness, degrees, carriers):
+    links = drawn(count=40, carriers=carriers)
+    links.query.transmitters[1::2] = links.query.transmitters[::2]  # places coincide
+    places, receivers, values = known(links)
+    readings = Readings(links.scene, places, receivers, 16)
+    held = readings.held_out(torch.arange(len(places)), folds_of(links, links.split.train), 20)
+    choice = Choice(smoothness, degrees, 1.0 if carriers else math.nan)
+    prior = torch.zeros(3, dtype=torch.float64)
+    cost = HeldOutCost(links.scene, values, held, choice, True, prior, ScalarOptions())
+    point = cost.start(torch.zeros(2, 3, dtype=torch.float64))
+    point = point + 0.2 * np.random.default_rng(0).standard_normal(len(point))
+    _, gradient = cost(point)
+    assert np.isfinite(gradient).all()
+    found = approx_fprime(point, lambda one: cost(one)[0], 1e-6)
+    np.testing.assert_allclose(gradient, found, rtol=1e-3, atol=1e-3)
 
 
-def test_gradients_are_those_of_finite_differences():
-    links = drawn(count=40)
-    *readings, values = known(links)
-    around = first(Readings(links.scene, *readings, 16), 3)
-
-    def both(logarithms, noises):
-        return conditional(
-            covariances(around, logarithms.exp(), Choice(1.5)), values[around.rows], noises
-        )
-
-    point = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
-    noises = torch.ones_like(around.exists, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(both, (point, noises))
+@pytest.mark.parametrize("smoothness", [0.5, 1.5])
+def test_tiles_are_nearly_the_dense_solve(smoothness, monkeypatch):
+    links = drawn((1.5, 0.8), smoothness, noise=2.0, count=1500)
+    model = fitted(links)
+    process = model.scalar
+    places, receivers, values = process.places, process.receivers, process.values
+    asked = coordinates(links.scene, links.query[links.split.test], 1.0)
+    of = links.query.receivers[links.split.test]
+    dense = process(asked, of)
+    assert not len(process.tiles)
+    process.options = replace(process.options, together=100)
+    process.solve(places, receivers, values)
+    assert len(process.tiles) > 8
+    tiled = process(asked, of)
+    assert (tiled - dense).square().mean().sqrt() < 0.02 * dense.std()
+    # A place's mean does not depend on those that are asked with it, nor on a checkpoint.
+    fresh = ScalarProcess(links.scene)
+    fresh.load_state_dict(process.state_dict())
+    assert torch.equal(fresh(asked[:5], of[:5]), process(asked[:5], of[:5]))
+    # A checkpoint of before has no tiles.
+    process.options = replace(process.options, together=10**6)
+    process.solve(places, receivers, values)
+    state = process.state_dict()
+    old = {name: value for name, value in state.items() if not name.startswith("tiles")}
+    fresh = ScalarProcess(links.scene)
+    fresh.load_state_dict(old)
+    assert torch.equal(fresh(asked, of), dense)
 
 
 def test_readings_of_the_own_fold_do_not_predict():
