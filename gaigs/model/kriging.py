@@ -23,7 +23,6 @@ from gaigs.kriging.field import FieldPosterior
 from gaigs.kriging.fit import FEWEST
 from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import PART, limit_known, single_readings
-from gaigs.kriging.path_terms import report_terms
 from gaigs.kriging.paths import PathPosterior
 from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar import ScalarPosterior
@@ -148,8 +147,6 @@ class Kriging(Wrapper):
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
         values = predicted(self.trend, links, links.split.known)
         self.fallback.fit(links)
-        if is_final:
-            report_terms(self.fallback)
         if by_paths is None and self.trend.has_margins:
             is_few = len(single_readings(links, links.split.validation)) < FEWEST
             return self._krige_better(links, values, is_final, is_few)
@@ -202,7 +199,9 @@ class Kriging(Wrapper):
         held = links.split.validation
         is_unlearnt = False
         if len(held):
-            alone = registry("model").build(self.fallback_options, scene=self.scene)
+            # Levels know their place by more than the distance to a receiver.
+            law = self.scene.task.trends[-1] if self.scene.task.is_scalar else self.fallback_options
+            alone = registry("model").build(law, scene=self.scene)
             alone.fit(replace(links, split=links.split.validating()))
             trend = validation_scores(links, values[len(links.split.train) :])
             fallback = validation_scores(links, predicted(alone, links, held))
@@ -224,7 +223,13 @@ class Kriging(Wrapper):
                 log.warning(
                     "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
                     "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
-                    *(links.task.monitor, trend.mean().abs(), name, fallback.mean().abs(), name),
+                    *(
+                        links.task.monitor,
+                        trend.mean().abs(),
+                        name_of(alone),
+                        fallback.mean().abs(),
+                    ),
+                    name,
                     100 * (1 - self.weight * (1 - self.trend_weight)),
                 )
             self._log()

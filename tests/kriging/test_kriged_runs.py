@@ -68,7 +68,7 @@ def test_trend_and_kriging_are_reported(finished):
 
 def test_the_checkpoint_holds_the_kriged_model(finished):
     config, folder, metrics = finished
-    kriged = {"name": "kriging", "trend": config["model"], "fallback": {"name": "shaped_path_loss"}}
+    kriged = {"name": "kriging", "trend": config["model"], "fallback": {"name": "path_loss"}}
     assert checkpoint.read(folder / "best.ckpt")[checkpoint.KEY]["model"] == kriged
     assert checkpoint.read(folder / "last.ckpt")[checkpoint.KEY]["model"] == config["model"]
     assert metrics["checkpoint_bytes"] == (folder / "best.ckpt").stat().st_size
