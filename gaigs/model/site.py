@@ -54,18 +54,19 @@ class Site(Model):
         self.buildings = buildings
         self.height = height
         self.law = PathLoss(scene)
-        self.roofs: Roofs | None = None
         self.register_buffer("losses", torch.full((4,), torch.nan))  # c1 to c4
+        self.register_buffer("roofs", torch.zeros(1, 1))  # (rows, columns) [m]
+        self.register_buffer("grid", torch.zeros(3))  # lower corner, cell [m]
 
-    def get_extra_state(self) -> dict:
-        return {"roofs": self.roofs and [*self.roofs]}
-
-    def set_extra_state(self, state: dict) -> None:
-        self.roofs = state["roofs"] and Roofs(*state["roofs"])
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        self.roofs = torch.empty_like(state_dict.get(f"{prefix}roofs", self.roofs))  # a grid's size
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     def fit(self, links: Links) -> None:
         """Reads the buildings, and fits coefficients and path loss."""
-        self.roofs = self._read_roofs()
+        roofs = self._read_roofs()
+        self.roofs = roofs.heights.to(self.roofs)
+        self.grid.copy_(torch.tensor([*roofs.lower, roofs.cell]))
         kept = without_gross_errors(links)
         index = kept.split.known
         query = links.query[index]
@@ -90,12 +91,15 @@ class Site(Model):
         return Prediction(self.law(batch).value - loss, {})
 
     def _features(self, query: Query) -> Float[Tensor, "b 4"]:
-        if self.roofs is None:
+        x, y, cell = self.grid.tolist()
+        if not cell:  # before the fit
             return query.transmitters.new_full((len(query), 4), torch.nan)
         # Another wavelength adds a constant to the loss behind an edge, which c1 takes.
         wavelength = speed_of_light / (self.scene.middle_frequency or 2e9)
         positions = self.scene.positions(query.transmitters)[query.receivers]  # (b, 3)
-        features = obstruct(self.roofs, positions, query.transmitters, wavelength)
+        features = obstruct(
+            Roofs(self.roofs, (x, y), cell), positions, query.transmitters, wavelength
+        )
         features[:, 1] = 10 * (1 + features[:, 1]).log10()
         return features
 
