@@ -60,7 +60,7 @@ SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "syntheti
 MADE_FOR = {
     "loss": {"l1_ssim": ["spectrum"], "relative_error": ["csi"], "log_relative_error": ["csi"]}
     | dict.fromkeys(("absolute", "squared", "huber"), ("spectrum", "rssi")),
-    # The last three are made from trained models, and from a regressor.
+    # The last four are made from trained models, a regressor and a map.
     "model": {
         "path_loss": ["rssi"],
         "shaped_path_loss": ["rssi"],
@@ -68,6 +68,7 @@ MADE_FOR = {
         "kriging": [],
         "ensemble": [],
         "sklearn": [],
+        "site": [],
     },
 }
 """The tasks of a loss or model that refuses others."""

@@ -24,6 +24,7 @@ WITHOUT_SETTINGS = {
     "kriging": "is made of a trained model",
     "ensemble": "is made of trained models",
     "sklearn": "is made of a regressor",
+    "site": "needs a file of buildings",
     "ray_tracing": "needs a mesh of the room",
 }
 NAMES = [name for name in registry("model").names() if name not in WITHOUT_SETTINGS]

@@ -1,0 +1,146 @@
+"""Log-distance path loss and what buildings on a map take from it."""
+
+import logging
+import math
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.constants import speed_of_light
+from scipy.optimize import nnls
+from torch import Tensor
+
+from gaigs.core.query import Batch, Query
+from gaigs.core.roofs import Roofs, obstruct, rasterize_roofs
+from gaigs.core.scene import Scene
+from gaigs.data import Links
+from gaigs.data.geojson import read_buildings
+from gaigs.kriging.gross_errors import without_gross_errors
+from gaigs.model import Model, Prediction
+from gaigs.model.path_loss import PathLoss
+from gaigs.registry import register
+
+log = logging.getLogger(__name__)
+
+
+@register("model", "site")
+class Site(Model):
+    """``path_loss`` of each receiver, less a loss by buildings that all receivers share; NaN before
+    ``fit``.
+
+    Loss = c1 [a roof is above the direct path] + c2 10 log10(1 + length inside / 1 m) + c3 (walls
+    crossed) + c4 (knife-edge loss over the roofs). The coefficients are 0 or more, by least squares
+    of the known links together with the level and exponent of each receiver, and drawn towards 0 as
+    by one link. ``fit`` reads the file, and a checkpoint keeps the roofs on a grid of 1 m or, of a
+    large site, coarser.
+
+    Args:
+        buildings: GeoJSON file, see ``gaigs.data.geojson.read_buildings``: longitude and latitude,
+            or easting and northing, if the data have a place on the map; else metres of the data.
+        height: Height of buildings without one [m]; None: each must have its own.
+
+    Raises:
+        FileNotFoundError: ``fit`` finds no such file.
+        ValueError: A label is more than one real number. In ``fit``: the file has a defect, or no
+            building near the links.
+
+    Source: ITU-R P.526-15, sections 4.1 and 4.5.1; Lawson and Hanson, Solving Least Squares
+    Problems, 1974, chapter 23.
+    """
+
+    any_receiver = True
+
+    def __init__(self, scene: Scene, buildings: str, height: float | None = None):
+        super().__init__(scene)
+        self.buildings = buildings
+        self.height = height
+        self.law = PathLoss(scene)
+        self.register_buffer("losses", torch.full((4,), torch.nan))  # c1 to c4
+        self.register_buffer("roofs", torch.zeros(1, 1))  # (rows, columns) [m]
+        self.register_buffer("grid", torch.zeros(3))  # lower corner, cell [m]
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        self.roofs = torch.empty_like(state_dict.get(f"{prefix}roofs", self.roofs))  # a grid's size
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+    def fit(self, links: Links) -> None:
+        """Reads the buildings, and fits coefficients and path loss."""
+        roofs = self._read_roofs()
+        self.roofs = roofs.heights.to(self.roofs)
+        self.grid.copy_(torch.tensor([*roofs.lower, roofs.cell]))
+        kept = without_gross_errors(links)
+        index = kept.split.known
+        query = links.query[index]
+        features = self._features(query).double()  # (k, 4)
+        if not features[:, 0].any():
+            log.warning(
+                "%s: no roof is above the direct path of any link\n"
+                "compare heights of buildings and places: both are above 0 of the data's z",
+                self.buildings,
+            )
+        columns = torch.cat((links.labels[index, None].double(), -features), 1)  # (k, 5)
+        positions = self.scene.positions(query.transmitters)[query.receivers]  # (k, 3)
+        lengths = (query.transmitters - positions).norm(dim=1).double()
+        self.losses.copy_(shared_coefficients(columns, lengths, query.receivers))
+        log.info("losses by buildings, their length, walls and edges: %s", self.losses.tolist())
+        rest = links.labels.clone()
+        rest[index] += (features @ self.losses.double()).to(rest)
+        self.law.fit(replace(kept, labels=rest))
+
+    def forward(self, batch: Batch) -> Prediction:
+        loss = self._features(batch.query) @ self.losses
+        return Prediction(self.law(batch).value - loss, {})
+
+    def _features(self, query: Query) -> Float[Tensor, "b 4"]:
+        x, y, cell = self.grid.tolist()
+        if not cell:  # before the fit
+            return query.transmitters.new_full((len(query), 4), torch.nan)
+        # Another wavelength adds a constant to the loss behind an edge, which c1 takes.
+        wavelength = speed_of_light / (self.scene.middle_frequency or 2e9)
+        positions = self.scene.positions(query.transmitters)[query.receivers]  # (b, 3)
+        features = obstruct(
+            Roofs(self.roofs, (x, y), cell), positions, query.transmitters, wavelength
+        )
+        features[:, 1] = 10 * (1 + features[:, 1]).log10()
+        return features
+
+    def _read_roofs(self) -> Roofs:
+        """The roofs as far from the links as predictions go without a warning."""
+        buildings = read_buildings(self.buildings, self.scene.frame, self.height)
+        corners = np.concatenate([rings[0] for rings, _ in buildings])
+        lower, upper = (corner[:2].double().numpy() for corner in self.scene.box)
+        first = np.maximum(lower - self.scene.extent, corners.min(0))
+        last = np.minimum(upper + self.scene.extent, corners.max(0))
+        if (first >= last).any():
+            ends = [*corners.min(0), *corners.max(0), *lower, *upper]
+            raise ValueError(
+                "{}: buildings from ({:.0f}, {:.0f}) to ({:.0f}, {:.0f}) m are far from the links, "
+                "({:.0f}, {:.0f}) to ({:.0f}, {:.0f}) m\n"
+                "give both in one frame: data.epsg of the links, or buildings less their "
+                "origin".format(self.buildings, *ends)
+            )
+        return rasterize_roofs(buildings, first, last)
+
+
+def shared_coefficients(
+    columns: Float[Tensor, "k c"], lengths: Float[Tensor, " k"], receivers: Tensor
+) -> Float[Tensor, " f"]:
+    """Coefficients of 0 or more with which the last columns explain the first one, beside a level
+    and an exponent of each receiver.
+    """
+    columns = columns.clone()
+    decades = lengths.clamp_min(0.1).log10()
+    # What level and exponent explain is taken off first (Frisch and Waugh, 1933).
+    for receiver in receivers.unique():
+        rows = receivers == receiver
+        own = torch.stack((torch.ones_like(decades[rows]), decades[rows]), 1)  # (j, 2)
+        law = torch.linalg.lstsq(own, columns[rows], driver="gelsd").solution  # (2, c)
+        columns[rows] -= own @ law
+    spreads = columns[:, 1:].square().mean(0).sqrt()  # (f,)
+    spreads = spreads.where(spreads > 1e-6, math.inf)
+    # One more link for each coefficient, which says 0, in units of its spread.
+    matrix = torch.cat((columns[:, 1:] / spreads, torch.eye(len(spreads)).double()))
+    values = torch.cat((columns[:, 0], torch.zeros(len(spreads)).double()))
+    found, _ = nnls(matrix.cpu().numpy(), values.cpu().numpy())
+    return torch.from_numpy(found) / spreads.cpu()

@@ -1,0 +1,113 @@
+"""Path loss less the loss by buildings: coefficients of a law, checkpoints, kriging on top."""
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import gaigs
+from gaigs.core.roofs import obstruct
+from gaigs.model.site import Site, shared_coefficients
+
+
+def write_buildings(file, shift=0.0):
+    features = []
+    for x in (30, 70):
+        ring = [[x, 20], [x + 12, 20], [x + 12, 60], [x, 60], [x, 20]]
+        ring = [[a + shift, b] for a, b in ring]
+        geometry = {"type": "Polygon", "coordinates": [ring]}
+        features.append({"type": "Feature", "properties": {"height": 18.0}, "geometry": geometry})
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    return str(file)
+
+
+@pytest.fixture
+def site(tmp_path):
+    """Two masts, 300 places, 15 dB behind a building, a law of its own for each mast, 1 dB of
+    noise."""
+    file = write_buildings(tmp_path / "buildings.geojson")
+    draw = torch.Generator().manual_seed(0)
+    places = torch.rand(300, 3, generator=draw) * torch.tensor([110.0, 80.0, 0.0])
+    places[:, 2] = 1.5
+    is_inside = (places[:, 1] > 20) & (places[:, 1] < 60)
+    is_inside &= ((places[:, 0] - 36).abs() < 7) | ((places[:, 0] - 76).abs() < 7)
+    places = places[~is_inside]
+    masts = torch.tensor([[2.0, 40.0, 9.0], [56.0, 3.0, 6.0]])
+    probe = Site(gaigs.links("synthetic_rssi", transmitters=20).scene, file)
+    lengths = (places[:, None] - masts).norm(dim=-1)
+    labels = torch.tensor([-30.0, -38.0]) - 10 * torch.tensor([2.0, 2.6]) * lengths.log10()
+    labels += torch.randn(labels.shape, generator=draw)
+    links = gaigs.links(
+        task="rssi",
+        transmitters=places.numpy(),
+        receivers=masts.numpy(),
+        labels=labels.numpy(),
+        split="random",
+    )
+    model = Site(links.scene, file)
+    roofs = model._read_roofs()
+    starts = links.scene.positions(places)[links.query.receivers]
+    blocked = obstruct(roofs, starts, links.query.transmitters, 0.15)[:, 0]
+    assert 0.2 < blocked.mean() < 0.8
+    assert probe.losses.isnan().all()
+    links.labels.sub_(15 * blocked)
+    return links, file
+
+
+def test_the_loss_behind_buildings_and_both_laws_are_found(site):
+    links, file = site
+    model = Site(links.scene, file)
+    model.fit(links)
+    assert (model.losses >= 0).all()
+    assert model.law.exponents.tolist() == pytest.approx([2.0, 2.6], abs=0.25)
+    test = links.split.test
+    error = (model.predict(links.query[test]) - links.labels[test]).abs().mean()
+    assert error < 1.3  # the noise alone has 0.8 dB
+    without = gaigs.registries["model"].build("path_loss", scene=links.scene)
+    without.fit(links)
+    assert error < (without.predict(links.query[test]) - links.labels[test]).abs().mean() - 2
+
+
+def test_a_process_over_the_site_loads_without_the_file(site, tmp_path):
+    links, file = site
+    options = {"name": "gaussian_process", "trend": {"name": "site", "buildings": file}}
+    model = gaigs.registries["model"].build(options, scene=links.scene)
+    model.fit(links)
+    model.save(tmp_path / "site.ckpt")
+    Path(file).unlink()
+    loaded = gaigs.load(tmp_path / "site.ckpt")
+    torch.testing.assert_close(loaded.predict(links.query), model.predict(links.query))
+
+
+def test_buildings_of_another_frame_are_named(site, tmp_path):
+    links, _ = site
+    file = write_buildings(tmp_path / "far.geojson", shift=5e5)
+    with pytest.raises(ValueError, match=r"are far from the links, .*\ngive both in one frame"):
+        Site(links.scene, file).fit(links)
+
+
+def test_roofs_below_all_paths_are_a_warning(site, caplog):
+    links, file = site
+    text = Path(file).read_text().replace("18.0", "0.5")
+    Path(file).write_text(text)
+    Site(links.scene, file).fit(links)
+    assert "no roof is above the direct path of any link" in caplog.text
+
+
+def test_coefficients_are_not_negative_and_a_constant_feature_has_none():
+    draw = torch.Generator().manual_seed(0)
+    lengths = 10 * torch.rand(200, generator=draw).double() + 1
+    features = torch.rand(200, 2, generator=draw).double()
+    labels = -30 - 20 * lengths.log10() - 4 * features[:, 0] + features[:, 1]
+    columns = torch.cat((labels[:, None], -features, -torch.ones(200, 1, dtype=torch.float64)), 1)
+    receivers = torch.zeros(200, dtype=torch.long)
+    found = shared_coefficients(columns, lengths, receivers)
+    assert found[0] == pytest.approx(4, abs=0.5)
+    assert found[1:].tolist() == [0, 0]
+
+
+def test_images_are_refused(tmp_path):
+    scene = gaigs.links("synthetic", transmitters=20, order=0).scene
+    with pytest.raises(ValueError, match="one real number a link"):
+        Site(scene, "buildings.geojson")
