@@ -128,6 +128,11 @@ class Calibration:
         new = self.elsewhere
         return None if new is None else replace(new, widths=widths, elsewhere=new)
 
+    @property
+    def is_adapted(self) -> bool:
+        """True if readings at receivers without links have made their intervals narrower."""
+        return self.widths is not None and bool(((self.widths > 0) & (self.widths < 1)).any())
+
     def estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
         """The interval of some predictions; raises a ``ValueError`` where it needs more links."""
         widths = query.receivers.new_zeros(len(query)).to(value.real)
@@ -148,7 +153,9 @@ class Calibration:
         new = self.elsewhere._estimate(value, usual, query, level)
         if is_new.all():
             return new
-        own = self._estimate(value, deviations, query, level)
+        # Groups are of receivers with links alone: the others get a value that does not count.
+        receivers = torch.where(is_new, query.receivers[~is_new][0], query.receivers)
+        own = self._estimate(value, deviations, replace(query, receivers=receivers), level)
         fields: list[Any] = []
         for one, other in zip(new, own, strict=True):
             if one is None:

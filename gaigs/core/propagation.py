@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Complex, Float, Inexact, Int
 from scipy.constants import speed_of_light
 from torch import Tensor
 
@@ -151,6 +151,17 @@ def fit_gain(
         return torch.zeros((), dtype=torch.complex128, device=h.device)
     alike = (w.conj() * h).sum(1)[counts] / (sizes * strengths)[counts]
     return (sizes / strengths)[counts].quantile(0.5) * alike.sum().sgn()
+
+
+def common_gain(gains: Inexact[Tensor, " r *shape"]) -> Inexact[Tensor, " *shape"]:
+    """Gain of a receiver in general: the mean over receivers.
+
+    Of complex gains it is the root mean square with the phase of the mean: phases of cables differ,
+    and would cancel.
+    """
+    if not gains.is_complex():
+        return gains.mean(0)
+    return gains.abs().square().mean(0).sqrt() * gains.sum(0).sgn()
 
 
 def strength(

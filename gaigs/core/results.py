@@ -52,6 +52,8 @@ def plot(result: Any, /, ax: Any = None, **options: Any) -> Any:
         "LearntRoom": "report.room.plot_room",
     }
     name = type(result).__name__
+    if result is None:
+        raise TypeError("plot got None; learnt_room is None where the labels show no room")
     if name not in functions:
         raise TypeError(f"plot takes one of {', '.join(functions)}, got {name}\nhelp(gaigs.plot)")
     library("matplotlib", "a plot")

@@ -29,11 +29,11 @@ def known_links(links: Links, any_receiver: bool = False) -> list[Int[Tensor, " 
     without = [receiver.name for receiver, index in pairs if not len(index)]
     if without and not (any_receiver and links.split.by_receivers):
         kind = "known" if len(links.split.validation) else "training"
+        mend = "choose another split"
+        if links.split.by_receivers:
+            mend += ", or a model for receivers without links"
         raise ValueError(
-            f"split {links.split.name!r} has no {kind} links of {', '.join(without)}; "
-            "choose another split"
-            + ", or a model for receivers without links"
-            * links.split.by_receivers
+            f"split {links.split.name!r} has no {kind} links of {', '.join(without)}; {mend}"
         )
     return known
 

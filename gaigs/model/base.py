@@ -31,6 +31,7 @@ from gaigs.model.requests import (
     as_known_subcarriers,
     as_new_receiver,
     check_interval,
+    is_same,
     lacks_elements,
     usual_batch_size,
 )
@@ -247,8 +248,8 @@ class Model(Movable):
         model, receiver = self._located(receiver, transmitters)
         scene = model.scene
         if interval is not None:
-            has_calibration = model.calibration is not None
-            check_interval(interval, has_calibration, scene, frequencies, model.any_frequency)
+            calibrations = self.calibration, model.calibration
+            check_interval(interval, calibrations, scene, frequencies, model.any_frequency)
         request = model._request(transmitters, receiver, frequency, directions, frequencies)
         if interval is None:
             values = torch.cat([*model._values(request, batch_size)])
@@ -302,9 +303,7 @@ class Model(Movable):
         if new is None:
             return self, receiver
         for number, known in enumerate(self.scene.receivers):
-            if known is new or (
-                known.name == new.name and torch.equal(known.pose.position, new.pose.position)
-            ):
+            if known.name == new.name and is_same(known, new):
                 return self, number
         return self.at_receivers([new]), 0
 

@@ -7,7 +7,7 @@ from jaxtyping import Complex, Float
 from torch import Tensor
 
 from gaigs.core.phases import TELLING
-from gaigs.core.propagation import fit_gain
+from gaigs.core.propagation import common_gain, fit_gain
 from gaigs.core.query import Batch, Query
 from gaigs.core.scene import Scene, check_elements, direct_gains, direct_waves
 from gaigs.data import Links
@@ -66,7 +66,7 @@ class Friis(Model):
             gain = fit_gain(links.labels[rows], self._waves(links.query[rows]))
             self.gains[receiver] = gain.to(self.gains)
         is_known = torch.tensor([*map(len, known)]) > 0
-        self.gains[~is_known] = self.gains[is_known].mean()
+        self.gains[~is_known] = common_gain(self.gains[is_known])
 
     def forward(self, batch: Batch) -> Prediction:
         waves = self._waves(batch.query).to(self.gains)

@@ -223,12 +223,10 @@ class Kriging(Wrapper):
                 log.warning(
                     "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
                     "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
-                    *(
-                        links.task.monitor,
-                        trend.mean().abs(),
-                        name_of(alone),
-                        fallback.mean().abs(),
-                    ),
+                    links.task.monitor,
+                    trend.mean().abs(),
+                    name_of(alone),
+                    fallback.mean().abs(),
                     name,
                     100 * (1 - self.weight * (1 - self.trend_weight)),
                 )
@@ -451,8 +449,8 @@ class Kriging(Wrapper):
         return self.trend
 
     @property
-    def has_room(self) -> bool:
-        """True if predictions have a part of the trend: else its room is none, and not shown."""
+    def has_room(self) -> bool:  # type: ignore[override]
+        """True if predictions have a part of the trend."""
         return bool(self.trend_weight > 0 or self.weight < 1)
 
     def learnt_room(self, links: Links | None = None) -> Any:
@@ -461,6 +459,10 @@ class Kriging(Wrapper):
     def learnt_paths(self, query: Query) -> list:
         return super().learnt_paths(query) if self.has_room else []
 
+    @property
+    def primitives(self) -> Any:  # type: ignore[override]
+        return super().primitives if self.has_room else None
+
     def export(self, folder: Path) -> None:
         if self.has_room:
             super().export(folder)
@@ -468,7 +470,8 @@ class Kriging(Wrapper):
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
         weights = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
-        return self.trend.facts() | {"kriging": weights | dict(self.posterior.facts())}
+        room = {} if self.has_room else {"room": False}
+        return self.trend.facts() | {"kriging": weights | room | dict(self.posterior.facts())}
 
 
 def validation_scores(links: Links, values: Tensor) -> Float[Tensor, " k"]:

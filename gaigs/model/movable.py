@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 
 from gaigs.core.antenna import Receiver
+from gaigs.core.propagation import common_gain
 from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.registry import name_of
@@ -68,8 +69,18 @@ class Movable(nn.Module):
                 f"model {name_of(self)!r} predicts for its own receivers alone; for others take "
                 "mirrored, gaigs, friis, path_loss, mean, or gaussian_process of levels"
             )
-        if not receivers:
-            raise ValueError("at_receivers takes one receiver or more, got none")
+        receivers = [receivers] if isinstance(receivers, Receiver) else [*receivers]
+        for receiver in receivers:
+            if not isinstance(receiver, Receiver):
+                raise TypeError(
+                    f"at_receivers takes gaigs.Receiver objects, got {receiver!r:.100}; "
+                    'gaigs.Receiver("door", gaigs.Pose.at([x, y, z])) is one'
+                )
+        if not receivers or len({receiver.name for receiver in receivers}) < len(receivers):
+            names = [receiver.name for receiver in receivers]
+            raise ValueError(
+                f"at_receivers takes one receiver or more, each with a name of its own, got {names}"
+            )
         room = torch.stack(self.scene.box)
         # No measurement tells the front end of a new receiver.
         scene = replace(self.scene, receivers=tuple(receivers), room=room, responses=None)
@@ -80,8 +91,8 @@ class Movable(nn.Module):
                 part.scene = scene
             for name in getattr(part, "of_receivers", ()):
                 values = getattr(part, name)
-                mean = (values if known is None else values[known]).mean(0, keepdim=True)
-                setattr(part, name, mean.repeat(len(receivers), *[1] * (values.ndim - 1)))
+                general = common_gain(values if known is None else values[known])
+                setattr(part, name, general.repeat(len(receivers), *[1] * general.ndim))
             if hasattr(part, "take_receivers"):
                 part.take_receivers(scene, known)
         other.take_calibration(self)
@@ -91,14 +102,16 @@ class Movable(nn.Module):
     def adapt(self, links: Links) -> Any:
         """A copy at the receivers of a few links, whose levels these correct; the room stays.
 
-        With n links of mean error e, the level of a receiver moves by e s / (s + w / n): s is the
-        variance of errors between receivers, w the one within them. Intervals shrink accordingly.
+        With n places of mean error e, the level of a receiver moves by e s / (s + w / n): s is the
+        variance of errors between receivers, w the one within them. Repeated readings of a place
+        count as one. Intervals shrink accordingly.
 
         Args:
             links: Readings at one or several receivers without training links; a split is not used.
 
         Raises:
-            ValueError: The labels are no levels, or too few receivers have told how they differ.
+            ValueError: The labels are no levels, too few receivers have told how they differ, or
+                the model is an adapted one.
 
         Source: Robinson, That BLUP is a good thing: the estimation of random effects, 1991.
 
@@ -111,6 +124,11 @@ class Movable(nn.Module):
             >>> model.adapt(gaigs.links(task="rssi", **few)).predict([1.0, 1.0, 1.0]).shape
             torch.Size([1])
         """
+        if self.calibration is not None and self.calibration.is_adapted:
+            raise ValueError(
+                "adapt takes a model without readings at new receivers; give the trained model all "
+                "readings together"
+            )
         moved = self.at_receivers(links.receivers)
         new = moved.calibration
         parts = [part for part in moved.modules() if hasattr(part, "of_level")]
@@ -119,12 +137,14 @@ class Movable(nn.Module):
                 "adapt takes a model of levels, calibrated with links of three receivers or more, "
                 "such as path_loss or mirrored"
             )
-        between, within = new.scatter
+        between, within = new.scatter.clamp_min(1e-9)  # of constant levels both are 0
         receivers = links.query.receivers
         errors = (links.labels - moved.predict(links.query).cpu()).double()
-        counts = receivers.bincount(minlength=len(links.receivers)).double()  # (r,)
-        sums = torch.zeros_like(counts).index_add(0, receivers, errors)
-        variances = 1 / (1 / between.clamp_min(1e-9) + counts / within)  # of what is left
+        votes = links.query.votes  # (n,)
+        none = votes.new_zeros(len(links.receivers))
+        counts = none.index_add(0, receivers, votes)  # (r,), of places
+        sums = none.index_add(0, receivers, votes * errors)
+        variances = 1 / (1 / between + counts / within)  # of what is left
         for part in parts:
             level = getattr(part, part.of_level)
             level += (variances * sums / within).to(level)

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gaigs.calibration.conformal import Calibration
 from gaigs.calibration.estimate import Asked, Estimate
 from gaigs.core.antenna import Receiver
 from gaigs.core.geometry import Directions, Grid, Pose, Rays
@@ -169,9 +170,8 @@ def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver 
     pose = receiver if isinstance(receiver, Pose) else None
     if pose is None:
         kind, shape = _kind_of(receiver)
-        is_index = kind in "iu" and np.shape(getattr(transmitters, "transmitters", transmitters))[
-            :-1
-        ] == (3,)
+        _, places = _kind_of(getattr(transmitters, "transmitters", transmitters))
+        is_index = kind in "iu" and places[:-1] == (3,)
         if shape != (3,) or kind not in "iuf" or is_index:
             return None
         pose = Pose.at(as_positions("receiver", receiver).cpu())
@@ -189,6 +189,16 @@ def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver 
             f"position {pose.position.tolist()}"
         )
     return Receiver("new", pose, array)
+
+
+def is_same(one: Receiver, other: Receiver) -> bool:
+    """True if two receivers have the same pose and array."""
+    parts = []
+    for receiver in (one, other):
+        pose, array = receiver.pose, receiver.array
+        parts.append((pose.position, pose.rotation, array.elements))
+    alike = [a.shape == b.shape and torch.allclose(a.to(b), b) for a, b in zip(*parts, strict=True)]
+    return all(alike) and one.array.pattern == other.array.pattern
 
 
 def _kind_of(values: Any) -> tuple[str, tuple[int, ...]]:
@@ -241,14 +251,27 @@ def as_known_subcarriers(frequencies: object, scene: Scene, any_frequency: bool)
 
 
 def check_interval(
-    interval: float, has_calibration: bool, scene: Scene, frequencies: object, any_frequency: bool
+    interval: float,
+    calibrations: tuple[Calibration | None, Calibration | None],
+    scene: Scene,
+    frequencies: object,
+    any_frequency: bool,
 ) -> None:
-    """Raises the ``ValueError`` of ``Model.predict`` for an interval that it cannot give."""
+    """Raises the ``ValueError`` of ``Model.predict`` for an interval that it cannot give.
+
+    ``calibrations`` are the trained model's and its copy's at the receiver that is asked for.
+    """
     if not 0 < interval < 1:
         raise ValueError(
             f"interval must be a probability between 0 and 1 such as 0.9, got {interval!r}"
         )
-    if not has_calibration:
+    if calibrations[1] is None and calibrations[0] is not None:
+        raise ValueError(
+            "the model has no intervals at receivers without links, which three receivers or more "
+            "with held-out links calibrate\n"
+            "leave interval out, or train with more receivers; an older checkpoint also lacks them"
+        )
+    if calibrations[1] is None:
         raise ValueError(
             "the model has no intervals: no held-out links have measured its errors\n"
             "train it with split.validation above 0, on two places, runs or blocks or more, "
@@ -270,6 +293,14 @@ def extrapolations(query: Query, scene: Scene) -> list[str]:
     """Sentences on positions farther from the training transmitters' box than the scene's extent,
     and on carriers outside the training links' band."""
     messages = []
+    lower, upper = (corner.to(scene.lower) for corner in scene.box)
+    positions = scene.positions(lower)
+    beyond = (positions - positions.clamp(lower, upper)).norm(dim=-1).amax()
+    if beyond > scene.extent:
+        messages.append(
+            f"a receiver is {beyond:.3g} m outside the box of the training links, which is "
+            f"{scene.extent:.3g} m across: nothing was measured near there"
+        )
     points = query.transmitters
     nearest = points.clamp(scene.lower.to(points), scene.upper.to(points))  # (b, 3), in the box
     distances = (points - nearest).norm(dim=-1)  # (b,)

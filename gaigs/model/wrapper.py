@@ -24,6 +24,11 @@ class Wrapper(Model):
         """The model within, such as the trend of kriging."""
 
     @property
+    def has_room(self) -> bool:
+        """False if predictions have no part of the underlying model: its room is not shown."""
+        return True
+
+    @property
     def primitives(self) -> Gaussians | None:  # type: ignore[override]
         return self.underlying.primitives
 

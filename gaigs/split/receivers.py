@@ -14,7 +14,7 @@ from gaigs.split import check, check_validation, generator_of, hold_out, places_
 @register("split", "receivers")
 def receivers(
     links: Links,
-    hold: Sequence[str] | None = None,
+    hold: str | Sequence[str] | None = None,
     test: float = 0.25,
     fold: str | None = None,
     validation: float | None = None,
@@ -25,7 +25,7 @@ def receivers(
     Where three receivers or more are left, whole receivers validate, too; of two, random places.
 
     Args:
-        hold: Names of the receivers that test; None: random ones.
+        hold: Names of the receivers that test, or one; None: random ones.
         test: Fraction of the receivers that test, at least one; for random ones.
         fold: Fold of the receivers that tests, such as ``1/3`` for the first of three folds, in
             place of a fraction.
@@ -44,6 +44,11 @@ def receivers(
     if links.uncertainties is not None:  # a receiver without a place is located by its links
         order = order[links.uncertainties[order].isfinite()]
     held, name = _held(links, order, hold, test, fold)
+    if not torch.isin(held, order).all() or not len(held):
+        raise ValueError(
+            f"split=receivers tests at receivers of known places, of which the data have "
+            f"{len(order)}; give others by data.gateways, or take split=random"
+        )
     of_links = links.query.receivers
     rest = of_links[~torch.isin(of_links, held)].unique()
     if len(rest) < 2:
@@ -56,7 +61,9 @@ def receivers(
     training = (~is_test).nonzero()[:, 0]
     if len(rest) > 2 and validation != 0:
         share = 0.2 if validation is None else validation
-        validating = order[: max(1, round(share * len(order)))]
+        # Two receivers or more train.
+        count = min(max(1, round(share * len(order))), len(rest) - 2)
+        validating = order[:count]
         is_validating = torch.isin(of_links[training], validating)
         train, validated = training[~is_validating], training[is_validating]
         name += f", validation {len(validating)}"
@@ -78,13 +85,15 @@ def receivers(
 def _held(
     links: Links,
     order: Int[Tensor, " r"],
-    hold: Sequence[str] | None,
+    hold: str | Sequence[str] | None,
     test: float,
     fold: str | None,
 ) -> tuple[Int[Tensor, " h"], str]:
     """Numbers of the receivers that test, from a random ``order``, and the protocol's name."""
     names = [receiver.name for receiver in links.receivers]
-    if hold is not None:
+    if hold and fold is not None:
+        raise ValueError("split.hold and split.fold both choose receivers; leave one out")
+    if hold:
         hold = [hold] if isinstance(hold, str) else [*hold]
         for name in hold:
             if name not in names:

@@ -48,6 +48,37 @@ def test_whole_numbers_beside_as_many_transmitters_are_indices(path_loss):
     torch.testing.assert_close(indices, torch.stack((every[0, 3], every[1, 2], every[2, 2])))
 
 
+def test_a_receiver_that_is_turned_is_another_one():
+    channels = gaigs.links("synthetic_csi", transmitters=30, order=0)
+    friis = Friis(channels.scene)
+    friis.fit(channels)
+    known = channels.receivers[0]
+    turned = Pose(known.pose.position, known.pose.rotation.roll(1, 1))
+    there = friis.predict(PLACES, receiver=Receiver(known.name, turned, known.array))
+    assert not torch.equal(there, friis.predict(PLACES, receiver=0))
+
+
+def test_phases_of_cables_do_not_weaken_a_new_receiver(links):
+    channels = gaigs.links("synthetic_csi", transmitters=30, order=0, receivers=3)
+    friis = Friis(channels.scene)
+    friis.fit(channels)
+    friis.gains.copy_(torch.polar(torch.full((3,), 2.0), torch.tensor([0.0, 2.0, 4.0])))
+    moved = friis.at_receivers(channels.receivers[:1])
+    torch.testing.assert_close(moved.gains.abs(), torch.tensor([2.0]))
+
+
+def test_a_far_receiver_warns(path_loss):
+    with pytest.warns(gaigs.core.geometry.ExtrapolationWarning, match="a receiver is"):
+        path_loss.predict(PLACES, receiver=[1e4, 0.0, 2.0])
+
+
+@pytest.mark.parametrize("names", [[], ["a", "a"]])
+def test_new_receivers_have_names_of_their_own(path_loss, names):
+    receivers = [Receiver(name, Pose.at([3.0, 2.0, 2.0])) for name in names]
+    with pytest.raises(ValueError, match="each with a name of its own"):
+        path_loss.at_receivers(receivers)
+
+
 def test_a_receiver_of_the_scene_is_known(path_loss, links):
     own = path_loss.predict(PLACES, receiver=links.receivers[1])
     assert torch.equal(own, path_loss.predict(PLACES, receiver="south"))
@@ -102,7 +133,7 @@ def test_mirrored_gaussians_share_the_room(links, tmp_path):
     gain = 20 / math.log(10) * (0.3 - 0.4) + model.trend.means.mean() - model.trend.means[2]
     expected = model.predict(PLACES, receiver=2) + gain
     torch.testing.assert_close(other.predict(PLACES)[:, 0], expected, atol=1e-3, rtol=0)
-    far = model.at_receivers([Receiver("far", Pose.at([20.0, 2.0, 2.0]))])
+    far = model.at_receivers([Receiver("far", Pose.at([14.0, 2.0, 2.0]))])
     far.save(tmp_path / "far.ckpt")  # the room does not move with the receivers
     assert torch.equal(gaigs.load(tmp_path / "far.ckpt").predict(PLACES), far.predict(PLACES))
 
@@ -160,6 +191,14 @@ def test_intervals_at_new_receivers_count_receivers(tmp_path):
     assert torch.isfinite(moved.std).all()
 
 
+def test_intervals_know_receivers_up_to_the_last_with_links():
+    links = gaigs.links(
+        "synthetic_rssi", transmitters=150, receivers=4, split="receivers", hold="gateway4"
+    )
+    model = gaigs.train("path_loss", links, progress=False)
+    assert torch.isfinite(model.predict(PLACES, interval=0.5).std).all()
+
+
 def test_readings_at_a_new_receiver_correct_its_level():
     links = gaigs.links("synthetic_rssi", transmitters=80, receivers=9, split="receivers")
     model = gaigs.train("path_loss", links, progress=False)
@@ -181,5 +220,11 @@ def test_readings_at_a_new_receiver_correct_its_level():
     error = (far.labels - before.predict(far.query)).double().mean().item()
     shift = (moved.levels - before.levels).item()
     assert shift == pytest.approx(error * between / (between + within / 60), rel=1e-4)
+    repeated = readings(far, 0, torch.zeros(30, dtype=torch.long))
+    torch.testing.assert_close(
+        model.adapt(repeated).levels, model.adapt(readings(far, 0, torch.arange(1))).levels
+    )
+    with pytest.raises(ValueError, match="all readings together"):
+        moved.adapt(far)
     with pytest.raises(ValueError, match="adapt takes a model of levels"):
         gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0)).adapt(far)

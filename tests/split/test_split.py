@@ -320,8 +320,13 @@ def test_receivers_are_held_out_whole():
     few = part(many, name="receivers", hold=["ap0", "ap1", "ap2", "ap3"])
     assert heard(few.train) == heard(few.validation) == {4, 5}  # of two, places validate
     assert not len(part(many, name="receivers", validation=0.0).validation)
+    assert len(heard(part(many, name="receivers", validation=0.9).train)) == 2
+    lost = replace(many, uncertainties=torch.full((6,), torch.inf))
+    with pytest.raises(ValueError, match="receivers of known places"):
+        part(lost, name="receivers")
     for options, words in (
         ({"hold": ["cellar"]}, "got 'cellar'"),
+        ({"hold": "ap1", "fold": "1/3"}, "leave one out"),
         ({"fold": "4/3"}, "split.fold must be a fold such as 1/3"),
         ({"fold": "x"}, "split.fold must be a fold"),
         ({"test": 0.9}, "two receivers or more to train on"),

@@ -92,6 +92,11 @@ def _carrier(mirrored: MirroredSplatting, frequency: float | None) -> float:
 def mirrored_of(kind: str, model: Model) -> MirroredSplatting:
     """The mirrored Gaussians of a model, without its kriging; an ensemble's first member counts."""
     while isinstance(model, Wrapper):
+        if not model.has_room:
+            raise ValueError(
+                f"{kind} takes a learnt room, and the levels show none: predictions have no part "
+                "of the trained model (see the log)\nexport model.underlying to see it all the same"
+            )
         model = model.underlying
     if not isinstance(model, MirroredSplatting):
         raise ValueError(

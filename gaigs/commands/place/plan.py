@@ -124,9 +124,12 @@ def place(
     """
     scene = scalar_scene(model, "a placement")
     check_type("count", count, int)
-    if not math.isfinite(threshold):
+    check_type("known", known, bool)
+    if not isinstance(threshold, int | float) or not math.isfinite(threshold):
         raise ValueError(f"threshold must be a finite level, got {threshold}")
-    sites = candidate_places(scene, candidates)
+    sites = candidate_places(scene, candidates).unique(dim=0)
+    if not len(sites):
+        raise ValueError("candidates must be one place or more, got none")
     if not 1 <= count <= len(sites):
         raise ValueError(f"count must be 1 to {len(sites)}, the candidates, got {count}")
     area = survey_places(model, region, None).candidates  # (g, 3)
@@ -164,7 +167,7 @@ def place(
 
 def candidate_places(scene: Scene, candidates: object, usual: int = 64) -> Float[Tensor, "c 3"]:
     """Candidates of the argument of ``place``."""
-    if candidates is not None and not isinstance(candidates, int | float):
+    if candidates is not None and np.ndim(candidates):
         return as_positions("candidates", candidates).reshape(-1, 3)
     x, y = torch.stack(scene.box)[:, :2].T.numpy()
     corners = np.stack((x[[0, 1, 1, 0, 0]], y[[0, 0, 1, 1, 0]]))  # (2, 5), once around
