@@ -81,7 +81,7 @@ def simulate(seed: int, places: int) -> Links:
         )
 
     simulated = SimulatedRoom(
-        pose=Pose(position, POSE.rotation),
+        poses=(Pose(position, POSE.rotation),),
         gateways=(),
         edges=edges(room),
         place=place,

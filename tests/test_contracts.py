@@ -259,11 +259,14 @@ def test_data(name, tmp_path, request):
 def test_split(name, task):
     """The links of the RSSI share rows; the spectra's do not."""
     links, config = example_links(task), configured("split", name, "split.validation=0.25")
+    if name == "receivers":  # the example has two
+        data = {"spectrum": "synthetic", "rssi": "synthetic_rssi"}[task]
+        links = gaigs.links(data, transmitters=9, receivers=6, order=0)
 
     def build(seed):
         return registry("split").build(config | {"seed": seed}, links=links)
 
-    check_split(build, links, parts_rows=name == "official")
+    check_split(build, links, parts_rows=name in ("official", "receivers"))
 
 
 # --- the parts of the splatting pipeline ---
@@ -389,7 +392,7 @@ def test_training(device):
 )
 def test_a_task_that_a_component_is_not_made_for_is_refused(kind, name, task):
     links = example_links(task)
-    with pytest.raises(ValueError, match=r"label|needs (option (trend|members)|a regressor)"):
+    with pytest.raises(ValueError, match=r"label|needs (option (trend|members|buildings)|a regressor)"):
         registry(kind).build({"name": name}, scene=links.scene, task=links.task)
 
 

@@ -80,7 +80,7 @@ def test_a_run_prints_what_it_does_and_nothing_else(uninterrupted):
     folder, out, err = uninterrupted
     assert err == ""
     lines = out.splitlines()
-    assert (folder / "gaigs.log").read_text().splitlines() == [*lines[:3], *lines[4:6]]
+    assert (folder / "gaigs.log").read_text().splitlines() == [*lines[:3], *lines[4:7]]
     assert (
         lines[0]
         == "data: synthetic; split official, validation 0.1, seed 0: 22 train, 2 validation, 6 test"
@@ -96,9 +96,10 @@ def test_a_run_prints_what_it_does_and_nothing_else(uninterrupted):
     )
     assert re.match(r"trained 40 steps of 7 places in \d+ s: [\d.]+ steps/s$", lines[4])
     assert lines[5] == "gaigs has no intervals: 2 links calibrate them, and 9 are needed"
-    assert "Test scores" in lines[6]
+    assert lines[6].startswith("seconds: reading ")
+    assert "Test scores" in lines[7]
     assert lines[-1].endswith(str(folder))
-    assert all(len(line) <= 80 for line in lines[3:-1])
+    assert all(len(line) <= 80 for line in [*lines[3:6], *lines[7:-1]])
 
 
 def test_a_run_folder(uninterrupted):

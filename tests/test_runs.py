@@ -82,7 +82,7 @@ CASES = {
 METRICS = [
     "task", "data", "split", "seed", "device", "rasterizer", "train_seconds", "inference_ms", "render_ms",
     "num_gaussians", "num_gaussians_start", "num_parameters", "checkpoint_bytes", "models", "validation",
-    "validation_score", "receivers", "paired",
+    "validation_score", "receivers", "paired", "seconds",
 ]  # fmt: skip
 
 

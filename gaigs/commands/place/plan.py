@@ -38,6 +38,12 @@ class SitePlan:
         threshold: Level that ``coverage`` asks for.
         unit: Unit of the labels.
         frame: Place of x and y on a map; None if unknown.
+
+    Example:
+        >>> model = gaigs.train("path_loss", gaigs.links("synthetic_rssi", transmitters=50))
+        >>> plan = gaigs.place(model, [[3.0, 0.2, 2.0], [1.0, 3.0, 2.0]], objective="mean")
+        >>> tuple(plan.places.shape), len(plan.standing), plan.score_unit
+        ((1, 3), 4, 'dBm')
     """
 
     places: Float[Tensor, "n 3"]
@@ -121,6 +127,12 @@ def place(
     Raises:
         ValueError: The model has no levels, no intervals or no new receivers; an option is out of
             range, or a place is impossible.
+
+    Example:
+        >>> model = gaigs.train("path_loss", gaigs.links("synthetic_rssi", transmitters=50))
+        >>> plan = gaigs.place(model, [[3.0, 0.2, 2.0], [1.0, 3.0, 2.0]], threshold=-45.0)
+        >>> bool(plan.scores[1] >= plan.scores[0])  # more places are covered
+        True
     """
     scene = scalar_scene(model, "a placement")
     check_type("count", count, int)
