@@ -72,7 +72,7 @@ class ScalarProcess(nn.Module):
         self.register_buffer("receivers", empty.long())
         for name in ("values", "variances", "weights"):
             self.register_buffer(name, empty.clone())
-        self.tiles = Tiles(self.places.shape[1])
+        self.tiles = Tiles()
 
     # --- predictions ---
 
@@ -81,10 +81,12 @@ class ScalarProcess(nn.Module):
     ) -> Float[Tensor, " b"]:
         """Mean of z at some places."""
         means = places.new_zeros(len(places))
+        scale = self._choice.scale
+        all_places = scaled(self.places, scale)
         for receiver in receivers.unique().tolist():
             asked, known = receivers == receiver, self.receivers == receiver
             of_receiver = partial(self._covariances, receiver=receiver)
-            tiles = self.tiles.numbers(scaled(places[asked], self._choice.scale), receiver)
+            tiles = self.tiles.numbers(scaled(places[asked], scale), all_places, known)
             if len(tiles):
                 solve = partial(self._solved, receiver=receiver)
                 means[asked] = self.tiles.mean(
@@ -267,7 +269,7 @@ class ScalarProcess(nn.Module):
         for receiver in receivers.unique().tolist():
             known = (receivers == receiver).nonzero()[:, 0]
             if len(known) > self.options.together:
-                self.tiles.add(scaled(places[known], self._choice.scale), known, receiver)
+                self.tiles.add(scaled(places[known], self._choice.scale), known)
             else:
                 self.weights[known] = self._solved(known, receiver)
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from gaigs.kriging.kernel import resize
@@ -14,59 +14,75 @@ from gaigs.kriging.links import nearest_places
 class Tiles(nn.Module):
     """Parts of the readings of receivers that have too many for one covariance matrix.
 
-    A tile has ``size`` readings, the nearest to its centre. The tile of a place is that with the
-    nearest centre, so that ``size`` / ``core`` - 1 readings lie around each of its own: they screen
-    those behind them. Tiles are solved when a place in them is first asked for.
+    A tile is solved with ``size`` readings: its own, ``core`` at most, then those around each of
+    its own, which screen those behind them, then those nearest to its centre. The tile of a place
+    is that of the nearest reading. Tiles are solved when a place in them is first asked for.
 
     Attributes:
-        centres: Centres of the tiles (t, d), see ``coordinates``.
-        receivers: Receivers of the tiles (t,).
-        rows: Rows of the readings of each tile (t, j).
-        weights: Values over the covariances of the tile's readings (t, j); NaN until asked for.
+        readings: Rows of the divided readings among all known readings (n,).
+        owners: Tiles whose own these readings are (n,).
+        rows: Rows of the readings with which each tile is solved (t, j).
+        weights: Values over the covariances of a tile's readings (t, j); NaN until asked for, and
+            not stored.
     """
 
     core = 128
-    """Readings nearest to a tile's centre among all centres, about."""
+    """Most readings of a tile's own."""
     size = 512
     """Readings of a tile; see docs/methods.md for the error that more would take away."""
+    neighbours = 64
+    """Readings around each of a tile's own: as many as fill a tile where density is even."""
 
-    centres: Tensor
-    receivers: Tensor
+    readings: Tensor
+    owners: Tensor
     rows: Tensor
     weights: Tensor
 
-    def __init__(self, dimensions: int):
+    def __init__(self) -> None:
         super().__init__()
-        empty = torch.zeros(0, dtype=torch.float64)
-        self.register_buffer("centres", empty.new_zeros(0, dimensions))
-        self.register_buffer("receivers", empty.long())
-        self.register_buffer("rows", empty.new_zeros(0, self.size, dtype=torch.int32))
-        self.register_buffer("weights", empty.new_zeros(0, self.size))
+        empty = torch.zeros(0, dtype=torch.int32)
+        self.register_buffer("readings", empty)
+        self.register_buffer("owners", empty.clone())
+        self.register_buffer("rows", empty.new_zeros(0, self.size))
+        weights = torch.zeros(0, self.size, dtype=torch.float64)
+        self.register_buffer("weights", weights, persistent=False)
 
     def __len__(self) -> int:
-        return len(self.centres)
+        return len(self.rows)
 
     def clear(self) -> None:
         """Takes all tiles away."""
-        self.centres, self.receivers = self.centres[:0], self.receivers[:0]
+        self.readings, self.owners = self.readings[:0], self.owners[:0]
         self.rows = self.rows.new_zeros(0, self.size)
-        self.weights = self.weights.new_zeros(0, self.size)
 
-    def add(self, places: Float[Tensor, "k d"], rows: Int[Tensor, " k"], receiver: int) -> None:
+    def add(self, places: Float[Tensor, "k d"], rows: Int[Tensor, " k"]) -> None:
         """Divides the readings of a receiver, whose rows among all readings are given."""
-        centres = torch.stack([places[part].mean(0) for part in halves(places, self.core)])
+        parts = halves(places, self.core)
+        centres = torch.stack([places[part].mean(0) for part in parts])
         near = nearest_places(centres, places, self.size).rows  # (t, j)
-        self.centres = torch.cat((self.centres, centres))
-        self.receivers = torch.cat((self.receivers, rows.new_full((len(centres),), receiver)))
-        self.rows = torch.cat((self.rows, rows[near].int()))
-        self.weights = torch.cat(
-            (self.weights, torch.full_like(near, math.nan, dtype=torch.float64))
-        )
+        around = nearest_places(places, places, self.neighbours).rows  # (k, n)
+        tiles = []
+        for part, nearest in zip(parts, near, strict=True):
+            order = torch.cat((part, around[part].mT.flatten(), nearest))  # nearest ranks first
+            tiles.append([*dict.fromkeys(order.tolist())][: near.shape[1]])
+        sizes = torch.tensor([len(part) for part in parts], device=rows.device)
+        owners = torch.repeat_interleave(sizes) + len(self)
+        self.readings = torch.cat((self.readings, rows[torch.cat(parts)].int()))
+        self.owners = torch.cat((self.owners, owners.int()))
+        self.rows = torch.cat((self.rows, rows[torch.tensor(tiles, device=rows.device)].int()))
+        self.weights = torch.full_like(self.rows, math.nan, dtype=torch.float64)
 
-    def numbers(self, places: Float[Tensor, "b d"], receiver: int) -> Int[Tensor, " b"]:
-        """Tiles of some places of a receiver; none if it has no tiles."""
-        own = (self.receivers == receiver).nonzero()[:, 0]
-        return own[nearest_places(places, self.centres[own], 1).rows[:, 0]] if len(own) else own
+    def numbers(
+        self, asked: Float[Tensor, "b d"], places: Float[Tensor, "k d"], known: Bool[Tensor, " k"]
+    ) -> Int[Tensor, " _"]:
+        """Tiles of places, by the ``places`` of all readings and which of them are ``known`` to a
+        receiver; none if it has no tiles.
+        """
+        is_own = known[self.readings]
+        rows, owners = self.readings[is_own], self.owners[is_own]
+        if not len(rows):
+            return owners
+        return owners[nearest_places(asked, places[rows], 1).rows[:, 0]]
 
     def mean(
         self,
@@ -90,10 +106,12 @@ class Tiles(nn.Module):
         return means
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        resize(self, state_dict, prefix, "centres", "receivers", "rows", "weights")
-        # Checkpoints of before have no tiles.
-        for name in ("centres", "receivers", "rows", "weights"):
-            state_dict.setdefault(f"{prefix}{name}", getattr(self, name)[:0])
+        if not len(state_dict.get(f"{prefix}rows", ())):  # also one of before
+            state_dict.clear()
+            for name in ("readings", "owners", "rows"):
+                state_dict[f"{prefix}{name}"] = getattr(self, name)[:0]
+        resize(self, state_dict, prefix, "readings", "owners", "rows")
+        self.weights = torch.full_like(self.rows, math.nan, dtype=torch.float64)
         super()._load_from_state_dict(state_dict, prefix, *args)
 
 
