@@ -180,8 +180,16 @@ class HeldOutCost:
             means, variances, noise = leaves
             total = -log_density(self.asked - means, variances, noise, choice.degrees).sum()
             of_mean, of_variance, of_noise = torch.autograd.grad(total, leaves)
-        arguments = between, of_readings, solution, of_mean, of_variance
-        found = slopes(self.around, hyperparameters, choice, *arguments)
+        found = slopes(
+            self.around,
+            hyperparameters,
+            choice,
+            between=between,
+            variances=of_readings,
+            solution=solution,
+            of_mean=of_mean,
+            of_variance=of_variance,
+        )
         found[:, 2] += 2 * of_noise * noises
         gradient = torch.zeros_like(logarithms).index_add(0, receivers, found[:, :3])
         return total.item(), gradient, found[:, 3].sum().item()
