@@ -173,22 +173,15 @@ class HeldOutCost:
         noises = hyperparameters[receivers, 2].square()  # (m,)
         between = covariances(self.around, hyperparameters, choice)
         of_readings = noises[:, None] * self.factors  # (m, j)
-        solution = conditional(between, self.readings, of_readings)
+        given = conditional(between, self.readings, of_readings)
         with torch.enable_grad():
-            leaves = [solution.means, solution.variances, noises]
+            leaves = [given.means, solution.variances, noises]
             leaves = [leaf.detach().requires_grad_() for leaf in leaves]
             means, variances, noise = leaves
             total = -log_density(self.asked - means, variances, noise, choice.degrees).sum()
             of_mean, of_variance, of_noise = torch.autograd.grad(total, leaves)
         found = slopes(
-            self.around,
-            hyperparameters,
-            choice,
-            between=between,
-            variances=of_readings,
-            solution=solution,
-            of_mean=of_mean,
-            of_variance=of_variance,
+            self.around, hyperparameters, choice, between, of_readings, given, of_mean, of_variance
         )
         found[:, 2] += 2 * of_noise * noises
         gradient = torch.zeros_like(logarithms).index_add(0, receivers, found[:, :3])

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -9,6 +10,14 @@ from torch import Tensor, nn
 
 from gaigs.kriging.kernel import resize
 from gaigs.kriging.links import nearest_places
+
+
+class Merged(NamedTuple):
+    """Readings of a receiver; of many, those at one place and carrier are one."""
+
+    rows: Int[Tensor, " m"]  # of the first at each place
+    values: Float[Tensor, " m"]  # means, weighted by 1 / variance
+    variances: Float[Tensor, " m"]  # of their noise
 
 
 class Tiles(nn.Module):
@@ -19,9 +28,10 @@ class Tiles(nn.Module):
     is that of the nearest reading. Tiles are solved when a place in them is first asked for.
 
     Attributes:
-        readings: Rows of the divided readings among all known readings (n,).
-        owners: Tiles whose own these readings are (n,).
-        rows: Rows of the readings with which each tile is solved (t, j).
+        readings: Rows of the divided readings, one a place, among all known readings (n,).
+        values, variances: Their values, and variances of their noise, see ``Merged`` (n,).
+        owners: Tiles whose own they are (n,).
+        rows: Rows of those with which each tile is solved among ``readings`` (t, j).
         weights: Values over the covariances of a tile's readings (t, j); NaN until asked for, and
             not stored.
     """
@@ -33,7 +43,11 @@ class Tiles(nn.Module):
     neighbours = 64
     """Readings around each of a tile's own: as many as fill a tile where density is even."""
 
+    stored = "readings", "values", "variances", "owners", "rows"
+
     readings: Tensor
+    values: Tensor
+    variances: Tensor
     owners: Tensor
     rows: Tensor
     weights: Tensor
@@ -43,33 +57,37 @@ class Tiles(nn.Module):
         empty = torch.zeros(0, dtype=torch.int32)
         self.register_buffer("readings", empty)
         self.register_buffer("owners", empty.clone())
+        for name in ("values", "variances"):
+            self.register_buffer(name, empty.double())
         self.register_buffer("rows", empty.new_zeros(0, self.size))
-        weights = torch.zeros(0, self.size, dtype=torch.float64)
-        self.register_buffer("weights", weights, persistent=False)
+        self.register_buffer("weights", self.rows.double(), persistent=False)
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def clear(self) -> None:
         """Takes all tiles away."""
-        self.readings, self.owners = self.readings[:0], self.owners[:0]
+        for name in self.stored[:-1]:
+            setattr(self, name, getattr(self, name)[:0])
         self.rows = self.rows.new_zeros(0, self.size)
 
-    def add(self, places: Float[Tensor, "k d"], rows: Int[Tensor, " k"]) -> None:
-        """Divides the readings of a receiver, whose rows among all readings are given."""
+    def add(self, places: Float[Tensor, "m d"], readings: Merged) -> None:
+        """Divides the readings of a receiver at some places."""
         parts = halves(places, self.core)
         centres = torch.stack([places[part].mean(0) for part in parts])
         near = nearest_places(centres, places, self.size).rows  # (t, j)
-        around = nearest_places(places, places, self.neighbours).rows  # (k, n)
+        around = nearest_places(places, places, self.neighbours).rows  # (m, n)
         tiles = []
         for part, nearest in zip(parts, near, strict=True):
             order = torch.cat((part, around[part].mT.flatten(), nearest))  # nearest ranks first
             tiles.append([*dict.fromkeys(order.tolist())][: near.shape[1]])
-        sizes = torch.tensor([len(part) for part in parts], device=rows.device)
-        owners = torch.repeat_interleave(sizes) + len(self)
-        self.readings = torch.cat((self.readings, rows[torch.cat(parts)].int()))
-        self.owners = torch.cat((self.owners, owners.int()))
-        self.rows = torch.cat((self.rows, rows[torch.tensor(tiles, device=rows.device)].int()))
+        owners = torch.empty_like(readings.rows)
+        for number, part in enumerate(parts, len(self)):
+            owners[part] = number
+        rows = near.new_tensor(tiles) + len(self.readings)
+        for name, added in zip(self.stored, (*readings, owners, rows), strict=True):
+            old = getattr(self, name)
+            setattr(self, name, torch.cat((old, added.to(old.dtype))))
         self.weights = torch.full_like(self.rows, math.nan, dtype=torch.float64)
 
     def numbers(
@@ -90,29 +108,42 @@ class Tiles(nn.Module):
         tiles: Int[Tensor, " b"],
         places: Float[Tensor, "k d"],
         covariances: Callable[[Tensor, Tensor], Tensor],
-        solve: Callable[[Int[Tensor, " j"]], Float[Tensor, " j"]],
+        solve: Callable[[Merged], Tensor],
     ) -> Float[Tensor, " b"]:
         """Means at places in their ``tiles``: ``covariances`` with the ``places`` of all readings,
-        times weights from ``solve`` of a tile's rows.
+        times weights from ``solve`` of a tile's readings.
         """
         means = asked.new_zeros(len(asked))
         order = tiles.argsort()
         numbers, counts = tiles[order].unique_consecutive(return_counts=True)
         for tile, part in zip(numbers.tolist(), order.split(counts.tolist()), strict=True):
-            rows = self.rows[tile].long()
+            rows = self.rows[tile]
+            readings = Merged(self.readings[rows].long(), self.values[rows], self.variances[rows])
             if self.weights[tile, 0].isnan():
-                self.weights[tile] = solve(rows)
-            means[part] = covariances(asked[part], places[rows]) @ self.weights[tile]
+                self.weights[tile] = solve(readings)
+            means[part] = covariances(asked[part], places[readings.rows]) @ self.weights[tile]
         return means
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
         if not len(state_dict.get(f"{prefix}rows", ())):  # also one of before
             state_dict.clear()
-            for name in ("readings", "owners", "rows"):
+            for name in self.stored:
                 state_dict[f"{prefix}{name}"] = getattr(self, name)[:0]
-        resize(self, state_dict, prefix, "readings", "owners", "rows")
+        resize(self, state_dict, prefix, *self.stored)
         self.weights = torch.full_like(self.rows, math.nan, dtype=torch.float64)
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def merged(
+    places: Float[Tensor, "k d"], values: Float[Tensor, " k"], variances: Float[Tensor, " k"]
+) -> Merged:
+    """Readings whose process is that of the given ones, with those of one place as one."""
+    unique, numbers = places.unique(dim=0, return_inverse=True)
+    rows = torch.arange(len(places), device=places.device)
+    first = rows.new_full((len(unique),), len(rows)).scatter_reduce(0, numbers, rows, "amin")
+    precisions = values.new_zeros(len(unique)).index_add(0, numbers, 1 / variances)
+    sums = values.new_zeros(len(unique)).index_add(0, numbers, values / variances)
+    return Merged(first, sums / precisions, 1 / precisions)
 
 
 def halves(places: Float[Tensor, "k d"], most: int) -> list[Int[Tensor, " _"]]:

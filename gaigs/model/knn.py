@@ -131,9 +131,10 @@ class KNearestNeighbours(LookUp):
         near = nearest_places(asked, known, count)
         labels = self._mean(near, index)
         if count < len(index):
+            # Links at one place.
             is_tied = near.apart[:, -1] <= near.apart[:, self.chosen - 1]
             for rows in is_tied.nonzero()[:, 0].split(max(1, size // (4 * count))):
-                labels[rows] = self._levels(query[rows], index, 4 * count)  # links at one place
+                labels[rows] = self._levels(query[rows], index, 4 * count, size)
         return labels
 
     def _weights(self, apart: Float[Tensor, "b j"]) -> Float[Tensor, "b j"]:

@@ -210,6 +210,30 @@ def test_models_with_tiles_are_saved_and_loaded(tmp_path, monkeypatch):
         assert torch.equal(gaigs.load(tmp_path / f"{name}.ckpt").predict(places), before)
 
 
+@pytest.mark.parametrize("together", [150, 60])
+def test_readings_of_one_place_are_merged(together, monkeypatch):
+    monkeypatch.setattr(Tiles, "core", 16)
+    monkeypatch.setattr(Tiles, "size", 60)
+    rng = np.random.default_rng(0)
+    places = torch.from_numpy(rng.uniform(size=(100, 3)) * 20).repeat(5, 1)
+    asked = torch.from_numpy(rng.uniform(size=(50, 3)) * 20)
+    values = torch.from_numpy(rng.standard_normal(500)) + 4 * places[:, 0].sin()
+    process = ScalarProcess(example_links("rssi").scene)
+    process.logarithms[:] = torch.tensor([6.0, 5.0, 3.0]).log()
+    process.choice[1] = 4.0  # variances differ
+    means = []
+    for most in (10**6, together):
+        process.options = replace(process.options, together=most)
+        process.solve(places, torch.ones(500, dtype=torch.long), values)
+        means.append(process(asked, torch.ones(50, dtype=torch.long)))
+    dense, found = means
+    assert len(process.tiles) == (0 if together == 150 else 8)
+    if together == 150:
+        torch.testing.assert_close(found, dense)
+    else:  # 60 of 100 places
+        assert (found - dense).square().mean().sqrt() < 0.05 * dense.std()
+
+
 def test_sparse_readings_beside_many_are_in_tiles(monkeypatch):
     """A road out of a town, and one place far off: nearest to the centre of no tile."""
     monkeypatch.setattr(Tiles, "core", 32)
