@@ -175,7 +175,7 @@ class HeldOutCost:
         of_readings = noises[:, None] * self.factors  # (m, j)
         given = conditional(between, self.readings, of_readings)
         with torch.enable_grad():
-            leaves = [given.means, solution.variances, noises]
+            leaves = [given.means, given.variances, noises]
             leaves = [leaf.detach().requires_grad_() for leaf in leaves]
             means, variances, noise = leaves
             total = -log_density(self.asked - means, variances, noise, choice.degrees).sum()
