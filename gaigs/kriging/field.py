@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -13,7 +14,7 @@ from gaigs.core.query import Batch, Query, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.kriging.fit import Hyperparameters, damping, fit_hyperparameters, local_deviations
-from gaigs.kriging.kernel import Process, cholesky_factor, covariance, kernel, resize
+from gaigs.kriging.kernel import LIMIT, Process, cholesky_factor, covariance, kernel, resize
 from gaigs.kriging.links import at_directions, coordinates, scaled
 from gaigs.kriging.posterior import Posterior
 
@@ -197,7 +198,8 @@ class FieldPosterior(Posterior):
     def process_at(self, receiver: int) -> Process:
         field, process = self.fields[receiver], self.process
         places = scaled(field.places, 1 / process.scale)  # of scale 1
-        return process.at(places, field.size(process).item() ** 2)
+        found = process.at(places, field.size(process).item() ** 2)
+        return replace(found, is_part=len(places) >= LIMIT)
 
     def facts(self) -> Mapping[str, float]:
         places = [len(field.places) for field in self.fields]  # type: ignore[arg-type]

@@ -63,10 +63,12 @@ def are_alone(
     far = (errors.abs() > most).nonzero()[:, 0]
     if len(errors) <= neighbours or not len(far):
         return is_alone
-    apart = distances(places[far], places)  # (f, k)
-    itself = far[:, None] == torch.arange(len(errors))
-    near = apart.masked_fill(itself, math.inf).topk(neighbours, largest=False).indices
-    differs = (errors[far, None] - errors[near]).abs().amin(1) > most
+    near = []
+    for part in far.split(256):  # for memory's sake
+        apart = distances(places[part], places)  # (f, k)
+        itself = part[:, None] == torch.arange(len(errors))
+        near.append(apart.masked_fill(itself, math.inf).topk(neighbours, largest=False).indices)
+    differs = (errors[far, None] - errors[torch.cat(near)]).abs().amin(1) > most
     is_few = differs.sum() <= max(1, len(errors) // 20)
     is_alone[far] = differs & is_few
     return is_alone

@@ -24,12 +24,14 @@ class Process:
         places: Places of the known readings, ``coordinates`` of scale 1 (k, d) [m].
         noises: Variances of the noise of the known readings (k,).
         noise: Variance of the noise of a new reading.
+        is_part: True if a part of the receiver's readings was left out.
     """
 
     covariances: Callable[[Tensor, Tensor], Tensor]
     places: Float[Tensor, "k d"]
     noises: Float[Tensor, " k"]
     noise: float
+    is_part: bool = False
 
     def whitened(
         self, asked: Float[Tensor, "g d"], rows: Int[Tensor, " j"] | slice = slice(None)
@@ -69,7 +71,7 @@ def matern(apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, equations 4.16
     and 4.17.
     """
-    steps = apart * (-math.sqrt(2 * smoothness) / length)  # a division has a slower gradient
+    steps = apart * (-math.sqrt(2 * smoothness) / length)
     return steps.exp() if smoothness == 0.5 else (1 - steps) * steps.exp()
 
 

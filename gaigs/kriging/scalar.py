@@ -22,7 +22,7 @@ from gaigs.kriging.links import coordinates, distances, folds_of, scaled
 from gaigs.kriging.neighbours import HeldOutReadings, Nearest, Readings
 from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar_fit import HeldOutCost, ScalarFit, ScalarOptions, maximise
-from gaigs.kriging.tiles import Tiles
+from gaigs.kriging.tiles import Merged, Tiles, merged
 
 
 class ScalarProcess(nn.Module):
@@ -46,8 +46,8 @@ class ScalarProcess(nn.Module):
         receivers, values: Receivers and residuals of the known readings (k,).
         variances: Variance of the noise of each known reading (k,).
         weights: Values over the covariances of their receiver's readings (k,); 0 at receivers with
-            ``tiles``.
-        tiles: Parts of the readings of receivers with more than ``options.together``.
+            ``tiles``, and, where readings of one place are merged, at all but the first.
+        tiles: Parts of the readings of receivers with more places than ``options.together``.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2 and
     5.4.2; Lange, Little and Taylor, Robust statistical modeling using the t distribution, 1989.
@@ -72,7 +72,7 @@ class ScalarProcess(nn.Module):
         self.register_buffer("receivers", empty.long())
         for name in ("values", "variances", "weights"):
             self.register_buffer(name, empty.clone())
-        self.tiles = Tiles(self.places.shape[1])
+        self.tiles = Tiles()
 
     # --- predictions ---
 
@@ -81,10 +81,12 @@ class ScalarProcess(nn.Module):
     ) -> Float[Tensor, " b"]:
         """Mean of z at some places."""
         means = places.new_zeros(len(places))
+        scale = self._choice.scale
+        all_places = scaled(self.places, scale)
         for receiver in receivers.unique().tolist():
             asked, known = receivers == receiver, self.receivers == receiver
             of_receiver = partial(self._covariances, receiver=receiver)
-            tiles = self.tiles.numbers(scaled(places[asked], self._choice.scale), receiver)
+            tiles = self.tiles.numbers(scaled(places[asked], scale), all_places, known)
             if len(tiles):
                 solve = partial(self._solved, receiver=receiver)
                 means[asked] = self.tiles.mean(
@@ -95,12 +97,13 @@ class ScalarProcess(nn.Module):
                 means[asked] = towards @ self.weights[known]
         return means
 
-    def _solved(self, rows: Int[Tensor, " j"], receiver: int) -> Float[Tensor, " j"]:
+    def _solved(self, readings: Merged, receiver: int) -> Float[Tensor, " j"]:
         """Values over the covariances of some readings of a receiver."""
-        between = self._covariances(self.places[rows], self.places[rows], receiver)
-        between.diagonal().add_(self.variances[rows])
+        places = self.places[readings.rows]
+        between = self._covariances(places, places, receiver)
+        between.diagonal().add_(readings.variances)
         factor = torch.linalg.cholesky(between)
-        return torch.cholesky_solve(self.values[rows, None], factor)[:, 0]
+        return torch.cholesky_solve(readings.values[:, None], factor)[:, 0]
 
     def deviations(
         self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
@@ -266,10 +269,14 @@ class ScalarProcess(nn.Module):
         self.tiles.clear()
         for receiver in receivers.unique().tolist():
             known = (receivers == receiver).nonzero()[:, 0]
+            readings = Merged(known, self.values[known], self.variances[known])
             if len(known) > self.options.together:
-                self.tiles.add(scaled(places[known], self._choice.scale), known, receiver)
+                one_each = merged(places[known], *readings[1:])
+                readings = one_each._replace(rows=known[one_each.rows])
+            if len(readings.rows) > self.options.together:
+                self.tiles.add(scaled(places[readings.rows], self._choice.scale), readings)
             else:
-                self.weights[known] = self._solved(known, receiver)
+                self.weights[readings.rows] = self._solved(readings, receiver)
 
     def take(self, other: "ScalarProcess") -> None:
         """Takes the hyperparameters of another process.

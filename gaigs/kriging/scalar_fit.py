@@ -173,15 +173,16 @@ class HeldOutCost:
         noises = hyperparameters[receivers, 2].square()  # (m,)
         between = covariances(self.around, hyperparameters, choice)
         of_readings = noises[:, None] * self.factors  # (m, j)
-        solution = conditional(between, self.readings, of_readings)
+        given = conditional(between, self.readings, of_readings)
         with torch.enable_grad():
-            leaves = [solution.means, solution.variances, noises]
+            leaves = [given.means, given.variances, noises]
             leaves = [leaf.detach().requires_grad_() for leaf in leaves]
             means, variances, noise = leaves
             total = -log_density(self.asked - means, variances, noise, choice.degrees).sum()
             of_mean, of_variance, of_noise = torch.autograd.grad(total, leaves)
-        arguments = between, of_readings, solution, of_mean, of_variance
-        found = slopes(self.around, hyperparameters, choice, *arguments)
+        found = slopes(
+            self.around, hyperparameters, choice, between, of_readings, given, of_mean, of_variance
+        )
         found[:, 2] += 2 * of_noise * noises
         gradient = torch.zeros_like(logarithms).index_add(0, receivers, found[:, :3])
         return total.item(), gradient, found[:, 3].sum().item()

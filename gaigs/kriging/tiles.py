@@ -2,71 +2,105 @@
 
 import math
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from gaigs.kriging.kernel import resize
 from gaigs.kriging.links import nearest_places
 
 
+class Merged(NamedTuple):
+    """Readings of a receiver; of many, those at one place and carrier are one."""
+
+    rows: Int[Tensor, " m"]  # of the first at each place
+    values: Float[Tensor, " m"]  # means, weighted by 1 / variance
+    variances: Float[Tensor, " m"]  # of their noise
+
+
 class Tiles(nn.Module):
     """Parts of the readings of receivers that have too many for one covariance matrix.
 
-    A tile has ``size`` readings, the nearest to its centre. The tile of a place is that with the
-    nearest centre, so that ``size`` / ``core`` - 1 readings lie around each of its own: they screen
-    those behind them. Tiles are solved when a place in them is first asked for.
+    A tile is solved with ``size`` readings: its own, ``core`` at most, then those around each of
+    its own, which screen those behind them, then those nearest to its centre. The tile of a place
+    is that of the nearest reading. Tiles are solved when a place in them is first asked for.
 
     Attributes:
-        centres: Centres of the tiles (t, d), see ``coordinates``.
-        receivers: Receivers of the tiles (t,).
-        rows: Rows of the readings of each tile (t, j).
-        weights: Values over the covariances of the tile's readings (t, j); NaN until asked for.
+        readings: Rows of the divided readings, one a place, among all known readings (n,).
+        values, variances: Their values, and variances of their noise, see ``Merged`` (n,).
+        owners: Tiles whose own they are (n,).
+        rows: Rows of those with which each tile is solved among ``readings`` (t, j).
+        weights: Values over the covariances of a tile's readings (t, j); NaN until asked for, and
+            not stored.
     """
 
     core = 128
-    """Readings nearest to a tile's centre among all centres, about."""
+    """Most readings of a tile's own."""
     size = 512
     """Readings of a tile; see docs/methods.md for the error that more would take away."""
+    neighbours = 64
+    """Readings around each of a tile's own: as many as fill a tile where density is even."""
 
-    centres: Tensor
-    receivers: Tensor
+    stored = "readings", "values", "variances", "owners", "rows"
+
+    readings: Tensor
+    values: Tensor
+    variances: Tensor
+    owners: Tensor
     rows: Tensor
     weights: Tensor
 
-    def __init__(self, dimensions: int):
+    def __init__(self) -> None:
         super().__init__()
-        empty = torch.zeros(0, dtype=torch.float64)
-        self.register_buffer("centres", empty.new_zeros(0, dimensions))
-        self.register_buffer("receivers", empty.long())
-        self.register_buffer("rows", empty.new_zeros(0, self.size, dtype=torch.int32))
-        self.register_buffer("weights", empty.new_zeros(0, self.size))
+        empty = torch.zeros(0, dtype=torch.int32)
+        self.register_buffer("readings", empty)
+        self.register_buffer("owners", empty.clone())
+        for name in ("values", "variances"):
+            self.register_buffer(name, empty.double())
+        self.register_buffer("rows", empty.new_zeros(0, self.size))
+        self.register_buffer("weights", self.rows.double(), persistent=False)
 
     def __len__(self) -> int:
-        return len(self.centres)
+        return len(self.rows)
 
     def clear(self) -> None:
         """Takes all tiles away."""
-        self.centres, self.receivers = self.centres[:0], self.receivers[:0]
+        for name in self.stored[:-1]:
+            setattr(self, name, getattr(self, name)[:0])
         self.rows = self.rows.new_zeros(0, self.size)
-        self.weights = self.weights.new_zeros(0, self.size)
 
-    def add(self, places: Float[Tensor, "k d"], rows: Int[Tensor, " k"], receiver: int) -> None:
-        """Divides the readings of a receiver, whose rows among all readings are given."""
-        centres = torch.stack([places[part].mean(0) for part in halves(places, self.core)])
+    def add(self, places: Float[Tensor, "m d"], readings: Merged) -> None:
+        """Divides the readings of a receiver at some places."""
+        parts = halves(places, self.core)
+        centres = torch.stack([places[part].mean(0) for part in parts])
         near = nearest_places(centres, places, self.size).rows  # (t, j)
-        self.centres = torch.cat((self.centres, centres))
-        self.receivers = torch.cat((self.receivers, rows.new_full((len(centres),), receiver)))
-        self.rows = torch.cat((self.rows, rows[near].int()))
-        self.weights = torch.cat(
-            (self.weights, torch.full_like(near, math.nan, dtype=torch.float64))
-        )
+        around = nearest_places(places, places, self.neighbours).rows  # (m, n)
+        tiles = []
+        for part, nearest in zip(parts, near, strict=True):
+            order = torch.cat((part, around[part].mT.flatten(), nearest))  # nearest ranks first
+            tiles.append([*dict.fromkeys(order.tolist())][: near.shape[1]])
+        owners = torch.empty_like(readings.rows)
+        for number, part in enumerate(parts, len(self)):
+            owners[part] = number
+        rows = near.new_tensor(tiles) + len(self.readings)
+        for name, added in zip(self.stored, (*readings, owners, rows), strict=True):
+            old = getattr(self, name)
+            setattr(self, name, torch.cat((old, added.to(old.dtype))))
+        self.weights = torch.full_like(self.rows, math.nan, dtype=torch.float64)
 
-    def numbers(self, places: Float[Tensor, "b d"], receiver: int) -> Int[Tensor, " b"]:
-        """Tiles of some places of a receiver; none if it has no tiles."""
-        own = (self.receivers == receiver).nonzero()[:, 0]
-        return own[nearest_places(places, self.centres[own], 1).rows[:, 0]] if len(own) else own
+    def numbers(
+        self, asked: Float[Tensor, "b d"], places: Float[Tensor, "k d"], known: Bool[Tensor, " k"]
+    ) -> Int[Tensor, " _"]:
+        """Tiles of places, by the ``places`` of all readings and which of them are ``known`` to a
+        receiver; none if it has no tiles.
+        """
+        is_own = known[self.readings]
+        rows, owners = self.readings[is_own], self.owners[is_own]
+        if not len(rows):
+            return owners
+        return owners[nearest_places(asked, places[rows], 1).rows[:, 0]]
 
     def mean(
         self,
@@ -74,27 +108,42 @@ class Tiles(nn.Module):
         tiles: Int[Tensor, " b"],
         places: Float[Tensor, "k d"],
         covariances: Callable[[Tensor, Tensor], Tensor],
-        solve: Callable[[Int[Tensor, " j"]], Float[Tensor, " j"]],
+        solve: Callable[[Merged], Tensor],
     ) -> Float[Tensor, " b"]:
         """Means at places in their ``tiles``: ``covariances`` with the ``places`` of all readings,
-        times weights from ``solve`` of a tile's rows.
+        times weights from ``solve`` of a tile's readings.
         """
         means = asked.new_zeros(len(asked))
         order = tiles.argsort()
         numbers, counts = tiles[order].unique_consecutive(return_counts=True)
         for tile, part in zip(numbers.tolist(), order.split(counts.tolist()), strict=True):
-            rows = self.rows[tile].long()
+            rows = self.rows[tile]
+            readings = Merged(self.readings[rows].long(), self.values[rows], self.variances[rows])
             if self.weights[tile, 0].isnan():
-                self.weights[tile] = solve(rows)
-            means[part] = covariances(asked[part], places[rows]) @ self.weights[tile]
+                self.weights[tile] = solve(readings)
+            means[part] = covariances(asked[part], places[readings.rows]) @ self.weights[tile]
         return means
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        resize(self, state_dict, prefix, "centres", "receivers", "rows", "weights")
-        # Checkpoints of before have no tiles.
-        for name in ("centres", "receivers", "rows", "weights"):
-            state_dict.setdefault(f"{prefix}{name}", getattr(self, name)[:0])
+        if not len(state_dict.get(f"{prefix}rows", ())):  # also one of before
+            state_dict.clear()
+            for name in self.stored:
+                state_dict[f"{prefix}{name}"] = getattr(self, name)[:0]
+        resize(self, state_dict, prefix, *self.stored)
+        self.weights = torch.full_like(self.rows, math.nan, dtype=torch.float64)
         super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def merged(
+    places: Float[Tensor, "k d"], values: Float[Tensor, " k"], variances: Float[Tensor, " k"]
+) -> Merged:
+    """Readings whose process is that of the given ones, with those of one place as one."""
+    unique, numbers = places.unique(dim=0, return_inverse=True)
+    rows = torch.arange(len(places), device=places.device)
+    first = rows.new_full((len(unique),), len(rows)).scatter_reduce(0, numbers, rows, "amin")
+    precisions = values.new_zeros(len(unique)).index_add(0, numbers, 1 / variances)
+    sums = values.new_zeros(len(unique)).index_add(0, numbers, values / variances)
+    return Merged(first, sums / precisions, 1 / precisions)
 
 
 def halves(places: Float[Tensor, "k d"], most: int) -> list[Int[Tensor, " _"]]:

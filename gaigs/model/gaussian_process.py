@@ -135,9 +135,10 @@ class GaussianProcess(LookUp):
         if self.scalar is not None:
             links = without_gross_errors(links)
         self.links, self.known = links, known_links(links, self.any_receiver)
-        for trend in self.trends if chooses else ():
-            trend.fit(links)
-        if not chooses:
+        if chooses:
+            for trend in self.trends:
+                trend.fit(links)
+        else:
             self.trend.refit(links)
         if self.scalar is not None:
             self._fit_scalar(self.scalar, links, chooses)

@@ -107,8 +107,7 @@ class KNearestNeighbours(LookUp):
             is_asked = query.receivers == receiver
             index = self.known[receiver]
             if not self.scene.task.shape:
-                near = self._nearest(query[is_asked], index)
-                labels[is_asked] = self._mean(near, index)
+                labels[is_asked] = self._levels(query[is_asked], index, self.chosen + 1)
                 continue
             apart = self._distances(query[is_asked], index, self.scale)
             labels[is_asked] = self._look_up(apart, index)
@@ -121,17 +120,22 @@ class KNearestNeighbours(LookUp):
         known = coordinates(self.scene, self.links.query[index], scale)
         return distances(asked, known)
 
-    def _nearest(self, query: Query, index: Int[Tensor, " k"]) -> Near:
-        """The nearest known links of each asked one, and all that are as near as the last."""
+    def _levels(
+        self, query: Query, index: Int[Tensor, " k"], count: int, size: int = 2**20
+    ) -> Float[Tensor, " b"]:
+        """Labels of one number from the ``count`` nearest known links, and all that are as near as
+        the last that counts; at most ``size`` distances of these at a time.
+        """
         asked = coordinates(self.scene, query, self.scale)
         known = coordinates(self.scene, self.links.query[index], self.scale)
-        count = self.chosen + 1
-        while True:
-            near = nearest_places(asked, known, count)
-            is_tied = near.apart[:, -1] <= near.apart[:, min(self.chosen, len(index)) - 1]
-            if count >= len(index) or not is_tied.any():
-                return near
-            count *= 4  # links at one place
+        near = nearest_places(asked, known, count)
+        labels = self._mean(near, index)
+        if count < len(index):
+            # Links at one place.
+            is_tied = near.apart[:, -1] <= near.apart[:, self.chosen - 1]
+            for rows in is_tied.nonzero()[:, 0].split(max(1, size // (4 * count))):
+                labels[rows] = self._levels(query[rows], index, 4 * count, size)
+        return labels
 
     def _weights(self, apart: Float[Tensor, "b j"]) -> Float[Tensor, "b j"]:
         """Weights of known links by their distances; of links at an infinite distance 0."""

@@ -111,10 +111,10 @@ class MirroredSplatting(GaussianSplatting):
         searches = is_known and self.placement.order > 0 and not self.placement.fixed
         if searches and isinstance(self.pooling, PathSpectrum):
             self._search_spectra(links, self.pooling)
-        if searches and isinstance(self.pooling, PathRssi):
+        if is_known and isinstance(self.pooling, PathRssi):
             wavelength = speed_of_light / carriers(self.scene, links.query).max().item()
             self.is_wide = self.placement.diagonal > self.widest * wavelength
-            if not self.is_wide:
+            if searches and not self.is_wide:
                 self._prepare_levels(links)
         task = self.scene.task
         if task.is_channel and isinstance(self.pooling, ChannelPooling) and self.trend is None:

@@ -21,6 +21,7 @@ from gaigs.kriging.links import coordinates, folds_of
 from gaigs.kriging.neighbours import Readings
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.kriging.scalar_fit import HeldOutCost, ScalarOptions
+from gaigs.kriging.tiles import Tiles
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.testing import example_links
 
@@ -192,6 +193,72 @@ def test_tiles_are_nearly_the_dense_solve(smoothness, monkeypatch):
     fresh = ScalarProcess(links.scene)
     fresh.load_state_dict(old)
     assert torch.equal(fresh(asked, of), dense)
+
+
+def test_models_with_tiles_are_saved_and_loaded(tmp_path, monkeypatch):
+    monkeypatch.setattr(Tiles, "core", 16)
+    monkeypatch.setattr(Tiles, "size", 64)
+    monkeypatch.setattr(ScalarProcess, "options", ScalarOptions(neighbours=16, together=100))
+    links = drawn()
+    model = gaigs.train("gaussian_process", links)
+    places = links.query.transmitters[:40].numpy()
+    model.save(tmp_path / "fresh.ckpt")
+    before = model.predict(places)  # solves some of the tiles
+    assert len(model.scalar.tiles) > 4
+    model.save(tmp_path / "used.ckpt")
+    for name in ("fresh", "used"):
+        assert torch.equal(gaigs.load(tmp_path / f"{name}.ckpt").predict(places), before)
+
+
+@pytest.mark.parametrize("together", [150, 60])
+def test_readings_of_one_place_are_merged(together, monkeypatch):
+    monkeypatch.setattr(Tiles, "core", 16)
+    monkeypatch.setattr(Tiles, "size", 60)
+    rng = np.random.default_rng(0)
+    places = torch.from_numpy(rng.uniform(size=(100, 3)) * 20).repeat(5, 1)
+    asked = torch.from_numpy(rng.uniform(size=(50, 3)) * 20)
+    values = torch.from_numpy(rng.standard_normal(500)) + 4 * places[:, 0].sin()
+    process = ScalarProcess(example_links("rssi").scene)
+    process.logarithms[:] = torch.tensor([6.0, 5.0, 3.0]).log()
+    process.choice[1] = 4.0  # variances differ
+    means = []
+    for most in (10**6, together):
+        process.options = replace(process.options, together=most)
+        process.solve(places, torch.ones(500, dtype=torch.long), values)
+        means.append(process(asked, torch.ones(50, dtype=torch.long)))
+    dense, found = means
+    assert len(process.tiles) == (0 if together == 150 else 8)
+    if together == 150:
+        torch.testing.assert_close(found, dense)
+    else:  # 60 of 100 places
+        assert (found - dense).square().mean().sqrt() < 0.05 * dense.std()
+
+
+def test_sparse_readings_beside_many_are_in_tiles(monkeypatch):
+    """A road out of a town, and one place far off: nearest to the centre of no tile."""
+    monkeypatch.setattr(Tiles, "core", 32)
+    monkeypatch.setattr(Tiles, "size", 128)
+    rng = np.random.default_rng(0)
+    town = np.c_[rng.uniform(size=(1000, 2)) * 20, np.ones(1000)]
+    road = np.c_[np.linspace(25, 300, 50), np.full(50, 10.0), np.ones(50)]
+    outlier = np.array([[1e4, 0, 1]])
+    places = torch.from_numpy(np.r_[town, road, outlier])
+    asked = torch.from_numpy(np.r_[road, outlier, outlier + 1])
+    process = ScalarProcess(example_links("rssi").scene)
+    process.logarithms[:] = torch.tensor([20.0, 6.0, 2.0]).log()
+    apart = torch.cdist(places, places)
+    factor = torch.linalg.cholesky((-apart / 20).exp() + 1e-8 * torch.eye(len(places)))
+    values = 6 * factor @ torch.from_numpy(rng.standard_normal(len(places)))
+    values += 2 * torch.from_numpy(rng.standard_normal(len(places)))
+    means = []
+    for together in (10**6, 500):
+        process.options = replace(process.options, together=together)
+        process.solve(places, torch.zeros(len(places), dtype=torch.long), values)
+        means.append(process(asked, torch.zeros(len(asked), dtype=torch.long)))
+    dense, tiled = means
+    assert len(process.tiles) > 8
+    assert dense.std() > 3
+    assert (tiled - dense).square().mean().sqrt() < 0.1
 
 
 def test_readings_of_the_own_fold_do_not_predict():

@@ -8,9 +8,9 @@ import torch
 
 import gaigs
 from gaigs.core.geometry import ExtrapolationWarning, Grid, Rays
-from gaigs.core.query import Query
+from gaigs.core.query import Batch, Query
 from gaigs.data import Split
-from gaigs.kriging.links import distances
+from gaigs.kriging.links import Near, distances, nearest_places
 from gaigs.model.knn import KNearestNeighbours
 from gaigs.model.mean import Mean
 from gaigs.registry import registry
@@ -98,6 +98,34 @@ def test_the_number_of_neighbours_follows_from_held_out_groups():
         chosen.append(model.chosen)
     assert chosen[0] > 1
     assert chosen[1] == 1
+
+
+def test_many_readings_of_one_place_are_sought_for_those_near_it_alone(monkeypatch):
+    links = gaigs.links("synthetic_rssi", transmitters=200)
+    links.query.transmitters[:300] = links.query.transmitters[0]
+    model = KNearestNeighbours(links.scene, 3)
+    model.fit(links)
+    asked = links.query[torch.arange(0, len(links), 7)]
+    expected = []
+    for query in (asked[row : row + 1] for row in range(len(asked))):
+        index = model.known[query.receivers[0]]
+        apart = model._distances(query, index, model.scale)
+        expected.append(model._mean(Near(apart, torch.arange(len(index))[None]), index))
+    searches = []
+
+    def search(asked, known, count):
+        searches.append((len(asked), count))
+        return nearest_places(asked, known, count)
+
+    monkeypatch.setattr("gaigs.model.knn.nearest_places", search)
+    torch.testing.assert_close(model(Batch(asked)).value, torch.cat(expected))
+    first, last = searches[0], max(searches, key=lambda pair: pair[1])
+    assert last[1] > 100
+    assert last[0] < first[0]
+    searches.clear()
+    model._levels(asked[asked.receivers == 0], model.known[0], 4, size=100)
+    assert len(searches) > 2
+    assert all(many == 1 or many * count <= 100 for many, count in searches[1:]), "in pieces"
 
 
 @pytest.mark.parametrize("receivers", [1, 2])

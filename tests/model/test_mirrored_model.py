@@ -406,6 +406,14 @@ def test_levels_of_a_wide_site_are_not_searched_for_phases(widest, monkeypatch):
     if model.is_wide:
         line = model.revise(2, links.batch(torch.arange(4)), None, lambda batch: 1.0)
         assert line == "the box is too wide for phases, so powers add to the end"
+    fixed = build(
+        links,
+        pooling={"name": "path_rssi", "floor_db": -60.0},
+        placement=MIRRORED | {"fixed": True},
+    )
+    fixed.fit(links)
+    assert fixed.levels is None
+    assert fixed.is_wide == model.is_wide
 
 
 def test_a_loaded_model_exports_its_planes(tmp_path):

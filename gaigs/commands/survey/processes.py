@@ -100,7 +100,7 @@ def reception_chances(
     is_received = known.new_zeros(len(known), len(processes))
     is_received[rows, receivers[at_carrier]] = 1
     for receiver, process in enumerate(processes):
-        if len(process.places) >= LIMIT:  # a part of its readings, so their places do not tell
+        if process.is_part:  # places of its other readings are unknown
             is_received[:, receiver] = 1
     return reception_probability(asked, known, is_received, is_received.mean(0)).mT
 

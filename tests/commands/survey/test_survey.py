@@ -121,6 +121,9 @@ def test_a_receiver_counts_where_it_is_likely_to_be_heard():
     assert (hearing[0] == 1).all()
     assert (hearing[1, :5] > 0.9).all()
     assert (hearing[1, 5:] < 0.1).all()
+    # Of a part of its readings, places do not tell.
+    first = replace(first, is_part=True)
+    assert reception_chances([both, first], far[:5].double())[1].min() > 0.9
 
 
 def test_plans_count_a_receiver_where_it_is_heard():
