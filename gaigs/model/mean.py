@@ -2,6 +2,7 @@
 
 import torch
 
+from gaigs.core.propagation import common_gain
 from gaigs.core.query import Batch
 from gaigs.core.scene import Scene
 from gaigs.data import Links
@@ -39,7 +40,7 @@ class Mean(Model):
             )
             self.means[receiver] = (total / len(index)).to(self.means)
         is_known = torch.tensor([*map(len, known)]) > 0
-        self.means[~is_known] = self.means[is_known].mean(0)
+        self.means[~is_known] = common_gain(self.means[is_known])
 
     def forward(self, batch: Batch) -> Prediction:
         return Prediction(at_directions(self.means[batch.query.receivers], batch, self.scene), {})
