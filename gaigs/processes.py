@@ -191,9 +191,6 @@ def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
     Args:
         folder: An existing folder.
         waits: True to wait for another process that holds the folder.
-
-    Raises:
-        ValueError: Another process holds the folder, and this one does not wait.
     """
     folder.stat()  # raises an error for a missing folder, which FileLock would make
     lock = FileLock(folder / LOCK)

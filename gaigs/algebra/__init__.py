@@ -147,10 +147,7 @@ class Algebra:
         """Motion of x by a versor u: u x u⁻¹ for an even u, u involute(x) u⁻¹ for an odd one.
 
         A vector u mirrors at the hyperplane orthogonal to it; products of vectors rotate and
-        translate.
-
-        Raises:
-            ValueError: u reverse(u) is 0, so that u has no inverse.
+        translate. A u without an inverse is a ``ValueError``.
 
         Source: GAI-GS, eq. (6) and (7).
         """

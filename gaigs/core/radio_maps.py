@@ -70,11 +70,7 @@ class RadioMap:
     plot = plot
 
     def to_xarray(self) -> Any:
-        """An ``xarray.Dataset`` with ``value`` and, if it is known, ``std`` by receiver, y and x.
-
-        Raises:
-            ImportError: Xarray is not installed.
-        """
+        """An ``xarray.Dataset`` with ``value`` and, if it is known, ``std`` by receiver, y, x."""
         places = {"x": ("x", self.x, {"units": "m"}), "y": ("y", self.y, {"units": "m"})}
         scalars = {"z": ((), self.height, {"units": "m"})}
         if self.frequency is not None:
@@ -88,8 +84,7 @@ class RadioMap:
         return xarray.Dataset(variables, names | places | scalars)
 
     def save(self, path: str | Path) -> None:
-        """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and all other attributes
-        that are known.
+        """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and the other attributes.
 
         The values are ``values`` if the unit has other signs than letters.
         """
@@ -142,8 +137,7 @@ def radio_map(
     *,
     progress: bool = True,
 ) -> RadioMap:
-    """Predictions on a horizontal plane over the box of training transmitters and all receivers,
-    widened.
+    """Predictions on a plane over the widened box of training transmitters and all receivers.
 
     Args:
         model: A fitted or loaded model of a task whose label is one real number, e.g. RSSI.

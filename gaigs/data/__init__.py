@@ -244,10 +244,6 @@ def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
 
     In links with ``uncertainties``, receivers without a training link are left out, and receivers
     without a place get an estimate of it from the training links.
-
-    Raises:
-        ValueError: An option of the split has a defect, two of its parts share a link, or all
-            spectra are constant.
     """
     if links.task.is_channel and isinstance(links.labels, Tensor):
         check_elements(links)
@@ -331,9 +327,6 @@ def without_constant(links: Links) -> Links:
 
     The same holds for the subcarriers that are held out. If all subcarriers of the links are so,
     they stay.
-
-    Raises:
-        ValueError: All subcarriers that are held out are so.
     """
     both = []
     remarks = [links.remarks]

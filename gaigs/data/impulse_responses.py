@@ -95,9 +95,6 @@ def from_sionna(
             ``rx`` with e antennas and n transmitters ``tx`` with m; ``carrier`` [Hz];
             ``frequencies``, absolute or relative to it [Hz].
         needs_delays: True if delays must count from the transmission.
-
-    Raises:
-        ValueError: Shapes do not fit, or a delay is not from 0 to 1 ms.
     """
     carrier = _read_carrier(arrays)
     responses = _with_fixed_end(_without_missing_delays(_to_responses(arrays), needs_delays))

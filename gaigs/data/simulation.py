@@ -173,11 +173,7 @@ def _distort(
 
 
 def without_silent(links: Links, transmitters: int, has_path: Bool[Tensor, " n"]) -> Links:
-    """Links from places that a path leads to; the remarks count the others.
-
-    Raises:
-        ValueError: Paths lead to fewer than two places.
-    """
+    """Links from places that a path leads to; the remarks count the others."""
     if has_path.all():
         return links
     rows = links.rows[has_path]

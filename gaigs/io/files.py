@@ -17,9 +17,6 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
     Each writer has a path of its own: of several the last replaces the file. If writing fails or is
     interrupted, the temporary file is removed and the old file stays.
-
-    Raises:
-        OSError: The file cannot be written; with the ``errno`` of the cause.
     """
     path = Path(path)
     part = path.with_name(f"{path.stem}.gaigs-{secrets.token_hex(4)}.part{path.suffix}")

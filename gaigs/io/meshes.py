@@ -81,11 +81,7 @@ def read_obj(file: Path) -> tuple[Float[np.ndarray, "v 3"], Groups]:
 
 
 def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3"], Groups]:
-    """Vertices [m] and faces of the lines of a Wavefront OBJ file.
-
-    Raises:
-        ValueError: A line has a defect; the message names the source, the line and its text.
-    """
+    """Vertices [m] and faces of the lines of a Wavefront OBJ file; errors name source and line."""
     # trimesh's reader cuts polygons, loses materials without an .mtl file, counts negative numbers
     # from the end of the file, and leaves defects without their line.
     vertices: list[list[float]] = []
@@ -152,10 +148,6 @@ def read_ply(file: Path) -> tuple[np.ndarray, list[Face]]:
     """Vertices and faces of a PLY file.
 
     Vertices are a structured array, with x, y and z [m] among its columns.
-
-    Raises:
-        ValueError: The file is damaged, a column holds no numbers, or the mesh has a defect, see
-            ``check_mesh``.
     """
     try:
         content = PlyData.read(str(file), mmap=False)
@@ -188,11 +180,7 @@ def triangles(faces: Iterable[Face]) -> list[tuple[int, int, int]]:
 
 
 def check_mesh(points: Float[np.ndarray, "v 3"], faces: Sequence[Face], source: str) -> None:
-    """Checks that vertices are numbers within ``FAR``, and that faces refer to them.
-
-    Raises:
-        ValueError: A vertex or a face has a defect; the message names its number.
-    """
+    """Raises a ``ValueError`` unless vertices are within ``FAR`` and faces refer to them."""
     near = np.abs(points) < FAR
     if not near.all():
         row = int((~near).any(1).argmax())

@@ -173,11 +173,7 @@ def split_cells(line: str, delimiter: str = ",") -> list[str]:
 def split_rows(
     file: Path, lines: Sequence[str], names: Sequence[str], skip: int, delimiter: str
 ) -> dict[int, list[str]]:
-    """Cells of all lines except the first few. A comma that separates no cells is a decimal one.
-
-    Raises:
-        ValueError: A line has not one cell for each name.
-    """
+    """Cells of all lines but the first few, one a name. A comma that separates none is decimal."""
     rows: dict[int, list[str]] = {}
     wrong: dict[int, str] = {}
     for number, line in enumerate(lines[skip:], skip + 1):

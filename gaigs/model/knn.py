@@ -80,9 +80,7 @@ class KNearestNeighbours(LookUp):
         self.scale = math.nan
 
     def fit(self, links: Links) -> None:
-        """Keeps the links, and chooses the scale of frequencies, and the number of neighbours if it
-        is None.
-        """
+        """Keeps the links; chooses the scale of frequencies, and ``neighbours`` if it is None."""
         self.links, self.known = links, known_links(links)
         self.scale = math.nan
         self.chosen = self.k or 3
@@ -164,9 +162,7 @@ class KNearestNeighbours(LookUp):
         return torch.stack(rows)
 
     def _held_out(self, folds: Sequence[Int[Tensor, " _"]] | None = None) -> Iterator[HeldOutLinks]:
-        """Some known links of each receiver, held out with their fold, or for None with their
-        place.
-        """
+        """Some known links of each receiver, held out with their fold, or for None their place."""
         for receiver, index in enumerate(self.known):
             for rows in evenly(torch.arange(len(index)), max(1, 256 // len(self.known))).split(32):
                 asked, known = self.links.query[index[rows]], self.links.query[index]

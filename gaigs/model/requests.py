@@ -161,9 +161,6 @@ def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver 
 
     Three whole numbers beside three transmitters are indices. A pose has the array of the scene's
     receivers, and so has a position where this array has no orientation.
-
-    Raises:
-        ValueError: The receivers' arrays differ, or need an orientation.
     """
     if isinstance(receiver, Receiver) or receiver is None:
         return receiver
@@ -218,11 +215,7 @@ def lacks_elements(scene: Scene) -> bool:
 
 
 def as_known_subcarriers(frequencies: object, scene: Scene, any_frequency: bool) -> Subcarriers:
-    """Subcarriers of ``Model.predict``, for a model that computes them anywhere or does not.
-
-    Raises:
-        ValueError: The labels have no subcarriers, or a frequency is impossible.
-    """
+    """Subcarriers of ``Model.predict``, for a model that computes them anywhere or does not."""
     if frequencies is None:
         return Subcarriers()
     if not scene.task.is_channel:
@@ -290,8 +283,7 @@ def usual_batch_size(shape: tuple[int, ...], numbers: int = 2**17, most: int = 1
 
 
 def extrapolations(query: Query, scene: Scene) -> list[str]:
-    """Sentences on positions farther from the training transmitters' box than the scene's extent,
-    and on carriers outside the training links' band."""
+    """Sentences on positions far from the training box, and on carriers beyond the band."""
     messages = []
     lower, upper = (corner.to(scene.lower) for corner in scene.box)
     positions = scene.positions(lower)

@@ -339,9 +339,6 @@ def fit_sheets(
 
     Returns:
         The sheets, and the gain of all paths beside them [Np].
-
-    Raises:
-        ValueError: No path passes the obstacles.
     """
     options = options or SurfaceOptions()
     obstacles = placement.obstacles

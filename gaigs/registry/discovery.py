@@ -99,14 +99,7 @@ class Holder:
         return None
 
     def read_options(self, given: tuple[str, ...]) -> dict[str, Any]:
-        """The options of the component with their defaults, from its source.
-
-        Args:
-            given: Parameters that are no options.
-
-        Raises:
-            UnclearSource: The source does not tell them.
-        """
+        """Options with their defaults, from the source, but for the parameters ``given``."""
         module, _, attribute = self.target.partition(":")
         file = self.file or self._module_file(module)
         registration = self.registration

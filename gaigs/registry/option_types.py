@@ -39,9 +39,6 @@ def check_type(name: str, value: Any, annotation: Any) -> None:
 
     Other annotations are not checked. In a union with other classes, their objects are accepted,
     too.
-
-    Raises:
-        TypeError: The value does not suit.
     """
     allowed = _allowed(value, annotation)
     if not allowed:

@@ -39,11 +39,7 @@ class UnclearSource(Exception):
 
 
 def registrations(file: Path) -> list[Registration]:
-    """The components that a file registers.
-
-    Raises:
-        SyntaxError: The file is no Python.
-    """
+    """The components that a file registers; a ``SyntaxError`` if it is no Python."""
     components = []
     for node in _parsed(file).body:
         if not isinstance(node, Definition):

@@ -29,12 +29,7 @@ def name_of(component: object) -> str:
 
 
 def configuration_of(component: object) -> dict:
-    """The configuration of a component, an argument of ``Registry.build``.
-
-    Raises:
-        ValueError: The component or a part has no registered name, or an argument that no file can
-            hold.
-    """
+    """The configuration of a component, an argument of ``Registry.build``, as files can hold it."""
     if not hasattr(component, "configuration"):
         kind = type(component).__name__
         advice = "put @gaigs.register(kind, name) over the class"

@@ -1,6 +1,4 @@
-"""A callback of Hydra that requests the tables of a multirun; an experiment names it under
-``hydra.callbacks``.
-"""
+"""A callback of Hydra, named in ``hydra.callbacks``, that requests the tables of a multirun."""
 
 import sys
 from pathlib import Path

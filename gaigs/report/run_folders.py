@@ -51,11 +51,7 @@ def by_seed(runs: Sequence[Run]) -> list[list[Run]]:
 
 
 def read_metrics(file: Path) -> dict:
-    """Contents of a run's ``metrics.json``.
-
-    Raises:
-        ValueError: The file is damaged, or its task is not installed.
-    """
+    """Contents of a run's ``metrics.json``; a ``ValueError`` if it is damaged."""
     try:
         metrics = json.loads(file.read_text())
         _check_metrics(metrics)
@@ -84,12 +80,7 @@ def _check_metrics(metrics: Any) -> None:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """The runs at any depth of a folder, sorted by name, with numbers in names by value.
-
-    Raises:
-        FileNotFoundError: The folder holds no run.
-        ValueError: One was started anew with another configuration, or a file is damaged.
-    """
+    """The runs at any depth of a folder, sorted by name, with numbers in names by value."""
     places = [file.parents[1] for file in folder.glob("**/.hydra/overrides.yaml")]
     if not places:
         raise FileNotFoundError(

@@ -1,6 +1,4 @@
-"""Figures of one real number a link: predicted against measured values, radio maps, the
-distribution of errors.
-"""
+"""Figures of one real number a link: predictions against labels, radio maps, errors."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -148,9 +148,7 @@ def score_latex(metrics: Mapping) -> str:
 
 
 def verdict(metrics: Mapping) -> str:
-    """A sentence that compares the run's model, the first one, with the best baseline by one
-    metric, and one on the model before its kriging.
-    """
+    """A sentence: the run's model beside the best baseline, and before its kriging."""
     (model, scores), *baselines = metrics["models"].items()
     name, metric = headline(metrics["task"], metrics["models"])
     quantity, _, unit = metric.title.removesuffix("]").partition(" [")

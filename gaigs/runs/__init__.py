@@ -27,8 +27,7 @@ log = logging.getLogger(__name__)
 
 
 def run(config: dict, folder: Path, launcher: str | None = None) -> dict | None:
-    """Trains, tests, and writes the run folder; resumes a run of the same configuration that was
-    stopped there.
+    """Trains, tests, and writes the run folder; a stopped run of this configuration goes on.
 
     Args:
         config: The resolved configuration.

@@ -154,12 +154,9 @@ def _run(
     validation: InOrder | None,
     resumed: Path | None,
 ) -> None:
-    """All steps of a training, from the start or from a checkpoint.
+    """All steps of a training, from the start or a checkpoint; ``Stopped`` after a signal.
 
     Signals have their former handlers afterwards.
-
-    Raises:
-        Stopped: A signal has stopped the training.
     """
     expected = (
         ".*LeafSpec",  # Lightning's use of torch
@@ -197,11 +194,7 @@ def _log_speed(trainer: lightning.Trainer, budget: Budget, places: int) -> None:
 
 
 def make_trainer(options: dict, **context: Any) -> lightning.Trainer:
-    """A trainer that can stop and resume at any step, in one process or several.
-
-    Raises:
-        ValueError: An option would prevent that.
-    """
+    """A trainer that stops and resumes at any step; a ``ValueError`` if an option prevents it."""
     for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
         logging.getLogger(name).setLevel(logging.WARNING)
     with warnings.catch_warnings():

@@ -159,9 +159,7 @@ def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float
 def _add_members(
     model: Model, loss: Loss, links: Links, config: dict, folder: Path
 ) -> tuple[Ensemble, float]:
-    """An ensemble of a trained model and of others with the next seeds, each trained in a folder of
-    its own; and the time of the others [s].
-    """
+    """An ensemble of a model and others of the next seeds, and the others' training time [s]."""
     members = [model]
     total = 0.0
     for number in range(1, config["ensemble"]):

@@ -111,9 +111,6 @@ def measure(
         block: Number of distances in memory at a time.
         most: Largest number of pairs of a cell whose labels are compared; at least 30 of large
             labels.
-
-    Raises:
-        ValueError: No two links share receiver and carrier, or all transmitters stand at one point.
     """
     places = links.query.transmitters.double().numpy()
     groups = groups_of(links)

@@ -52,9 +52,6 @@ def write_predictions(
         frequency: Carrier of positions [Hz]; None: the only known one.
         interval: Probability with which an interval holds the label. A model without intervals
             gives values alone.
-
-    Raises:
-        ValueError: There is no place, or a place, frequency or probability is impossible.
     """
     scene = model.scene
     query, task, measured, subcarriers = _to_predict(scene, places, frequency)

@@ -81,9 +81,7 @@ class SitePlan:
         return f"{subject} the {what} {start}to {last} {self.score_unit}".rstrip()
 
     def save(self, path: str | Path) -> None:
-        """Writes a CSV table: receivers that stand, then places, with the score after each place;
-        with a ``frame`` easting and northing too.
-        """
+        """Writes a CSV table: receivers that stand, then places, each with the score after it."""
         on_map = [] if self.frame is None else ["easting", "northing"]
         rows = [["use", "x", "y", "z", *on_map, self.objective]]
         for place in self.standing.tolist():

@@ -92,8 +92,7 @@ class SurveyPlan:
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes a CSV table: places to measure, each with the error after it, then measured ones
-        to leave out.
+        """Writes a CSV table: places to measure with the error after each, then those to leave out.
 
         With a ``frame`` it has easting and northing too. Without a model errors are empty.
         """
@@ -131,8 +130,7 @@ def survey(
     *,
     progress: bool = True,
 ) -> SurveyPlan:
-    """The next places to measure: each lowers the mean variance over a region most, at all
-    receivers together.
+    """The next places to measure: each lowers the mean variance over a region and receivers most.
 
     A receiver counts at a place as much as it is likely to hear it, by the measured places around.
     Labels do not enter beyond the fitted process, so a plan is made before anything is measured.
@@ -346,9 +344,7 @@ class Selection:
     def choose(
         self, count: int, spacing: "Spacing | None" = None, enough: float = -math.inf
     ) -> tuple[list[int], Float[Tensor, " n1"]]:
-        """Numbers of so many candidates, or all, until the error is ``enough``; and the errors
-        before and after each.
-        """
+        """Numbers of the best candidates, until the error is ``enough``; the errors around each."""
         numbers = []
         errors = [self.error()]
         for _ in track(range(min(count, len(self.is_free))), "places to measure"):

@@ -26,11 +26,7 @@ from gaigs.data.checks.places import scale_of
 
 
 def check_spectra(links: Any) -> Iterator[Finding]:
-    """Findings about spectra.
-
-    Raises:
-        ValueError: All spectra are constant, or too small for SSIM.
-    """
+    """Findings about spectra; a ``ValueError`` if all are constant, or too small for SSIM."""
     yield from check_extremes(links)
     yield from check_directions(links)
 

@@ -76,11 +76,7 @@ def plain_name(name: str) -> tuple[str, float | None]:
 
 
 def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
-    """Factors of x, y and z to metres, or of x and y to the unit of the system.
-
-    Raises:
-        ValueError: A heading's unit differs from the system's.
-    """
+    """Factors of x, y and z to metres, or of x and y to the unit of the system, by headings."""
     columns = [axes.x, axes.y, axes.z if axes.z >= 0 else axes.x]
     units = [plain_name(table.names[column])[1] for column in columns]
     metres = 1.0 if epsg is None else metres_of(epsg)

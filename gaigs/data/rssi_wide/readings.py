@@ -28,11 +28,7 @@ class Pivoted(NamedTuple):
 
 
 def pivoted(table: tables.Table, axes: Axes, receiver: str | None, level: str | None) -> Pivoted:
-    """A table with a gateway a column, of one with a reading a row.
-
-    Raises:
-        ValueError: One of the two columns is not named, or a reading has no gateway's name.
-    """
+    """A table with a gateway a column, of one with a reading a row."""
     if receiver is None or level is None:
         missing = "data.receiver" if receiver is None else "data.level"
         raise ValueError(

@@ -1,6 +1,4 @@
-"""The image-source method in a furnished box room, in float64; docs/data.md has the formulas and
-their limits.
-"""
+"""The image-source method in a furnished box room, in float64; docs/data.md has its formulas."""
 
 import itertools
 import math
@@ -69,12 +67,7 @@ class Room:
 
 
 def permittivity(material: str, frequency: float) -> complex:
-    """Complex relative permittivity of a material at a frequency [Hz].
-
-    The time dependence is exp(+j omega t).
-
-    Raises:
-        ValueError: The material is unknown, or the frequency is outside the tables.
+    """Complex relative permittivity of a material at a frequency [Hz], for exp(+j omega t).
 
     Source: ITU-R P.2040-3, section 2.1.4.
     """
@@ -164,10 +157,6 @@ def trace(
     at floor and ceiling. The furniture is mirrored with the room, so a path is the straight line
     from the receiver to an image.
 
-    Raises:
-        ValueError: A transmitter or the receiver is outside the room or inside furniture; the order
-            is negative; a material is unknown or not tabulated at the frequency.
-
     Source: Allen and Berkley, Image method for efficiently simulating small-room acoustics, 1979;
     ITU-R P.2040-3.
     """
@@ -251,9 +240,6 @@ def respond(
     The phase follows a spherical wave from each image to each element. Gains and the elements'
     pattern belong to paths to the array's centre at the carrier; ``offsets`` are relative to it
     [Hz].
-
-    Raises:
-        ValueError: A frequency is not positive.
     """
     frequencies = frequency + offsets.double()
     if frequencies.min() <= 0:

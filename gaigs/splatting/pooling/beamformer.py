@@ -41,9 +41,6 @@ class Beamformer:
         owner: Component named in errors.
         scene: Its task has the directions and the normalisation, its receivers the arrays.
 
-    Raises:
-        ValueError: The labels are no spectra scaled to [0, 1], or an array has a single element.
-
     Source: GAI-GS, eq. (4); Bartlett, Smoothing periodograms from time series with continuous
     spectra, 1948; the spectra of NeRF².
     """

@@ -27,9 +27,6 @@ class ChannelPooling(Pooling):
         sign: Sign with which phases follow the direct distance, -1 for the time dependence exp(+j
             omega t) or 1; 0 for neither, as without a common clock that the data do not declare.
         array_sign: Sign between the elements and subcarriers of a link, -1 or 1.
-
-    Raises:
-        ValueError: The labels are no channels, or the arrays do not have their elements.
     """
 
     strength: Tensor

@@ -82,9 +82,6 @@ class LagPooling(PathPooling):
         least_spread: Least standard deviation of a path's direction cosines where powers add: the
             one of a pixel of 24 x 48.
 
-    Raises:
-        ValueError: An array is not planar.
-
     Source: Van Trees, Optimum Array Processing, 2002, section 5.2, for covariances by lags; the
     partial coherence is ours.
     """

@@ -7,11 +7,7 @@ import pyopencl as cl
 
 
 def devices() -> list[str]:
-    """Lists the OpenCL devices of this machine, each as "platform: device (kind)".
-
-    Raises:
-        RuntimeError: No driver lists a device.
-    """
+    """The OpenCL devices, each as "platform: device (kind)"; a ``RuntimeError`` without any."""
     return [name_of(device) for device in _devices()]
 
 
@@ -69,10 +65,6 @@ def open_queue(name: str | None) -> cl.CommandQueue:
 
     Args:
         name: As for ``OpenCLRasterizer``.
-
-    Raises:
-        RuntimeError: The process is forked, no driver works, or the device cannot be opened.
-        ValueError: No device has this name.
     """
     if is_forked():
         raise RuntimeError(
