@@ -189,7 +189,6 @@ def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
     The file ``.lock`` in the folder is removed at the end. A killed process leaves it, unlocked.
 
     Args:
-        folder: An existing folder.
         waits: True to wait for another process that holds the folder.
     """
     folder.stat()  # raises an error for a missing folder, which FileLock would make

@@ -91,10 +91,7 @@ def is_multirun() -> bool:
 
 
 def nearest(word: str, config: Mapping) -> str:
-    """Full keys of the options whose name is most similar to a word, joined by or.
-
-    It is empty if no name is similar.
-    """
+    """Full keys of the options with the name most similar to a word, joined by or; may be empty."""
     parts = config.keys() - {"hydra", "survey", "place", "locate", "export", "view"}
     names = {key: key.rpartition(".")[2] for key in (*parts, *option_keys(config, parts))}
     near = similar(word, {*names.values()} - {"name"})

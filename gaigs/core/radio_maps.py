@@ -273,13 +273,7 @@ def _check_pitch(pitch: float, lower: ndarray, upper: ndarray) -> None:
 
 
 class _Predictions:
-    """Predictions at places for several receivers.
-
-    Args:
-        model: The model of a real number a link.
-        receivers: Indices of the receivers.
-        frequency: Carrier [Hz]; None if unknown.
-    """
+    """Predictions at places for several receivers."""
 
     def __init__(self, model, receivers: Int[ndarray, " k"], frequency: float | None):
         self.model = model

@@ -151,10 +151,7 @@ class Scene:
         return positions.to(query.transmitters.dtype)
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Scene":
-        """The scene of channels at other subcarriers [Hz].
-
-        Responses are interpolated, and constant beyond the band.
-        """
+        """The scene of channels at other subcarriers [Hz], with interpolated responses."""
         responses = self.responses
         if responses is not None:
             known = self.task.frequencies.double().numpy()

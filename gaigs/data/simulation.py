@@ -59,10 +59,7 @@ def simulate_spectra(
     bandwidth: float,
     seed: int,
 ) -> Links:
-    """Spectra of transmitters at random places.
-
-    ``gaigs.data.synthetic.furnished_room`` describes the options.
-    """
+    """Spectra of transmitters at random places, by the options of ``synthetic.furnished_room``."""
     carriers = _to_carriers(frequency)
     offsets = spectrum_offsets(spectrum, room.frequency_offsets, bandwidth)
     places = room.place(transmitters, seed)
@@ -251,10 +248,7 @@ def spectrum_offsets(
 
 
 def patch_arrays(poses: Sequence[Pose], frequency: float) -> tuple[Receiver, ...]:
-    """Receivers with 4 x 4 patches half a wavelength of the frequency [Hz] apart.
-
-    The NeRF² spectra have such an array.
-    """
+    """Receivers with 4 x 4 patches half a wavelength apart, as for the NeRF² spectra."""
     check_carrier("frequency", frequency)
     array = Array.planar(4, 4, speed_of_light / frequency / 2, "cosine")
     return tuple(Receiver(f"gateway{number}", pose, array) for number, pose in enumerate(poses, 1))
@@ -293,10 +287,7 @@ def draw_places(
 
 
 def sample_band(bandwidth: float, longest: float) -> Float[Tensor, " f"]:
-    """Frequencies that sample a band, relative to its middle [Hz].
-
-    Beats of paths up to the longest length [m] are not aliased.
-    """
+    """Frequencies about a band's middle [Hz] that alias no beat of paths up to a length [m]."""
     if not 0 < bandwidth < math.inf:
         raise ValueError(
             f"bandwidth must be positive [Hz], got {bandwidth}; "
@@ -321,8 +312,5 @@ def to_spectra(
 
 
 def rss_dbm(responses: Complex[Tensor, "b elements f"]) -> Float[Tensor, " b"]:
-    """Received signal strength of a transmitter of 0 dBm [dBm].
-
-    Power is averaged over elements and frequencies.
-    """
+    """Received signal strength of 0 dBm sent, the mean over elements and frequencies [dBm]."""
     return 10 * torch.log10(responses.abs().square().mean((1, 2)))

@@ -55,10 +55,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def file_message(error: OSError, folder: Path) -> str:
-    """The message of a file's error.
-
-    For a plain system error it is the file or folder, the cause and the remedy.
-    """
+    """The message of a file's error, of a plain system error with file, cause and remedy."""
     if error.errno is None or error.strerror != os.strerror(error.errno):
         return str(error.strerror or error)
     path = error.filename or f"a file in {folder}"

@@ -145,10 +145,7 @@ def _face(words: Sequence[str], count: int) -> Face:
 
 
 def read_ply(file: Path) -> tuple[np.ndarray, list[Face]]:
-    """Vertices and faces of a PLY file.
-
-    Vertices are a structured array, with x, y and z [m] among its columns.
-    """
+    """Vertices, a structured array with x, y, z [m] among its columns, and faces of a PLY file."""
     try:
         content = PlyData.read(str(file), mmap=False)
         vertices = content["vertex"].data

@@ -70,10 +70,7 @@ def has_file(file: Path) -> bool:
 
 
 def check_empty(folder: Path) -> None:
-    """Raises a ``FileExistsError`` unless a folder to be written is empty or missing.
-
-    The file of a lock does not count.
-    """
+    """Raises a ``FileExistsError`` unless a folder is missing, or empty but for a lock."""
     if folder.exists() and (not folder.is_dir() or {*os.listdir(folder)} - {LOCK}):
         raise FileExistsError(f"{folder} must be an empty folder or missing; choose another name")
 
@@ -144,10 +141,7 @@ SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": 
 
 
 def find_delimiter(lines: Sequence[str]) -> str:
-    """The mark that cuts the first three lines into equally many cells, two or more.
-
-    Without such a mark it is a comma.
-    """
+    """The mark that cuts the first three lines into equally many cells, or else a comma."""
     for mark in SEPARATORS:
         counts = {len(split_cells(line, mark)) for line in lines[:3]}
         if len(counts) == 1 and counts != {1}:

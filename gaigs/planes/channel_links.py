@@ -179,10 +179,7 @@ class ReceiverChannels:
         return replace(self, **parts, channels=self.channels.to(torch.complex64))
 
     def of_unique_places(self) -> "ReceiverChannels":
-        """One link of each place that is received.
-
-        Links of one place have one channel, and would explain each other.
-        """
+        """One link of each received place: links of one place would explain each other."""
         received = self.at(self.channels.abs().amax((1, 2)) > 0)
         _, which = received.places.unique(dim=0, return_inverse=True)
         first: dict[int, int] = {}

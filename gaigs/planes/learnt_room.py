@@ -135,10 +135,7 @@ def tabulate_planes(placement: Mirrored, ends: Float[ndarray, "k 3"]) -> PlaneTa
 
 
 def other_offset(scene: Scene, planes: PlaneTable, number: int) -> float | None:
-    """Offset at which a plane would reflect paths of the same lengths [m], see ``FlatAxis``.
-
-    None if there is no such offset.
-    """
+    """Offset at which a plane reflects paths of equal lengths [m], see ``FlatAxis``; or None."""
     normal = planes.normals[number]
     for flat in scene.flat_axes:
         if abs(normal[flat.axis]) > 0.99:

@@ -335,7 +335,6 @@ def fit_sheets(
         placement: With obstacles, or without any, which have no sheets.
         query: Links.
         lower, upper: Corners of the room [m].
-        options: Options of the fit.
 
     Returns:
         The sheets, and the gain of all paths beside them [Np].

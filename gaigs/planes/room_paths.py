@@ -52,10 +52,7 @@ class TracedPaths(NamedTuple):
 
 
 class LearntPath(NamedTuple):
-    """Transmitter, bounces and receiver of a path [m], and its power.
-
-    The power is relative to the strongest path's [dB].
-    """
+    """Transmitter, bounces and receiver of a path [m], and its power over the strongest's [dB]."""
 
     points: Float[ndarray, "p 3"]
     power_db: float

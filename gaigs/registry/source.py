@@ -60,8 +60,6 @@ def read_options(file: Path, definition: str | Definition, given: tuple[str, ...
     """The options of a class or function with their defaults; ``???`` stands for a mandatory one.
 
     Args:
-        file: The module.
-        definition: The class or function, or its name.
         given: Parameters that are no options.
 
     Raises:
@@ -93,10 +91,7 @@ def read_options(file: Path, definition: str | Definition, given: tuple[str, ...
 
 
 def registering_statement(component: Callable) -> str:
-    """The statement that registers a component at this moment, with its definition.
-
-    It is empty if the text of the module is not kept.
-    """
+    """The statement that now registers a component, with its definition; empty if unknown."""
     frame: Any = sys._getframe()
     while frame is not None and frame.f_globals.get("__name__") != component.__module__:
         frame = frame.f_back

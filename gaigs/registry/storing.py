@@ -77,10 +77,7 @@ def _own_options(estimator: Any) -> dict:
 
 
 def note_arguments(kind: str, name: str, component: Any) -> Any:
-    """Makes the instances of a class note their arguments as ``configuration``.
-
-    Functions are returned unchanged.
-    """
+    """Makes instances of a class note their arguments as ``configuration``; keeps functions."""
     make: Any = getattr(component, "__init__", None)
     if not isinstance(component, type) or getattr(make, "notes", None) is component:
         return component

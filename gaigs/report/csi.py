@@ -225,10 +225,7 @@ def _limits(levels: Float[ndarray, "... 2 n"]) -> tuple[float, float]:
 def impulse_response(
     channels: Complex[ndarray, "... s"], frequencies: Float[ndarray, " s"]
 ) -> tuple[Float[ndarray, " d"], Complex[ndarray, "... d"]]:
-    """Delays [s], and the impulse response at them.
-
-    It is the mean over subcarriers of h exp(2 pi i f tau), with a Hann window.
-    """
+    """Delays [s], and the mean over subcarriers of h exp(2 pi i f tau), with a Hann window."""
     start = frequencies.min()
     spacing = np.median(np.diff(np.unique(frequencies)))
     # The window is 0 one spacing outside of the band, so that both end subcarriers count.

@@ -14,10 +14,7 @@ requested: list[tuple[Path, str | list[str]]] = []
 
 
 class MultirunReport(Callback):
-    """Requests the tables of a multirun.
-
-    ``main`` writes them, as Hydra calls no callback after a failed job.
-    """
+    """Requests tables, which ``main`` writes: Hydra calls no callback after a failed job."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         """Remembers the folder and the formats."""

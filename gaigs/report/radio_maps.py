@@ -154,7 +154,6 @@ def radio_maps(
     """The map of each receiver in a panel, all with the same axes and colours.
 
     Args:
-        radio_map: The map.
         gateways: Positions of all receivers by name [m]; empty if unknown.
         readings: x, y [m] and label [radio_map.unit] by receiver; of each at most 100, evenly
             chosen, are drawn.

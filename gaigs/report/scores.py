@@ -38,10 +38,7 @@ def task_class(name: str) -> type[Task]:
 
 
 def headline(task: str, models: Mapping[str, Mapping]) -> tuple[str, Metric]:
-    """The first of a task's metrics that the first model has.
-
-    Channels of unknown phase lack the plain SNR.
-    """
+    """The first of a task's metrics that the first model has: not all channels have an SNR."""
     known = task_class(task).metrics()
     scores = next(iter(models.values()))
     name = next((name for name in known if name in scores), next(iter(known)))

@@ -110,10 +110,7 @@ def _costs(metrics: Mapping) -> dict[str, float | None]:
 def _cells(
     systems: Sequence[System], published: Sequence[Mapping], titles: Mapping[str, str]
 ) -> list[dict]:
-    """Rows by title: published figures of systems in their usual setting, then ours.
-
-    Columns without a value are left out.
-    """
+    """Rows by title: published figures of systems in their usual setting, then ours, if known."""
     rows = []
     for system in systems:
         row: dict[str, float | Spread | None] = {}

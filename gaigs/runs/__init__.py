@@ -158,10 +158,7 @@ def _check_options(config: dict) -> None:
 
 
 def train_and_test(config: dict, folder: Path) -> dict | None:
-    """Contents of ``metrics.json`` of a run in a claimed folder.
-
-    The result is None in all but the first process.
-    """
+    """Contents of ``metrics.json`` of a run in a claimed folder; None in further processes."""
     import lightning
 
     _check_options(config)

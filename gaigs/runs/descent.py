@@ -154,10 +154,7 @@ def _run(
     validation: InOrder | None,
     resumed: Path | None,
 ) -> None:
-    """All steps of a training, from the start or a checkpoint; ``Stopped`` after a signal.
-
-    Signals have their former handlers afterwards.
-    """
+    """All steps of a training; after a signal ``Stopped``, with the former handlers."""
     expected = (
         ".*LeafSpec",  # Lightning's use of torch
         "You defined a `validation_step` but",  # a split without validation links

@@ -48,10 +48,7 @@ class Fitted(NamedTuple):
 
 
 def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
-    """Builds, fits, trains and kriges a model as configured.
-
-    The result is None in all but the first of several processes.
-    """
+    """Builds, fits, trains and kriges a model as configured; None in further processes."""
     name = config["model"]["name"]
     model = _checked(model, links, config)
     kriged = _untrained_kriging(model, links, config)

@@ -46,16 +46,7 @@ def write(
     split: str,
     remarks: Sequence[str],
 ) -> str:
-    """Writes ``agreement.md`` and ``agreement.png``, and returns the page.
-
-    Args:
-        folder: Gets the files.
-        task: Task of the labels.
-        cells: Cells with pairs.
-        rows: Metrics by predictor.
-        split: Name of the split.
-        remarks: Sentences below the tables.
-    """
+    """Writes ``agreement.md`` and ``agreement.png``, and returns the page."""
     score = task.pair_score
     parts = [
         f"Median {score} of two labels, 10th to 90th percentile, and number of pairs, "

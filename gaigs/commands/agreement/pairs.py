@@ -188,7 +188,6 @@ class Reservoir:
 
     Args:
         cells: Number of cells. Pairs of a further cell are never kept.
-        most: Largest number of pairs of a cell.
     """
 
     def __init__(self, cells: int, most: int):
@@ -226,13 +225,8 @@ def draw(
     """Number of pairs in each cell, and random pairs of each cell: earlier and later link.
 
     Args:
-        agreement: Edges of the cells.
-        places: Transmitters of the links [m].
         order: Measurement of each link, see ``visits``.
         groups: Links of one receiver and carrier, see ``groups_of``.
-        most: Largest number of drawn pairs of a cell.
-        block: Number of distances in memory at a time.
-        random: Draws the pairs.
     """
     size = agreement.pairs.size
     counts = np.zeros(size + 1, int)  # the last cell holds links that are not a pair

@@ -131,10 +131,7 @@ def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -
 def tabulate(
     query: Query, scene: Scene, task: Task, estimate: Estimate, measured: Tensor | None
 ) -> dict[str, Variable]:
-    """Columns of links, axes of labels, and values by links and axes.
-
-    Complex values have a real and an imaginary part.
-    """
+    """Columns of links, axes of labels, and values by links and axes, complex ones in parts."""
     axes = axes_of(task)
     variables = _link_columns(query, scene) | axes
     parts = {
@@ -195,10 +192,7 @@ def axes_of(task: Task) -> dict[str, Variable]:
 def _rows(
     variables: Mapping[str, Variable], absent: Bool[np.ndarray, " n *shape"]
 ) -> Iterator[Sequence[str]]:
-    """A heading, and a row for each number of each link that is not absent.
-
-    Columns describe the link, then the axes, then the values.
-    """
+    """A heading, and a row for each number that is not absent: link, axes, then values."""
     of_link = ("x", "y", "z", "easting", "northing", "receiver", "frequency")
     axes: dict[str, list] = {}
     links: dict[str, list] = {}

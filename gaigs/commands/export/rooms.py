@@ -150,10 +150,7 @@ def itu_bsdf(material: Material, frequency: float) -> Bsdf:
 
 
 def sheet_bsdf(sheet: Sheet) -> Bsdf:
-    """A sheet of obstacles, which reflects nothing.
-
-    All of that energy is scattered, which Sionna RT leaves out.
-    """
+    """A sheet of obstacles, which scatters what it does not transmit: Sionna RT leaves it out."""
     thickness = 1e-5  # [m]; thin against the wavelength, so that only the conductance counts
     impedance = 376.73  # of free space [ohm]
     properties = (

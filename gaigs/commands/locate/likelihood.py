@@ -191,8 +191,6 @@ def choose_likelihood(
     each fold the other folds choose.
 
     Args:
-        prints: The map.
-        trials: Held-out fingerprints of each fold.
         degrees: Degrees of freedom to choose from, the heaviest tails first.
         half_octaves: Integers i; the tempers to choose from are 2^(i / 2).
         fewest: Number of fingerprints below which the degrees are not chosen: so few hardly show

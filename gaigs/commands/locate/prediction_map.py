@@ -251,7 +251,6 @@ def held_out_folds(
     """Folds of known links with the maps of models that do not know them.
 
     Args:
-        maker: Makes the maps.
         model: The model that knows all.
         known: Known links at the carrier of the map.
         most: Largest number of fingerprints of a fold whose errors give the axes.

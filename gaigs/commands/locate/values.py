@@ -22,8 +22,6 @@ def as_fingerprints(
     """Fingerprints of received values, NaN where a receiver has received nothing.
 
     Args:
-        value: Labels of each receiver, see ``locate``.
-        prints: The map in which they are looked up.
         is_track: True if values may be received by no receiver.
     """
     if isinstance(value, Mapping):

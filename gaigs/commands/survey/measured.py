@@ -81,7 +81,6 @@ def measured_places(
     stays below ``tolerated`` times its value.
 
     Args:
-        processes: Processes of the receivers.
         asked: Places over which the error is the mean.
         factor: Mean absolute error of a label over its standard deviation.
         most: Largest number of readings of a receiver that count, an even part of more.

@@ -321,9 +321,6 @@ class Selection:
     """Covariances of all receivers at places, given the readings and the chosen candidates.
 
     Args:
-        processes: Processes of the receivers.
-        asked: Coordinates of all places.
-        places: The places.
         factor: Mean absolute error of a label over its standard deviation.
     """
 

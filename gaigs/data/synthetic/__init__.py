@@ -153,10 +153,7 @@ def respond_in_parts(
     offsets: Float[Tensor, " f"],
     order: int,
 ) -> Iterator[Complex[Tensor, "part elements f"]]:
-    """``respond`` for the paths of at most ``order`` reflections in any room.
-
-    ``PLACES_AT_A_TIME`` transmitters [m] are taken at a time.
-    """
+    """``respond`` in any room for ``PLACES_AT_A_TIME`` transmitters [m] at a time."""
     for part in transmitters.split(PLACES_AT_A_TIME):
         paths = trace(room, part, receiver.pose.position, frequency, order)
         yield respond(paths, receiver, frequency, offsets)

@@ -23,10 +23,7 @@ def _process() -> int:
 
 
 def is_forked() -> bool:
-    """True in a process forked from one that uses OpenCL.
-
-    It lacks the driver's threads, and would wait for ever.
-    """
+    """True in a fork of a process with OpenCL, which would wait for its threads for ever."""
     return _process() != os.getpid()
 
 

@@ -96,10 +96,7 @@ class _Tiles:
             self.chunks = self._chunks(touches, triples // (len(opacities) * self.edge**2))
 
     def _find_touched(self, means: Tensor, factors: Tensor, opacities: Tensor) -> Tensor:
-        """True where a splat reaches a tile (tiles, n).
-
-        Comparisons with NaN keep the splat, so that NaN shows in the map.
-        """
+        """True where a splat reaches a tile (tiles, n), and for NaN: the map then shows it."""
         # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box
         # has these halves.
         reach = (2 * (opacities / ALPHA_MIN).log().clamp_min(0)).sqrt()  # (b, n)

@@ -51,10 +51,7 @@ class Folded(NamedTuple):
     def parts(
         self, values: Inexact[Tensor, "b w *s"]
     ) -> Iterator[tuple[int, Inexact[Tensor, "b k *s"]]]:
-        """Values of the last bounces, of the last but one, and so on.
-
-        Each comes with the first sequence that has such a bounce.
-        """
+        """Values of the last bounces, the last but one, ..., each with its first sequence."""
         counts = [self.exists.shape[1] - first for first in self.firsts]
         return zip(self.firsts, values.split(counts, 1), strict=True)
 
@@ -241,9 +238,6 @@ def reflection_points(
 def polarised(
     normals: Float[Tensor, "*#n 3"], te: Complex[Tensor, "*n"], tm: Complex[Tensor, "*n"]
 ) -> Complex[Tensor, "*n"]:
-    """Reflection coefficients for vertical polarisation.
-
-    TE counts at upright planes, TM at level ones, a mean in between.
-    """
+    """Coefficients for vertical polarisation: TE at upright planes, TM at level, else a mean."""
     level = normals[..., 2].square()
     return (1 - level) * te + level * tm
