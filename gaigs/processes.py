@@ -295,11 +295,7 @@ def stopping(waits: bool = False) -> Iterator[None]:
             signal.signal(number, handler)
         if waits:
             for number in STOPPING[1:]:
-                signal.signal(number, _note_signal)
-
-
-def _note_signal(number: int, _) -> None:
-    received.append(number)
+                signal.signal(number, lambda number, _: received.append(number))
 
 
 def forward_to_children(number: int) -> None:

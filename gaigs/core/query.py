@@ -77,7 +77,8 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
             raise TypeError("masked")
         array: Any = np.array(values)  # a copy, since torch warns of arrays that are read-only
         if array.dtype == object and array.ndim:  # such as a column of pandas
-            array[np.frompyfunc(_is_missing, 1, 1)(array).astype(bool)] = np.nan
+            missing = [value is None or type(value).__name__ == "NAType" for value in array.flat]
+            array[np.reshape(missing, array.shape)] = np.nan
             array = np.array(array.tolist())
         # Torch takes no negative strides and no other byte order.
         return torch.from_numpy(
@@ -85,11 +86,6 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
         )
     except (TypeError, ValueError, RuntimeError, OverflowError):  # of words and ragged lists
         raise ValueError(f"{name} must be {expected}, got {reprlib.repr(values)}") from None
-
-
-def _is_missing(value: object) -> bool:
-    """True for None and the missing value of pandas."""
-    return value is None or type(value).__name__ == "NAType"
 
 
 def as_numbers(name: str, values: object, expected: str) -> Tensor:

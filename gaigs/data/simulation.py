@@ -20,7 +20,7 @@ from gaigs.core.query import Query, check_carrier
 from gaigs.core.task.csi import Csi
 from gaigs.core.task.rssi import Rssi
 from gaigs.core.task.spectrum import Spectrum
-from gaigs.data import Links, Parts
+from gaigs.data import Links, Parts, kept_links
 from gaigs.registry import check_type
 
 PLACES_AT_A_TIME = 64
@@ -125,9 +125,8 @@ def simulate_channels(
     places = room.place(transmitters, seed)
     receivers = patch_arrays(room.poses, frequency)
     task = Csi(len(receivers[0].array), frequency + offsets, phase)
-    channels = []
-    for receiver in receivers:
-        channels.append(torch.cat([*room.respond(places, receiver, frequency, offsets)]))
+    responses = [room.respond(places, receiver, frequency, offsets) for receiver in receivers]
+    channels = [torch.cat([*response]) for response in responses]
     labels = torch.stack(channels, 1).flatten(0, 1)  # (places * receivers, elements, f)
     if phase != "known":
         has_delays = phase == "per_link_and_delay"
@@ -173,20 +172,13 @@ def without_silent(links: Links, transmitters: int, has_path: Bool[Tensor, " n"]
     """Links from places that a path leads to; the remarks count the others."""
     if has_path.all():
         return links
-    rows = links.rows[has_path]
-    if len(rows.unique()) < 2:
+    if len(links.rows[has_path].unique()) < 2:
         raise ValueError(
             f"paths must lead to two of {transmitters} transmitters or more; "
             "move the receiver or heights"
         )
-    return replace(
-        links,
-        query=links.query[has_path],
-        labels=links.labels[has_path],
-        rows=rows,
-        official=partial(last_fifth, transmitters, rows),
-        remarks=f"{int((~has_path).sum())} links without a path are left out",
-    )
+    remarks = f"{int((~has_path).sum())} links without a path are left out"
+    return replace(kept_links(links, has_path), remarks=remarks)
 
 
 def simulate_readings(
@@ -305,10 +297,8 @@ def to_spectra(
     frequency: float,
 ) -> Float[Tensor, "n rows columns"]:
     """Spectra of an array's responses at a carrier [Hz], float32 in [0, 1]."""
-    spectra = []
-    for part in responses:
-        spectra.append(min_max(bartlett(part, grid, array, frequency)).float())
-    return torch.cat(spectra)
+    amplitudes = (bartlett(part, grid, array, frequency) for part in responses)
+    return torch.cat([min_max(part).float() for part in amplitudes])
 
 
 def rss_dbm(responses: Complex[Tensor, "b elements f"]) -> Float[Tensor, " b"]:

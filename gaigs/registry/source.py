@@ -103,7 +103,7 @@ def registering_statement(component: Callable) -> str:
         statements = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.stmt)]
     except SyntaxError:  # the file has been edited meanwhile
         return ""
-    around = [node for node in statements if _first_line(node) <= line <= _last_line(node)]
+    around = [node for node in statements if _first_line(node) <= line <= (node.end_lineno or 0)]
     named = [node for node in statements if getattr(node, "name", None) == component.__name__]
     innermost = [max(around, key=_first_line)] if around else []
     chosen = dict.fromkeys([*innermost, *named[-1:]])
@@ -113,10 +113,6 @@ def registering_statement(component: Callable) -> str:
 def _first_line(node: ast.stmt) -> int:
     decorators = getattr(node, "decorator_list", [])
     return min(part.lineno for part in (node, *decorators))
-
-
-def _last_line(node: ast.stmt) -> int:
-    return node.end_lineno or node.lineno
 
 
 def _parsed(file: Path) -> ast.Module:

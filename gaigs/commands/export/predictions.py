@@ -132,7 +132,9 @@ def tabulate(
     query: Query, scene: Scene, task: Task, estimate: Estimate, measured: Tensor | None
 ) -> dict[str, Variable]:
     """Columns of links, axes of labels, and values by links and axes, complex ones in parts."""
-    axes = axes_of(task)
+    axes = {}
+    for name, axis in task.axes().items():
+        axes[name] = Variable((name,), axis.values, {"units": axis.unit} if axis.unit else {})
     variables = _link_columns(query, scene) | axes
     parts = {
         "value": estimate.value,
@@ -178,15 +180,6 @@ def _link_columns(query: Query, scene: Scene) -> dict[str, Variable]:
         about = {"units": "Hz", "standard_name": "radiation_frequency"}
         columns["frequency"] = Variable(("link",), carriers, about)
     return columns
-
-
-def axes_of(task: Task) -> dict[str, Variable]:
-    """The axes of a label."""
-    variables = {}
-    for name, axis in task.axes().items():
-        units = {"units": axis.unit} if axis.unit else {}
-        variables[name] = Variable((name,), axis.values, units)
-    return variables
 
 
 def _rows(

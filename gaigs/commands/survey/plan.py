@@ -1,7 +1,7 @@
 """The next places to measure, chosen one by one for the least mean variance."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -96,26 +96,23 @@ class SurveyPlan:
 
         With a ``frame`` it has easting and northing too. Without a model errors are empty.
         """
-        on_map = [] if self.frame is None else ["easting", "northing"]
-        rows = [["use", "x", "y", "z", *on_map, "mean_error"]]
-        errors = [""] * len(self.places)
-        if self.errors is not None:
-            errors = [f"{error:.6g}" for error in self.errors[1:].tolist()]
-        for place, error in zip(self.places.tolist(), errors, strict=True):
-            rows.append(table_row("measure", place, self.frame, error))
+        errors = [None] * len(self.places) if self.errors is None else self.errors[1:].tolist()
+        rows = [("measure", *row) for row in zip(self.places.tolist(), errors, strict=True)]
         losses = self.losses[self.superfluous].tolist()
         for place, loss in zip(self.known[self.superfluous].tolist(), losses, strict=True):
-            without = f"{self.known_error + loss:.6g}"
-            rows.append(table_row("leave out", place, self.frame, without))
-        write_table(Path(path), rows)
+            rows.append(("leave out", place, self.known_error + loss))
+        write_places(Path(path), "mean_error", rows, self.frame)
 
 
-def table_row(use: str, place: Sequence[float], frame: Frame | None, value: str) -> list[str]:
-    """A row of a table of places, with easting and northing if there is a frame."""
-    numbers = [*place]
-    if frame is not None:
-        numbers += [frame.x + place[0], frame.y + place[1]]
-    return [use, *(f"{number:.3f}" for number in numbers), value]
+def write_places(file: Path, title: str, rows: Iterable[tuple], frame: Frame | None) -> None:
+    """Writes uses, places and numbers or None, with easting and northing if there is a frame."""
+    on_map = [] if frame is None else ["easting", "northing"]
+    lines = [["use", "x", "y", "z", *on_map, title]]
+    for use, place, number in rows:
+        numbers = [*place] if frame is None else [*place, frame.x + place[0], frame.y + place[1]]
+        end = "" if number is None else f"{number:.6g}"
+        lines.append([use, *(f"{coordinate:.3f}" for coordinate in numbers), end])
+    write_table(file, lines)
 
 
 @with_progress
@@ -196,7 +193,7 @@ def survey(
         centres = model.scene.positions(asked)
     spacing = Spacing(processes, asked[: len(places.candidates)])
     pairs = zip(processes, centres, strict=True)
-    processes = [with_trend(process, centre) for process, centre in pairs]
+    processes = [with_trend(*pair) for pair in pairs]
     factor = error_factor(model)
     selection = Selection(processes, asked, places, factor)
     scatter = selection.scatter()
@@ -253,7 +250,7 @@ def survey_places(model: Model | None, region: object, candidates: object) -> Su
                 "region must be two corners [[x, y, z], [x, y, z]] [m], "
                 f"got {len(box)} points{advice}"
             )
-        even = grid(box[0], box[1])
+        even = even_places(box[0], box[1], 1000)
     elif candidates is None:
         if model is None:
             raise ValueError(
@@ -266,19 +263,9 @@ def survey_places(model: Model | None, region: object, candidates: object) -> Su
     return SurveyPlaces(as_positions("candidates", candidates).reshape(-1, 3), even)
 
 
-def grid(
-    lower: Float[Tensor, "3"],
-    upper: Float[Tensor, "3"],
-    floors: Sequence[float] | Tensor = (),
-    count: int = 1000,
-) -> Float[Tensor, "g 3"]:
-    """Even places in a box, as candidates or for the mean error over it."""
-    return even_places(lower, upper, count, floors)
-
-
 def training_grid(model: Model) -> Float[Tensor, "g 3"]:
-    """Even places in the box of the training transmitters, or on their floors."""
-    return grid(model.scene.lower, model.scene.upper, model.scene.floors)
+    """A thousand even places in the box of the training transmitters, or on their floors."""
+    return even_places(model.scene.lower, model.scene.upper, 1000, model.scene.floors)
 
 
 def check_memory(candidates: int, receivers: int, limit: float = 2e9) -> None:
