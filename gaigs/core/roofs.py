@@ -16,18 +16,12 @@ Building = tuple[list[Float[ndarray, "_ 2"]], float]
 
 
 class Roofs(NamedTuple):
-    """Heights of roofs on a grid.
+    """Heights of roofs on a grid."""
 
-    Attributes:
-        heights: Height of the roof above each cell's middle, world frame, far below it without
-            a building (rows, columns) [m].
-        lower: Lower corner of the grid, x and y [m].
-        cell: Edge of a cell [m].
-    """
-
+    # Height of the roof above each cell's middle, world frame, far below it without a building [m].
     heights: Float[Tensor, "rows columns"]
-    lower: tuple[float, float]
-    cell: float
+    lower: tuple[float, float]  # lower corner of the grid, x and y [m]
+    cell: float  # edge of a cell [m]
 
 
 def rasterize_roofs(

@@ -65,17 +65,12 @@ def lacks_carrier(
 
 
 class Responses(NamedTuple):
-    """Impulse responses between places.
+    """Impulse responses between places."""
 
-    Attributes:
-        gains: Complex gains (k, e, n, m, p) of p paths; k receivers have e antennas, n
-            transmitters m.
-        delays: The same, or with a 1 for the antennas [s].
-        tx, rx: Places of both ends (n, 3), (k, 3) [m].
-    """
-
+    # Complex gains of p paths; k receivers have e antennas, n transmitters m.
     gains: Complex[ndarray, "k e n m p"]
-    delays: ndarray
+    delays: ndarray  # the same, or with a 1 for the antennas [s]
+    # Places of both ends (n, 3), (k, 3) [m].
     tx: ndarray
     rx: ndarray
 

@@ -29,25 +29,17 @@ PLACES_AT_A_TIME = 64
 
 @dataclass(frozen=True)
 class SimulatedRoom:
-    """A room with its receivers, and the responses of their antennas.
+    """A room with its receivers, and the responses of their antennas."""
 
-    Attributes:
-        poses: Positions and orientations of the receivers with an array.
-        gateways: Receivers with a single antenna.
-        edges: Line segments to draw in figures (k, 2, 3) [m].
-        place: From a count and a seed, random places of transmitters (count, 3) [m].
-        frequency_offsets: From a bandwidth, frequencies that sample the band, relative to its
-            middle [Hz].
-        respond: From places (n, 3), a receiver, a frequency and offsets (f,), the response of each
-            element to unit-power transmitters, ``PLACES_AT_A_TIME`` of them at a time
-            (part, elements, f).
-    """
-
-    poses: tuple[Pose, ...]
-    gateways: tuple[Receiver, ...]
-    edges: Float[Tensor, "k 2 3"]
+    poses: tuple[Pose, ...]  # positions and orientations of the receivers with an array
+    gateways: tuple[Receiver, ...]  # receivers with a single antenna
+    edges: Float[Tensor, "k 2 3"]  # line segments to draw in figures [m]
+    # From a count and a seed, random places of transmitters (count, 3) [m].
     place: Callable[[int, int], Tensor]
+    # From a bandwidth, frequencies that sample the band, relative to its middle [Hz].
     frequency_offsets: Callable[[float], Tensor]
+    # From places (n, 3), a receiver, a frequency and offsets (f,), the response of each element to
+    # unit-power transmitters, ``PLACES_AT_A_TIME`` of them at a time (part, elements, f).
     respond: Callable[[Tensor, Receiver, float, Tensor], Iterable[Tensor]]
 
 

@@ -24,19 +24,12 @@ NO_NAME = "mesh", "unnamed"
 
 @dataclass(frozen=True)
 class Mesh:
-    """One object of one material.
+    """One object of one material."""
 
-    Attributes:
-        name: Name of the object; several meshes may share it.
-        material: Name of the material; empty without one.
-        vertices: Corners, world frame [m].
-        faces: Corners of each planar convex face, counted from 0, in order.
-    """
-
-    name: str
-    material: str
-    vertices: tuple[tuple[float, float, float], ...]
-    faces: tuple[Face, ...]
+    name: str  # name of the object; several meshes may share it
+    material: str  # name of the material; empty without one
+    vertices: tuple[tuple[float, float, float], ...]  # corners, world frame [m]
+    faces: tuple[Face, ...]  # corners of each planar convex face, counted from 0, in order
 
     def triangles(self) -> list[tuple[int, int, int]]:
         """Faces cut into triangles."""

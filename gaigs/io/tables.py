@@ -204,23 +204,15 @@ def described(cell: str) -> str:
 
 
 class Table(NamedTuple):
-    """A table in numbers, a column a name.
+    """A table in numbers, a column a name."""
 
-    Attributes:
-        file: File, or a word for a table in memory.
-        names: Names of the columns.
-        numbers: Numbers, NaN for an empty cell and infinity for another text.
-        text: Text of a cell by its row and column.
-        unit: Word for a row in messages.
-        first: Number of the first row in messages.
-    """
-
-    file: Path
-    names: list[str]
+    file: Path  # file, or a word for a table in memory
+    names: list[str]  # names of the columns
+    # Numbers, NaN for an empty cell and infinity for another text.
     numbers: Float[ndarray, "rows columns"]
-    text: Callable[[int, int], str]
-    unit: str = "line"
-    first: int = 2
+    text: Callable[[int, int], str]  # text of a cell by its row and column
+    unit: str = "line"  # word for a row in messages
+    first: int = 2  # number of the first row in messages
 
     @property
     def heading(self) -> str:

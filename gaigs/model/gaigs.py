@@ -28,17 +28,11 @@ from gaigs.splatting.rasterizer import Rasterizer
 
 
 class Excited(NamedTuple):
-    """The Gaussians as places excite them.
+    """The Gaussians as places excite them."""
 
-    Attributes:
-        placed: Gaussians before the deformation.
-        residuals: Changes by the deformation.
-        semi_axes: Semi-axes after it, a column for each axis [m].
-    """
-
-    placed: Placed
-    residuals: Residuals
-    semi_axes: Float[Tensor, "places n 3 3"]
+    placed: Placed  # Gaussians before the deformation
+    residuals: Residuals  # changes by the deformation
+    semi_axes: Float[Tensor, "places n 3 3"]  # semi-axes after it, a column for each axis [m]
 
 
 class Strengths(NamedTuple):

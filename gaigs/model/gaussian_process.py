@@ -31,15 +31,10 @@ from gaigs.registry import name_of, register
 
 
 class Solved(NamedTuple):
-    """What predictions of one receiver are made from; neither in local kriging.
+    """What predictions of one receiver are made from; neither in local kriging."""
 
-    Attributes:
-        solution: Residuals over the covariances of their links (k, m).
-        factor: Cholesky factor of the covariances (k, k).
-    """
-
-    solution: Tensor | None
-    factor: Tensor | None
+    solution: Tensor | None  # residuals over the covariances of their links (k, m)
+    factor: Tensor | None  # Cholesky factor of the covariances (k, k)
 
 
 @register("model", "gaussian_process")

@@ -29,17 +29,12 @@ COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 
 
 class HeldOutLinks(NamedTuple):
-    """Held-out links of one receiver.
+    """Held-out links of one receiver."""
 
-    Attributes:
-        rows: Their rows among the known links (h,).
-        apart: Distances of the known links [m], infinite for those that are held out, too (h, k).
-        index: The known links (k,).
-    """
-
-    rows: Int[Tensor, " h"]
+    rows: Int[Tensor, " h"]  # their rows among the known links
+    # Distances of the known links [m], infinite for those that are held out, too.
     apart: Float[Tensor, "h k"]
-    index: Int[Tensor, " k"]
+    index: Int[Tensor, " k"]  # the known links
 
 
 @register("model", "knn")

@@ -27,39 +27,25 @@ from gaigs.core.task import Axis
 
 
 class Subcarriers(NamedTuple):
-    """Subcarriers that a prediction is asked at.
+    """Subcarriers that a prediction is asked at."""
 
-    Attributes:
-        exchanged: Frequencies [Hz] that the model computes in place of the labels' own; None: the
-            labels' own.
-        columns: The labels' own subcarriers that are taken (s,); None: all.
-        warning: Sentence on the values, empty if there is nothing to say.
-    """
-
+    # Frequencies [Hz] that the model computes in place of the labels' own; None: the labels' own.
     exchanged: Float[Tensor, " s"] | None = None
+    # The labels' own subcarriers that are taken; None: all.
     columns: Int[Tensor, " s"] | None = None
-    warning: str = ""
+    warning: str = ""  # sentence on the values, empty if there is nothing to say
 
 
 class Request(NamedTuple):
-    """Links to predict, and how their values are arranged.
+    """Links to predict, and how their values are arranged."""
 
-    Attributes:
-        query: Links, the receivers of a position one after the other.
-        axes: Axes of the links in the answer, see ``Query.from_positions``.
-        receiver: Receivers as they were asked for; None: all.
-        each: Number of links of a position.
-        directions: Directions to predict; None: the label's own.
-        subcarriers: Subcarriers to predict.
-        warnings: Sentences on positions, carriers and subcarriers far from the training links.
-    """
-
-    query: Query
-    axes: tuple[int, ...]
-    receiver: object
-    each: int
-    directions: Directions | None
-    subcarriers: Subcarriers
+    query: Query  # links, the receivers of a position one after the other
+    axes: tuple[int, ...]  # axes of the links in the answer, see ``Query.from_positions``
+    receiver: object  # receivers as they were asked for; None: all
+    each: int  # number of links of a position
+    directions: Directions | None  # directions to predict; None: the label's own
+    subcarriers: Subcarriers  # subcarriers to predict
+    # Sentences on positions, carriers and subcarriers far from the training links.
     warnings: list[str]
 
     @classmethod

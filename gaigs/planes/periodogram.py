@@ -16,15 +16,11 @@ from gaigs.splatting.placement.mirrored.reflections import reflect, tangents
 
 
 class Likeness(NamedTuple):
-    """Likeness of the reflection at each plane to a further wave.
+    """Likeness of the reflection at each plane to a further wave."""
 
-    Attributes:
-        values: Products of both waves, of about the same size at all links (c, b).
-        rates: Change of their phases if the plane moves [rad/m], or turns about its pivot towards
-            two axes [1] (c, b, 3).
-    """
-
-    values: Complex[Tensor, "c b"]
+    values: Complex[Tensor, "c b"]  # products of both waves, of about the same size at all links
+    # Change of their phases if the plane moves [rad/m], or turns about its pivot towards two axes
+    # [1].
     rates: Float[Tensor, "c b 3"]
 
 

@@ -15,17 +15,12 @@ from gaigs.splatting.placement.mirrored.reflections import polarised, reflect, t
 
 
 class Phasors(NamedTuple):
-    """Single reflections at a plane, at the places where they are strongest.
+    """Single reflections at a plane, at the places where they are strongest."""
 
-    Attributes:
-        values: Strengths over the channels' root power, with the phase against the direct path.
-        slopes: Change of the length by offset and two tilts (b, 3).
-        cosines: Cosines of the angles of incidence.
-    """
-
+    # Strengths over the channels' root power, with the phase against the direct path.
     values: Complex[Tensor, " b"]
-    slopes: Float[Tensor, "b 3"]
-    cosines: Float[Tensor, " b"]
+    slopes: Float[Tensor, "b 3"]  # change of the length by offset and two tilts
+    cosines: Float[Tensor, " b"]  # cosines of the angles of incidence
 
 
 class SlabPeak(NamedTuple):

@@ -38,21 +38,14 @@ ROOMS = {
 
 @dataclass(frozen=True)
 class Holder:
-    """The owner of a name.
-
-    Attributes:
-        where: File or distribution, for errors.
-        target: ``module`` that registers the component by decorator, or ``module:attribute``.
-        file: File of the module if the name was read from it.
-        root: Folder that the import needs on ``sys.path``; None if it is there.
-    """
+    """The owner of a name."""
 
     kind: str
     name: str
-    where: str
-    target: str
-    file: Path | None = None
-    root: Path | None = None
+    where: str  # file or distribution, for errors
+    target: str  # ``module`` that registers the component by decorator, or ``module:attribute``
+    file: Path | None = None  # file of the module if the name was read from it
+    root: Path | None = None  # folder that the import needs on ``sys.path``; None if it is there
 
     @property
     def package(self) -> str:

@@ -20,25 +20,16 @@ from gaigs.report.scores import headline
 
 
 class Run(NamedTuple):
-    """One job of a multirun.
+    """One job of a multirun."""
 
-    Attributes:
-        name: Its sub-folder.
-        folder: Path of this folder.
-        overrides: Values of the command line, by key.
-        config: The run's configuration; empty if it is unknown.
-        metrics: Contents of ``metrics.json``; None where the job failed, was stopped or still runs.
-        failure: The error of a failed job; else None.
-        doubts: Sentences on overrides that differ from the run's configuration.
-    """
-
-    name: str
-    folder: Path
-    overrides: dict[str, str]
-    config: dict
+    name: str  # its sub-folder
+    folder: Path  # path of this folder
+    overrides: dict[str, str]  # values of the command line, by key
+    config: dict  # the run's configuration; empty if it is unknown
+    # Contents of ``metrics.json``; None where the job failed, was stopped or still runs.
     metrics: dict | None
-    failure: str | None
-    doubts: list[str]
+    failure: str | None  # the error of a failed job; else None
+    doubts: list[str]  # sentences on overrides that differ from the run's configuration
 
 
 def by_seed(runs: Sequence[Run]) -> list[list[Run]]:

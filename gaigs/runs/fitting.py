@@ -26,25 +26,17 @@ log = logging.getLogger(__name__)
 
 
 class Fitted(NamedTuple):
-    """Result of ``fit``.
+    """Result of ``fit``."""
 
-    Attributes:
-        models: The model by its name; a kriged one is followed by the trained model alone,
-            ``<name>_trend``.
-        unseen: The same, not fitted to validation links; empty for a model without a training.
-        start: Number of Gaussians before the training.
-        seconds: Duration of ``Model.fit``, as of a search for planes, and of the training; None
-            without one.
-        kriging_seconds: Duration of kriging; None without it.
-        facts: Entries of ``metrics.json`` beside the model's own.
-    """
-
+    # The model by its name; a kriged one is followed by the trained model alone, ``<name>_trend``.
     models: dict[str, Model]
+    # The same, not fitted to validation links; empty for a model without a training.
     unseen: dict[str, Model]
-    start: int
+    start: int  # number of Gaussians before the training
+    # Duration of ``Model.fit``, as of a search for planes, and of the training; None without one.
     seconds: float | None = None
-    kriging_seconds: float | None = None
-    facts: Mapping[str, Any] = {}
+    kriging_seconds: float | None = None  # duration of kriging; None without it
+    facts: Mapping[str, Any] = {}  # entries of ``metrics.json`` beside the model's own
 
 
 def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:

@@ -16,20 +16,14 @@ from gaigs.report.table import markdown
 
 
 class Cell(NamedTuple):
-    """Pairs of labels of similar distance and separation.
+    """Pairs of labels of similar distance and separation."""
 
-    Attributes:
-        distance: Distance of their places, from and to below [m]; 0 and 0 for one place.
-        separation: Measurements between them, from and to.
-        pairs: Number of pairs.
-        compared: Number of pairs whose labels were compared.
-        quantiles: 10th percentile, median and 90th percentile of the score.
-    """
-
+    # Distance of their places, from and to below [m]; 0 and 0 for one place.
     distance: tuple[float, float]
-    separation: tuple[int, float]
-    pairs: int
-    compared: int
+    separation: tuple[int, float]  # measurements between them, from and to
+    pairs: int  # number of pairs
+    compared: int  # number of pairs whose labels were compared
+    # 10th percentile, median and 90th percentile of the score.
     quantiles: tuple[float, float, float]
 
     def text(self, score: str) -> str:

@@ -20,27 +20,17 @@ from gaigs.split import rows_of
 
 @dataclass(frozen=True)
 class Agreement:
-    """Scores of pairs of labels, in cells of distance (rows) and separation (columns).
+    """Scores of pairs of labels, in cells of distance (rows) and separation (columns)."""
 
-    Attributes:
-        distances: Upper edges of the rows [m]; the first row holds pairs at one place, and its edge
-            is next to 0.
-        separations: Last separations of the columns but the last, ascending; in measurements.
-        pairs: Number of pairs in each cell.
-        share: Share of the pairs that were counted.
-        scores: Scores of the compared pairs by cell (row times columns plus column) and by the
-            score's name.
-        step: Median distance from a measurement to the next [m].
-        apart: Median distance of two random measurements [m].
-    """
-
+    # Upper edges of the rows [m]; the first row holds pairs at one place, its edge is next to 0.
     distances: ndarray
-    separations: ndarray
-    pairs: Int[ndarray, "rows columns"]
-    share: float
+    separations: ndarray  # last separations of the columns but the last, ascending; in measurements
+    pairs: Int[ndarray, "rows columns"]  # number of pairs in each cell
+    share: float  # share of the pairs that were counted
+    # Scores of the compared pairs by cell (row times columns plus column) and by the score's name.
     scores: dict[int, dict[str, Tensor]]
-    step: float
-    apart: float
+    step: float  # median distance from a measurement to the next [m]
+    apart: float  # median distance of two random measurements [m]
 
     @property
     def has_order(self) -> bool:

@@ -27,18 +27,12 @@ log = logging.getLogger(__name__)
 
 
 class Labels(NamedTuple):
-    """The links to predict, and their test labels.
-
-    Attributes:
-        task: Task of the values; of held-out subcarriers their own.
-        measured: Labels of links' test; None for places.
-        subcarriers: Held-out subcarriers [Hz]; None without any.
-    """
+    """The links to predict, and their test labels."""
 
     query: Query
-    task: Task
-    measured: Tensor | None
-    subcarriers: Tensor | None
+    task: Task  # task of the values; of held-out subcarriers their own
+    measured: Tensor | None  # labels of links' test; None for places
+    subcarriers: Tensor | None  # held-out subcarriers [Hz]; None without any
 
 
 def write_predictions(

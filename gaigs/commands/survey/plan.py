@@ -216,15 +216,10 @@ def survey(
 
 
 class SurveyPlaces(NamedTuple):
-    """Places of a survey.
+    """Places of a survey."""
 
-    Attributes:
-        candidates: Places that can be measured (c, 3) [m].
-        others: Places over which the error is stated (e, 3) [m]; if empty, it is stated over the
-            candidates.
-    """
-
-    candidates: Float[Tensor, "c 3"]
+    candidates: Float[Tensor, "c 3"]  # places that can be measured [m]
+    # Places over which the error is stated [m]; if empty, it is stated over the candidates.
     others: Float[Tensor, "e 3"]
 
     @property

@@ -38,19 +38,12 @@ WEAK = -20.0
 
 
 class Columns(NamedTuple):
-    """Columns of gateways and what else the table has.
+    """Columns of gateways and what else the table has."""
 
-    Attributes:
-        gateways: Numbers of the gateways' columns.
-        marks: Values that mean "not heard".
-        silent: Names of gateways that received nothing.
-        ignored: Names of other columns.
-    """
-
-    gateways: list[int]
-    marks: list[float]
-    silent: list[str]
-    ignored: list[str]
+    gateways: list[int]  # numbers of the gateways' columns
+    marks: list[float]  # values that mean "not heard"
+    silent: list[str]  # names of gateways that received nothing
+    ignored: list[str]  # names of other columns
 
 
 class Axes(NamedTuple):

@@ -38,30 +38,21 @@ TABULATED = {
 
 @dataclass(frozen=True)
 class Box:
-    """A piece of furniture: a cuboid along the room's axes that dims every wave passing through it.
-
-    Attributes:
-        lower, upper: Opposite corners, world frame [m].
-        loss_db: Penetration loss of one passage of any length [dB].
-    """
+    """A piece of furniture: a cuboid along the room's axes that dims waves passing through it."""
 
     name: str
+    # Opposite corners, world frame [m].
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
-    loss_db: float
+    loss_db: float  # penetration loss of one passage of any length [dB]
 
 
 @dataclass(frozen=True)
 class Room:
-    """A box room with one corner at the world's origin.
+    """A box room with one corner at the world's origin."""
 
-    Attributes:
-        size: Extent along x, y and z [m].
-        walls: Materials of the walls at x = 0, x = size, y = 0, y = size, of the floor and of the
-            ceiling.
-    """
-
-    size: tuple[float, float, float]
+    size: tuple[float, float, float]  # extent along x, y and z [m]
+    # Materials of the walls at x = 0, x = size, y = 0, y = size, of the floor and of the ceiling.
     walls: tuple[str, str, str, str, str, str]
     furniture: tuple[Box, ...] = ()
 
@@ -131,16 +122,11 @@ def passes(
 
 @dataclass(frozen=True)
 class Paths:
-    """Paths from transmitters to one receiver point, each replaced by a straight one from an image.
+    """Paths from transmitters to one receiver point, each straight from an image."""
 
-    Attributes:
-        images: Mirrored transmitters, world frame (b, p, 3) [m]; the first is the transmitter
-            itself.
-        gains: Product of the path's reflection coefficients and penetration losses (b, p); free
-            space has 1.
-    """
-
+    # Mirrored transmitters, world frame [m]; the first is the transmitter itself.
     images: Float[Tensor, "b p 3"]
+    # Product of the path's reflection coefficients and penetration losses; free space has 1.
     gains: Complex[Tensor, "b p"]
 
 

@@ -78,14 +78,12 @@ class LagPooling(PathPooling):
     Args:
         scene: Its receivers have planar arrays.
 
-    Attributes:
-        least_spread: Least standard deviation of a path's direction cosines where powers add: the
-            one of a pixel of 24 x 48.
-
     Source: Van Trees, Optimum Array Processing, 2002, section 5.2, for covariances by lags; the
     partial coherence is ours.
     """
 
+    # Least standard deviation of a path's direction cosines where powers add: the one of a pixel of
+    # 24 x 48.
     least_spread: float = Grid.sphere(24, 48).pitch / math.sqrt(12)
 
     def __init__(self, scene: Scene):
@@ -172,17 +170,11 @@ class _Steering:
 
 
 class _Seen(NamedTuple):
-    """Gaussians as an array sees them.
+    """Gaussians as an array sees them."""
 
-    Attributes:
-        points: Centres in the array's frame [m].
-        wavenumbers: 2 pi / lambda of each query [rad/m].
-        across: Semi-axes across the way, as angles at the middle of the array times the wavenumber
-            [rad/m].
-    """
-
-    points: Float[Tensor, "b n 3"]
-    wavenumbers: Float[Tensor, "b 1 1"]
+    points: Float[Tensor, "b n 3"]  # centres in the array's frame [m]
+    wavenumbers: Float[Tensor, "b 1 1"]  # 2 pi / lambda of each query [rad/m]
+    # Semi-axes across the way, as angles at the middle of the array times the wavenumber [rad/m].
     across: Float[Tensor, "b n 3 3"]
 
 
@@ -242,15 +234,10 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
 
 
 class _PathDifferences(NamedTuple):
-    """Ways to the elements beside the way to the middle.
+    """Ways to the elements beside the way to the middle."""
 
-    Attributes:
-        differences: |p - x| - |p| [m].
-        ratios: |p| / |p - x|, each at least ``NEAREST``.
-    """
-
-    differences: Float[Tensor, "b n e"]
-    ratios: Float[Tensor, "b n e"]
+    differences: Float[Tensor, "b n e"]  # |p - x| - |p| [m]
+    ratios: Float[Tensor, "b n e"]  # |p| / |p - x|, each at least ``NEAREST``
 
 
 def _path_differences(

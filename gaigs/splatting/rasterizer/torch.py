@@ -210,24 +210,16 @@ class _SplatParts(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """One chunk composited, for b transmitters, t tiles, k splats a tile, y x pixels a tile.
+    """One chunk composited, for b transmitters, t tiles, k splats a tile, y x pixels a tile."""
 
-    Attributes:
-        s, y: (du, dv) of the pixels, in units of the splat's factor (1 or b, t, k, y or 1, x or 1).
-        footprint: G (b, t, k, y x).
-        alpha: A = a G within its bounds (b, t, k, y x).
-        live: True where a splat acts (b, t, k, y x).
-        transmittance: T, in front of each splat (b, t, k, y x).
-        remaining: Transmittance behind the last splat (b, t, y x).
-    """
-
+    # (du, dv) of the pixels, in units of the splat's factor (1 or b, t, k, y or 1, x or 1).
     s: Tensor
     y: Tensor
-    footprint: Tensor
-    alpha: Tensor
-    live: Tensor
-    transmittance: Tensor
-    remaining: Tensor
+    footprint: Tensor  # G (b, t, k, y x)
+    alpha: Tensor  # A = a G within its bounds (b, t, k, y x)
+    live: Tensor  # True where a splat acts (b, t, k, y x)
+    transmittance: Tensor  # T, in front of each splat (b, t, k, y x)
+    remaining: Tensor  # transmittance behind the last splat (b, t, y x)
 
 
 def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _SplatParts) -> _Weights:

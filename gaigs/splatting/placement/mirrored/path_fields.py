@@ -20,17 +20,11 @@ from gaigs.splatting.placement.mirrored.reflections import Folded, fold, images,
 
 
 class FoldedLinks(NamedTuple):
-    """Links with their paths through a room; positions are from its middle [m].
+    """Links with their paths through a room; positions are from its middle [m]."""
 
-    Attributes:
-        seen: Images of the transmitters, see ``reflections.images``.
-        receivers: Position of each link's receiver.
-        paths: Through the room.
-    """
-
-    seen: list[Float[Tensor, "b n 3"]]
-    receivers: Float[Tensor, "b 3"]
-    paths: Folded
+    seen: list[Float[Tensor, "b n 3"]]  # images of the transmitters, see ``reflections.images``
+    receivers: Float[Tensor, "b 3"]  # position of each link's receiver
+    paths: Folded  # through the room
 
     @property
     def ways(self) -> Float[Tensor, "b n 3"]:

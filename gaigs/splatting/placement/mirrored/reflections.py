@@ -15,24 +15,18 @@ class Folded(NamedTuple):
 
     Legs that start at the last bounces of all sequences come first, then those at the last but one,
     and so on, and at last those from the transmitter.
-
-    Attributes:
-        start, end: Ends of all legs [m].
-        path: Number of the sequence of each leg.
-        firsts: Number of the first sequence that has a last bounce, a last but one, and so on.
-        planes: Plane of each bounce, of all legs but the last n.
-        normals: Its normal.
-        cosines: Cosines of the angles of incidence.
-        exists: True if a path meets its planes in their order, from inside the room (b, n).
     """
 
+    # Ends of all legs [m].
     start: Float[Tensor, "b s 3"]
     end: Float[Tensor, "b s 3"]
-    path: Int[Tensor, " s"]
+    path: Int[Tensor, " s"]  # number of the sequence of each leg
+    # Number of the first sequence that has a last bounce, a last but one, and so on.
     firsts: list[int]
-    planes: Int[Tensor, " w"]
-    normals: Float[Tensor, "w 3"]
-    cosines: Float[Tensor, "b w"]
+    planes: Int[Tensor, " w"]  # plane of each bounce, of all legs but the last n
+    normals: Float[Tensor, "w 3"]  # its normal
+    cosines: Float[Tensor, "b w"]  # cosines of the angles of incidence
+    # True if a path meets its planes in their order, from inside the room.
     exists: Bool[Tensor, "b n"]
 
     @property
