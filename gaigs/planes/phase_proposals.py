@@ -32,22 +32,14 @@ class SlabPeak(NamedTuple):
 
 
 def propose_by_phases(
-    data: ChannelData,
-    planes: Float[Tensor, "w 4"],
-    number: int,
-    reach: float,
-    tilt: float,
-    slabs: Float[Tensor, "m 3"],
+    data: ChannelData,  # training channels
+    planes: Float[Tensor, "w 4"],  # all known planes
+    number: int,  # the plane that is moved
+    reach: float,  # largest move along the normal [m]
+    tilt: float,  # largest turn towards either side [rad]
+    slabs: Float[Tensor, "m 3"],  # slabs that are tried
 ) -> list[tuple[Float[Tensor, "4"], Float[Tensor, "3"]]]:
     """Planes near one of some planes, and slabs, with which its reflections have like phases.
-
-    Args:
-        data: Training channels.
-        planes: All known planes.
-        number: The plane that is moved.
-        reach: Largest move along the normal [m].
-        tilt: Largest turn towards either side [rad].
-        slabs: Slabs that are tried.
 
     Returns:
         Planes (4,) and slabs (3,): at most eight half-spaces and eight slabs, highest maxima of the

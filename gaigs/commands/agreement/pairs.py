@@ -206,18 +206,13 @@ class Reservoir:
 def draw(
     agreement: Agreement,
     places: Float[ndarray, "n 3"],
-    order: Int[ndarray, " n"],
-    groups: Sequence[ndarray],
+    order: Int[ndarray, " n"],  # measurement of each link, see ``visits``
+    groups: Sequence[ndarray],  # links of one receiver and carrier, see ``groups_of``
     most: int,
     block: int,
     random: np.random.Generator,
 ) -> tuple[Int[ndarray, " cells"], dict[int, Int[ndarray, "k 2"]]]:
-    """Number of pairs in each cell, and random pairs of each cell: earlier and later link.
-
-    Args:
-        order: Measurement of each link, see ``visits``.
-        groups: Links of one receiver and carrier, see ``groups_of``.
-    """
+    """Number of pairs in each cell, and random pairs of each cell: earlier and later link."""
     size = agreement.pairs.size
     counts = np.zeros(size + 1, int)  # the last cell holds links that are not a pair
     reservoir = Reservoir(size, most)

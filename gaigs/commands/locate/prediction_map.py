@@ -222,21 +222,13 @@ class PrintFold(NamedTuple):
 
 def held_out_folds(
     maker: MapMaker,
-    model: Model,
-    known: Int[Tensor, " k"],
-    most: int = 500,
-    located: int = 200,
-    enough: int = 300,
+    model: Model,  # the model that knows all
+    known: Int[Tensor, " k"],  # known links at the carrier of the map
+    most: int = 500,  # largest number of fingerprints of a fold whose errors give the axes
+    located: int = 200,  # largest number of them that are located
+    enough: int = 300,  # number of located fingerprints after which no fold is added
 ) -> list[PrintFold]:
-    """Folds of known links with the maps of models that do not know them.
-
-    Args:
-        model: The model that knows all.
-        known: Known links at the carrier of the map.
-        most: Largest number of fingerprints of a fold whose errors give the axes.
-        located: Largest number of them that are located.
-        enough: Number of located fingerprints after which no fold is added.
-    """
+    """Folds of known links with the maps of models that do not know them."""
     links = maker.links
     folds: list[PrintFold] = []
     for one, part, others in stages.track(model.unseen(links), "folds", model.fold_count):

@@ -56,21 +56,15 @@ class ReceiverReadings(NamedTuple):
 
 def measured_places(
     processes: Sequence[Process],
-    asked: Float[Tensor, "g d"],
-    factor: float,
-    most: int = 1500,
-    tolerated: float = 1.05,
+    asked: Float[Tensor, "g d"],  # places over which the error is the mean
+    factor: float,  # mean absolute error of a label over its standard deviation
+    most: int = 1500,  # largest number of readings of a receiver that count, an even part of more
+    tolerated: float = 1.05,  # largest factor on the mean error without the superfluous places
 ) -> Measured:
     """The measured places, and how much each lowers the mean error at the asked places.
 
     Superfluous are the places of the least losses that may all be left out while the mean error
     stays below ``tolerated`` times its value.
-
-    Args:
-        asked: Places over which the error is the mean.
-        factor: Mean absolute error of a label over its standard deviation.
-        most: Largest number of readings of a receiver that count, an even part of more.
-        tolerated: Largest factor on the mean error without the superfluous places.
     """
     rows = []
     places = []

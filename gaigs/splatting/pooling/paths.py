@@ -258,26 +258,18 @@ def _path_differences(
 
 
 def _sum_by_series(
-    lengths: Float[Tensor, "b n"],
-    longer: Float[Tensor, "b n e"],
-    waves: Complex[Tensor, "b n e"],
-    rates: Float[Tensor, "b s"],
-    reach: float,
-    widest: float,
+    lengths: Float[Tensor, "b n"],  # from the transmitter to the middle of the array [m]
+    longer: Float[Tensor, "b n e"],  # further way to each element [m]
+    waves: Complex[Tensor, "b n e"],  # field of each path at each element, at the carrier
+    rates: Float[Tensor, "b s"],  # change of phase by delay at each frequency [rad/s]
+    reach: float,  # largest delay over the array [s]
+    widest: float,  # largest phase of the band over the array [rad]
 ) -> Complex[Tensor, "b e s"]:
     """Sum over the paths by one product of matrices, without a wave of each path and frequency.
 
         exp(j rate (t + dt)) = exp(j rate t) sum_k (j rate dt)^k / k!
 
     |dt| is at most the reach. Up to 3 rad the terms of the series stay small.
-
-    Args:
-        lengths: From the transmitter to the middle of the array [m].
-        longer: Further way to each element [m].
-        waves: Field of each path at each element, at the carrier.
-        rates: Change of phase by delay at each frequency [rad/s].
-        reach: Largest delay over the array [s].
-        widest: Largest phase of the band over the array [rad].
     """
     terms = [waves]
     size = widest

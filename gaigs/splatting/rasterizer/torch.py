@@ -308,23 +308,14 @@ class _Composite(torch.autograd.Function):
 
 
 def _differentiate(
-    w: _Weights,
-    k: Tensor,
-    inputs: _SplatParts,
-    towards: Tensor,
-    remaining_gradient: Tensor,
-    edge: int,
+    w: _Weights,  # the chunk composited; used up
+    k: Tensor,  # splats of each tile (t, k)
+    inputs: _SplatParts,  # all splats
+    towards: Tensor,  # gradient of the map's pixels (b, t, c, y x)
+    remaining_gradient: Tensor,  # gradient of the remaining transmittance (b, t, y x)
+    edge: int,  # edge of a tile [pixels]
 ) -> _SplatParts:
-    """Gradients of a chunk's splats (t, k).
-
-    Args:
-        w: The chunk composited; used up.
-        k: Splats of each tile (t, k).
-        inputs: All splats.
-        towards: Gradient of the map's pixels (b, t, c, y x).
-        remaining_gradient: Gradient of the remaining transmittance (b, t, y x).
-        edge: Edge of a tile [pixels].
-    """
+    """Gradients of a chunk's splats (t, k)."""
     blend = w.alpha * w.transmittance  # A T
     d_signal = blend @ towards.mT  # (b, t, k, c)
     d = inputs.signal[:, k] @ towards  # D, (b, t, k, y x)
