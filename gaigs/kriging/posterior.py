@@ -49,7 +49,9 @@ class Posterior(nn.Module):
         raise NotImplementedError
 
     def start_from(self, other: Any) -> None:
-        """Starts the next fit from that of another posterior; by default does nothing."""
+        """Starts the next fit from that of another posterior, which saves time; by default does
+        nothing.
+        """
 
     @abstractmethod
     def mean(self, batch: Batch, like: Tensor) -> Tensor:

@@ -254,7 +254,10 @@ class ScalarProcess(nn.Module):
         receivers: Int[Tensor, " k"],
         values: Float[Tensor, " k"],
     ) -> None:
-        """Takes residuals of known readings, after ``fit``, and weights them for predictions."""
+        """Takes residuals of known readings and weights them for predictions.
+
+        ``fit`` has chosen the hyperparameters before.
+        """
         self.places, self.receivers, self.values = places, receivers, values.clone()
         noises = (2 * self.logarithms[receivers, 2]).exp()
         self.variances = noises * self._factors(values)

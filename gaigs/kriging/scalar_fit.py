@@ -26,47 +26,61 @@ from gaigs.kriging.neighbours import HeldOutReadings
 
 @dataclass(frozen=True)
 class ScalarOptions:
-    """Options of a process of one number."""
+    """Options of a process of one number.
 
-    neighbours: int = 32  # readings around a held-out one while a process is fitted
-    # Readings around a place whose variance is asked of many: those behind them lower it by a
-    # hundredth.
+    Attributes:
+        neighbours: Readings around a held-out one while a process is fitted.
+        around: Readings around a place whose variance is asked of many: those behind them lower it
+            by a hundredth.
+        many: Readings of a receiver that all enter a variance; of more the nearest, which then take
+            less time.
+        together: Readings of a receiver that enter one covariance matrix; of more see ``Tiles``.
+        scatter: Scatter between receivers of the logarithms of length, signal and noise: the prior
+            of each receiver's.
+        degrees: Degrees of freedom of Student's t: of the scatter, and of the noise where it is not
+            normal.
+        rounds: Repetitions of expectation and maximisation for the variances of single readings.
+        iterations: Most iterations of a maximisation.
+        tolerance: Relative change of the negative log likelihood that ends a maximisation, far
+            below what distinguishes hyperparameters.
+        size: Places whose covariances are held in memory at a time.
+        edges: Longest correlation length, in longest edges of the box of places: beyond it the
+            kernel is a line in the box.
+        widest: Largest deviation of the signal over the residuals' root mean square. Readings
+            millimetres apart show its ratio to a power of the length alone: beside them a larger
+            one would give levels that no receiver hears.
+        largest: Largest deviation of the noise over the residuals' root mean square, and the
+            inverse of the least one of both: the noise keeps matrices regular where a place is
+            measured twice.
+    """
+
+    neighbours: int = 32
     around: int = 16
-    # Readings of a receiver that all enter a variance; of more the nearest, which then take less
-    # time.
     many: int = 300
-    # Readings of a receiver that enter one covariance matrix; of more see ``Tiles``.
     together: int = 1500
-    # Scatter between receivers of the logarithms of length, signal and noise: the prior of each
-    # receiver's.
     scatter: tuple[float, float, float] = (0.25, 0.15, 0.15)
-    # Degrees of freedom of Student's t: of the scatter, and of the noise where it is not normal.
     degrees: float = 4.0
-    # Repetitions of expectation and maximisation for the variances of single readings.
     rounds: int = 3
-    iterations: int = 50  # most iterations of a maximisation
-    # Relative change of the negative log likelihood that ends a maximisation, far below what
-    # distinguishes hyperparameters.
+    iterations: int = 50
     tolerance: float = 1e-6
-    size: int = 2048  # places whose covariances are held in memory at a time
-    # Longest correlation length, in longest edges of the box of places: beyond it the kernel is a
-    # line in the box.
+    size: int = 2048
     edges: float = 8.0
-    # Largest deviation of the signal over the residuals' root mean square. Readings millimetres
-    # apart show its ratio to a power of the length alone: beside them a larger one would give
-    # levels that no receiver hears.
     widest: float = 2.0
-    # Largest deviation of the noise over the residuals' root mean square, and the inverse of the
-    # least one of both: the noise keeps matrices regular where a place is measured twice.
     largest: float = 50.0
 
 
 class ScalarFit(NamedTuple):
-    """Hyperparameters with the least cost."""
+    """Hyperparameters with the least cost.
 
-    cost: float  # negative log likelihood of the held-out readings, with the prior
-    logarithms: Float[Tensor, "r 3"]  # logarithms of length, signal and noise at each receiver
-    choice: Choice  # kernel, noise and scale of carriers
+    Attributes:
+        cost: Negative log likelihood of the held-out readings, with the prior.
+        logarithms: Logarithms of length, signal and noise at each receiver (r, 3).
+        choice: Kernel, noise and scale of carriers.
+    """
+
+    cost: float
+    logarithms: Float[Tensor, "r 3"]
+    choice: Choice
 
 
 class HeldOutCost:
@@ -150,7 +164,10 @@ class HeldOutCost:
         return likelihood + prior.item(), gradient.numpy()
 
     def _likelihood(self, point: np.ndarray) -> tuple[float, Float[Tensor, "r 3"], float]:
-        """Negative log likelihood and its gradients, written out, as autograd is much slower."""
+        """Negative log likelihood; its gradient by all logarithms, and by that of the scale.
+
+        The gradient of the matrices is written out: autograd takes several times as long.
+        """
         logarithms, choice = self.unpacked(torch.from_numpy(point))
         receivers, hyperparameters = self.around.receivers, logarithms.exp()
         noises = hyperparameters[receivers, 2].square()  # (m,)
@@ -187,7 +204,8 @@ class HeldOutCost:
         return np.concatenate((point, np.zeros(len(self.bounds) - self.shared)))
 
     def expect(self, point: np.ndarray) -> None:
-        """Takes expected noise of single readings: one that disagrees with others counts little."""
+        """Takes the expected variances of the noise of single readings: one that disagrees with all
+        around it counts little."""
         logarithms, choice = self.unpacked(torch.from_numpy(point))
         between = covariances(self.around, logarithms.exp(), choice)[:, :-1, :-1]
         noises = (2 * logarithms[self.around.receivers, 2]).exp()

@@ -54,11 +54,17 @@ class Kriged(NamedTuple):
 
 
 class Variation(NamedTuple):
-    """How strengths of paths vary over places: a Gaussian process for each path."""
+    """How strengths of paths vary over places: a Gaussian process for each path.
 
-    share: float  # standard deviation of a path's field over its mean
-    length: float  # distance at which the kernel falls to 1 / e [m]
-    noise: float  # standard deviation of the rest over the mean field
+    Attributes:
+        share: Standard deviation of a path's field over its mean.
+        length: Distance at which the kernel falls to 1 / e [m].
+        noise: Standard deviation of the rest over the mean field.
+    """
+
+    share: float
+    length: float
+    noise: float
 
     @classmethod
     def choices(cls) -> list["Variation"]:
@@ -91,11 +97,17 @@ def multiply_gains(gains: Complex[Tensor, " w"], sequences: Int[Tensor, "n order
 
 
 class PlaceBlock(NamedTuple):
-    """Numbers of neighbouring places at one receiver."""
+    """Numbers of neighbouring places at one receiver.
 
-    rows: Int[Tensor, " c"]  # of all numbers, those of a place in a row
-    gaps: Float[Tensor, "c c"]  # distances of their places [m]
-    each: int  # numbers of a place
+    Attributes:
+        rows: Of all numbers, those of a place in a row.
+        gaps: Distances of their places [m].
+        each: Numbers of a place.
+    """
+
+    rows: Int[Tensor, " c"]
+    gaps: Float[Tensor, "c c"]
+    each: int
 
 
 class FieldFit:
@@ -177,7 +189,10 @@ class FieldFit:
         waves: Complex[Tensor, "m n"] | None = None,
         kriged: Kriged | None = None,
     ) -> FieldRoom:
-        """The room with gains of least mean log error, by iteratively reweighted least squares."""
+        """The room with the gains of least mean log error: damped steps of Gauss and Newton.
+
+        Weights make least squares the logarithm's (iteratively reweighted least squares).
+        """
         waves = self.waves(room.planes, room) if waves is None else waves
         best = room
         whiten = (kriged or self.krige(room, waves)).whiten
