@@ -4,7 +4,9 @@ import logging
 import math
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -179,9 +181,9 @@ def radio_map(
         warnings.warn(message, ExtrapolationWarning, stacklevel=4)  # two decorators lie between
     if frequency is None:
         frequency = scene.middle_frequency
-    predict = _Predictions(model, chosen, frequency)
+    predict = partial(_predict, model, chosen, frequency)
     if pitch is None:
-        pitch = _affordable_pitch(predict, lower, upper, float(height))
+        pitch = _affordable_pitch(predict, len(chosen), lower, upper, float(height))
     else:
         _check_pitch(pitch, lower, upper)
     x, y = _axes(lower, upper, float(pitch))
@@ -272,40 +274,35 @@ def _check_pitch(pitch: float, lower: ndarray, upper: ndarray) -> None:
     )
 
 
-class _Predictions:
-    """Predictions at places for several receivers."""
-
-    def __init__(self, model, receivers: Int[ndarray, " k"], frequency: float | None):
-        self.model = model
-        self.receivers = receivers
-        self.frequency = frequency
-        # An interval brings the standard deviation, whatever its level.
-        has_intervals = model.calibration is not None and model.calibration.gives(0.5)
-        self.level = 0.5 if has_intervals else None
-
-    def __call__(self, points: Float[ndarray, "*points 3"]) -> Float[ndarray, "m *points k"]:
-        """Values, and their standard deviations if the model has intervals."""
-        shape = (*points.shape[:-1], len(self.receivers))
-        places = np.broadcast_to(points[..., None, :], (*shape, 3))  # (..., k, 3)
-        index = np.broadcast_to(self.receivers, shape)  # (..., k)
-        with warnings.catch_warnings():
-            warnings.filterwarnings(
-                "ignore", r"\d+ of \d+ positions are up to", ExtrapolationWarning
-            )
-            # All receivers of a place are in one batch: its excitation is computed once.
-            prediction = self.model.predict(
-                torch.from_numpy(places.astype(np.float32)),
-                torch.from_numpy(index.copy()),
-                frequency=self.frequency,
-                batch_size=128 * len(self.receivers),
-                interval=self.level,
-            )
-        parts = prediction[:2] if self.level else (prediction,)
-        return torch.stack([part.cpu() for part in parts]).numpy()
+def _predict(
+    model,
+    receivers: Int[ndarray, " k"],
+    frequency: float | None,
+    points: Float[ndarray, "*points 3"],
+) -> Float[ndarray, "m *points k"]:
+    """Values at places for some receivers, and deviations if the model has intervals."""
+    shape = (*points.shape[:-1], len(receivers))
+    places = np.broadcast_to(points[..., None, :], (*shape, 3))  # (..., k, 3)
+    index = np.broadcast_to(receivers, shape)  # (..., k)
+    # An interval brings the standard deviation, whatever its level.
+    has_intervals = model.calibration is not None and model.calibration.gives(0.5)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"\d+ of \d+ positions are up to", ExtrapolationWarning)
+        # All receivers of a place are in one batch: its excitation is computed once.
+        prediction = model.predict(
+            torch.from_numpy(places.astype(np.float32)),
+            torch.from_numpy(index.copy()),
+            frequency=frequency,
+            batch_size=128 * len(receivers),
+            interval=0.5 if has_intervals else None,
+        )
+    parts = prediction[:2] if has_intervals else (prediction,)
+    return torch.stack([part.cpu() for part in parts]).numpy()
 
 
 def _affordable_pitch(
-    predict: _Predictions,
+    predict: Callable[[ndarray], ndarray],
+    receivers: int,
     lower: ndarray,
     upper: ndarray,
     height: float,
@@ -330,7 +327,7 @@ def _affordable_pitch(
         elapsed = time.perf_counter() - start
     # Half of the time left at most: figures follow.
     most = points * min(seconds, stages.left() / 2) / elapsed
-    most = min(most, predictions / len(predict.receivers))
+    most = min(most, predictions / receivers)
     while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, fewest):
         pitch *= 2
     return pitch

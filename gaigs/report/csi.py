@@ -191,10 +191,8 @@ def _strongest(shown: Examples) -> list[int]:
 
 def _pairs(shown: Examples) -> Complex[ndarray, "k 2 s"]:
     """Prediction and label of each link at the label's strongest element."""
-    pairs = []
-    for index, element in enumerate(_strongest(shown)):
-        pairs.append((shown.predictions[index, element], shown.labels[index, element]))
-    return np.array(pairs)
+    rows, elements = np.arange(len(shown.labels)), _strongest(shown)
+    return np.stack((shown.predictions[rows, elements], shown.labels[rows, elements]), 1)
 
 
 def _titles(shown: Examples) -> list[str]:

@@ -179,10 +179,8 @@ def best_convention(sample: Sample, score: Measure) -> Finding | None:
     if not tried:
         return None
     likely = sorted((share for share, _ in tried), reverse=True)[:8]
-    fitting = []
-    for share, convention in tried:
-        if share >= likely[-1]:
-            fitting.append((score.measure(convention.change(sample)), convention))
+    kept = [convention for share, convention in tried if share >= likely[-1]]
+    fitting = [(score.measure(convention.change(sample)), convention) for convention in kept]
     fits = max(share for share, _ in fitting)
     is_better = fits > 1.5 * read + 0.05 or 1 - fits < (1 - read) / 2
     if fits < score.least or not is_better:

@@ -335,9 +335,7 @@ def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sa
     # The columns of ``crossed`` (k, 3, 3) are e x u; the equations are in s and t.
     equations = torch.cat((crossed * sample.transmitters[links, None], crossed), 2)  # (k, 3, 6)
     generator = torch.Generator().manual_seed(0)
-    threes = []
-    for _ in range(draws):
-        threes.append(torch.randperm(len(links), generator=generator)[:3])
+    threes = [torch.randperm(len(links), generator=generator)[:3] for _ in range(draws)]
     threes = torch.stack(threes)
     systems = equations[threes].flatten(1, 2)  # (draws, 9, 6)
     solutions = torch.linalg.svd(systems).Vh[:, -1]  # (draws, 6)
