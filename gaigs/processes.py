@@ -189,11 +189,7 @@ def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
     The file ``.lock`` in the folder is removed at the end. A killed process leaves it, unlocked.
 
     Args:
-        folder: An existing folder.
         waits: True to wait for another process that holds the folder.
-
-    Raises:
-        ValueError: Another process holds the folder, and this one does not wait.
     """
     folder.stat()  # raises an error for a missing folder, which FileLock would make
     lock = FileLock(folder / LOCK)
@@ -299,11 +295,7 @@ def stopping(waits: bool = False) -> Iterator[None]:
             signal.signal(number, handler)
         if waits:
             for number in STOPPING[1:]:
-                signal.signal(number, _note_signal)
-
-
-def _note_signal(number: int, _) -> None:
-    received.append(number)
+                signal.signal(number, lambda number, _: received.append(number))
 
 
 def forward_to_children(number: int) -> None:

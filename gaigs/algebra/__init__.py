@@ -82,10 +82,7 @@ class Algebra:
 
     @property
     def homogeneous(self) -> int:
-        """Index of the blade of all vectors that are not null.
-
-        It is e123, a projective point's homogeneous coordinate.
-        """
+        """Index of the blade of all vectors that are not null: e123, a point's homogeneous one."""
         return _vectors(self.dimension).index(tuple(range(self.r, self.dimension)))
 
     def product(
@@ -97,10 +94,7 @@ class Algebra:
     def wedge(
         self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
     ) -> Float[Tensor, "*batch k"]:
-        """Outer product x ∧ y.
-
-        In the projective algebra it is the intersection, such as the line of two planes.
-        """
+        """Outer product x ∧ y; in the projective algebra the intersection, as of two planes."""
         return self._multiply("wedge", x, y)
 
     def join(
@@ -123,10 +117,7 @@ class Algebra:
     def inner(
         self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
     ) -> Float[Tensor, "*batch"]:
-        """Invariant inner product, the scalar part of reverse(x) y.
-
-        Blades with a null vector have weight 0.
-        """
+        """Invariant inner product, the scalar part of reverse(x) y; 0 for blades with e0."""
         return (x * y * self.table("metric", x)).sum(-1)
 
     def reverse(self, x: Float[Tensor, "*batch k"]) -> Float[Tensor, "*batch k"]:
@@ -147,10 +138,7 @@ class Algebra:
         """Motion of x by a versor u: u x u⁻¹ for an even u, u involute(x) u⁻¹ for an odd one.
 
         A vector u mirrors at the hyperplane orthogonal to it; products of vectors rotate and
-        translate.
-
-        Raises:
-            ValueError: u reverse(u) is 0, so that u has no inverse.
+        translate. A u without an inverse is a ``ValueError``.
 
         Source: GAI-GS, eq. (6) and (7).
         """

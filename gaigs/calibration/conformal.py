@@ -29,37 +29,28 @@ class Calibration:
     within an interval of level 0.9 would scatter as much, so they are held with a probability
     of about p.
 
-    Attributes:
-        edges: Edges of the distances (r or 1, g - 1) [m].
-        amplitudes: Edges of the predicted amplitudes (bins - 1,).
-        counts: Links of each group (groups,).
-        quantiles: Quantiles of the errors for intervals of levels 0 to 1 (groups, bins,
-            steps + 1).
-        sizes: Root mean square of the errors (groups, bins).
-        places, receivers: Known links, for the distance; empty with one group of distances.
-        lowest: Least possible label.
-        widths: Relative width of intervals at each receiver without links, 0 at others (w,); None:
-            every receiver has links.
-        elsewhere: Calibration of receivers without links, by errors at each receiver of models that
-            have the mean of the others in its place; None if there are too few.
-        scatter: Variances of the errors between receivers and within them (2,), for labels of one
-            number.
-
     Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; by groups of
     links: Dunn, Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical
     models, 2022.
     """
 
-    edges: Float[Tensor, "r e"]
-    amplitudes: Float[Tensor, " a"]
-    counts: Int[Tensor, " g"]
+    edges: Float[Tensor, "r e"]  # of the distances (r or 1, g - 1) [m]
+    amplitudes: Float[Tensor, " a"]  # edges of the predicted amplitudes (bins - 1,)
+    counts: Int[Tensor, " g"]  # links of each group (groups,)
+    # Quantiles of the errors for intervals of levels 0 to 1 (groups, bins, steps + 1).
     quantiles: Float[Tensor, "g b q"]
-    sizes: Float[Tensor, "g b"]
+    sizes: Float[Tensor, "g b"]  # root mean square of the errors (groups, bins)
+    # Known links, for the distance; empty with one group of distances.
     places: Float[Tensor, "k 3"]
     receivers: Int[Tensor, " k"]
-    lowest: Float[Tensor, ""]
+    lowest: Float[Tensor, ""]  # least possible label
+    # Relative width of intervals at each receiver without links, 0 at others; None: every receiver
+    # has links.
     widths: Float[Tensor, " w"] | None = None
+    # Calibration of receivers without links, by errors at each receiver of models that have the
+    # mean of the others in its place; None if there are too few.
     elsewhere: "Calibration | None" = None
+    # Variances of the errors between receivers and within them, for labels of one number.
     scatter: Float[Tensor, "2"] | None = None
 
     @classmethod
@@ -216,8 +207,7 @@ class Calibration:
 
     @property
     def mean_error(self) -> float:
-        """Mean absolute error over the model's own deviation; of labels of one number, of which few
-        calibrate, a little too large."""
+        """Mean absolute error over the model's own deviation; of one number a little too large."""
         return torch.trapezoid(self.quantiles, dx=1 / self.steps).mean().item()
 
     def gives(self, level: float) -> bool:
@@ -243,17 +233,12 @@ class Calibration:
 
 
 class Groups(NamedTuple):
-    """Links in groups by receiver and distance.
+    """Links in groups by receiver and distance."""
 
-    Attributes:
-        edges: Distances between the groups of a receiver, or of all receivers (r or 1, g - 1) [m].
-        numbers: Group of each link (n,).
-        counts: Links of each group (groups,).
-    """
-
+    # Distances between the groups of a receiver, or of all receivers (r or 1, g - 1) [m].
     edges: Float[Tensor, "r e"]
-    numbers: Int[Tensor, " n"]
-    counts: Int[Tensor, " g"]
+    numbers: Int[Tensor, " n"]  # group of each link
+    counts: Int[Tensor, " g"]  # links of each group (groups,)
 
 
 def group_links(
@@ -302,15 +287,10 @@ def group_links(
 
 
 class Bins(NamedTuple):
-    """Numbers of labels in bins by the predicted amplitude.
+    """Numbers of labels in bins by the predicted amplitude."""
 
-    Attributes:
-        amplitudes: Edges of the bins (bins - 1,).
-        numbers: Bin of each number of each link (n, m).
-    """
-
-    amplitudes: Float[Tensor, " a"]
-    numbers: Int[Tensor, "n m"]
+    amplitudes: Float[Tensor, " a"]  # edges of the bins (bins - 1,)
+    numbers: Int[Tensor, "n m"]  # bin of each number of each link
 
 
 def bin_numbers(values: Inexact[Tensor, "n m"], most: int = 8) -> Bins:
@@ -422,9 +402,7 @@ def thinned(
     values: Inexact[Tensor, " n *shape"],
     deviations: Float[Tensor, " n ..."],
 ) -> Thinned:
-    """Aligned labels, predictions and, unless there is one for each link, deviations by
-    ``thin_labels``.
-    """
+    """Aligned labels, predictions and deviations (unless one each link) by ``thin_labels``."""
     if deviations.ndim > 1:
         deviations = thin_labels(deviations)
     # An alignment takes several times the memory of the labels.

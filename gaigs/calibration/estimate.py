@@ -12,20 +12,15 @@ from gaigs.core.task import Axis
 
 
 class Asked(NamedTuple):
-    """Names and coordinates of the axes of a prediction.
+    """Names and coordinates of the axes of a prediction."""
 
-    Attributes:
-        positions: Positions of the transmitters (..., 3) [m].
-        receivers: Names (k,) of the receivers of an axis of their own; or, without that axis, of
-            the receiver of each position (...).
-        axes: Axes of a label.
-        quantity, unit: Name and unit of a value.
-    """
-
-    positions: Float[Tensor, "*places 3"]
+    positions: Float[Tensor, "*places 3"]  # positions of the transmitters (..., 3) [m]
+    # Names (k,) of the receivers of an axis of their own; or, without that axis, of the receiver of
+    # each position (...).
     receivers: ndarray
     has_axis: bool
-    axes: Mapping[str, Axis]
+    axes: Mapping[str, Axis]  # axes of a label
+    # Name and unit of a value.
     quantity: str
     unit: str
 

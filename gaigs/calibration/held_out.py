@@ -35,17 +35,11 @@ class Fold(NamedTuple):
 
 
 class Answers(NamedTuple):
-    """Predictions of some links.
+    """Predictions of some links."""
 
-    Attributes:
-        values: Predictions (k, *shape).
-        deviations: Standard deviations of the labels (k,) or (k, *shape).
-        are_stated: True if the model knows its deviations; False if they are a default.
-    """
-
-    values: Inexact[Tensor, " k *shape"]
-    deviations: Float[Tensor, " k ..."]
-    are_stated: bool
+    values: Inexact[Tensor, " k *shape"]  # predictions
+    deviations: Float[Tensor, " k ..."]  # standard deviations of the labels (k,) or (k, *shape)
+    are_stated: bool  # True if the model knows its deviations; False if they are a default
 
 
 def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -> Iterator[Fold]:

@@ -83,9 +83,7 @@ def scores_of_links(
 def shares_within(
     calibration: Calibration, links: Thinned, query: Query, most: int = 300
 ) -> np.ndarray:
-    """Shares of labels within intervals of the levels 0.05 to 0.95 (19,), of ``most`` links; NaN
-    where an interval needs more links.
-    """
+    """Shares of labels within intervals of levels 0.05 to 0.95 (19,); NaN of too few links."""
     rows = evenly(torch.arange(len(query)), most)
     arguments = links.values[rows], links.deviations[rows], query[rows]
     shares = []

@@ -26,19 +26,12 @@ log = logging.getLogger("gaigs")
 
 
 class Job(NamedTuple):
-    """What Hydra knows of a job.
+    """What Hydra knows of a job."""
 
-    Attributes:
-        folder: The run folder.
-        is_sweep: True for a job of a multirun.
-        launcher: Class name of Hydra's launcher.
-        goes_on: How to resume the run, for messages.
-    """
-
-    folder: Path
-    is_sweep: bool
-    launcher: str
-    goes_on: str
+    folder: Path  # the run folder
+    is_sweep: bool  # True for a job of a multirun
+    launcher: str  # class name of Hydra's launcher
+    goes_on: str  # how to resume the run, for messages
 
 
 def run(config: DictConfig) -> float | None:

@@ -79,17 +79,11 @@ def describe(links: Links) -> Description:
 
 @dataclass(frozen=True)
 class Levels:
-    """One number of each of some links: its label, the label's mean, or a channel's mean power.
+    """One number of each of some links: its label, the label's mean, or a channel's mean power."""
 
-    Attributes:
-        index: The links.
-        values: Their numbers.
-        title: Name and unit of a number.
-    """
-
-    index: Int[Tensor, " k"]
-    values: Float[Tensor, " k"]
-    title: str
+    index: Int[Tensor, " k"]  # the links
+    values: Float[Tensor, " k"]  # their numbers
+    title: str  # name and unit of a number
 
     @classmethod
     def of(cls, links: Links, most: int = 2000) -> "Levels":

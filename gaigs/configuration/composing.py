@@ -92,10 +92,7 @@ def preset(model: str, task: str) -> list[str]:
 
 
 def resolve(config: DictConfig) -> dict:
-    """A composed configuration in plain dictionaries, unchecked.
-
-    A baseline's name becomes its configuration.
-    """
+    """A composed configuration in plain dictionaries, unchecked; baselines' names are expanded."""
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
@@ -187,8 +184,6 @@ def _unknown_option(config: dict, name: str, sections: Sequence[str], names: set
     """The message for an option that no part has.
 
     Args:
-        config: The configuration.
-        name: The option.
         sections: Keys of the parts that were searched; all without any.
         names: Options that the parts have.
     """

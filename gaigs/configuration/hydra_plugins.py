@@ -91,10 +91,7 @@ class Constructors(ConfigSource):
 
 
 def run_folder(overrides: str) -> str:
-    """The folder name of a job from its overrides.
-
-    It has at most 200 bytes, as most file systems allow 255.
-    """
+    """The folder name of a job from its overrides, of 200 bytes: most file systems allow 255."""
     name = overrides.replace("/", "_") or "defaults"
     if name == overrides and len(name.encode()) <= 200:
         return name
@@ -112,10 +109,7 @@ def installed(*names: str) -> str:
 
 
 def known(kind: str, name: str, otherwise: str) -> str:
-    """The name if a configuration file or a component has it, else the other one.
-
-    It is for choices by task.
-    """
+    """The name if a configuration file or a component has it, else the other, as for a task."""
     return name if files_of(kind, name) or name in registry(kind).names() else otherwise
 
 
@@ -134,10 +128,7 @@ def launcher(name: str) -> str:
 
 
 def install() -> None:
-    """Makes Hydra and OmegaConf know the extensions.
-
-    It is called at import, as a launcher's workers need them too.
-    """
+    """Makes Hydra and OmegaConf know the extensions, at import: launchers' workers need them."""
     for resolver in (run_folder, known, by_task, launcher):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
     OmegaConf.register_new_resolver("installed", installed, replace=True, use_cache=True)

@@ -61,12 +61,7 @@ def differences(there: Mapping, here: Mapping, prefix: str = "") -> dict[str, tu
 
 
 def check(config: dict) -> None:
-    """Checks the keys of a configuration and their values.
-
-    Raises:
-        TypeError: A value has another type.
-        ValueError: A key is unknown or missing, or a number is out of range.
-    """
+    """Raises a ``TypeError`` or a ``ValueError`` for a wrong key or value of a configuration."""
     unknown = [key for key in config if key not in KEYS]
     if unknown:
         words = f"{suggest(unknown[0], KEYS)}; it has: {listed(sorted(KEYS))}"

@@ -30,7 +30,9 @@ def explain(error: Exception) -> str | None:
         case _, ConfigAttributeError(full_key=str(key)) | ConfigKeyError(full_key=str(key)):
             return _unknown_key(key, cause.parent_node)
         case MissingConfigException(missing_cfg_file=str(file), options=list(names)), _:
-            return _unknown_choice(file, names)
+            kind, _, name = file.rpartition("/")
+            missing = f"there is no {kind} {suggest(name, names)}; there are: {listed(names)}"
+            return not_installed(kind, name) or missing
         case HydraException(), _ if str(error).startswith("gaigs: "):  # the message of a job
             reason = f"\n{cause}" if isinstance(cause, OmegaConfBaseException) else ""
             return f"{str(error).removeprefix('gaigs: ')}{reason}"
@@ -62,13 +64,6 @@ def _unknown_key(key: str, parent: Any) -> str:
     return f"{part} has no key {suggest(word, known)}; it has: {listed(sorted(known))}{hint}"
 
 
-def _unknown_choice(file: str, names: list[str]) -> str:
-    """The message for a part that does not exist, or whose package is not installed."""
-    kind, _, name = file.rpartition("/")
-    missing = f"there is no {kind} {suggest(name, names)}; there are: {listed(names)}"
-    return not_installed(kind, name) or missing
-
-
 def _unreadable() -> str | None:
     """The message for the first configuration file that cannot be parsed; None if all can."""
     files: list[Path] = []
@@ -91,10 +86,7 @@ def is_multirun() -> bool:
 
 
 def nearest(word: str, config: Mapping) -> str:
-    """Full keys of the options whose name is most similar to a word, joined by or.
-
-    It is empty if no name is similar.
-    """
+    """Full keys of the options with the name most similar to a word, joined by or; may be empty."""
     parts = config.keys() - {"hydra", "survey", "place", "locate", "export", "view"}
     names = {key: key.rpartition(".")[2] for key in (*parts, *option_keys(config, parts))}
     near = similar(word, {*names.values()} - {"name"})

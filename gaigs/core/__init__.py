@@ -1,3 +1,1 @@
-"""Geometry, antennas, queries, tasks and the laws of propagation: what data, models and figures
-share.
-"""
+"""Geometry, antennas, queries, tasks and laws of propagation, which all other parts share."""

@@ -137,8 +137,6 @@ class Receiver:
 def lacking(
     receivers: Sequence[Receiver], index: Int[Tensor, " b"], count: int
 ) -> Bool[Tensor, "b e"]:
-    """True for each of ``count`` elements that the array of a link's receiver lacks; ``index``
-    numbers receivers.
-    """
+    """True for each of ``count`` elements that the array of a link's receiver lacks."""
     sizes = torch.tensor([len(receiver.array) for receiver in receivers], device=index.device)
     return torch.arange(count, device=index.device) >= sizes[index.long()][:, None]

@@ -28,18 +28,14 @@ class Shape(NamedTuple):
 
 
 class FrontEnd(NamedTuple):
-    """The response of a receiver's front end.
+    """The response of a receiver's front end."""
 
-    Attributes:
-        response: Factor of each element and subcarrier, of mean power 1. Its common phase is free,
-            and with links of unknown delay its delay.
-        errors: Standard deviation of its complex numbers, by the scatter of the links.
-        explained: Mean share of a link's power that response and direct wave explain.
-    """
-
+    # Factor of each element and subcarrier, of mean power 1. Its common phase is free, and with
+    # links of unknown delay its delay.
     response: Complex[Tensor, "e s"]
+    # Standard deviation of its complex numbers, by the scatter of the links.
     errors: Float[Tensor, "e s"]
-    explained: float
+    explained: float  # mean share of a link's power that response and direct wave explain
 
 
 class Chosen(NamedTuple):
@@ -53,27 +49,18 @@ class Chosen(NamedTuple):
 
 @dataclass(frozen=True)
 class FrontEndOptions:
-    """When a receiver gets a response.
+    """When a receiver gets a response."""
 
-    Attributes:
-        fewest_places: Fewer places tell nothing beside their own reflections.
-        least_gain: Least gain of free space's mean score at places left out [dB]; without a front
-            end it is within 0.02 dB in the built-in room.
-        deviations: Least gain in its standard errors.
-        counts: Numbers over the band to choose from.
-        folds: Parts of the places, each left out once.
-        floor: Least error of a link relative to its power, so that none decides alone.
-        rounds: Turns of alignment and mean; the first ones suffice but for strong ripples.
-        most: Numbers of the links that choose, and of those that are fitted.
-    """
-
-    fewest_places: int = 12
+    fewest_places: int = 12  # fewer places tell nothing beside their own reflections
+    # Least gain of free space's mean score at places left out [dB]; without a front end it is
+    # within 0.02 dB in the built-in room.
     least_gain: float = 0.2
-    deviations: float = 2.0
-    counts: tuple[int, ...] = (1, 2, 4, 8, 16, 32)
-    folds: int = 4
-    floor: float = 1e-3
-    rounds: int = 6
+    deviations: float = 2.0  # least gain in its standard errors
+    counts: tuple[int, ...] = (1, 2, 4, 8, 16, 32)  # numbers over the band to choose from
+    folds: int = 4  # parts of the places, each left out once
+    floor: float = 1e-3  # least error of a link relative to its power, so that none decides alone
+    rounds: int = 6  # turns of alignment and mean; the first ones suffice but for strong ripples
+    # Numbers of the links that choose, and of those that are fitted.
     most: tuple[int, int] = (2**17, 2**23)
 
 

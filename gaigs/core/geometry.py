@@ -243,8 +243,7 @@ def sinc(values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 def spherical_harmonics(
     vectors: Float[Tensor, "*batch 3"], degree: int
 ) -> Float[Tensor, "*batch k"]:
-    """The k = (degree + 1)² real spherical harmonics of degree n up to ``degree`` in given
-    directions.
+    """The k = (degree + 1)² real spherical harmonics of degree n up to ``degree``.
 
     Number n² + n + m is sqrt(2) N P_n^|m|(z) times cos(m az) for m > 0, sin(|m| az) for m < 0, and
     N P_n(z) for m = 0. P has the factor (-1)^m, and N makes the mean square over the sphere 1 / 4

@@ -59,11 +59,7 @@ def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped
 
 
 def as_tensor(name: str, values: object, expected: str) -> Tensor:
-    """Numbers of any kind as a tensor of their own type.
-
-    Raises:
-        ValueError: The values are not numbers, or lists of different lengths.
-    """
+    """Numbers of any kind as a tensor of their own type; a ``ValueError`` for anything else."""
     if isinstance(values, Tensor):
         if values.is_meta or values.layout is not torch.strided:
             kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
@@ -81,7 +77,8 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
             raise TypeError("masked")
         array: Any = np.array(values)  # a copy, since torch warns of arrays that are read-only
         if array.dtype == object and array.ndim:  # such as a column of pandas
-            array[np.frompyfunc(_is_missing, 1, 1)(array).astype(bool)] = np.nan
+            missing = [value is None or type(value).__name__ == "NAType" for value in array.flat]
+            array[np.reshape(missing, array.shape)] = np.nan
             array = np.array(array.tolist())
         # Torch takes no negative strides and no other byte order.
         return torch.from_numpy(
@@ -89,11 +86,6 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
         )
     except (TypeError, ValueError, RuntimeError, OverflowError):  # of words and ragged lists
         raise ValueError(f"{name} must be {expected}, got {reprlib.repr(values)}") from None
-
-
-def _is_missing(value: object) -> bool:
-    """True for None and the missing value of pandas."""
-    return value is None or type(value).__name__ == "NAType"
 
 
 def as_numbers(name: str, values: object, expected: str) -> Tensor:
@@ -106,11 +98,7 @@ def as_numbers(name: str, values: object, expected: str) -> Tensor:
 
 
 def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
-    """Positions of any kind as a float32 tensor [m].
-
-    Raises:
-        ValueError: The shape is wrong, or a coordinate is not finite or out of range.
-    """
+    """Positions of any kind as a float32 tensor [m], checked for shape and range."""
     positions = as_numbers(name, values, "(..., 3) positions [m]")
     if positions.shape == (0,):  # an empty list
         positions = positions.reshape(0, 3)
@@ -127,11 +115,7 @@ def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
 
 
 def as_receivers(values: Any, names: Sequence[str]) -> Int[Tensor, "*points"]:
-    """Indices of receivers, given by names or indices.
-
-    Raises:
-        ValueError: A receiver is unknown.
-    """
+    """Indices of receivers, given by names or indices; a ``ValueError`` for an unknown one."""
     expected = f"one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
     if isinstance(values, KeysView | ValuesView) or hasattr(values, "to_numpy"):
         values = [*values]
@@ -163,12 +147,7 @@ def _is_text(values: object) -> bool:
 
 
 def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, "*points"] | None:
-    """Carriers that a user asks for [Hz]; for None the known one, or None if none is known.
-
-    Raises:
-        ValueError: A carrier is out of range, differs from the only known one, or is missing beside
-            several.
-    """
+    """Carriers that a user asks for, checked [Hz]; for None the only known one, if there is one."""
     if values is None:
         if len(known) > 1:
             span = f"{known[0]:.7g} to {known[-1]:.7g} Hz"
@@ -190,11 +169,7 @@ def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, 
 
 
 def as_subcarriers(values: object) -> Float[Tensor, " s"]:
-    """Subcarriers that a user asks for [Hz], one or several, in float64.
-
-    Raises:
-        ValueError: They are not a list of different carriers in range.
-    """
+    """Different subcarriers that a user asks for [Hz], one or several, in float64 and checked."""
     expected = "different subcarriers (s,) in Hz"
     as_numbers("frequencies", values, expected)
     exact = as_tensor("frequencies", values, expected).detach().cpu()
@@ -213,12 +188,7 @@ def as_subcarriers(values: object) -> Float[Tensor, " s"]:
 
 
 def as_directions(directions: Directions | None, own: Grid | None, task: str) -> Directions | None:
-    """Directions that a user asks for, in float32, or for None the label's own of a task.
-
-    Raises:
-        ValueError: The label has no directions; an angle is not a number, or too large for radians;
-            or rays have different numbers of elevations and azimuths.
-    """
+    """Directions that a user asks for, checked and in float32; for None the label's own."""
     if directions is None:
         return own
     if own is None:
@@ -275,8 +245,7 @@ class Query:
         names: Sequence[str],
         known: Float[Tensor, " f"],
     ) -> tuple["Query", tuple[int, ...]]:
-        """Links from transmitters at the positions that a user gives; every number is checked here,
-        and only here.
+        """Links from transmitters at a user's positions; every number is checked here alone.
 
         Args:
             positions: Positions (..., 3) [m], anything that becomes a float tensor; or a whole

@@ -4,7 +4,9 @@ import logging
 import math
 import time
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -70,11 +72,7 @@ class RadioMap:
     plot = plot
 
     def to_xarray(self) -> Any:
-        """An ``xarray.Dataset`` with ``value`` and, if it is known, ``std`` by receiver, y and x.
-
-        Raises:
-            ImportError: Xarray is not installed.
-        """
+        """An ``xarray.Dataset`` with ``value`` and, if it is known, ``std`` by receiver, y, x."""
         places = {"x": ("x", self.x, {"units": "m"}), "y": ("y", self.y, {"units": "m"})}
         scalars = {"z": ((), self.height, {"units": "m"})}
         if self.frequency is not None:
@@ -88,8 +86,7 @@ class RadioMap:
         return xarray.Dataset(variables, names | places | scalars)
 
     def save(self, path: str | Path) -> None:
-        """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and all other attributes
-        that are known.
+        """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and the other attributes.
 
         The values are ``values`` if the unit has other signs than letters.
         """
@@ -142,8 +139,7 @@ def radio_map(
     *,
     progress: bool = True,
 ) -> RadioMap:
-    """Predictions on a horizontal plane over the box of training transmitters and all receivers,
-    widened.
+    """Predictions on a plane over the widened box of training transmitters and all receivers.
 
     Args:
         model: A fitted or loaded model of a task whose label is one real number, e.g. RSSI.
@@ -185,9 +181,9 @@ def radio_map(
         warnings.warn(message, ExtrapolationWarning, stacklevel=4)  # two decorators lie between
     if frequency is None:
         frequency = scene.middle_frequency
-    predict = _Predictions(model, chosen, frequency)
+    predict = partial(_predict, model, chosen, frequency)
     if pitch is None:
-        pitch = _affordable_pitch(predict, lower, upper, float(height))
+        pitch = _affordable_pitch(predict, len(chosen), lower, upper, float(height))
     else:
         _check_pitch(pitch, lower, upper)
     x, y = _axes(lower, upper, float(pitch))
@@ -278,46 +274,35 @@ def _check_pitch(pitch: float, lower: ndarray, upper: ndarray) -> None:
     )
 
 
-class _Predictions:
-    """Predictions at places for several receivers.
-
-    Args:
-        model: The model of a real number a link.
-        receivers: Indices of the receivers.
-        frequency: Carrier [Hz]; None if unknown.
-    """
-
-    def __init__(self, model, receivers: Int[ndarray, " k"], frequency: float | None):
-        self.model = model
-        self.receivers = receivers
-        self.frequency = frequency
-        # An interval brings the standard deviation, whatever its level.
-        has_intervals = model.calibration is not None and model.calibration.gives(0.5)
-        self.level = 0.5 if has_intervals else None
-
-    def __call__(self, points: Float[ndarray, "*points 3"]) -> Float[ndarray, "m *points k"]:
-        """Values, and their standard deviations if the model has intervals."""
-        shape = (*points.shape[:-1], len(self.receivers))
-        places = np.broadcast_to(points[..., None, :], (*shape, 3))  # (..., k, 3)
-        index = np.broadcast_to(self.receivers, shape)  # (..., k)
-        with warnings.catch_warnings():
-            warnings.filterwarnings(
-                "ignore", r"\d+ of \d+ positions are up to", ExtrapolationWarning
-            )
-            # All receivers of a place are in one batch: its excitation is computed once.
-            prediction = self.model.predict(
-                torch.from_numpy(places.astype(np.float32)),
-                torch.from_numpy(index.copy()),
-                frequency=self.frequency,
-                batch_size=128 * len(self.receivers),
-                interval=self.level,
-            )
-        parts = prediction[:2] if self.level else (prediction,)
-        return torch.stack([part.cpu() for part in parts]).numpy()
+def _predict(
+    model,
+    receivers: Int[ndarray, " k"],
+    frequency: float | None,
+    points: Float[ndarray, "*points 3"],
+) -> Float[ndarray, "m *points k"]:
+    """Values at places for some receivers, and deviations if the model has intervals."""
+    shape = (*points.shape[:-1], len(receivers))
+    places = np.broadcast_to(points[..., None, :], (*shape, 3))  # (..., k, 3)
+    index = np.broadcast_to(receivers, shape)  # (..., k)
+    # An interval brings the standard deviation, whatever its level.
+    has_intervals = model.calibration is not None and model.calibration.gives(0.5)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", r"\d+ of \d+ positions are up to", ExtrapolationWarning)
+        # All receivers of a place are in one batch: its excitation is computed once.
+        prediction = model.predict(
+            torch.from_numpy(places.astype(np.float32)),
+            torch.from_numpy(index.copy()),
+            frequency=frequency,
+            batch_size=128 * len(receivers),
+            interval=0.5 if has_intervals else None,
+        )
+    parts = prediction[:2] if has_intervals else (prediction,)
+    return torch.stack([part.cpu() for part in parts]).numpy()
 
 
 def _affordable_pitch(
-    predict: _Predictions,
+    predict: Callable[[ndarray], ndarray],
+    receivers: int,
     lower: ndarray,
     upper: ndarray,
     height: float,
@@ -342,7 +327,7 @@ def _affordable_pitch(
         elapsed = time.perf_counter() - start
     # Half of the time left at most: figures follow.
     most = points * min(seconds, stages.left() / 2) / elapsed
-    most = min(most, predictions / len(predict.receivers))
+    most = min(most, predictions / receivers)
     while math.prod(map(len, _axes(lower, upper, pitch))) > max(most, fewest):
         pitch *= 2
     return pitch

@@ -1,6 +1,4 @@
-"""Buildings between the ends of a link: how much of the direct path they block, and the loss over
-their roofs.
-"""
+"""Buildings between the ends of a link: how they block the direct path, and the loss over roofs."""
 
 import math
 from collections.abc import Sequence
@@ -18,18 +16,12 @@ Building = tuple[list[Float[ndarray, "_ 2"]], float]
 
 
 class Roofs(NamedTuple):
-    """Heights of roofs on a grid.
+    """Heights of roofs on a grid."""
 
-    Attributes:
-        heights: Height of the roof above each cell's middle, world frame, far below it without
-            a building (rows, columns) [m].
-        lower: Lower corner of the grid, x and y [m].
-        cell: Edge of a cell [m].
-    """
-
+    # Height of the roof above each cell's middle, world frame, far below it without a building [m].
     heights: Float[Tensor, "rows columns"]
-    lower: tuple[float, float]
-    cell: float
+    lower: tuple[float, float]  # lower corner of the grid, x and y [m]
+    cell: float  # edge of a cell [m]
 
 
 def rasterize_roofs(
@@ -107,8 +99,7 @@ def _bullington(
     plan: Float[Tensor, "b 1"],
     wavelength: float,
 ) -> Float[Tensor, " b"]:
-    """v of the edge that stands for all roofs: where the steepest lines from both ends meet, or of
-    a free path the roof with the largest v.
+    """v of the edge for all roofs, where the steepest lines meet; of a free path the largest v.
 
     Source: ITU-R P.526-15, section 4.5.1, over a flat earth.
     """

@@ -151,10 +151,7 @@ class Scene:
         return positions.to(query.transmitters.dtype)
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> "Scene":
-        """The scene of channels at other subcarriers [Hz].
-
-        Responses are interpolated, and constant beyond the band.
-        """
+        """The scene of channels at other subcarriers [Hz], with interpolated responses."""
         responses = self.responses
         if responses is not None:
             known = self.task.frequencies.double().numpy()
@@ -225,11 +222,7 @@ class Scene:
 
 
 def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
-    """Frequency of each link [Hz]: the query's, the data's only one, or a channel's middle one.
-
-    Raises:
-        ValueError: The query has no frequency, and the data do not have exactly one.
-    """
+    """Frequency of each link [Hz]: the query's, the data's only one, or a channel's middle one."""
     if scene.task.is_channel:
         return scene.task.frequencies.mean().to(query.transmitters).expand(len(query))
     if query.frequencies is not None:
@@ -247,9 +240,6 @@ def check_elements(owner: str, scene: Scene, pads: bool = False) -> Task:
 
     ``owner`` names a component in errors. One that ``pads`` takes smaller arrays too, and predicts
     0 at the elements that they lack.
-
-    Raises:
-        ValueError: Labels are not channels, or an array has another number of elements.
     """
     task = scene.task
     if not task.is_channel:

@@ -244,10 +244,6 @@ def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
 
     In links with ``uncertainties``, receivers without a training link are left out, and receivers
     without a place get an estimate of it from the training links.
-
-    Raises:
-        ValueError: An option of the split has a defect, two of its parts share a link, or all
-            spectra are constant.
     """
     if links.task.is_channel and isinstance(links.labels, Tensor):
         check_elements(links)
@@ -331,9 +327,6 @@ def without_constant(links: Links) -> Links:
 
     The same holds for the subcarriers that are held out. If all subcarriers of the links are so,
     they stay.
-
-    Raises:
-        ValueError: All subcarriers that are held out are so.
     """
     both = []
     remarks = [links.remarks]
@@ -392,11 +385,9 @@ def only_trained(links: Links) -> Links:
         return links
     number = torch.full((len(links.receivers),), -1)
     number = number.index_copy(0, trained, torch.arange(len(trained)))  # (receivers,), anew
-    index = (number[links.query.receivers] >= 0).nonzero()[:, 0]
-
-    def at_index(values):
-        return None if values is None else values[index]
-
+    is_kept = number[links.query.receivers] >= 0
+    index = is_kept.nonzero()[:, 0]
+    groups = None if split.groups is None else split.groups[index]
     parts = {}
     for name, part in links.split.parts().items():
         parts[name] = torch.isin(index, part).nonzero()[:, 0]
@@ -413,15 +404,12 @@ def only_trained(links: Links) -> Links:
         f"{shortened(untrained)}"
     )
     return replace(
-        links,
+        kept_links(links, is_kept),
         query=replace(links.query[index], receivers=number[links.query.receivers[index]]),
         receivers=tuple(links.receivers[old] for old in trained.tolist()),
-        labels=links.labels[index],
-        rows=at_index(links.rows),
         official=None,
-        split=replace(split, **parts, groups=at_index(links.split.groups)),
+        split=replace(split, **parts, groups=groups),
         uncertainties=links.uncertainties[trained],
-        noises=at_index(links.noises),
         remarks="; ".join(filter(None, (links.remarks, remark))),
     )
 

@@ -93,10 +93,7 @@ def _geometry(data: str, options: dict[str, Any]) -> list[Mesh]:
 
 
 def _write_paths(folder: Path, links: Links, order: int) -> None:
-    """Writes the paths of the built-in room as a scenario of DeepMIMO v4.
-
-    They lead to the receivers of the links, at the only carrier.
-    """
+    """Writes the paths of the built-in room to the receivers as a scenario of DeepMIMO v4."""
     frequencies = links.query.frequencies.unique().tolist()
     if len(frequencies) > 1:
         raise ValueError(f"a scenario of DeepMIMO has one carrier, got frequency={frequencies}")

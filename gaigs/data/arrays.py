@@ -231,11 +231,7 @@ def _find_stands(
     height: float,
     task: Task,
 ) -> _Stands:
-    """Receivers by their positions, or by labels of a ``shape``, whose ``columns`` may name them.
-
-    Raises:
-        ValueError: A position is neither given nor to be estimated, or no column has its name.
-    """
+    """Receivers by their positions, or by labels of a ``shape`` whose ``columns`` may name them."""
     names = [*columns]
     if isinstance(receivers, Mapping):
         names = names or [*receivers]

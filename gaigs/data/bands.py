@@ -18,7 +18,6 @@ def hold_out_band(
     """Channels with the subcarriers of one band, whose ``held_out`` have another band's.
 
     Args:
-        links: Channels at all subcarriers.
         band_train: Lowest and highest subcarrier to train and validate on [Hz]; None for all, with
             none held out.
         band_test: Lowest and highest subcarrier to test on [Hz], except those to train on; None for

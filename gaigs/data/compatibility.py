@@ -11,11 +11,7 @@ from gaigs.data import Links
 
 
 def check_fit(links: Links, scene: Scene | None = None) -> None:
-    """Checks that links have a split and, given a model's scene, its receivers and labels.
-
-    Raises:
-        ValueError: The links do not fit; the message has both sides.
-    """
+    """Raises a ``ValueError`` unless links have a split and a scene's receivers and labels."""
     if links.split is None:
         raise ValueError("links must have a split; gaigs.links(..., split='random') gives one")
     if scene is None:

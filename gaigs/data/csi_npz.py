@@ -321,11 +321,7 @@ def _fits(shape: Sequence[int], sizes: Sequence[str | int]) -> bool:
 
 
 def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Converts arrays to the types of the computation.
-
-    Raises:
-        ValueError: A number is out of range; the message names array, row and value.
-    """
+    """Converts arrays to the types of the computation."""
     dtypes = {"h": np.complex64, "rx_index": np.int64}
     for name, array in arrays.items():
         # Numbers too large for a type become infinite, which fails below.

@@ -11,17 +11,13 @@ from gaigs.core.scene import Scene, direct_gains, direct_waves
 
 
 class FrontEnds(NamedTuple):
-    """Responses of receivers, and what was found.
+    """Responses of receivers, and what was found."""
 
-    Attributes:
-        responses: Factors of each receiver's channels, 1 where nothing was learnt.
-        errors: Standard deviations of their complex numbers, 0 where nothing was learnt.
-        remark: What was learnt.
-    """
-
+    # Factors of each receiver's channels, 1 where nothing was learnt.
     responses: Complex[Tensor, "r e s"]
+    # Standard deviations of their complex numbers, 0 where nothing was learnt.
     errors: Float[Tensor, "r e s"]
-    remark: str
+    remark: str  # what was learnt
 
 
 def learn_responses(links: Any, options: FrontEndOptions | None = None) -> FrontEnds | None:

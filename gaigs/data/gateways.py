@@ -12,40 +12,27 @@ from gaigs.core.query import evenly
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a gateway before any reading, and how its place is searched.
+    """What is known of a gateway before any reading, and how its place is searched."""
 
-    Attributes:
-        readings: Most readings that count, evenly spread.
-        rounds: Number of grids, each finer than the last.
-        across: Candidates along x and along y.
-        slope: Mean slope of levels [dB per decade].
-        slope_deviation: Its standard deviation [dB per decade].
-        shadowing: Standard deviation of shadowing [dB].
-        correlations: Correlation lengths [m] to average over, each with the share of the variance
-            that is correlated; the rest is noise. They grow with a site that is larger than
-            ``site``: houses in place of furniture.
-        site: Extent of the readings [m].
-        above: Greatest height above the highest place [m].
-        nearest: Least distance; shorter ones count as this [m].
-        noise: Least standard deviation of the noise [dB].
-    """
-
-    readings: int = 100
-    rounds: int = 3
-    across: int = 18
-    slope: float = -30.0
-    slope_deviation: float = 10.0
-    shadowing: float = 6.0
+    readings: int = 100  # most readings that count, evenly spread
+    rounds: int = 3  # number of grids, each finer than the last
+    across: int = 18  # candidates along x and along y
+    slope: float = -30.0  # mean slope of levels [dB per decade]
+    slope_deviation: float = 10.0  # its standard deviation [dB per decade]
+    shadowing: float = 6.0  # standard deviation of shadowing [dB]
+    # Correlation lengths [m] to average over, each with the share of the variance that is
+    # correlated; the rest is noise. They grow with a site that is larger than ``site``: houses in
+    # place of furniture.
     correlations: tuple[tuple[float, float], ...] = (
         (2.0, 0.5),
         (6.0, 0.5),
         (6.0, 0.9),
         (20.0, 0.9),
     )
-    site: float = 100.0
-    above: float = 2.0
-    nearest: float = 0.5
-    noise: float = 0.5
+    site: float = 100.0  # extent of the readings [m]
+    above: float = 2.0  # greatest height above the highest place [m]
+    nearest: float = 0.5  # least distance; shorter ones count as this [m]
+    noise: float = 0.5  # least standard deviation of the noise [dB]
 
 
 class Laws(NamedTuple):

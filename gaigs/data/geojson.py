@@ -24,9 +24,6 @@ def read_polygons(file: Path, frame: Frame | None, mend: str) -> list[tuple[Ring
     Positions are longitude and latitude, or easting and northing, if there is a frame; else metres
     of the world frame. A height that the file does not give is NaN.
 
-    Raises:
-        ValueError: The file is no GeoJSON, or has no polygon; ``mend`` says what to do.
-
     Source: RFC 7946.
     """
     try:
@@ -53,10 +50,6 @@ def read_buildings(
 
     Args:
         height: Height of buildings without one [m].
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        ValueError: As of ``read_polygons``, or a building has no height.
     """
     file = find_file(file, "buildings", "buildings")
     buildings = []

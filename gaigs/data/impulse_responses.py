@@ -65,17 +65,12 @@ def lacks_carrier(
 
 
 class Responses(NamedTuple):
-    """Impulse responses between places.
+    """Impulse responses between places."""
 
-    Attributes:
-        gains: Complex gains (k, e, n, m, p) of p paths; k receivers have e antennas, n
-            transmitters m.
-        delays: The same, or with a 1 for the antennas [s].
-        tx, rx: Places of both ends (n, 3), (k, 3) [m].
-    """
-
+    # Complex gains of p paths; k receivers have e antennas, n transmitters m.
     gains: Complex[ndarray, "k e n m p"]
-    delays: ndarray
+    delays: ndarray  # the same, or with a 1 for the antennas [s]
+    # Places of both ends (n, 3), (k, 3) [m].
     tx: ndarray
     rx: ndarray
 
@@ -95,9 +90,6 @@ def from_sionna(
             ``rx`` with e antennas and n transmitters ``tx`` with m; ``carrier`` [Hz];
             ``frequencies``, absolute or relative to it [Hz].
         needs_delays: True if delays must count from the transmission.
-
-    Raises:
-        ValueError: Shapes do not fit, or a delay is not from 0 to 1 ms.
     """
     carrier = _read_carrier(arrays)
     responses = _with_fixed_end(_without_missing_delays(_to_responses(arrays), needs_delays))

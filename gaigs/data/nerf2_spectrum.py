@@ -107,10 +107,6 @@ def write(folder: str | Path, links: Links) -> None:
 
     The index files hold the split's training and validation links together, and its test links.
     ``freq.txt`` holds known carriers; the layout has no place for the array.
-
-    Raises:
-        OSError: The folder is not empty, or a file cannot be written.
-        ValueError: The links have several receivers, no split, or no spectra on the format's grid.
     """
     folder = Path(folder)
     tables.check_empty(folder)
@@ -189,11 +185,7 @@ def _read_frequencies(file: Path, count: int) -> Float[Tensor, " n"]:
 
 
 def _find_images(root: Path, count: int) -> list[Path]:
-    """The image of each position.
-
-    Raises:
-        ValueError: An image is missing, has no position, or is there twice.
-    """
+    """The image of each position; a ``ValueError`` where one is missing, too many or twice."""
     folder = root / "spectrum"
     names = [f"{number:05d}.png" for number in range(1, count + 1)]
     images: dict[str, list[Path]] = {}

@@ -44,13 +44,10 @@ def join(arrays: list[ndarray], axis: str | None) -> ndarray:
 
 
 def check_parts(name: str, channels: ndarray) -> None:
-    """Checks 100 or more complex numbers for amplitude and phase in place of their parts.
+    """Raises a ``ValueError`` if 100 or more complex numbers are amplitudes and phases.
 
     One part then is positive or below -20, as in dB, and the other fills a turn in radians or
     degrees evenly.
-
-    Raises:
-        ValueError: The parts are an amplitude and a phase.
     """
     if channels.size < 100:
         return

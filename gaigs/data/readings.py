@@ -37,12 +37,9 @@ def to_dbm(
     not_heard: Sequence[float],
     mend: str,
 ) -> list[list[float]]:
-    """Cells of a table as readings [dBm].
+    """Cells of a table as readings [dBm], each ``not_heard`` or in range.
 
     ``mend`` says in the error what to do with other marks of "not heard".
-
-    Raises:
-        ValueError: A cell is neither ``not_heard`` nor in range.
     """
     cells = {}
     for line, texts in rows.items():

@@ -20,7 +20,7 @@ from gaigs.core.query import Query, check_carrier
 from gaigs.core.task.csi import Csi
 from gaigs.core.task.rssi import Rssi
 from gaigs.core.task.spectrum import Spectrum
-from gaigs.data import Links, Parts
+from gaigs.data import Links, Parts, kept_links
 from gaigs.registry import check_type
 
 PLACES_AT_A_TIME = 64
@@ -29,25 +29,17 @@ PLACES_AT_A_TIME = 64
 
 @dataclass(frozen=True)
 class SimulatedRoom:
-    """A room with its receivers, and the responses of their antennas.
+    """A room with its receivers, and the responses of their antennas."""
 
-    Attributes:
-        poses: Positions and orientations of the receivers with an array.
-        gateways: Receivers with a single antenna.
-        edges: Line segments to draw in figures (k, 2, 3) [m].
-        place: From a count and a seed, random places of transmitters (count, 3) [m].
-        frequency_offsets: From a bandwidth, frequencies that sample the band, relative to its
-            middle [Hz].
-        respond: From places (n, 3), a receiver, a frequency and offsets (f,), the response of each
-            element to unit-power transmitters, ``PLACES_AT_A_TIME`` of them at a time
-            (part, elements, f).
-    """
-
-    poses: tuple[Pose, ...]
-    gateways: tuple[Receiver, ...]
-    edges: Float[Tensor, "k 2 3"]
+    poses: tuple[Pose, ...]  # positions and orientations of the receivers with an array
+    gateways: tuple[Receiver, ...]  # receivers with a single antenna
+    edges: Float[Tensor, "k 2 3"]  # line segments to draw in figures [m]
+    # From a count and a seed, random places of transmitters (count, 3) [m].
     place: Callable[[int, int], Tensor]
+    # From a bandwidth, frequencies that sample the band, relative to its middle [Hz].
     frequency_offsets: Callable[[float], Tensor]
+    # From places (n, 3), a receiver, a frequency and offsets (f,), the response of each element to
+    # unit-power transmitters, ``PLACES_AT_A_TIME`` of them at a time (part, elements, f).
     respond: Callable[[Tensor, Receiver, float, Tensor], Iterable[Tensor]]
 
 
@@ -59,10 +51,7 @@ def simulate_spectra(
     bandwidth: float,
     seed: int,
 ) -> Links:
-    """Spectra of transmitters at random places.
-
-    ``gaigs.data.synthetic.furnished_room`` describes the options.
-    """
+    """Spectra of transmitters at random places, by the options of ``synthetic.furnished_room``."""
     carriers = _to_carriers(frequency)
     offsets = spectrum_offsets(spectrum, room.frequency_offsets, bandwidth)
     places = room.place(transmitters, seed)
@@ -128,9 +117,8 @@ def simulate_channels(
     places = room.place(transmitters, seed)
     receivers = patch_arrays(room.poses, frequency)
     task = Csi(len(receivers[0].array), frequency + offsets, phase)
-    channels = []
-    for receiver in receivers:
-        channels.append(torch.cat([*room.respond(places, receiver, frequency, offsets)]))
+    responses = [room.respond(places, receiver, frequency, offsets) for receiver in receivers]
+    channels = [torch.cat([*response]) for response in responses]
     labels = torch.stack(channels, 1).flatten(0, 1)  # (places * receivers, elements, f)
     if phase != "known":
         has_delays = phase == "per_link_and_delay"
@@ -173,27 +161,16 @@ def _distort(
 
 
 def without_silent(links: Links, transmitters: int, has_path: Bool[Tensor, " n"]) -> Links:
-    """Links from places that a path leads to; the remarks count the others.
-
-    Raises:
-        ValueError: Paths lead to fewer than two places.
-    """
+    """Links from places that a path leads to; the remarks count the others."""
     if has_path.all():
         return links
-    rows = links.rows[has_path]
-    if len(rows.unique()) < 2:
+    if len(links.rows[has_path].unique()) < 2:
         raise ValueError(
             f"paths must lead to two of {transmitters} transmitters or more; "
             "move the receiver or heights"
         )
-    return replace(
-        links,
-        query=links.query[has_path],
-        labels=links.labels[has_path],
-        rows=rows,
-        official=partial(last_fifth, transmitters, rows),
-        remarks=f"{int((~has_path).sum())} links without a path are left out",
-    )
+    remarks = f"{int((~has_path).sum())} links without a path are left out"
+    return replace(kept_links(links, has_path), remarks=remarks)
 
 
 def simulate_readings(
@@ -255,10 +232,7 @@ def spectrum_offsets(
 
 
 def patch_arrays(poses: Sequence[Pose], frequency: float) -> tuple[Receiver, ...]:
-    """Receivers with 4 x 4 patches half a wavelength of the frequency [Hz] apart.
-
-    The NeRF² spectra have such an array.
-    """
+    """Receivers with 4 x 4 patches half a wavelength apart, as for the NeRF² spectra."""
     check_carrier("frequency", frequency)
     array = Array.planar(4, 4, speed_of_light / frequency / 2, "cosine")
     return tuple(Receiver(f"gateway{number}", pose, array) for number, pose in enumerate(poses, 1))
@@ -297,10 +271,7 @@ def draw_places(
 
 
 def sample_band(bandwidth: float, longest: float) -> Float[Tensor, " f"]:
-    """Frequencies that sample a band, relative to its middle [Hz].
-
-    Beats of paths up to the longest length [m] are not aliased.
-    """
+    """Frequencies about a band's middle [Hz] that alias no beat of paths up to a length [m]."""
     if not 0 < bandwidth < math.inf:
         raise ValueError(
             f"bandwidth must be positive [Hz], got {bandwidth}; "
@@ -318,15 +289,10 @@ def to_spectra(
     frequency: float,
 ) -> Float[Tensor, "n rows columns"]:
     """Spectra of an array's responses at a carrier [Hz], float32 in [0, 1]."""
-    spectra = []
-    for part in responses:
-        spectra.append(min_max(bartlett(part, grid, array, frequency)).float())
-    return torch.cat(spectra)
+    amplitudes = (bartlett(part, grid, array, frequency) for part in responses)
+    return torch.cat([min_max(part).float() for part in amplitudes])
 
 
 def rss_dbm(responses: Complex[Tensor, "b elements f"]) -> Float[Tensor, " b"]:
-    """Received signal strength of a transmitter of 0 dBm [dBm].
-
-    Power is averaged over elements and frequencies.
-    """
+    """Received signal strength of 0 dBm sent, the mean over elements and frequencies [dBm]."""
     return 10 * torch.log10(responses.abs().square().mean((1, 2)))

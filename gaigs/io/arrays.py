@@ -19,17 +19,12 @@ class ArrayFile(NamedTuple):
 
 
 class ArrayFormat(NamedTuple):
-    """A format of files.
+    """A format of files."""
 
-    Attributes:
-        open: Opens a file as a context manager.
-        description: Words for errors.
-        is_matlab: True if vectors may have two axes and whole numbers may be doubles.
-    """
-
+    # Opens a file as a context manager.
     open: Callable[[Path], contextlib.AbstractContextManager[ArrayFile]]
-    description: str
-    is_matlab: bool
+    description: str  # words for errors
+    is_matlab: bool  # True if vectors may have two axes and whole numbers may be doubles
 
 
 def array_format(file: Path) -> ArrayFormat:

@@ -13,16 +13,12 @@ from gaigs.io.files import atomic_write, write_text
 
 
 class Station(NamedTuple):
-    """A base station and its paths to users.
+    """A base station and its paths to users."""
 
-    Attributes:
-        position: Place of the station [m].
-        fields: Gain of each path at the carrier, with the phase of its length; 0 for no path.
-        bounces: Points of its reflections from the station on [m]; NaN for missing ones.
-    """
-
-    position: Float[np.ndarray, "3"]
+    position: Float[np.ndarray, "3"]  # place of the station [m]
+    # Gain of each path at the carrier, with the phase of its length; 0 for no path.
     fields: Complex[np.ndarray, "n p"]
+    # Points of its reflections from the station on [m]; NaN for missing ones.
     bounces: Float[np.ndarray, "n p k 3"]
 
 

@@ -17,9 +17,6 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
 
     Each writer has a path of its own: of several the last replaces the file. If writing fails or is
     interrupted, the temporary file is removed and the old file stays.
-
-    Raises:
-        OSError: The file cannot be written; with the ``errno`` of the cause.
     """
     path = Path(path)
     part = path.with_name(f"{path.stem}.gaigs-{secrets.token_hex(4)}.part{path.suffix}")
@@ -58,10 +55,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def file_message(error: OSError, folder: Path) -> str:
-    """The message of a file's error.
-
-    For a plain system error it is the file or folder, the cause and the remedy.
-    """
+    """The message of a file's error, of a plain system error with file, cause and remedy."""
     if error.errno is None or error.strerror != os.strerror(error.errno):
         return str(error.strerror or error)
     path = error.filename or f"a file in {folder}"

@@ -17,10 +17,6 @@ class GreyImages:
 
     They take one or two bytes a pixel. 8-bit values count in 255, 16-bit ones in 65535. Colour
     images have equal channels, and no pixel is transparent.
-
-    Raises:
-        ValueError: A file has no PNG header, or another shape; when requested: its pixels are
-            damaged or coloured.
     """
 
     def __init__(self, files: Sequence[Path], shape: tuple[int, int]):

@@ -24,19 +24,12 @@ NO_NAME = "mesh", "unnamed"
 
 @dataclass(frozen=True)
 class Mesh:
-    """One object of one material.
+    """One object of one material."""
 
-    Attributes:
-        name: Name of the object; several meshes may share it.
-        material: Name of the material; empty without one.
-        vertices: Corners, world frame [m].
-        faces: Corners of each planar convex face, counted from 0, in order.
-    """
-
-    name: str
-    material: str
-    vertices: tuple[tuple[float, float, float], ...]
-    faces: tuple[Face, ...]
+    name: str  # name of the object; several meshes may share it
+    material: str  # name of the material; empty without one
+    vertices: tuple[tuple[float, float, float], ...]  # corners, world frame [m]
+    faces: tuple[Face, ...]  # corners of each planar convex face, counted from 0, in order
 
     def triangles(self) -> list[tuple[int, int, int]]:
         """Faces cut into triangles."""
@@ -81,11 +74,7 @@ def read_obj(file: Path) -> tuple[Float[np.ndarray, "v 3"], Groups]:
 
 
 def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3"], Groups]:
-    """Vertices [m] and faces of the lines of a Wavefront OBJ file.
-
-    Raises:
-        ValueError: A line has a defect; the message names the source, the line and its text.
-    """
+    """Vertices [m] and faces of the lines of a Wavefront OBJ file; errors name source and line."""
     # trimesh's reader cuts polygons, loses materials without an .mtl file, counts negative numbers
     # from the end of the file, and leaves defects without their line.
     vertices: list[list[float]] = []
@@ -149,14 +138,7 @@ def _face(words: Sequence[str], count: int) -> Face:
 
 
 def read_ply(file: Path) -> tuple[np.ndarray, list[Face]]:
-    """Vertices and faces of a PLY file.
-
-    Vertices are a structured array, with x, y and z [m] among its columns.
-
-    Raises:
-        ValueError: The file is damaged, a column holds no numbers, or the mesh has a defect, see
-            ``check_mesh``.
-    """
+    """Vertices, a structured array with x, y, z [m] among its columns, and faces of a PLY file."""
     try:
         content = PlyData.read(str(file), mmap=False)
         vertices = content["vertex"].data
@@ -188,11 +170,7 @@ def triangles(faces: Iterable[Face]) -> list[tuple[int, int, int]]:
 
 
 def check_mesh(points: Float[np.ndarray, "v 3"], faces: Sequence[Face], source: str) -> None:
-    """Checks that vertices are numbers within ``FAR``, and that faces refer to them.
-
-    Raises:
-        ValueError: A vertex or a face has a defect; the message names its number.
-    """
+    """Raises a ``ValueError`` unless vertices are within ``FAR`` and faces refer to them."""
     near = np.abs(points) < FAR
     if not near.all():
         row = int((~near).any(1).argmax())

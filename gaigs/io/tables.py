@@ -70,10 +70,7 @@ def has_file(file: Path) -> bool:
 
 
 def check_empty(folder: Path) -> None:
-    """Raises a ``FileExistsError`` unless a folder to be written is empty or missing.
-
-    The file of a lock does not count.
-    """
+    """Raises a ``FileExistsError`` unless a folder is missing, or empty but for a lock."""
     if folder.exists() and (not folder.is_dir() or {*os.listdir(folder)} - {LOCK}):
         raise FileExistsError(f"{folder} must be an empty folder or missing; choose another name")
 
@@ -144,10 +141,7 @@ SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": 
 
 
 def find_delimiter(lines: Sequence[str]) -> str:
-    """The mark that cuts the first three lines into equally many cells, two or more.
-
-    Without such a mark it is a comma.
-    """
+    """The mark that cuts the first three lines into equally many cells, or else a comma."""
     for mark in SEPARATORS:
         counts = {len(split_cells(line, mark)) for line in lines[:3]}
         if len(counts) == 1 and counts != {1}:
@@ -173,11 +167,7 @@ def split_cells(line: str, delimiter: str = ",") -> list[str]:
 def split_rows(
     file: Path, lines: Sequence[str], names: Sequence[str], skip: int, delimiter: str
 ) -> dict[int, list[str]]:
-    """Cells of all lines except the first few. A comma that separates no cells is a decimal one.
-
-    Raises:
-        ValueError: A line has not one cell for each name.
-    """
+    """Cells of all lines but the first few, one a name. A comma that separates none is decimal."""
     rows: dict[int, list[str]] = {}
     wrong: dict[int, str] = {}
     for number, line in enumerate(lines[skip:], skip + 1):
@@ -214,23 +204,15 @@ def described(cell: str) -> str:
 
 
 class Table(NamedTuple):
-    """A table in numbers, a column a name.
+    """A table in numbers, a column a name."""
 
-    Attributes:
-        file: File, or a word for a table in memory.
-        names: Names of the columns.
-        numbers: Numbers, NaN for an empty cell and infinity for another text.
-        text: Text of a cell by its row and column.
-        unit: Word for a row in messages.
-        first: Number of the first row in messages.
-    """
-
-    file: Path
-    names: list[str]
+    file: Path  # file, or a word for a table in memory
+    names: list[str]  # names of the columns
+    # Numbers, NaN for an empty cell and infinity for another text.
     numbers: Float[ndarray, "rows columns"]
-    text: Callable[[int, int], str]
-    unit: str = "line"
-    first: int = 2
+    text: Callable[[int, int], str]  # text of a cell by its row and column
+    unit: str = "line"  # word for a row in messages
+    first: int = 2  # number of the first row in messages
 
     @property
     def heading(self) -> str:

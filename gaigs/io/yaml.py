@@ -29,11 +29,7 @@ TextLoader.yaml_implicit_resolvers = {}
 
 
 def read_mapping(file: Path, content: str) -> dict[str, object]:
-    """The mapping of names to text, lists and mappings in a file.
-
-    Raises:
-        ValueError: The file has another content.
-    """
+    """The mapping of names to text, lists and mappings in a file; a ``ValueError`` for others."""
     text = "\n".join(read_lines(file, content))
     try:
         mapping = yaml.load(text, TextLoader)
@@ -50,11 +46,7 @@ def read_mapping(file: Path, content: str) -> dict[str, object]:
 
 
 def to_vector(place: str, value: object, axes: str) -> list[float]:
-    """A list of finite numbers, one for each axis.
-
-    Raises:
-        ValueError: The value is another; the message names its place.
-    """
+    """A list of finite numbers, one for each axis; the error of another value names its place."""
     items = value if isinstance(value, list) else []
     octal = re.compile(r"[+-]?0[0-9]+")  # 010 is 8 in YAML 1.1 and 10 in YAML 1.2
     numbers = [
@@ -69,11 +61,7 @@ def to_vector(place: str, value: object, axes: str) -> list[float]:
 
 
 def to_position(place: str, value: object) -> list[float]:
-    """A list of coordinates [m].
-
-    Raises:
-        ValueError: The value is another, or too far for float32; the message names its place.
-    """
+    """A list of coordinates [m] near enough for float32; the error names its place."""
     numbers = to_vector(place, value, "xyz")
     if max(map(abs, numbers)) >= FAR:
         raise ValueError(f"{place}: expected {WITHIN}, got {quote(value)}")

@@ -22,19 +22,14 @@ from gaigs.kriging.posterior import Posterior
 class Field(nn.Module):
     """The kriged residual at one receiver, from k known links and q principal components of their
     residuals.
-
-    Attributes:
-        places: Places of the links (k, d) [m], see ``coordinates``.
-        weights: Scores of the components over the covariances of the links (k, q).
-        components: Components in half precision (q, *shape), complex ones as real and imaginary
-            part in the last dimension.
-        widened: The components in the task's precision, in which products are fast.
     """
 
-    places: Tensor
-    weights: Tensor
+    places: Tensor  # places of the links (k, d) [m], see ``coordinates``
+    weights: Tensor  # scores of the components over the covariances of the links (k, q)
+    # Components in half precision (q, *shape), complex ones as real and imaginary part in the last
+    # dimension.
     components: Tensor
-    widened: Tensor
+    widened: Tensor  # the components in the task's precision, in which products are fast
 
     def __init__(self, scene: Scene):
         super().__init__()
@@ -56,9 +51,7 @@ class Field(nn.Module):
         process: Hyperparameters,
         share: float = 5e-4,
     ) -> None:
-        """Takes residuals (k, *shape) at their places; components leave out a ``share`` of their
-        energy.
-        """
+        """Takes residuals (k, *shape) at their places; components lack a ``share`` of energy."""
         residuals = residuals.reshape(len(residuals), -1)  # (k, m)
         components = principal_components(residuals, share)  # (q, m)
         if components.is_complex():
@@ -212,8 +205,7 @@ class FieldPosterior(Posterior):
 
 
 def _like_loaded(buffer: Tensor, values: Tensor) -> Tensor:
-    """Values with the type and strides of a loaded buffer: other layouts round products
-    differently."""
+    """Values laid out like a loaded buffer: other types and strides round products differently."""
     return buffer.new_empty(values.shape).copy_(values)
 
 

@@ -57,16 +57,11 @@ readings as one: fewer ones overfit."""
 
 
 class HeldOut(NamedTuple):
-    """Held-out links of one receiver, and the links that predict them.
+    """Held-out links of one receiver, and the links that predict them."""
 
-    Attributes:
-        asked: Held-out links.
-        around: Links around each held-out link, one group after the other.
-        products: Products of the residuals of each held-out link and of those around it.
-    """
-
-    asked: Query
-    around: Query
+    asked: Query  # held-out links
+    around: Query  # links around each held-out link, one group after the other
+    # Products of the residuals of each held-out link and of those around it.
     products: Float[Tensor, "b j+1 j+1"]
 
 

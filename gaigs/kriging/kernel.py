@@ -16,22 +16,15 @@ from gaigs.kriging.links import distances
 
 @dataclass(frozen=True)
 class Process:
-    """The Gaussian process of one receiver's labels over places, and the readings that it knows.
+    """The Gaussian process of one receiver's labels over places, and the readings that it knows."""
 
-    Attributes:
-        covariances: Function of two sets of places (m, d) and (n, d) to the covariances of the
-            process, in the label's unit squared.
-        places: Places of the known readings, ``coordinates`` of scale 1 (k, d) [m].
-        noises: Variances of the noise of the known readings (k,).
-        noise: Variance of the noise of a new reading.
-        is_part: True if a part of the receiver's readings was left out.
-    """
-
+    # Function of two sets of places (m, d) and (n, d) to the covariances of the process, in the
+    # label's unit squared.
     covariances: Callable[[Tensor, Tensor], Tensor]
-    places: Float[Tensor, "k d"]
-    noises: Float[Tensor, " k"]
-    noise: float
-    is_part: bool = False
+    places: Float[Tensor, "k d"]  # places of the known readings, ``coordinates`` of scale 1 [m]
+    noises: Float[Tensor, " k"]  # variances of the noise of the known readings
+    noise: float  # variance of the noise of a new reading
+    is_part: bool = False  # True if a part of the receiver's readings was left out
 
     def whitened(
         self, asked: Float[Tensor, "g d"], rows: Int[Tensor, " j"] | slice = slice(None)
@@ -50,9 +43,7 @@ class Process:
 
 
 def resize(module: nn.Module, state: Mapping[str, Tensor], prefix: str, *names: str) -> None:
-    """Gives buffers the shapes that they have in a state, which is then loaded: they depend on the
-    links.
-    """
+    """Gives buffers the shapes that they have in a state, which is then loaded."""
     for name in names:
         if f"{prefix}{name}" in state:
             setattr(module, name, getattr(module, name).new_empty(state[f"{prefix}{name}"].shape))
@@ -87,9 +78,7 @@ def matern_slope(correlation: Tensor, apart: Tensor, length: Tensor, smoothness:
 def kernel(
     a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"], length: float | Tensor
 ) -> Float[Tensor, "*c m n"]:
-    """Covariances exp(-d / length) of places ``a`` and ``b`` over the signal's variance; places and
-    length in [m].
-    """
+    """Covariances exp(-d / length) of places ``a`` and ``b`` [m] over the signal's variance."""
     return (distances(a, b) / -length).exp_()
 
 

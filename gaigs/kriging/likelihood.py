@@ -12,9 +12,7 @@ from gaigs.kriging.neighbours import Around
 
 
 class Choice(NamedTuple):
-    """Smoothness of the kernel, degrees of freedom of the noise (infinite: normal), scale of
-    carriers [m] or NaN.
-    """
+    """Smoothness of the kernel, degrees of freedom of the noise (inf: normal), scale [m] or NaN."""
 
     smoothness: float = 0.5
     degrees: float = math.inf
@@ -22,17 +20,12 @@ class Choice(NamedTuple):
 
 
 class Conditional(NamedTuple):
-    """Means and variances of the process at places (m,), given the readings around.
-
-    Attributes:
-        errors: Weights of the readings, and -1 of the place (m, j + 1).
-        solved: Readings over their covariances, and 0 of the place (m, j + 1).
-    """
+    """Means and variances of the process at places (m,), given the readings around."""
 
     means: Float[Tensor, " m"]
     variances: Float[Tensor, " m"]
-    errors: Float[Tensor, "m i"]
-    solved: Float[Tensor, "m i"]
+    errors: Float[Tensor, "m i"]  # weights of the readings, and -1 of the place (m, j + 1)
+    solved: Float[Tensor, "m i"]  # readings over their covariances, and 0 of the place (m, j + 1)
 
 
 def covariances(

@@ -39,9 +39,7 @@ def known_links(links: Links, any_receiver: bool = False) -> list[Int[Tensor, " 
 
 
 def check_known(links: Links) -> None:
-    """Raises the ``ValueError`` of ``known_links`` for all known links, and for the links of a
-    validation.
-    """
+    """Raises the ``ValueError`` of ``known_links`` for all known and validation links."""
     known_links(links, any_receiver=True)
     known_links(replace(links, split=links.split.validating()), any_receiver=True)
 
@@ -55,9 +53,7 @@ def limit_known(links: Links, most: int) -> Links:
 
 
 def folds_of(links: Links, index: Int[Tensor, " k"], count: int = 10) -> Int[Tensor, " k"]:
-    """Fold of some links, from 0; groups of the split, or places, are random whole folds, as the
-    test is.
-    """
+    """Fold of some links, from 0; groups of the split, or places, are random whole folds."""
     groups = links.split.groups
     if groups is None:
         groups = place_numbers(links.query.transmitters[index])
@@ -75,9 +71,7 @@ def place_numbers(places: Float[Tensor, "k 3"]) -> Int[Tensor, " k"]:
 
 
 def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]:
-    """One random link for each place, receiver and carrier: repeated readings have nearly the same
-    error.
-    """
+    """One random link a place, receiver and carrier: repeated ones have nearly the same error."""
     if not len(index):
         return index
     _, which = links.query[index].unique(with_receivers=True)
@@ -106,10 +100,7 @@ def scaled(places: Float[Tensor, "k d"], scale: float) -> Float[Tensor, "k d"]:
 
 
 def distances(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"]) -> Float[Tensor, "*c m n"]:
-    """Distances of all pairs [m].
-
-    Differences are plain: the matrix product would give copies of a place different distances.
-    """
+    """Distances of all pairs [m], by differences: products would part copies of a place."""
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
@@ -121,9 +112,7 @@ class Near(NamedTuple):
 
 
 def nearest_places(asked: Float[Tensor, "m d"], known: Float[Tensor, "k d"], count: int) -> Near:
-    """The ``count`` nearest known places, fewer if there are not as many; by a tree, whose time
-    grows with the logarithm of the known places.
-    """
+    """The ``count`` nearest known places, fewer if there are not as many; by a tree."""
     count = min(count, len(known))
     # Splits in the middle of a box stay fast where a place is measured often.
     tree = cKDTree(known.double().cpu().numpy(), balanced_tree=False)

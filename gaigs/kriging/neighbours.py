@@ -14,35 +14,25 @@ from gaigs.kriging.links import Near, distances, nearest_places, scale_bounds, s
 
 
 class Nearest(NamedTuple):
-    """Rows of known readings near each of m places.
+    """Rows of known readings near each of m places."""
 
-    Attributes:
-        rows: Rows of the readings (m, j).
-        exists: False beyond a receiver's readings (m, j).
-    """
-
-    rows: Int[Tensor, "m j"]
-    exists: Bool[Tensor, "m j"]
+    rows: Int[Tensor, "m j"]  # rows of the readings
+    exists: Bool[Tensor, "m j"]  # False beyond a receiver's readings
 
 
 class Around(NamedTuple):
     """The nearest readings of the same receiver around each of m asked places; the place itself
     comes last.
-
-    Attributes:
-        rows: Rows of the readings (m, j).
-        exists: False for rows beyond a receiver's readings (m, j).
-        receivers: Receivers of the asked places (m,).
-        apart: Distances of places [m] (m, j + 1, j + 1), 1e15 for rows that do not exist: nothing
-            correlates.
-        bands: Squared distances of carriers, see ``coordinates`` of scale 1 (m, j + 1, j + 1); None
-            without a band.
     """
 
-    rows: Int[Tensor, "m j"]
-    exists: Bool[Tensor, "m j"]
-    receivers: Int[Tensor, " m"]
+    rows: Int[Tensor, "m j"]  # rows of the readings
+    exists: Bool[Tensor, "m j"]  # False for rows beyond a receiver's readings
+    receivers: Int[Tensor, " m"]  # receivers of the asked places
+    # Distances of places [m] (m, j + 1, j + 1), 1e15 for rows that do not exist: nothing
+    # correlates.
     apart: Float[Tensor, "m i i"]
+    # Squared distances of carriers, see ``coordinates`` of scale 1 (m, j + 1, j + 1); None without
+    # a band.
     bands: Float[Tensor, "m i i"] | None
 
 
@@ -54,19 +44,12 @@ class HeldOutReadings(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Known readings, of which ``count`` are around a place.
+    """Known readings, of which ``count`` are around a place."""
 
-    Attributes:
-        scene: Receivers and carriers.
-        places: Places (k, d), see ``coordinates`` of scale 1.
-        receivers: Receivers (k,).
-        count: Number of readings around a place.
-    """
-
-    scene: Scene
-    places: Float[Tensor, "k d"]
+    scene: Scene  # receivers and carriers
+    places: Float[Tensor, "k d"]  # places, see ``coordinates`` of scale 1
     receivers: Int[Tensor, " k"]
-    count: int
+    count: int  # number of readings around a place
 
     def nearest(
         self,

@@ -18,26 +18,18 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class TermOptions:
-    """Options of ``PathTerms``.
+    """Options of ``PathTerms``."""
 
-    Attributes:
-        names: Of the terms.
-        harmonics: Largest harmonic of the azimuth: lobes of 60 degrees and wider, as of sectors.
-        breaks: Candidates of a break point, quantiles of a receiver's distances.
-        slope: Prior deviation of the change of slope at a break point, over the deviation of the
-            levels about their law [1 / decade].
-        alike: Readings that count as one: neighbours share their shadows.
-        errors: Least fall of the held-out error by a term [standard errors].
-        least: Least fall over the error itself: a smaller one is not worth a term.
-    """
-
-    names: tuple[str, ...] = ("break point", "lobes", "height")
+    names: tuple[str, ...] = ("break point", "lobes", "height")  # of the terms
+    # Largest harmonic of the azimuth: lobes of 60 degrees and wider, as of sectors.
     harmonics: int = 6
-    breaks: int = 15
+    breaks: int = 15  # candidates of a break point, quantiles of a receiver's distances
+    # Prior deviation of the change of slope at a break point, over the deviation of the levels
+    # about their law [1 / decade].
     slope: float = 5.0
-    alike: float = 10.0
-    errors: float = 3.0
-    least: float = 0.01
+    alike: float = 10.0  # readings that count as one: neighbours share their shadows
+    errors: float = 3.0  # least fall of the held-out error by a term [standard errors]
+    least: float = 0.01  # least fall over the error itself: a smaller one is not worth a term
 
 
 class Solution(NamedTuple):
@@ -62,27 +54,19 @@ class PathTerms(nn.Module):
     Coefficients have a normal prior; that of a lobe falls with its harmonic. Terms (lobes, height,
     break point) are added one by one, the same for all receivers.
 
-    Attributes:
-        used: True for terms in use, in the order of ``options.names`` (3,).
-        breaks: log10 of the distance d0 of each receiver (r,).
-        regions: Deviation of each receiver's place (r,) [m], as of ``path_loss``.
-        coefficients: c0, c1, a_1, b_1, a_2 .. c5 of each receiver (r, n).
-        deviations: Their standard errors (r, n).
-        unseen: Errors of the links of ``fit``, without the terms that saw their fold (n,); None
-            before.
-        added: What ``fit`` added, with held-out errors; None: nothing.
-
     Source: Feuerstein et al., Path loss, delay spread, and outage models as functions of antenna
     height, 1994 (break point); Hoerl and Kennard, Ridge regression, 1970.
     """
 
-    used: Tensor
-    breaks: Tensor
-    regions: Tensor
+    used: Tensor  # True for terms in use, in the order of ``options.names`` (3,)
+    breaks: Tensor  # log10 of the distance d0 of each receiver (r,)
+    regions: Tensor  # deviation of each receiver's place (r,) [m], as of ``path_loss``
+    # c0, c1, a_1, b_1, a_2 .. c5 of each receiver (r, n).
     coefficients: Tensor
-    deviations: Tensor
+    deviations: Tensor  # their standard errors (r, n)
+    # Errors of the links of ``fit``, without the terms that saw their fold (n,); None before.
     unseen: Tensor | None = None
-    added: str | None = None
+    added: str | None = None  # what ``fit`` added, with held-out errors; None: nothing
     options = TermOptions()
     of_receivers = ("breaks", "coefficients", "deviations")
 
@@ -199,9 +183,7 @@ class PathTerms(nn.Module):
         folds: Int[Tensor, " k"],
         used: Bool[Tensor, " t"],
     ) -> Solution:
-        """Most likely coefficients without each fold, with the break point of the least cost; one
-        fold is not left out.
-        """
+        """Likeliest coefficients without each fold, with the best break point; one fold stays."""
         both = torch.cat((columns, levels[:, None]), 1)
         parts = [both[folds == fold] for fold in range(int(folds.max()) + 1)]
         own = torch.stack([part.T @ part for part in parts])  # (f, m + 1, m + 1)

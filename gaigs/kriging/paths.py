@@ -48,16 +48,11 @@ class Equations:
     - sum_i u_i m_i|² / (nugget p): a quadratic form. p is the mean power of the residual's numbers,
     plus a ten-thousandth of the label's, which has the gain of the prediction: links in
     shadow have far larger residuals than others.
-
-    Attributes:
-        places: Places (k, 3) [m].
-        grams: Products of the m_i over p (k, n, n).
-        sides: Products of the m_i with r over p (k, n).
     """
 
-    places: Float[Tensor, "k 3"]
-    grams: Complex[Tensor, "k n n"]
-    sides: Complex[Tensor, "k n"]
+    places: Float[Tensor, "k 3"]  # [m]
+    grams: Complex[Tensor, "k n n"]  # products of the m_i over p
+    sides: Complex[Tensor, "k n"]  # products of the m_i with r over p
 
     @classmethod
     def of(
@@ -98,18 +93,13 @@ class Equations:
 
 
 class PathField(nn.Module):
-    """Kriged strengths of the n paths to one receiver, from k known links.
+    """Kriged strengths of the n paths to one receiver, from k known links."""
 
-    Attributes:
-        places: Places of the known links (k, 3) [m].
-        weights: Weights of the links (k, n): the mean of the processes at a place are its
-            covariances with the places times these.
-        precisions: Precision of each path's strength from each link alone (k, n).
-    """
-
-    places: Tensor
+    places: Tensor  # places of the known links (k, 3) [m]
+    # Weights of the links (k, n): the mean of the processes at a place are its covariances with the
+    # places times these.
     weights: Tensor
-    precisions: Tensor
+    precisions: Tensor  # precision of each path's strength from each link alone (k, n)
 
     def __init__(self):
         super().__init__()
@@ -218,9 +208,7 @@ class PathPosterior(Posterior):
         residuals: Complex[Tensor, "k e s"],
         device: torch.device,
     ) -> list[Equations]:
-        """Equations of each receiver, from links with their aligned labels and residuals; margins
-        are computed on the device.
-        """
+        """Equations of each receiver, from links with aligned labels and residuals."""
         equations = []
         for receiver in range(len(self.fields)):
             rows = (query.receivers == receiver).nonzero()[:, 0]
@@ -261,8 +249,7 @@ class PathPosterior(Posterior):
         return mean
 
     def deviations(self, batch: Batch) -> Tensor:
-        """Standard deviations of each number (b, e, s), without noise, as if the elements resolved
-        all paths."""
+        """Standard deviations (b, e, s) without noise, as if the elements resolved all paths."""
         query, places = batch.query, batch.query.transmitters
         squares = places.new_zeros(len(query), *self.scene.task.shape)
         for receiver in query.receivers.unique().tolist():

@@ -108,9 +108,7 @@ class ScalarProcess(nn.Module):
     def deviations(
         self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
-        """Standard deviations of new readings at some places: z given the known readings, plus
-        noise.
-        """
+        """Standard deviations of new readings: z given the known readings, plus noise."""
         variances = places.new_zeros(len(places))
         is_many = self.receivers.bincount(minlength=len(self.logarithms)) > self.options.many
         for receiver in receivers.unique().tolist():
@@ -146,9 +144,7 @@ class ScalarProcess(nn.Module):
         return Process(of_receiver, self.places[known], self.variances[known], noise)
 
     def facts(self) -> dict[str, float]:
-        """Medians over the receivers of length and nugget; smoothness; degrees of freedom, 0 if the
-        noise is normal.
-        """
+        """Medians over receivers of length and nugget; smoothness; degrees of freedom or 0."""
         length, signal, noise = self.logarithms.exp().unbind(1)
         smoothness, degrees, scale = self.choice.tolist()
         facts = {
@@ -279,10 +275,7 @@ class ScalarProcess(nn.Module):
                 self.weights[readings.rows] = self._solved(readings, receiver)
 
     def take(self, other: "ScalarProcess") -> None:
-        """Takes the hyperparameters of another process.
-
-        ``deviations`` follow at once; for means call ``solve`` again.
-        """
+        """Takes another process's hyperparameters; for means call ``solve`` again."""
         ratios = (2 * (other.logarithms - self.logarithms)[self.receivers, 2]).exp()
         is_alike = torch.equal(self.choice[:2], other.choice[:2])
         self.variances = self.variances * ratios

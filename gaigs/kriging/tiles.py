@@ -26,14 +26,6 @@ class Tiles(nn.Module):
     A tile is solved with ``size`` readings: its own, ``core`` at most, then those around each of
     its own, which screen those behind them, then those nearest to its centre. The tile of a place
     is that of the nearest reading. Tiles are solved when a place in them is first asked for.
-
-    Attributes:
-        readings: Rows of the divided readings, one a place, among all known readings (n,).
-        values, variances: Their values, and variances of their noise, see ``Merged`` (n,).
-        owners: Tiles whose own they are (n,).
-        rows: Rows of those with which each tile is solved among ``readings`` (t, j).
-        weights: Values over the covariances of a tile's readings (t, j); NaN until asked for, and
-            not stored.
     """
 
     core = 128
@@ -45,11 +37,13 @@ class Tiles(nn.Module):
 
     stored = "readings", "values", "variances", "owners", "rows"
 
-    readings: Tensor
+    readings: Tensor  # rows of the divided readings, one a place, among all known readings (n,)
+    # Their values, and variances of their noise, see ``Merged`` (n,).
     values: Tensor
     variances: Tensor
-    owners: Tensor
-    rows: Tensor
+    owners: Tensor  # tiles whose own they are (n,)
+    rows: Tensor  # rows of those with which each tile is solved among ``readings`` (t, j)
+    # Values over the covariances of a tile's readings (t, j); NaN until asked for, and not stored.
     weights: Tensor
 
     def __init__(self) -> None:
@@ -93,9 +87,7 @@ class Tiles(nn.Module):
     def numbers(
         self, asked: Float[Tensor, "b d"], places: Float[Tensor, "k d"], known: Bool[Tensor, " k"]
     ) -> Int[Tensor, " _"]:
-        """Tiles of places, by the ``places`` of all readings and which of them are ``known`` to a
-        receiver; none if it has no tiles.
-        """
+        """Tiles of ``places`` that are ``known`` to a receiver; none if it has no tiles."""
         is_own = known[self.readings]
         rows, owners = self.readings[is_own], self.owners[is_own]
         if not len(rows):
@@ -110,9 +102,7 @@ class Tiles(nn.Module):
         covariances: Callable[[Tensor, Tensor], Tensor],
         solve: Callable[[Merged], Tensor],
     ) -> Float[Tensor, " b"]:
-        """Means at places in their ``tiles``: ``covariances`` with the ``places`` of all readings,
-        times weights from ``solve`` of a tile's readings.
-        """
+        """Means at places in their ``tiles``: ``covariances`` times weights of the readings."""
         means = asked.new_zeros(len(asked))
         order = tiles.argsort()
         numbers, counts = tiles[order].unique_consecutive(return_counts=True)

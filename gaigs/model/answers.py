@@ -30,9 +30,7 @@ def predicted(
     index: Int[Tensor, " k"],
     frequencies: Float[Tensor, " s"] | None = None,
 ) -> Tensor:
-    """Predictions of a model for some links, on the CPU; of channels at other subcarriers, if they
-    are given [Hz].
-    """
+    """Predictions of a model for some links, on the CPU, also at other subcarriers [Hz]."""
     size = batch_size(links)
     values = model.predict_batches(links.query[index], batch_size=size, frequencies=frequencies)
     return torch.cat([part.cpu() for part in values])
@@ -50,9 +48,7 @@ def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor
 
 
 def calibrated(model: Model, links: Links) -> Calibration | None:
-    """The calibration of a model, by errors at links that it has not seen, see ``Model.unseen``;
-    None without such links, or if the test is at other subcarriers.
-    """
+    """The calibration of a model by its ``unseen`` links; None without, or for other carriers."""
     if links.held_out is not None:
         return None
 
@@ -77,8 +73,7 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
 def at_new_receivers(
     model: Model, links: Links, most: int = 1000, receivers: int = 40
 ) -> Calibration | None:
-    """The calibration of a model at receivers without links; None with fewer than three to learn
-    from.
+    """The calibration of a model at receivers without links; None with fewer than three.
 
     Each receiver with links in turn has the mean of the others in place of what it has of its own.
     Receivers err as a whole: the errors of one are a cluster.

@@ -155,9 +155,7 @@ class Model(Movable):
 
     @torch.no_grad()
     def evaluate(self, batch: Batch) -> Tensor:
-        """Values (b, *shape) of a batch in all its directions, ``chunk`` pairs of a link and a
-        direction at a time.
-        """
+        """Values (b, *shape) of a batch in all its directions, ``chunk`` pairs at a time."""
         if self.chunk is None or batch.directions is None:
             return self(batch).value
         rays = batch.directions.flatten()
@@ -279,8 +277,7 @@ class Model(Movable):
         directions: Directions | None = None,
         frequencies: object = None,
     ) -> Iterator[Any]:
-        """The values of ``predict`` for a list of positions, a batch at a time, each computed when
-        it is asked for.
+        """The values of ``predict`` for a list of positions, each batch computed when asked for.
 
         A batch is (b, receivers, *shape), with a receiver (b, *shape). Arguments, warnings and
         errors are those of ``predict``, and come at once. The positions of a grid are in the order
@@ -296,9 +293,7 @@ class Model(Movable):
         )
 
     def _located(self, receiver: object, transmitters: object) -> tuple[Any, object]:
-        """The model that knows a receiver, and the receiver's number in it; names and numbers stay
-        as they are.
-        """
+        """The model that knows a receiver, whose names and numbers stay, and its number there."""
         new = as_new_receiver(receiver, self.scene, transmitters)
         if new is None:
             return self, receiver
@@ -412,8 +407,7 @@ class Model(Movable):
         return None
 
     def learnt_paths(self, query: Query) -> list:
-        """The strongest paths of some links together, each a
-        ``gaigs.planes.learnt_room.LearntPath``."""
+        """The strongest paths of some links, each a ``gaigs.planes.learnt_room.LearntPath``."""
         return []
 
     def export(self, folder: Path) -> None:
@@ -462,8 +456,7 @@ class Model(Movable):
         self.fit(links)
 
     def take_hyperparameters(self, other: "Model") -> None:
-        """Takes from a model of the same kind what its ``deviations`` depend on; by default
-        nothing."""
+        """Takes what its ``deviations`` depend on from a model of its kind; by default nothing."""
 
     @property
     def fold_count(self) -> int:

@@ -1,6 +1,4 @@
-"""Complete checkpoints: configuration, scene, split and weights in one file, loaded without the
-data.
-"""
+"""Complete checkpoints: configuration, scene, split and weights, loaded without the data."""
 
 import hashlib
 import io
@@ -161,9 +159,7 @@ def trained_weights(content: dict) -> dict:
 
 
 def described(model: nn.Module) -> dict:
-    """A model's configuration and, if it has them, its calibration and the keys of the places that
-    it knows.
-    """
+    """A model's configuration, calibration and keys of the places that it knows, as it has them."""
     calibration = None if model.calibration is None else model.calibration.state()
     return {
         "model": configuration_of(model),
@@ -173,9 +169,7 @@ def described(model: nn.Module) -> dict:
 
 
 def update(path: Path, model: nn.Module, trained: str | None = None) -> None:
-    """Gives a checkpoint its model's calibration; or another model of the scene, whose part
-    ``trained`` was trained.
-    """
+    """Gives a checkpoint its model's calibration, or another model with a ``trained`` part."""
     content = read(path)
     content[KEY] |= described(model)
     if trained is not None:
@@ -187,9 +181,7 @@ def update(path: Path, model: nn.Module, trained: str | None = None) -> None:
 
 
 def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
-    """All tensors in nested mappings and lists, with their places; a ``ValueError`` if these nest
-    without an end.
-    """
+    """All tensors in nested mappings and lists, with their places; endless ones are refused."""
     parts = [(name, value, 0)]
     for count in itertools.count():
         if not parts:

@@ -18,8 +18,7 @@ from gaigs.registry import register
 
 @register("model", "friis")
 class Friis(Model):
-    """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element, with one complex gain g for
-    each receiver.
+    """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element, one complex g a receiver.
 
     a is the elements' pattern towards the transmitter. The gain, ``fit_gain`` of the known links,
     contains transmit power, cables and the clock's phase. The sign of the phase is estimated from

@@ -28,17 +28,11 @@ from gaigs.splatting.rasterizer import Rasterizer
 
 
 class Excited(NamedTuple):
-    """The Gaussians as places excite them.
+    """The Gaussians as places excite them."""
 
-    Attributes:
-        placed: Gaussians before the deformation.
-        residuals: Changes by the deformation.
-        semi_axes: Semi-axes after it, a column for each axis [m].
-    """
-
-    placed: Placed
-    residuals: Residuals
-    semi_axes: Float[Tensor, "places n 3 3"]
+    placed: Placed  # Gaussians before the deformation
+    residuals: Residuals  # changes by the deformation
+    semi_axes: Float[Tensor, "places n 3 3"]  # semi-axes after it, a column for each axis [m]
 
 
 class Strengths(NamedTuple):
@@ -235,9 +229,7 @@ class GaussianSplatting(Model):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits placement, pooling and trend; takes off the mean level of the map, so that training
-        starts from the trend.
-        """
+        """Fits placement, pooling and trend; takes the map's level off, to start from the trend."""
         self.placement.fit(links)
         self.pooling.fit(links)
         if self.trend is None:
@@ -276,9 +268,7 @@ class GaussianSplatting(Model):
         return self.respond(self.excite(places), which, batch)
 
     def respond(self, excited: Excited, which: Int[Tensor, " b"], batch: Batch) -> Prediction:
-        """Values of a batch whose rows excite the Gaussians as the rows ``which`` of
-        ``excited``.
-        """
+        """Values of a batch whose rows excite the Gaussians as rows ``which`` of ``excited``."""
         query = batch.query
         links, values = [], []
         together = self.takes_paths and self.pooling.is_same_for_all
@@ -340,9 +330,7 @@ class GaussianSplatting(Model):
         return {} if self.rasterizer is None else {"rasterizer": self.rasterizer.used}
 
     def rendering(self, batch: Batch) -> Callable[[], object]:
-        """The rasterizer alone, or the sum over paths, for the links to the first link's
-        receiver.
-        """
+        """The rasterizer alone, or the sum over paths, for links to the first link's receiver."""
         receiver = int(batch.query.receivers[0])
         query = batch.query[(batch.query.receivers == receiver).nonzero()[:, 0]]
         with torch.no_grad():
@@ -404,9 +392,7 @@ class GaussianSplatting(Model):
         )
 
     def carriers(self, query: Query) -> Float[Tensor, " b"]:
-        """The links' frequencies [Hz]; single antennas receive equal powers at any, so they need
-        none.
-        """
+        """The links' frequencies [Hz]; None for single antennas, whose power is the same at any."""
         is_known = (
             query.frequencies is not None
             or len(self.scene.frequencies)
@@ -480,9 +466,7 @@ class GaussianSplatting(Model):
 def _towards(
     bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]
 ) -> Float[Tensor, "*b n c 1"]:
-    """Signal of Gaussians towards transmitters at these offsets [m], before the factor of the
-    constant harmonic.
-    """
+    """Signal of Gaussians towards transmitters at offsets [m], over the constant harmonic."""
     if bands.shape[-1] == 1:
         return bands
     # On a centre there is no direction. Nearer than 0.05 m the harmonics fade: gradients stay

@@ -1,6 +1,4 @@
-"""Gaussian process regression over a trend (kriging): the strongest simple predictor from
-positions.
-"""
+"""Gaussian process over a trend (kriging): the strongest simple predictor from positions."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -33,21 +31,15 @@ from gaigs.registry import name_of, register
 
 
 class Solved(NamedTuple):
-    """What predictions of one receiver are made from; neither in local kriging.
+    """What predictions of one receiver are made from; neither in local kriging."""
 
-    Attributes:
-        solution: Residuals over the covariances of their links (k, m).
-        factor: Cholesky factor of the covariances (k, k).
-    """
-
-    solution: Tensor | None
-    factor: Tensor | None
+    solution: Tensor | None  # residuals over the covariances of their links (k, m)
+    factor: Tensor | None  # Cholesky factor of the covariances (k, k)
 
 
 @register("model", "gaussian_process")
 class GaussianProcess(LookUp):
-    """label = trend + z + noise, z a Gaussian process over places with the Matern-1/2 kernel exp(-d
-    / l).
+    """label = trend + z + noise, z a process over places with the kernel exp(-d / l), Matern-1/2.
 
     d is the distance of transmitters. With several carriers it is the distance in place and
     frequency, d² = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are
@@ -225,9 +217,7 @@ class GaussianProcess(LookUp):
         return trend
 
     def facts(self) -> dict[str, object]:
-        """``length_m``, ``nugget``, with several carriers ``frequency_scale_m``; of scalars the
-        other choices.
-        """
+        """``length_m``, ``nugget``, ``frequency_scale_m`` of a band; of scalars other choices."""
         if self.scalar is not None:
             return {**self.scalar.facts(), "trend": name_of(self.trend)} | self.trend.facts()
         return {**self.process.facts()}

@@ -29,17 +29,12 @@ COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 
 
 class HeldOutLinks(NamedTuple):
-    """Held-out links of one receiver.
+    """Held-out links of one receiver."""
 
-    Attributes:
-        rows: Their rows among the known links (h,).
-        apart: Distances of the known links [m], infinite for those that are held out, too (h, k).
-        index: The known links (k,).
-    """
-
-    rows: Int[Tensor, " h"]
+    rows: Int[Tensor, " h"]  # their rows among the known links
+    # Distances of the known links [m], infinite for those that are held out, too.
     apart: Float[Tensor, "h k"]
-    index: Int[Tensor, " k"]
+    index: Int[Tensor, " k"]  # the known links
 
 
 @register("model", "knn")
@@ -80,9 +75,7 @@ class KNearestNeighbours(LookUp):
         self.scale = math.nan
 
     def fit(self, links: Links) -> None:
-        """Keeps the links, and chooses the scale of frequencies, and the number of neighbours if it
-        is None.
-        """
+        """Keeps the links; chooses the scale of frequencies, and ``neighbours`` if it is None."""
         self.links, self.known = links, known_links(links)
         self.scale = math.nan
         self.chosen = self.k or 3
@@ -164,9 +157,7 @@ class KNearestNeighbours(LookUp):
         return torch.stack(rows)
 
     def _held_out(self, folds: Sequence[Int[Tensor, " _"]] | None = None) -> Iterator[HeldOutLinks]:
-        """Some known links of each receiver, held out with their fold, or for None with their
-        place.
-        """
+        """Some known links of each receiver, held out with their fold, or for None their place."""
         for receiver, index in enumerate(self.known):
             for rows in evenly(torch.arange(len(index)), max(1, 256 // len(self.known))).split(32):
                 asked, known = self.links.query[index[rows]], self.links.query[index]

@@ -35,8 +35,7 @@ log = logging.getLogger(__name__)
 
 @register("model", "kriging")
 class Kriging(Wrapper):
-    """weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend, z the
-    kriged residual.
+    """weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend.
 
     The trend is a trained model. The fallback is a model that is fitted at once. z is the mean of a
     Gaussian process over places, as in ``gaigs.model.gaussian_process``, and 0 far from all known
@@ -128,8 +127,7 @@ class Kriging(Wrapper):
         by_paths: bool | None = None,
         most: int | None = None,
     ) -> "Kriging":
-        """Fits, and gives the validation model: the same weights and hyperparameters on the
-        training links alone.
+        """Fits, and gives the validation model: the same choices on the training links alone.
 
         Args:
             links: Links with a split.
@@ -394,9 +392,7 @@ class Kriging(Wrapper):
         return self._alone.any_frequency
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
-        """The trend alone, or the fallback: residuals at other frequencies do not correlate with
-        the known ones.
-        """
+        """The trend alone, or the fallback: residuals at other frequencies do not correlate."""
         return self._alone.at_frequencies(frequencies)
 
     @property

@@ -14,8 +14,7 @@ from gaigs.registry import name_of
 
 
 class LookUp(Model):
-    """Base of a model that keeps its known links: they are its state, with the attributes of the
-    names ``learnt``.
+    """Base of a model whose state are its known links and the attributes named in ``learnt``.
 
     It answers on the processor.
 
@@ -33,9 +32,7 @@ class LookUp(Model):
         return self
 
     def get_extra_state(self) -> dict:
-        """Known links and ``learnt``; labels in bytes if all are 255ths from 0 to 1, as of 8-bit
-        images.
-        """
+        """Known links and ``learnt``; labels in bytes if all are 255ths, as of 8-bit images."""
         if self.links is None:
             raise ValueError(f"model {name_of(self)!r} has no links to save; fit it first")
         index = torch.cat([*self.known])

@@ -80,17 +80,8 @@ class MirroredSplatting(GaussianSplatting):
         gaussians: Mapping | None = None,
         trend: str | Mapping | Model | None = None,
     ):
-        super().__init__(
-            scene,
-            placement,
-            tokenizer,
-            deformation,
-            projection,
-            rasterizer,
-            pooling,
-            gaussians,
-            trend,
-        )
+        image = projection, rasterizer, pooling
+        super().__init__(scene, placement, tokenizer, deformation, *image, gaussians, trend)
 
     @staticmethod
     def own_pooling(scene: Scene) -> str:
@@ -188,12 +179,8 @@ class MirroredSplatting(GaussianSplatting):
             len(placement.origin),
             start,
         ).run()
-        for number, (plane, slab) in enumerate(zip(planes, slabs, strict=True)):
-            placement.place(number, plane, slab)
-        placement.planned.copy_(placement.sequences_of(torch.arange(len(planes))))
-        placement.most.copy_(placement.planned.sum())
+        self._plan(planes, slabs)
         placement.step.mul_(0.1)  # the search is exact to millimetres
-        placement.found.fill_(True)
 
     def _search_field(
         self, links: Links, sign: int, start: Float[Tensor, "w 4"], pooling: ChannelPooling
@@ -203,19 +190,23 @@ class MirroredSplatting(GaussianSplatting):
         search = FieldSearch(links, sign, placement.order, len(placement.origin), start)
         room = search.run()
         planes = search.frame.to_world(room.planes)
-        for number, (plane, slab) in enumerate(zip(planes, room.slabs, strict=True)):
-            placement.place(number, plane, slab)
-        placement.planned.copy_(placement.sequences_of(torch.arange(len(planes))))
-        longer = (placement.sequences >= 0).sum(1) > search.data.order
-        placement.planned[longer] = False
-        placement.most.copy_(placement.planned.sum())
-        placement.found.fill_(True)
+        self._plan(planes, room.slabs, search.data.order)
         if not len(planes):
             return
         unit = pooling.strength.item() * search.data.wavelength / (4 * math.pi)
         receivers = torch.tensor(search.data.numbers)
         placement.start_strengths(room.gains, receivers, room.receivers / unit)
         placement.step.mul_(0.1)
+
+    def _plan(self, planes: Tensor, slabs: Tensor, order: int | float = math.inf) -> None:
+        """Puts planes with their slabs for the first revision; paths have up to ``order``."""
+        placement = self.placement
+        for number, (plane, slab) in enumerate(zip(planes, slabs, strict=True)):
+            placement.place(number, plane, slab)
+        placement.planned.copy_(placement.sequences_of(torch.arange(len(planes))))
+        placement.planned[(placement.sequences >= 0).sum(1) > order] = False
+        placement.most.copy_(placement.planned.sum())
+        placement.found.fill_(True)
 
     def _receiver_gains(
         self,

@@ -27,39 +27,25 @@ from gaigs.core.task import Axis
 
 
 class Subcarriers(NamedTuple):
-    """Subcarriers that a prediction is asked at.
+    """Subcarriers that a prediction is asked at."""
 
-    Attributes:
-        exchanged: Frequencies [Hz] that the model computes in place of the labels' own; None: the
-            labels' own.
-        columns: The labels' own subcarriers that are taken (s,); None: all.
-        warning: Sentence on the values, empty if there is nothing to say.
-    """
-
+    # Frequencies [Hz] that the model computes in place of the labels' own; None: the labels' own.
     exchanged: Float[Tensor, " s"] | None = None
+    # The labels' own subcarriers that are taken; None: all.
     columns: Int[Tensor, " s"] | None = None
-    warning: str = ""
+    warning: str = ""  # sentence on the values, empty if there is nothing to say
 
 
 class Request(NamedTuple):
-    """Links to predict, and how their values are arranged.
+    """Links to predict, and how their values are arranged."""
 
-    Attributes:
-        query: Links, the receivers of a position one after the other.
-        axes: Axes of the links in the answer, see ``Query.from_positions``.
-        receiver: Receivers as they were asked for; None: all.
-        each: Number of links of a position.
-        directions: Directions to predict; None: the label's own.
-        subcarriers: Subcarriers to predict.
-        warnings: Sentences on positions, carriers and subcarriers far from the training links.
-    """
-
-    query: Query
-    axes: tuple[int, ...]
-    receiver: object
-    each: int
-    directions: Directions | None
-    subcarriers: Subcarriers
+    query: Query  # links, the receivers of a position one after the other
+    axes: tuple[int, ...]  # axes of the links in the answer, see ``Query.from_positions``
+    receiver: object  # receivers as they were asked for; None: all
+    each: int  # number of links of a position
+    directions: Directions | None  # directions to predict; None: the label's own
+    subcarriers: Subcarriers  # subcarriers to predict
+    # Sentences on positions, carriers and subcarriers far from the training links.
     warnings: list[str]
 
     @classmethod
@@ -161,9 +147,6 @@ def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver 
 
     Three whole numbers beside three transmitters are indices. A pose has the array of the scene's
     receivers, and so has a position where this array has no orientation.
-
-    Raises:
-        ValueError: The receivers' arrays differ, or need an orientation.
     """
     if isinstance(receiver, Receiver) or receiver is None:
         return receiver
@@ -218,11 +201,7 @@ def lacks_elements(scene: Scene) -> bool:
 
 
 def as_known_subcarriers(frequencies: object, scene: Scene, any_frequency: bool) -> Subcarriers:
-    """Subcarriers of ``Model.predict``, for a model that computes them anywhere or does not.
-
-    Raises:
-        ValueError: The labels have no subcarriers, or a frequency is impossible.
-    """
+    """Subcarriers of ``Model.predict``, for a model that computes them anywhere or does not."""
     if frequencies is None:
         return Subcarriers()
     if not scene.task.is_channel:
@@ -290,8 +269,7 @@ def usual_batch_size(shape: tuple[int, ...], numbers: int = 2**17, most: int = 1
 
 
 def extrapolations(query: Query, scene: Scene) -> list[str]:
-    """Sentences on positions farther from the training transmitters' box than the scene's extent,
-    and on carriers outside the training links' band."""
+    """Sentences on positions far from the training box, and on carriers beyond the band."""
     messages = []
     lower, upper = (corner.to(scene.lower) for corner in scene.box)
     positions = scene.positions(lower)

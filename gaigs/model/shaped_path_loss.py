@@ -14,8 +14,7 @@ from gaigs.registry import register
 
 @register("model", "shaped_path_loss")
 class ShapedPathLoss(PathLoss):
-    """``path_loss`` with a break point, lobes of the receivers' antennas, and the transmitter's
-    height, each where held-out links are clearly better with it.
+    """``path_loss`` with a break point, lobes and heights, each where held-out links gain by it.
 
     Source: as of ``PathTerms``, which has the terms.
     """

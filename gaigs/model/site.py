@@ -26,8 +26,7 @@ log = logging.getLogger(__name__)
 
 @register("model", "site")
 class Site(Model):
-    """``path_loss`` of each receiver, less a loss by buildings that all receivers share; NaN before
-    ``fit``.
+    """``path_loss`` of each receiver, less a common loss by buildings; NaN before ``fit``.
 
     Loss = c1 [a roof is above the direct path] + c2 10 log10(1 + length inside / 1 m) + c3 (walls
     crossed) + c4 (knife-edge loss over the roofs). The coefficients are 0 or more, by least squares
@@ -126,9 +125,7 @@ class Site(Model):
 def shared_coefficients(
     columns: Float[Tensor, "k c"], lengths: Float[Tensor, " k"], receivers: Tensor
 ) -> Float[Tensor, " f"]:
-    """Coefficients of 0 or more with which the last columns explain the first one, beside a level
-    and an exponent of each receiver.
-    """
+    """Coefficients of 0 or more of the last columns, beside each receiver's level and exponent."""
     columns = columns.clone()
     decades = lengths.clamp_min(0.1).log10()
     # What level and exponent explain is taken off first (Frisch and Waugh, 1933).

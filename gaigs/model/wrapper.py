@@ -14,9 +14,7 @@ from gaigs.splatting.gaussians import Gaussians
 
 
 class Wrapper(Model):
-    """Base of a model around an ``underlying`` one, which has the room, the Gaussians, the
-    rendering and the files.
-    """
+    """Base of a model around an ``underlying`` one, whose room, Gaussians and files it shows."""
 
     @property
     @abstractmethod

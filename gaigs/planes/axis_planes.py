@@ -122,10 +122,7 @@ def _strongest(candidates: list[Candidate], least: float) -> list[Float[Tensor, 
 
 
 def room_axes(planes: Float[Tensor, "w 4"]) -> Float[Tensor, "k 3"]:
-    """Normals of planes, and others that a room may have.
-
-    These are level, upright, and at right angles to upright ones.
-    """
+    """Normals of planes, and level, upright ones and those at right angles to upright ones."""
     normals = planes[:, :3]
     up = planes.new_tensor([0.0, 0.0, 1.0])
     upright = functional.normalize(normals[normals[:, 2].abs() < 0.5] * (1 - up), dim=1)

@@ -31,48 +31,39 @@ part, and of the thickness [m]; a metre is a half-space."""
 
 @dataclass(frozen=True)
 class ChannelOptions:
-    """Options of the search for planes in channels.
+    """Options of the search for planes in channels."""
 
-    Attributes:
-        ridge: Ridge of path strengths over their mean power.
-        fewest_free: Numbers of a channel, elements times delays that its band resolves in the room,
-            below which free strengths explain it by any planes. A room of six has as many paths of
-            up to two reflections.
-        certain_share: Share of the power from which a plane is taken.
-        faint_share: The same if the rest falls by ``certain_fall``. Validation drops planes later;
-            a few too many cost time alone.
-        certain_fall: Fall of the mean log of the rest by a true plane behind others: false ones
-            reach 0.3.
-        price: Least fall of the mean log of what neighbours do not predict by a true plane. Walls
-            have 0.05 and more, false planes up to 0.02, furniture 0.01 to 0.06.
-        neighbours: Places whose strengths predict a place.
-        predicted: Most places that are predicted.
-        added_share: Least share of the rest that a candidate along the room's axes explains.
-        margin: Largest distance of a plane from all transmitters and receivers [diagonals].
-        offset_cells, tilt_cells: Most steps of the periodogram on either side. Steps follow the
-            wavelength, of a tilt over the room's diagonal. At 60 GHz they reach 2 cm, and 0.004 rad
-            in a room of 10 m; in a hall of 100 m 0.007 rad at 3.5 GHz.
-        most_waves: Most waves of ``find_axis_walls``, some seconds' work for each plane: offsets
-            times places times numbers.
-        drawing_error: Largest error of a wall in a floor plan [m].
-        chance: Share of the rest that the best of thousands of planes explains by chance, times the
-            number of places.
-    """
-
-    ridge: float = 1e-3
+    ridge: float = 1e-3  # ridge of path strengths over their mean power
+    # Numbers of a channel, elements times delays that its band resolves in the room, below which
+    # free strengths explain it by any planes. A room of six has as many paths of up to two
+    # reflections.
     fewest_free: int = 37
-    certain_share: float = 0.006
+    certain_share: float = 0.006  # share of the power from which a plane is taken
+    # The same if the rest falls by ``certain_fall``. Validation drops planes later; a few too many
+    # cost time alone.
     faint_share: float = 0.003
+    # Fall of the mean log of the rest by a true plane behind others: false ones reach 0.3.
     certain_fall: float = 0.5
+    # Least fall of the mean log of what neighbours do not predict by a true plane. Walls have 0.05
+    # and more, false planes up to 0.02, furniture 0.01 to 0.06.
     price: float = 0.02
-    neighbours: int = 8
-    predicted: int = 250
+    neighbours: int = 8  # places whose strengths predict a place
+    predicted: int = 250  # most places that are predicted
+    # Least share of the rest that a candidate along the room's axes explains.
     added_share: float = 0.05
+    # Largest distance of a plane from all transmitters and receivers [diagonals].
     margin: float = 0.3
+    # Most steps of the periodogram on either side. Steps follow the wavelength, of a tilt over the
+    # room's diagonal. At 60 GHz they reach 2 cm, and 0.004 rad in a room of 10 m; in a hall of 100
+    # m 0.007 rad at 3.5 GHz.
     offset_cells: int = 64
     tilt_cells: int = 40
+    # Most waves of ``find_axis_walls``, some seconds' work for each plane: offsets times places
+    # times numbers.
     most_waves: int = 100_000_000
-    drawing_error: float = 0.2
+    drawing_error: float = 0.2  # largest error of a wall in a floor plan [m]
+    # Share of the rest that the best of thousands of planes explains by chance, times the number of
+    # places.
     chance: float = 6.0
 
 
@@ -117,21 +108,13 @@ def materials_of(slabs: Float[Tensor, "*w 3"]) -> SlabMaterials:
 
 @dataclass(frozen=True)
 class ReceiverChannels:
-    """The training channels of one receiver, thinned to some elements and subcarriers.
+    """The training channels of one receiver, thinned to some elements and subcarriers."""
 
-    Attributes:
-        places: Transmitters (b, 3) [m].
-        channels: With phases as of exp(-j 2 pi f t) (b, e, s).
-        position: Middle of the array (3,) [m].
-        elements: World frame (e, 3) [m].
-        frequencies: (s,) [Hz].
-    """
-
-    places: Float[Tensor, "b 3"]
-    channels: Complex[Tensor, "b e s"]
-    position: Float[Tensor, "3"]
-    elements: Float[Tensor, "e 3"]
-    frequencies: Float[Tensor, " s"]
+    places: Float[Tensor, "b 3"]  # transmitters [m]
+    channels: Complex[Tensor, "b e s"]  # with phases as of exp(-j 2 pi f t)
+    position: Float[Tensor, "3"]  # middle of the array [m]
+    elements: Float[Tensor, "e 3"]  # world frame [m]
+    frequencies: Float[Tensor, " s"]  # [Hz]
 
     @classmethod
     def of(
@@ -179,10 +162,7 @@ class ReceiverChannels:
         return replace(self, **parts, channels=self.channels.to(torch.complex64))
 
     def of_unique_places(self) -> "ReceiverChannels":
-        """One link of each place that is received.
-
-        Links of one place have one channel, and would explain each other.
-        """
+        """One link of each received place: links of one place would explain each other."""
         received = self.at(self.channels.abs().amax((1, 2)) > 0)
         _, which = received.places.unique(dim=0, return_inverse=True)
         first: dict[int, int] = {}

@@ -16,19 +16,13 @@ from gaigs.planes.strengths import align_phases, log_share, real_residual, real_
 
 
 class NeighbourLinks(NamedTuple):
-    """Channels of one receiver, and the nearest places to those that are predicted.
+    """Channels of one receiver, and the nearest places to those that are predicted."""
 
-    Attributes:
-        receiver: Channels of targets and neighbours.
-        targets: Rows of the predicted places.
-        near: Rows of their nearest places (t, k).
-        counts: True for neighbours a wavelength away or farther: closer ones share the interference
-            of all paths.
-    """
-
-    receiver: ReceiverChannels
-    targets: Int[Tensor, " t"]
-    near: Int[Tensor, "t k"]
+    receiver: ReceiverChannels  # channels of targets and neighbours
+    targets: Int[Tensor, " t"]  # rows of the predicted places
+    near: Int[Tensor, "t k"]  # rows of their nearest places
+    # True for neighbours a wavelength away or farther: closer ones share the interference of all
+    # paths.
     counts: Bool[Tensor, "t k"]
 
 

@@ -151,10 +151,7 @@ class ChannelSearch:
         return search.sweep(room, turns, "search of planes", replace).planes
 
     def resolve(self, planes: Float[Tensor, "w 4"]) -> SlabRoom:
-        """Moves planes to where real strengths of slabs leave least.
-
-        Planes not yet resolved keep complex strengths.
-        """
+        """Moves planes to where real strengths of slabs leave least; others stay complex."""
         room = half_spaces(planes)
         resolved = torch.zeros(len(planes), dtype=torch.bool)
         sample = self.data.sample(planes)

@@ -23,23 +23,14 @@ log = logging.getLogger(__name__)
 
 
 class PlaneGrid(NamedTuple):
-    """Planes that are rated with places in groups.
+    """Planes that are rated with places in groups."""
 
-    Attributes:
-        title: For the log.
-        normals: Their normals.
-        offsets: Number of offsets of each normal.
-        groups: Number of groups of neighbouring places.
-        turn: Angle between neighbouring normals [rad].
-        shift: Distance of neighbouring offsets [m].
-    """
-
-    title: str
-    normals: Float[Tensor, "n 3"]
-    offsets: int
-    groups: int
-    turn: float
-    shift: float
+    title: str  # for the log
+    normals: Float[Tensor, "n 3"]  # their normals
+    offsets: int  # number of offsets of each normal
+    groups: int  # number of groups of neighbouring places
+    turn: float  # angle between neighbouring normals [rad]
+    shift: float  # distance of neighbouring offsets [m]
 
     @property
     def size(self) -> int:

@@ -33,10 +33,7 @@ class RoomFrame:
 
     @cached_property
     def generator(self) -> torch.Generator:
-        """Random numbers of the search.
-
-        A search that draws nothing leaves the training's random numbers alone.
-        """
+        """Random numbers of the search, made when drawn: the training's are left alone."""
         return torch.Generator().manual_seed(int(torch.randint(2**31, ())))
 
     def from_world(self, planes: Float[Tensor, "*w 4"]) -> Float[Tensor, "*w 4"]:

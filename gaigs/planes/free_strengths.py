@@ -14,17 +14,11 @@ from gaigs.planes.strengths import fit_free, log_share
 
 
 class FreeRoom(NamedTuple):
-    """Planes with what free strengths at each place leave of the channels.
+    """Planes with what free strengths at each place leave of the channels."""
 
-    Attributes:
-        planes: Planes in the frame (w, 4).
-        error: Mean over links of the log of the share of power that remains.
-        share: Share of power that the last added plane explains, its rating.
-    """
-
-    planes: Float[Tensor, "w 4"]
-    error: float
-    share: float = 0.0
+    planes: Float[Tensor, "w 4"]  # planes in the frame
+    error: float  # mean over links of the log of the share of power that remains
+    share: float = 0.0  # share of power that the last added plane explains, its rating
 
 
 class FreeScore(Score[FreeRoom]):

@@ -19,44 +19,33 @@ from gaigs.splatting.placement.mirrored.reflections import all_sequences, square
 
 @dataclass(frozen=True)
 class LagOptions:
-    """Options of the search for planes in spectra.
+    """Options of the search for planes in spectra."""
 
-    Attributes:
-        certain: Least fall of the mean error by which a plane moves [standard errors].
-        blocked: Rise of a link's log error by which a path counts as blocked there: without it, any
-            plane explains some links.
-        gain: Least fall of the mean log error by a further plane.
-        faint: Share of the power below which paths of several reflections are left out.
-        bands: Bandwidths that are tried, where it is unknown [speed of light over the diagonal]:
-            from a carrier to a band in which hardly two paths interfere.
-        strange: Share of a spectrum that its array cannot explain, from which on the search is left
-            out. Measured spectra have 0.001, powers in place of amplitudes 0.05.
-        margin: Largest distance of a plane from all transmitters and receivers [diagonals].
-        pairs: Most pairs of a receiver and a carrier: each costs a periodogram.
-    """
-
-    certain: float = 2.0
+    certain: float = 2.0  # least fall of the mean error by which a plane moves [standard errors]
+    # Rise of a link's log error by which a path counts as blocked there: without it, any plane
+    # explains some links.
     blocked: float = 0.1
-    gain: float = 0.03
-    faint: float = 1e-3
+    gain: float = 0.03  # least fall of the mean log error by a further plane
+    faint: float = 1e-3  # share of the power below which paths of several reflections are left out
+    # Bandwidths that are tried, where it is unknown [speed of light over the diagonal]: from a
+    # carrier to a band in which hardly two paths interfere.
     bands: tuple[float, ...] = (0.01, 1.0, 3.0, 10.0, 30.0, 100.0)
+    # Share of a spectrum that its array cannot explain, from which on the search is left out.
+    # Measured spectra have 0.001, powers in place of amplitudes 0.05.
     strange: float = 0.01
+    # Largest distance of a plane from all transmitters and receivers [diagonals].
     margin: float = 0.15
-    pairs: int = 16
+    pairs: int = 16  # most pairs of a receiver and a carrier: each costs a periodogram
 
 
 class LagRoom(NamedTuple):
-    """Planes of the room, and which paths are open at each link.
+    """Planes of the room, and which paths are open at each link."""
 
-    Attributes:
-        planes: Normals and offsets (w, 4) [m].
-        open: For each link the direct path, then all paths at each plane (b, w + 1).
-        errors: Error of each link (b,). Where the last moved plane is not open, it is the error
-            without this plane plus ``LagOptions.blocked``.
-    """
-
-    planes: Float[Tensor, "w 4"]
+    planes: Float[Tensor, "w 4"]  # normals and offsets [m]
+    # For each link the direct path, then all paths at each plane (b, w + 1).
     open: Bool[Tensor, "b v"]
+    # Error of each link. Where the last moved plane is not open, it is the error without this plane
+    # plus ``LagOptions.blocked``.
     errors: Float[Tensor, " b"]
 
     def opened(self, column: int, value: Bool[Tensor, " b"] | bool) -> Bool[Tensor, "b v"]:

@@ -28,17 +28,11 @@ def reflection(
 
 
 class ArrayPaths(NamedTuple):
-    """Paths as an array receives them.
+    """Paths as an array receives them."""
 
-    Attributes:
-        fields: Fields at the middle of the array (b, n).
-        steering: Phase factors at the elements (b, n, e).
-        lengths: Lengths of the paths (b, n) [m].
-    """
-
-    fields: Complex[Tensor, "b n"]
-    steering: Complex[Tensor, "b n e"]
-    lengths: Float[Tensor, "b n"]
+    fields: Complex[Tensor, "b n"]  # fields at the middle of the array
+    steering: Complex[Tensor, "b n e"]  # phase factors at the elements
+    lengths: Float[Tensor, "b n"]  # lengths of the paths [m]
 
 
 class FurtherWave(NamedTuple):
@@ -46,50 +40,34 @@ class FurtherWave(NamedTuple):
 
     For a weak further path with conjugate wave w* at the elements, the error falls by 2 Re sum(w*
     times the weights), summed over known paths and elements.
-
-    Attributes:
-        weights: Weights for each known path and element (b, n, e). Without a bandwidth they are
-            summed over the known paths, and n is 1.
-        lengths: Lengths of the known paths (b, n) [m].
     """
 
+    # Weights for each known path and element. Without a bandwidth they are summed over the known
+    # paths, and n is 1.
     weights: Complex[Tensor, "b n e"]
-    lengths: Float[Tensor, "b n"]
+    lengths: Float[Tensor, "b n"]  # lengths of the known paths [m]
 
 
 class SingleReflections(NamedTuple):
-    """Paths of one reflection at planes (b, c).
+    """Paths of one reflection at planes (b, c)."""
 
-    Attributes:
-        directions: Unit vectors in the array's frame.
-        lengths: Lengths of the paths [m].
-        gains: Fields without a phase; 0 for places behind a plane.
-        cosines: Cosines of the angles of incidence, negative behind a plane.
-    """
-
-    directions: Float[Tensor, "b c 3"]
-    lengths: Float[Tensor, "b c"]
-    gains: Complex[Tensor, "b c"]
-    cosines: Float[Tensor, "b c"]
+    directions: Float[Tensor, "b c 3"]  # unit vectors in the array's frame
+    lengths: Float[Tensor, "b c"]  # lengths of the paths [m]
+    gains: Complex[Tensor, "b c"]  # fields without a phase; 0 for places behind a plane
+    cosines: Float[Tensor, "b c"]  # cosines of the angles of incidence, negative behind a plane
 
 
 @dataclass(frozen=True)
 class ReceiverLags:
-    """Covariances of one receiver's elements at some training links of one carrier.
+    """Covariances of one receiver's elements at some training links of one carrier."""
 
-    Attributes:
-        places: Transmitters (b, 3) [m].
-        lags: Covariances at each of ``array.lags``, over the power (b, l).
-        frequency: Carrier [Hz].
-        pose, array: Pose and array of the receiver.
-        directions: Directions in which spectra are compared: 4 x 4 elements resolve no more (k, 3).
-    """
-
-    places: Float[Tensor, "b 3"]
-    lags: Complex[Tensor, "b l"]
-    frequency: float
+    places: Float[Tensor, "b 3"]  # transmitters [m]
+    lags: Complex[Tensor, "b l"]  # covariances at each of ``array.lags``, over the power
+    frequency: float  # carrier [Hz]
+    # Pose and array of the receiver.
     pose: Pose
     array: Array
+    # Directions in which spectra are compared: 4 x 4 elements resolve no more.
     directions: Float[Tensor, "k 3"] = field(
         default=Grid.degrees(range(4, 90, 8), range(0, 360, 15)).flatten().vectors(), repr=False
     )

@@ -27,51 +27,32 @@ NEPER = 20 / math.log(10)
 
 
 class PlaneTable(NamedTuple):
-    """All learnt planes, float64.
+    """All learnt planes, float64."""
 
-    Attributes:
-        normals: Unit normals out of the room.
-        offsets: Along the normals from the world's origin [m].
-        losses: Least losses of a reflection at normal incidence [dB].
-        middles: Points with the least losses [m].
-        extents: Standard deviations of the reflecting areas along the world's axes [m].
-    """
-
-    normals: Float[ndarray, "w 3"]
-    offsets: Float[ndarray, " w"]
-    losses: Float[ndarray, " w"]
-    middles: Float[ndarray, "w 3"]
+    normals: Float[ndarray, "w 3"]  # unit normals out of the room
+    offsets: Float[ndarray, " w"]  # along the normals from the world's origin [m]
+    losses: Float[ndarray, " w"]  # least losses of a reflection at normal incidence [dB]
+    middles: Float[ndarray, "w 3"]  # points with the least losses [m]
+    # Standard deviations of the reflecting areas along the world's axes [m].
     extents: Float[ndarray, "w 3"]
 
 
 class LearntPlane(NamedTuple):
-    """The drawn part of a learnt plane.
+    """The drawn part of a learnt plane."""
 
-    Attributes:
-        number: As in ``metrics.json``.
-        corners: A convex polygon, counterclockwise as seen from outside the room [m].
-        normal: Unit normal out of the room.
-        share: Share of the paths at the plane in the received power.
-    """
-
-    number: int
+    number: int  # as in ``metrics.json``
+    # A convex polygon, counterclockwise as seen from outside the room [m].
     corners: Float[ndarray, "c 3"]
-    normal: Float[ndarray, "3"]
-    share: float
+    normal: Float[ndarray, "3"]  # unit normal out of the room
+    share: float  # share of the paths at the plane in the received power
 
 
 class Matter(NamedTuple):
-    """Obstacles.
+    """Obstacles."""
 
-    Attributes:
-        centres: [m].
-        widths: Standard deviations along the world's axes [m].
-        densities: Densities at the centres [dB/m].
-    """
-
-    centres: Float[ndarray, "k 3"]
-    widths: Float[ndarray, "k 3"]
-    densities: Float[ndarray, " k"]
+    centres: Float[ndarray, "k 3"]  # [m]
+    widths: Float[ndarray, "k 3"]  # standard deviations along the world's axes [m]
+    densities: Float[ndarray, " k"]  # densities at the centres [dB/m]
 
 
 class LearntRoom(NamedTuple):
@@ -135,10 +116,7 @@ def tabulate_planes(placement: Mirrored, ends: Float[ndarray, "k 3"]) -> PlaneTa
 
 
 def other_offset(scene: Scene, planes: PlaneTable, number: int) -> float | None:
-    """Offset at which a plane would reflect paths of the same lengths [m], see ``FlatAxis``.
-
-    None if there is no such offset.
-    """
+    """Offset at which a plane reflects paths of equal lengths [m], see ``FlatAxis``; or None."""
     normal = planes.normals[number]
     for flat in scene.flat_axes:
         if abs(normal[flat.axis]) > 0.99:

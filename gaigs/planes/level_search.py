@@ -29,20 +29,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LevelOptions:
-    """Options of the search for planes in received levels.
+    """Options of the search for planes in received levels."""
 
-    Attributes:
-        clear: Least fall of the errors by a plane whose phases count [standard errors].
-        chance: Least ratio of this fall to the largest one by chance: of few links some plane
-            always explains much.
-        shuffles: How often chance is tried: with errors that have changed their links.
-        maxima: Maxima of the periodograms whose errors are compared.
-    """
-
-    clear: float = 3.0
+    clear: float = 3.0  # least fall of the errors by a plane whose phases count [standard errors]
+    # Least ratio of this fall to the largest one by chance: of few links some plane always explains
+    # much.
     chance: float = 1.1
-    shuffles: int = 4
-    maxima: int = 4
+    shuffles: int = 4  # how often chance is tried: with errors that have changed their links
+    maxima: int = 4  # maxima of the periodograms whose errors are compared
 
 
 @dataclass(frozen=True)
@@ -62,24 +56,16 @@ class ReceiverLevels(ReceiverLags):
 
 
 class LevelRoom(NamedTuple):
-    """Planes of the room, and what a model knows of them from powers.
+    """Planes of the room, and what a model knows of them from powers."""
 
-    Attributes:
-        planes: Normals and offsets (w, 4) [m].
-        located: True for planes whose paths interfere (w,).
-        passing: Share of the direct path's field, and of the field at each plane, that obstacles
-            let through at each link (b, w + 1).
-        gain: Fall of the errors by the plane located last [standard errors].
-        number: Number of this plane.
-        bandwidth: Over which powers were averaged [Hz].
-    """
-
-    planes: Float[Tensor, "w 4"]
-    located: Bool[Tensor, " w"]
+    planes: Float[Tensor, "w 4"]  # normals and offsets [m]
+    located: Bool[Tensor, " w"]  # True for planes whose paths interfere
+    # Share of the direct path's field, and of the field at each plane, that obstacles let through
+    # at each link (b, w + 1).
     passing: Float[Tensor, "b v"]
-    gain: float = 0.0
-    number: int = 0
-    bandwidth: float = 0.0
+    gain: float = 0.0  # fall of the errors by the plane located last [standard errors]
+    number: int = 0  # number of this plane
+    bandwidth: float = 0.0  # over which powers were averaged [Hz]
 
 
 class LevelScore(Score[LevelRoom]):

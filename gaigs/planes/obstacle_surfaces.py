@@ -25,25 +25,19 @@ from gaigs.splatting.placement.mirrored.paths import Mirrored
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """Options of the fit of sheets.
+    """Options of the fit of sheets."""
 
-    Attributes:
-        densities: Number of densities with sheets: more are more exact, but a ray tracer counts
-            each crossing as an interaction.
-        candidates: Densities that are tried.
-        faint: Share of a link's power, obstacles apart, from which a path counts.
-        least_conductance: Conductance from which a sheet is used: 0.1 dB at normal incidence.
-        samples: Points of a leg at which the density is computed: 5 cm apart on a leg of 10 m.
-        paths: Largest number of paths to which sheets are fitted.
-        voxels: Points of the grid on which surfaces are found: 6 cm apart in a room of 100 m³.
-    """
-
+    # Number of densities with sheets: more are more exact, but a ray tracer counts each crossing as
+    # an interaction.
     densities: int = 3
-    candidates: int = 6
-    faint: float = 1e-4
+    candidates: int = 6  # densities that are tried
+    faint: float = 1e-4  # share of a link's power, obstacles apart, from which a path counts
+    # Conductance from which a sheet is used: 0.1 dB at normal incidence.
     least_conductance: float = 0.023
+    # Points of a leg at which the density is computed: 5 cm apart on a leg of 10 m.
     samples: int = 192
-    paths: int = 20_000
+    paths: int = 20_000  # largest number of paths to which sheets are fitted
+    # Points of the grid on which surfaces are found: 6 cm apart in a room of 100 m³.
     voxels: int = 500_000
 
 
@@ -68,18 +62,12 @@ class Sheet(NamedTuple):
 
 
 class Legs(NamedTuple):
-    """Straight pieces of paths, from the middle of the room.
+    """Straight pieces of paths, from the middle of the room."""
 
-    Attributes:
-        start: First ends [m].
-        along: From first to last ends [m].
-        paths: Number of each leg's path.
-        densities: Densities of matter, at points evenly spread over a leg [Np/m].
-    """
-
-    start: Float[Tensor, "s 3"]
-    along: Float[Tensor, "s 3"]
-    paths: Int[Tensor, " s"]
+    start: Float[Tensor, "s 3"]  # first ends [m]
+    along: Float[Tensor, "s 3"]  # from first to last ends [m]
+    paths: Int[Tensor, " s"]  # number of each leg's path
+    # Densities of matter, at points evenly spread over a leg [Np/m].
     densities: Float[Tensor, "s k"]
 
 
@@ -92,16 +80,11 @@ class AttenuatedPaths(NamedTuple):
 
 
 class Crossings(NamedTuple):
-    """Points where paths cross surfaces.
+    """Points where paths cross surfaces."""
 
-    Attributes:
-        cosines: Cosines of the angles of incidence (c,).
-        tm_shares: Shares of the TM field in vertical polarisation (c,).
-        paths, surfaces: Numbers of the path and of the surface (c,).
-    """
-
-    cosines: Float[Tensor, " c"]
-    tm_shares: Float[Tensor, " c"]
+    cosines: Float[Tensor, " c"]  # cosines of the angles of incidence
+    tm_shares: Float[Tensor, " c"]  # shares of the TM field in vertical polarisation
+    # Numbers of the path and of the surface.
     paths: Int[Tensor, " c"]
     surfaces: Int[Tensor, " c"]
 
@@ -335,13 +318,9 @@ def fit_sheets(
         placement: With obstacles, or without any, which have no sheets.
         query: Links.
         lower, upper: Corners of the room [m].
-        options: Options of the fit.
 
     Returns:
         The sheets, and the gain of all paths beside them [Np].
-
-    Raises:
-        ValueError: No path passes the obstacles.
     """
     options = options or SurfaceOptions()
     obstacles = placement.obstacles

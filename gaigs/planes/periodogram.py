@@ -16,15 +16,11 @@ from gaigs.splatting.placement.mirrored.reflections import reflect, tangents
 
 
 class Likeness(NamedTuple):
-    """Likeness of the reflection at each plane to a further wave.
+    """Likeness of the reflection at each plane to a further wave."""
 
-    Attributes:
-        values: Products of both waves, of about the same size at all links (c, b).
-        rates: Change of their phases if the plane moves [rad/m], or turns about its pivot towards
-            two axes [1] (c, b, 3).
-    """
-
-    values: Complex[Tensor, "c b"]
+    values: Complex[Tensor, "c b"]  # products of both waves, of about the same size at all links
+    # Change of their phases if the plane moves [rad/m], or turns about its pivot towards two axes
+    # [1].
     rates: Float[Tensor, "c b 3"]
 
 
@@ -134,23 +130,14 @@ class PlanePeriodogram:
 
 
 def compare_with_wave(
-    receiver: ReceiverLags,
-    wave: FurtherWave,
-    bandwidth: float,
-    planes: Float[Tensor, "c 4"],
-    pivots: Float[Tensor, "c 3"],
-    axes: Float[Tensor, "2 3"],
+    receiver: ReceiverLags,  # links of one receiver
+    wave: FurtherWave,  # the further wave; its weights are on each known path and element
+    bandwidth: float,  # bandwidth of the covariances [Hz]
+    planes: Float[Tensor, "c 4"],  # planes (normal, offset [m])
+    pivots: Float[Tensor, "c 3"],  # points about which the planes turn [m]
+    axes: Float[Tensor, "2 3"],  # unit vectors towards which the normals turn
 ) -> Likeness:
-    """Likeness of the reflection at each plane to a further wave.
-
-    Args:
-        receiver: Links of one receiver.
-        wave: The further wave; its weights are on each known path and element.
-        bandwidth: Bandwidth of the covariances [Hz].
-        planes: Planes (normal, offset [m]).
-        pivots: Points about which the planes turn [m].
-        axes: Unit vectors towards which the normals turn.
-    """
+    """Likeness of the reflection at each plane to a further wave."""
     single = receiver.reflect_once(planes)
     directions = single.directions.transpose(0, 1)  # (c, b, 3)
     lengths = single.lengths.transpose(0, 1)  # (c, b)

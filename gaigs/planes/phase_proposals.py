@@ -15,17 +15,12 @@ from gaigs.splatting.placement.mirrored.reflections import polarised, reflect, t
 
 
 class Phasors(NamedTuple):
-    """Single reflections at a plane, at the places where they are strongest.
+    """Single reflections at a plane, at the places where they are strongest."""
 
-    Attributes:
-        values: Strengths over the channels' root power, with the phase against the direct path.
-        slopes: Change of the length by offset and two tilts (b, 3).
-        cosines: Cosines of the angles of incidence.
-    """
-
+    # Strengths over the channels' root power, with the phase against the direct path.
     values: Complex[Tensor, " b"]
-    slopes: Float[Tensor, "b 3"]
-    cosines: Float[Tensor, " b"]
+    slopes: Float[Tensor, "b 3"]  # change of the length by offset and two tilts
+    cosines: Float[Tensor, " b"]  # cosines of the angles of incidence
 
 
 class SlabPeak(NamedTuple):
@@ -37,22 +32,14 @@ class SlabPeak(NamedTuple):
 
 
 def propose_by_phases(
-    data: ChannelData,
-    planes: Float[Tensor, "w 4"],
-    number: int,
-    reach: float,
-    tilt: float,
-    slabs: Float[Tensor, "m 3"],
+    data: ChannelData,  # training channels
+    planes: Float[Tensor, "w 4"],  # all known planes
+    number: int,  # the plane that is moved
+    reach: float,  # largest move along the normal [m]
+    tilt: float,  # largest turn towards either side [rad]
+    slabs: Float[Tensor, "m 3"],  # slabs that are tried
 ) -> list[tuple[Float[Tensor, "4"], Float[Tensor, "3"]]]:
     """Planes near one of some planes, and slabs, with which its reflections have like phases.
-
-    Args:
-        data: Training channels.
-        planes: All known planes.
-        number: The plane that is moved.
-        reach: Largest move along the normal [m].
-        tilt: Largest turn towards either side [rad].
-        slabs: Slabs that are tried.
 
     Returns:
         Planes (4,) and slabs (3,): at most eight half-spaces and eight slabs, highest maxima of the

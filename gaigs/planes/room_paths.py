@@ -14,18 +14,13 @@ from gaigs.splatting.placement.mirrored.paths import Mirrored
 
 
 class TracedPaths(NamedTuple):
-    """Powers and bounces of the kept paths of some links.
+    """Powers and bounces of the kept paths of some links."""
 
-    Attributes:
-        sequences: Numbers of the planes of each path, -1 for a missing plane.
-        powers: Free space included; 0 for a path that does not exist.
-        bounces: Points on the planes of each sequence, NaN for a missing plane [m].
-        transmitters, receivers: Ends of the links [m].
-    """
-
-    sequences: Int[ndarray, "n order"]
-    powers: Float[ndarray, "b n"]
+    sequences: Int[ndarray, "n order"]  # numbers of the planes of each path, -1 for a missing plane
+    powers: Float[ndarray, "b n"]  # free space included; 0 for a path that does not exist
+    # Points on the planes of each sequence, NaN for a missing plane [m].
     bounces: Float[ndarray, "b n order 3"]
+    # Ends of the links [m].
     transmitters: Float[ndarray, "b 3"]
     receivers: Float[ndarray, "b 3"]
 
@@ -52,10 +47,7 @@ class TracedPaths(NamedTuple):
 
 
 class LearntPath(NamedTuple):
-    """Transmitter, bounces and receiver of a path [m], and its power.
-
-    The power is relative to the strongest path's [dB].
-    """
+    """Transmitter, bounces and receiver of a path [m], and its power over the strongest's [dB]."""
 
     points: Float[ndarray, "p 3"]
     power_db: float

@@ -188,10 +188,7 @@ class PlaneSearch(Generic[R]):
         return room
 
     def prune(self, room: R, fewest: int) -> R:
-        """The room without planes whose absence lowers the error, worst first.
-
-        The first ``fewest`` planes stay.
-        """
+        """The room without planes beyond ``fewest`` whose absence lowers the error, worst first."""
         while len(room.planes) > fewest and not stages.is_up():
             smaller = [
                 self.score.remove(room, number) for number in range(fewest, len(room.planes))

@@ -15,10 +15,7 @@ class FreeFit(NamedTuple):
 
 
 def ridged(gram: Inexact[Tensor, "b n n"], ridge: float) -> Inexact[Tensor, "b n n"]:
-    """Gram matrices with a ridge over their mean power.
-
-    Images closer than the resolution then share their power.
-    """
+    """Gram matrices with a ridge over their mean power: unresolved images then share theirs."""
     power = gram.diagonal(dim1=1, dim2=2).real.mean(1)  # (b,)
     power = torch.where(power > 0, power, 1)  # without any wave strengths are 0
     return gram + ridge * power[:, None, None] * torch.eye(gram.shape[-1], dtype=gram.real.dtype)
@@ -64,10 +61,7 @@ def real_strengths(
 def log_share(
     rest: Complex[Tensor, "b k"], channels: Complex[Tensor, "b k"], floor: float = 1e-3
 ) -> Float[Tensor, " b"]:
-    """Logarithm of the share of the channels' power in a residual.
-
-    The floor is the share below which a residual hardly counts: 30 dB.
-    """
+    """Logarithm of a residual's share of the channels' power, from 30 dB below on constant."""
     power = channels.abs().square().sum(-1)
     return (rest.abs().square().sum(-1) / torch.where(power > 0, power, 1) + floor).log()
 

@@ -92,12 +92,7 @@ class Registry:
         return decorate
 
     def get(self, name: str) -> Callable:
-        """The class or function of that name; only its module is imported.
-
-        Raises:
-            ValueError: No component has the name, or two have it.
-            ImportError: The module cannot be imported.
-        """
+        """The class or function of that name; only its module is imported."""
         holders, unreadable = find_holders(self.kind, name)
         component = self._registered.get(name)
         claims = [holder.where for holder in holders]

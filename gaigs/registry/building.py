@@ -12,12 +12,6 @@ def call(owner: str, function: Callable, options: Mapping, /, **context):
 
     Args:
         owner: Name in errors.
-
-    Raises:
-        TypeError: The options are not a mapping, or one does not suit its annotation, see
-            ``check_type``.
-        ValueError: An option is missing or unknown; or the function overflows, runs out of memory,
-            ends the process or, if it is of torch or Lightning, fails.
     """
     if not isinstance(options, Mapping):
         raise TypeError(f"{owner} must be a mapping of options, got {options!r}")

@@ -38,21 +38,14 @@ ROOMS = {
 
 @dataclass(frozen=True)
 class Holder:
-    """The owner of a name.
-
-    Attributes:
-        where: File or distribution, for errors.
-        target: ``module`` that registers the component by decorator, or ``module:attribute``.
-        file: File of the module if the name was read from it.
-        root: Folder that the import needs on ``sys.path``; None if it is there.
-    """
+    """The owner of a name."""
 
     kind: str
     name: str
-    where: str
-    target: str
-    file: Path | None = None
-    root: Path | None = None
+    where: str  # file or distribution, for errors
+    target: str  # ``module`` that registers the component by decorator, or ``module:attribute``
+    file: Path | None = None  # file of the module if the name was read from it
+    root: Path | None = None  # folder that the import needs on ``sys.path``; None if it is there
 
     @property
     def package(self) -> str:
@@ -99,14 +92,7 @@ class Holder:
         return None
 
     def read_options(self, given: tuple[str, ...]) -> dict[str, Any]:
-        """The options of the component with their defaults, from its source.
-
-        Args:
-            given: Parameters that are no options.
-
-        Raises:
-            UnclearSource: The source does not tell them.
-        """
+        """Options with their defaults, from the source, but for the parameters ``given``."""
         module, _, attribute = self.target.partition(":")
         file = self.file or self._module_file(module)
         registration = self.registration

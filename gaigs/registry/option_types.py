@@ -39,9 +39,6 @@ def check_type(name: str, value: Any, annotation: Any) -> None:
 
     Other annotations are not checked. In a union with other classes, their objects are accepted,
     too.
-
-    Raises:
-        TypeError: The value does not suit.
     """
     allowed = _allowed(value, annotation)
     if not allowed:
@@ -57,7 +54,7 @@ def _allowed(value: Any, annotation: Any) -> list[Any]:
     """Annotations of ``PLAIN`` that a value may suit; empty for a value that is not checked."""
     is_union = typing.get_origin(annotation) in (typing.Union, UnionType)
     allowed = [*typing.get_args(annotation)] if is_union else [annotation]
-    plain = [kind for kind in allowed if _is_plain_type(_bare(kind))]
+    plain = [kind for kind in allowed if isinstance(_bare(kind), type) and _bare(kind) in PLAIN]
     if len(plain) == len(allowed):
         return plain
     has_classes = is_union and all(isinstance(_bare(kind), type) for kind in allowed)
@@ -69,10 +66,6 @@ def _allowed(value: Any, annotation: Any) -> list[Any]:
 def _bare(annotation: Any) -> Any:
     """An annotation without its arguments."""
     return typing.get_origin(annotation) or annotation
-
-
-def _is_plain_type(kind: Any) -> bool:
-    return isinstance(kind, type) and kind in PLAIN
 
 
 def _expectation(value: Any, kinds: list[Any]) -> str:

@@ -39,11 +39,7 @@ class UnclearSource(Exception):
 
 
 def registrations(file: Path) -> list[Registration]:
-    """The components that a file registers.
-
-    Raises:
-        SyntaxError: The file is no Python.
-    """
+    """The components that a file registers; a ``SyntaxError`` if it is no Python."""
     components = []
     for node in _parsed(file).body:
         if not isinstance(node, Definition):
@@ -64,8 +60,6 @@ def read_options(file: Path, definition: str | Definition, given: tuple[str, ...
     """The options of a class or function with their defaults; ``???`` stands for a mandatory one.
 
     Args:
-        file: The module.
-        definition: The class or function, or its name.
         given: Parameters that are no options.
 
     Raises:
@@ -97,10 +91,7 @@ def read_options(file: Path, definition: str | Definition, given: tuple[str, ...
 
 
 def registering_statement(component: Callable) -> str:
-    """The statement that registers a component at this moment, with its definition.
-
-    It is empty if the text of the module is not kept.
-    """
+    """The statement that now registers a component, with its definition; empty if unknown."""
     frame: Any = sys._getframe()
     while frame is not None and frame.f_globals.get("__name__") != component.__module__:
         frame = frame.f_back
@@ -112,7 +103,7 @@ def registering_statement(component: Callable) -> str:
         statements = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.stmt)]
     except SyntaxError:  # the file has been edited meanwhile
         return ""
-    around = [node for node in statements if _first_line(node) <= line <= _last_line(node)]
+    around = [node for node in statements if _first_line(node) <= line <= (node.end_lineno or 0)]
     named = [node for node in statements if getattr(node, "name", None) == component.__name__]
     innermost = [max(around, key=_first_line)] if around else []
     chosen = dict.fromkeys([*innermost, *named[-1:]])
@@ -122,10 +113,6 @@ def registering_statement(component: Callable) -> str:
 def _first_line(node: ast.stmt) -> int:
     decorators = getattr(node, "decorator_list", [])
     return min(part.lineno for part in (node, *decorators))
-
-
-def _last_line(node: ast.stmt) -> int:
-    return node.end_lineno or node.lineno
 
 
 def _parsed(file: Path) -> ast.Module:

@@ -29,12 +29,7 @@ def name_of(component: object) -> str:
 
 
 def configuration_of(component: object) -> dict:
-    """The configuration of a component, an argument of ``Registry.build``.
-
-    Raises:
-        ValueError: The component or a part has no registered name, or an argument that no file can
-            hold.
-    """
+    """The configuration of a component, an argument of ``Registry.build``, as files can hold it."""
     if not hasattr(component, "configuration"):
         kind = type(component).__name__
         advice = "put @gaigs.register(kind, name) over the class"
@@ -82,10 +77,7 @@ def _own_options(estimator: Any) -> dict:
 
 
 def note_arguments(kind: str, name: str, component: Any) -> Any:
-    """Makes the instances of a class note their arguments as ``configuration``.
-
-    Functions are returned unchanged.
-    """
+    """Makes instances of a class note their arguments as ``configuration``; keeps functions."""
     make: Any = getattr(component, "__init__", None)
     if not isinstance(component, type) or getattr(make, "notes", None) is component:
         return component

@@ -1,6 +1,4 @@
-"""``python -m gaigs.report FOLDER``: the runs of a Hydra multirun as one table, and their spread
-over seeds.
-"""
+"""``python -m gaigs.report FOLDER``: the runs of a multirun as tables, with spread over seeds."""
 
 from argparse import ArgumentParser
 from pathlib import Path

@@ -134,8 +134,7 @@ def write_ablation(
     shared: Mapping,
     metrics: Mapping[str, Metric],
 ) -> list[Table]:
-    """Writes ``ablation.csv``, ``ablation.md``, ``ablation.tex`` for a paper and, once a run has
-    ended, the figure of speed.
+    """Writes ``ablation.csv``, ``.md`` and, once a run has ended, ``.tex`` and a figure of speed.
 
     ``rows`` and ``shared`` are results of ``ablation``, ``metrics`` of the task. The result are
     tables for a terminal of 80 columns. All columns are in the CSV file alone.

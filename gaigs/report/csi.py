@@ -1,6 +1,4 @@
-"""Figures of complex channels: over frequency, as impulse responses over delay, and their errors by
-power.
-"""
+"""Figures of complex channels: over frequency, over delay, and their errors by power."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -74,9 +72,7 @@ def _looks(marker: str = "") -> dict[str, dict[str, Any]]:
 
 
 def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) -> Figure:
-    """Magnitude and phase over frequency [Hz], one link a row, at the element where the label is
-    strongest.
-    """
+    """Magnitude and phase over frequency [Hz] at the label's strongest element, a link a row."""
     order = np.argsort(frequencies)
     frequencies = frequencies[order]
     unit = "GHz" if frequencies[-1] >= 1e9 else "MHz"
@@ -153,8 +149,7 @@ def front_ends(
 
 
 def impulse_responses(shown: Examples, frequencies: Float[ndarray, " s"]) -> Figure:
-    """Magnitude over delay, relative to the label's peak, at the element where the label is
-    strongest.
+    """Magnitude over delay, relative to the label's peak, at the label's strongest element.
 
     The impulse response is the Fourier sum over the subcarriers, weighted by a Hann window over the
     band. Its period is one over the median spacing of the subcarriers. One period is drawn. It
@@ -196,10 +191,8 @@ def _strongest(shown: Examples) -> list[int]:
 
 def _pairs(shown: Examples) -> Complex[ndarray, "k 2 s"]:
     """Prediction and label of each link at the label's strongest element."""
-    pairs = []
-    for index, element in enumerate(_strongest(shown)):
-        pairs.append((shown.predictions[index, element], shown.labels[index, element]))
-    return np.array(pairs)
+    rows, elements = np.arange(len(shown.labels)), _strongest(shown)
+    return np.stack((shown.predictions[rows, elements], shown.labels[rows, elements]), 1)
 
 
 def _titles(shown: Examples) -> list[str]:
@@ -219,9 +212,7 @@ def decibels(amplitudes: Inexact[ndarray, "..."]) -> Float[ndarray, "..."]:
 
 
 def _limits(levels: Float[ndarray, "... 2 n"]) -> tuple[float, float]:
-    """Range of an axis [dB]: all of predictions and labels, but nothing 60 dB or more below a
-    label's peak.
-    """
+    """Range of an axis [dB]: all that is drawn, but nothing 60 dB or more below a label's peak."""
     highest = levels.max()
     peak = levels[..., 1, :].max()
     lowest = max(levels[np.isfinite(levels)].min(), peak - 60)
@@ -232,10 +223,7 @@ def _limits(levels: Float[ndarray, "... 2 n"]) -> tuple[float, float]:
 def impulse_response(
     channels: Complex[ndarray, "... s"], frequencies: Float[ndarray, " s"]
 ) -> tuple[Float[ndarray, " d"], Complex[ndarray, "... d"]]:
-    """Delays [s], and the impulse response at them.
-
-    It is the mean over subcarriers of h exp(2 pi i f tau), with a Hann window.
-    """
+    """Delays [s], and the mean over subcarriers of h exp(2 pi i f tau), with a Hann window."""
     start = frequencies.min()
     spacing = np.median(np.diff(np.unique(frequencies)))
     # The window is 0 one spacing outside of the band, so that both end subcarriers count.

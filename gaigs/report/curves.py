@@ -224,8 +224,7 @@ def speed_against_error(
 def learning_curves(
     curves: Mapping[str, Sequence], baselines: Mapping[str, float], score: Metric
 ) -> Figure:
-    """Validation scores over the time of training [s], both by system; baselines are horizontal
-    lines.
+    """Validation scores over the time of training [s], by system; baselines are horizontal.
 
     Errors have a logarithmic axis, so that large ones at the start leave space for small ones.
     """

@@ -1,6 +1,4 @@
-"""Figures of a task, registered for its class. Drawing modules are imported when something is
-drawn.
-"""
+"""Figures of a task, registered for its class; drawing modules are imported when needed."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path

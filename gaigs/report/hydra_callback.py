@@ -1,6 +1,4 @@
-"""A callback of Hydra that requests the tables of a multirun; an experiment names it under
-``hydra.callbacks``.
-"""
+"""A callback of Hydra, named in ``hydra.callbacks``, that requests the tables of a multirun."""
 
 import sys
 from pathlib import Path
@@ -16,10 +14,7 @@ requested: list[tuple[Path, str | list[str]]] = []
 
 
 class MultirunReport(Callback):
-    """Requests the tables of a multirun.
-
-    ``main`` writes them, as Hydra calls no callback after a failed job.
-    """
+    """Requests tables, which ``main`` writes: Hydra calls no callback after a failed job."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
         """Remembers the folder and the formats."""

@@ -1,6 +1,4 @@
-"""Figure of a run's intervals: how often they hold, and errors against the deviations that the
-model states.
-"""
+"""Figure of a run's intervals: how often they hold, and errors against stated deviations."""
 
 from collections.abc import Mapping
 from pathlib import Path

@@ -18,9 +18,6 @@ def report(folder: str | Path) -> Group:
     Args:
         folder: Folder of a Hydra multirun, or one above several.
 
-    Returns:
-        The tables, for a terminal of 80 columns.
-
     Raises:
         FileNotFoundError: The folder holds no run.
         ValueError: A file is damaged, or the runs are of several tasks.

@@ -12,16 +12,11 @@ from gaigs.report.scores import headline
 
 
 class Paired(NamedTuple):
-    """Models against the best baseline.
-
-    Attributes:
-        baseline: Its name.
-        places: Number of the test links' places.
-        p: Probability of a difference as large by chance, by the names of model and metric.
-    """
+    """Models against the best baseline."""
 
     baseline: str
-    places: int
+    places: int  # number of the test links' places
+    # Probability of a difference as large by chance, by the names of model and metric.
     p: dict[str, dict[str, float]]
 
 

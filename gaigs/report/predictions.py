@@ -42,19 +42,12 @@ def scores_of_systems(files: Mapping[str, Path], kind: str) -> dict[str, ndarray
 
 
 class Examples(NamedTuple):
-    """Test samples for a figure.
+    """Test samples for a figure."""
 
-    Attributes:
-        labels: Labels (k, *shape).
-        predictions: Predictions, likewise.
-        scores: Score of each sample.
-        names: Rank of each sample among all.
-    """
-
-    labels: ndarray
-    predictions: ndarray
-    scores: Float[ndarray, " k"]
-    names: list[str]
+    labels: ndarray  # labels (k, *shape)
+    predictions: ndarray  # predictions, likewise
+    scores: Float[ndarray, " k"]  # score of each sample
+    names: list[str]  # rank of each sample among all
 
 
 def read_examples(file: Path, kind: str) -> Examples:

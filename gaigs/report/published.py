@@ -12,9 +12,6 @@ def read_published() -> dict[str, dict]:
 
     ``names`` of models are in the order of the rows. ``scores`` and ``costs`` have for each task
     columns with ``title``, ``source``, and ``figures`` by model.
-
-    Raises:
-        ValueError: A file is of another form.
     """
     published: dict[str, dict] = {"names": {}, "scores": {}, "costs": {}}
     for folder in (conf_dir(), *plugin_conf_dirs()):

@@ -39,9 +39,7 @@ def map_pages(
     readings: Mapping[str, Float[ndarray, "k 3"]],
     edges: Float[ndarray, "s 2 3"],
 ) -> dict[str, Figure]:
-    """Pages of ``radio_map`` and, if deviations differ from place to place, of ``deviation_map``,
-    by name; see ``radio_maps``.
-    """
+    """Pages of ``radio_map`` and, if deviations differ by place, ``deviation_map``, by name."""
     pages = numbered("radio_map", radio_maps(radio_map, gateways, readings, edges))
     varied = [index for index, deviation in enumerate(_constants(radio_map)) if deviation is None]
     if radio_map.deviations is not None and varied:
@@ -156,7 +154,6 @@ def radio_maps(
     """The map of each receiver in a panel, all with the same axes and colours.
 
     Args:
-        radio_map: The map.
         gateways: Positions of all receivers by name [m]; empty if unknown.
         readings: x, y [m] and label [radio_map.unit] by receiver; of each at most 100, evenly
             chosen, are drawn.

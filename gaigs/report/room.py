@@ -1,6 +1,4 @@
-"""The room from above and from the side: transmitters, receivers, walls, Gaussians, and learnt
-planes and paths.
-"""
+"""The room from above and from the side: links, walls, Gaussians, learnt planes and paths."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -171,9 +169,7 @@ def plot_room(
 
 
 def paths(links: Links, learnt: LearntRoom) -> Figure:
-    """The learnt paths of a transmitter, at least one, folded through the room, in plan (x, y) and
-    side view (x, z).
-    """
+    """The learnt paths of a transmitter, folded through the room, in plan and side view."""
     receivers = _receivers(links)
     edges = links.edges.numpy()
     planes = _drawn_planes(learnt)
@@ -306,9 +302,7 @@ def _draw_gaussians(view: _View, cloud: _Cloud) -> EllipseCollection:
 
 
 def _draw_planes(view: _View, planes: Sequence[LearntPlane]) -> None:
-    """Outlines with their share of the power. A plane that faces the reader would cover the room
-    and is left out.
-    """
+    """Outlines with their share of the power, except of planes that face the reader."""
     # The limit is above 1 / sqrt(2), so that each plane is in one view at least.
     shown = [plane for plane in planes if abs(plane.normal[view.along]) < 0.77]
     if not shown:

@@ -20,25 +20,16 @@ from gaigs.report.scores import headline
 
 
 class Run(NamedTuple):
-    """One job of a multirun.
+    """One job of a multirun."""
 
-    Attributes:
-        name: Its sub-folder.
-        folder: Path of this folder.
-        overrides: Values of the command line, by key.
-        config: The run's configuration; empty if it is unknown.
-        metrics: Contents of ``metrics.json``; None where the job failed, was stopped or still runs.
-        failure: The error of a failed job; else None.
-        doubts: Sentences on overrides that differ from the run's configuration.
-    """
-
-    name: str
-    folder: Path
-    overrides: dict[str, str]
-    config: dict
+    name: str  # its sub-folder
+    folder: Path  # path of this folder
+    overrides: dict[str, str]  # values of the command line, by key
+    config: dict  # the run's configuration; empty if it is unknown
+    # Contents of ``metrics.json``; None where the job failed, was stopped or still runs.
     metrics: dict | None
-    failure: str | None
-    doubts: list[str]
+    failure: str | None  # the error of a failed job; else None
+    doubts: list[str]  # sentences on overrides that differ from the run's configuration
 
 
 def by_seed(runs: Sequence[Run]) -> list[list[Run]]:
@@ -51,11 +42,7 @@ def by_seed(runs: Sequence[Run]) -> list[list[Run]]:
 
 
 def read_metrics(file: Path) -> dict:
-    """Contents of a run's ``metrics.json``.
-
-    Raises:
-        ValueError: The file is damaged, or its task is not installed.
-    """
+    """Contents of a run's ``metrics.json``; a ``ValueError`` if it is damaged."""
     try:
         metrics = json.loads(file.read_text())
         _check_metrics(metrics)
@@ -84,12 +71,7 @@ def _check_metrics(metrics: Any) -> None:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """The runs at any depth of a folder, sorted by name, with numbers in names by value.
-
-    Raises:
-        FileNotFoundError: The folder holds no run.
-        ValueError: One was started anew with another configuration, or a file is damaged.
-    """
+    """The runs at any depth of a folder, sorted by name, with numbers in names by value."""
     places = [file.parents[1] for file in folder.glob("**/.hydra/overrides.yaml")]
     if not places:
         raise FileNotFoundError(

@@ -1,6 +1,4 @@
-"""Figures of one real number a link: predicted against measured values, radio maps, the
-distribution of errors.
-"""
+"""Figures of one real number a link: predictions against labels, radio maps, errors."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -81,9 +79,7 @@ def predicted_against_measured(
     Args:
         labels: Labels [task.unit].
         predictions: Predictions, likewise.
-        receiver: Index of each reading's receiver.
         names: Names of the receivers.
-        task: Task of the labels.
         max_dots: Largest number of readings of a receiver that are drawn as dots, which do not hide
             each other; more are counted in cells.
         max_panels: Most panels of a figure.

@@ -38,10 +38,7 @@ def task_class(name: str) -> type[Task]:
 
 
 def headline(task: str, models: Mapping[str, Mapping]) -> tuple[str, Metric]:
-    """The first of a task's metrics that the first model has.
-
-    Channels of unknown phase lack the plain SNR.
-    """
+    """The first of a task's metrics that the first model has: not all channels have an SNR."""
     known = task_class(task).metrics()
     scores = next(iter(models.values()))
     name = next((name for name in known if name in scores), next(iter(known)))
@@ -148,9 +145,7 @@ def score_latex(metrics: Mapping) -> str:
 
 
 def verdict(metrics: Mapping) -> str:
-    """A sentence that compares the run's model, the first one, with the best baseline by one
-    metric, and one on the model before its kriging.
-    """
+    """A sentence: the run's model beside the best baseline, and before its kriging."""
     (model, scores), *baselines = metrics["models"].items()
     name, metric = headline(metrics["task"], metrics["models"])
     quantity, _, unit = metric.title.removesuffix("]").partition(" [")

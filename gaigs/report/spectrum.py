@@ -107,9 +107,7 @@ def side_by_side(
     elevations: Float[ndarray, " rows"],
     azimuths: Float[ndarray, " columns"],
 ) -> Figure:
-    """Spectra by title on one grid [deg], e.g. a measured one and its predictions by several
-    systems.
-    """
+    """Spectra by title on one grid [deg], such as a measured one and several predictions."""
     columns = min(4, len(shown))
     rows = ceil(len(shown) / columns)
     edges = pixel_edges(azimuths, -np.inf, np.inf), pixel_edges(elevations, -90, 90)

@@ -1,6 +1,4 @@
-"""The look of all figures: sizes for a printed page, colours for colour-blind readers and grey
-print.
-"""
+"""The look of all figures: sizes for print, colours for colour-blind readers and grey print."""
 
 import math
 import textwrap
@@ -118,11 +116,7 @@ def ask(figure: Figure, question: str, note: str = "") -> None:
 
 
 def save(figure: Figure, file: Path) -> list[Path]:
-    """Writes a figure in the formats of ``figure_formats``, with their endings.
-
-    Returns:
-        The files.
-    """
+    """Writes a figure in the formats of ``figure_formats``; returns the files."""
     files = [file.with_suffix(f".{ending}") for ending in chosen.get()]
     for file in files:
         with atomic_write(file) as part, rc_context(STYLE):
@@ -160,9 +154,7 @@ def even_pages(items: Sequence, most: int) -> list[Sequence]:
 def scaled_panels(
     count: int, width: float, height: float, xlabel: str, ylabel: str
 ) -> tuple[Figure, list[Axes]]:
-    """Panels with common axes of an extent in one unit, as large as a page with colour bar and
-    legend allows.
-    """
+    """Panels of an extent in one unit with common axes, as large as a page allows."""
     bar = 1.5  # inches beside all panels
     title = 0.25  # inches above each panel
     foot = 1.0  # inches above and below all panels
@@ -199,8 +191,7 @@ def named_ones(
 
 
 def looks(systems: Iterable[str]) -> dict[str, tuple]:
-    """Colour and dash of systems by name, the same in all figures and different in one of 36 or
-    fewer.
+    """Colour and dash of systems by name, alike in all figures, different in one of up to 36.
 
     A baseline looks as the system of its name. A model without its kriging has the model's colour,
     and dots.
@@ -281,9 +272,7 @@ def _places() -> dict[str, int]:
 
 
 def round_step(span: float, most: int) -> float:
-    """The smallest step, 1, 2 or 5 times a power of ten, that covers a span above 0 by at most
-    ``most`` steps.
-    """
+    """The smallest step, 1, 2 or 5 times a power of ten, with at most ``most`` steps in a span."""
     least = span / most
     power = 10.0 ** math.floor(math.log10(least))
     return next((step * power for step in (1, 2, 5) if step * power >= least), 10 * power)

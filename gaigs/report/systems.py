@@ -26,23 +26,14 @@ from gaigs.report.training_log import read_validations
 
 
 class System(NamedTuple):
-    """A row of the table.
+    """A row of the table."""
 
-    Attributes:
-        model: Registered name.
-        name: Name for a reader.
-        runs: Runs that ended, one a seed; empty for a baseline.
-        values: Values of each metric and cost, one a run.
-        failures: Seed and cause of each run that has not ended.
-        is_varied: True if its runs differ from others in more than model and seed.
-    """
-
-    model: str
-    name: str
-    runs: Sequence[Run]
-    values: dict[str, list[float]]
-    failures: Sequence[str] = ()
-    is_varied: bool = False
+    model: str  # registered name
+    name: str  # name for a reader
+    runs: Sequence[Run]  # runs that ended, one a seed; empty for a baseline
+    values: dict[str, list[float]]  # values of each metric and cost, one a run
+    failures: Sequence[str] = ()  # seed and cause of each run that has not ended
+    is_varied: bool = False  # True if its runs differ from others in more than model and seed
 
 
 def find_systems(
@@ -110,10 +101,7 @@ def _costs(metrics: Mapping) -> dict[str, float | None]:
 def _cells(
     systems: Sequence[System], published: Sequence[Mapping], titles: Mapping[str, str]
 ) -> list[dict]:
-    """Rows by title: published figures of systems in their usual setting, then ours.
-
-    Columns without a value are left out.
-    """
+    """Rows by title: published figures of systems in their usual setting, then ours, if known."""
     rows = []
     for system in systems:
         row: dict[str, float | Spread | None] = {}

@@ -27,8 +27,7 @@ log = logging.getLogger(__name__)
 
 
 def run(config: dict, folder: Path, launcher: str | None = None) -> dict | None:
-    """Trains, tests, and writes the run folder; resumes a run of the same configuration that was
-    stopped there.
+    """Trains, tests, and writes the run folder; a stopped run of this configuration goes on.
 
     Args:
         config: The resolved configuration.
@@ -159,10 +158,7 @@ def _check_options(config: dict) -> None:
 
 
 def train_and_test(config: dict, folder: Path) -> dict | None:
-    """Contents of ``metrics.json`` of a run in a claimed folder.
-
-    The result is None in all but the first process.
-    """
+    """Contents of ``metrics.json`` of a run in a claimed folder; None in further processes."""
     import lightning
 
     _check_options(config)

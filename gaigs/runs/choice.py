@@ -35,25 +35,17 @@ NAME = "auto"
 
 
 class Tried(NamedTuple):
-    """A candidate and its scores where it has not learnt.
+    """A candidate and its scores where it has not learnt."""
 
-    Attributes:
-        label: Its name and options.
-        config: Configuration of a run with it.
-        folder: Folder of this run.
-        gains: Mean score of the links at each place, higher ones better, by the place's key.
-        seconds: Duration of fits, training and scores.
-        unseen: The model by name, not fitted to validation links; empty before a look-up's
-            validation.
-        fitted: Result of the training; None for a look-up, which is fitted once it is chosen.
-    """
-
-    label: str
-    config: dict
-    folder: Path
+    label: str  # its name and options
+    config: dict  # configuration of a run with it
+    folder: Path  # folder of this run
+    # Mean score of the links at each place, higher ones better, by the place's key.
     gains: dict[int, float]
-    seconds: float
+    seconds: float  # duration of fits, training and scores
+    # The model by name, not fitted to validation links; empty before a look-up's validation.
     unseen: Mapping[str, Model] = {}
+    # Result of the training; None for a look-up, which is fitted once it is chosen.
     fitted: Fitted | None = None
 
 
@@ -173,11 +165,7 @@ def _options(
 
 
 def _with_changes(made: dict, config: dict, changes: Mapping[str, tuple]) -> dict:
-    """The configuration of a candidate with what the run with ``model=auto`` has changed.
-
-    Raises:
-        ValueError: The run has an option that only some models have.
-    """
+    """The configuration of a candidate with what the run with ``model=auto`` has changed."""
     shared = ("loss", "training", "trainer", "ensemble", "seed")  # of all that are trained
     kept = ("data", "split", "save_every", "tensorboard", "figures")
     made |= {key: config[key] for key in kept} | {"threads": config["threads"] or made["threads"]}
@@ -231,10 +219,7 @@ def _validated(look_up: Tried, links: Links) -> Tried:
 
 
 def place_gains(model: Model, links: Links, index: Int[Tensor, " k"]) -> dict[int, float]:
-    """Mean monitored score of some links at each of their places, higher ones better.
-
-    Links of one place have errors alike: they count as one.
-    """
+    """Mean monitored score at each place: links of one place, with errors alike, are one."""
     task = links.task
     labels = torch.cat([links.labels[part] for part in index.split(64)])
     scores = task.scores(labels, predicted(model, links, index))[task.monitor].double()

@@ -154,13 +154,7 @@ def _run(
     validation: InOrder | None,
     resumed: Path | None,
 ) -> None:
-    """All steps of a training, from the start or from a checkpoint.
-
-    Signals have their former handlers afterwards.
-
-    Raises:
-        Stopped: A signal has stopped the training.
-    """
+    """All steps of a training; after a signal ``Stopped``, with the former handlers."""
     expected = (
         ".*LeafSpec",  # Lightning's use of torch
         "You defined a `validation_step` but",  # a split without validation links
@@ -197,11 +191,7 @@ def _log_speed(trainer: lightning.Trainer, budget: Budget, places: int) -> None:
 
 
 def make_trainer(options: dict, **context: Any) -> lightning.Trainer:
-    """A trainer that can stop and resume at any step, in one process or several.
-
-    Raises:
-        ValueError: An option would prevent that.
-    """
+    """A trainer that stops and resumes at any step; a ``ValueError`` if an option prevents it."""
     for name in ("lightning.pytorch", "lightning.fabric"):  # their messages list unused devices
         logging.getLogger(name).setLevel(logging.WARNING)
     with warnings.catch_warnings():

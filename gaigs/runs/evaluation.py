@@ -52,12 +52,7 @@ Scores = dict[str, dict[str, Tensor]]
 
 
 def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> dict[str, Model]:
-    """The baselines of a run by name, not fitted, without the one named as the run's model.
-
-    Raises:
-        ValueError: A baseline has no name, an unknown one or options that do not fit, has to be
-            trained, or two have the same name.
-    """
+    """The baselines of a run by name, not fitted, without the one named as the run's model."""
     models: dict[str, Model | None] = {}
     for config in configurations:
         config = {"name": config} if isinstance(config, str) else config
@@ -119,8 +114,7 @@ class Evaluation(JupyterMixin):
         return facts | {"models": self.models, "paired": self.paired and self.paired._asdict()}
 
     def to_dataframe(self) -> Any:
-        """A ``pandas.DataFrame``, models down; beside each score its ``p``, the probability of such
-        a difference from the best baseline by chance, see ``gaigs.report.paired``.
+        """A ``pandas.DataFrame``, models down; beside each score ``p`` of ``gaigs.report.paired``.
 
         Raises:
             ImportError: Pandas is not installed.
@@ -152,8 +146,7 @@ class Evaluation(JupyterMixin):
 def evaluate(
     model: Model, links: Links, baselines: Sequence | None = None, *, progress: bool = True
 ) -> Evaluation:
-    """Scores of a model on the test links, beside scores of baselines that are fitted to the other
-    links.
+    """Scores of a model on the test links, beside baselines fitted to the other links.
 
     Args:
         model: A trained, fitted or loaded model, of the same receivers and task.
@@ -241,8 +234,7 @@ def score(
     folder: Path | None = None,
     has_intervals: bool = True,
 ) -> Scores:
-    """Scores of every test link by fitted models and by look-ups; a folder gets predictions of the
-    first.
+    """Scores of every test link by models and look-ups; predictions of the first in a folder.
 
     Look-ups and models with a calibration have scores of intervals too. If subcarriers are held
     out, ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as an
@@ -367,9 +359,7 @@ class LinkScores:
 
 
 def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links) -> Scores:
-    """Scores of every validation link, by models that have not been fitted to these links; empty
-    without such links.
-    """
+    """Scores of the validation links by models that have not seen them; empty without any."""
     if not len(links.split.validation):
         return {}
     held_out = replace(links, split=links.split.validating(), held_out=None)

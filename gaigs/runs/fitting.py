@@ -26,32 +26,21 @@ log = logging.getLogger(__name__)
 
 
 class Fitted(NamedTuple):
-    """Result of ``fit``.
+    """Result of ``fit``."""
 
-    Attributes:
-        models: The model by its name; a kriged one is followed by the trained model alone,
-            ``<name>_trend``.
-        unseen: The same, not fitted to validation links; empty for a model without a training.
-        start: Number of Gaussians before the training.
-        seconds: Duration of ``Model.fit``, as of a search for planes, and of the training; None
-            without one.
-        kriging_seconds: Duration of kriging; None without it.
-        facts: Entries of ``metrics.json`` beside the model's own.
-    """
-
+    # The model by its name; a kriged one is followed by the trained model alone, ``<name>_trend``.
     models: dict[str, Model]
+    # The same, not fitted to validation links; empty for a model without a training.
     unseen: dict[str, Model]
-    start: int
+    start: int  # number of Gaussians before the training
+    # Duration of ``Model.fit``, as of a search for planes, and of the training; None without one.
     seconds: float | None = None
-    kriging_seconds: float | None = None
-    facts: Mapping[str, Any] = {}
+    kriging_seconds: float | None = None  # duration of kriging; None without it
+    facts: Mapping[str, Any] = {}  # entries of ``metrics.json`` beside the model's own
 
 
 def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
-    """Builds, fits, trains and kriges a model as configured.
-
-    The result is None in all but the first of several processes.
-    """
+    """Builds, fits, trains and kriges a model as configured; None in further processes."""
     name = config["model"]["name"]
     model = _checked(model, links, config)
     kriged = _untrained_kriging(model, links, config)
@@ -159,9 +148,7 @@ def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float
 def _add_members(
     model: Model, loss: Loss, links: Links, config: dict, folder: Path
 ) -> tuple[Ensemble, float]:
-    """An ensemble of a trained model and of others with the next seeds, each trained in a folder of
-    its own; and the time of the others [s].
-    """
+    """An ensemble of a model and others of the next seeds, and the others' training time [s]."""
     members = [model]
     total = 0.0
     for number in range(1, config["ensemble"]):

@@ -1,6 +1,4 @@
-"""The run folder: its claim by one configuration, and the checks before a training is resumed
-there.
-"""
+"""The run folder: its claim by one configuration, and the checks before it is resumed."""
 
 import hashlib
 import json
@@ -24,12 +22,7 @@ ANOTHER = "choose another folder (hydra.run.dir)"
 
 
 def claim(folder: Path, config: dict) -> None:
-    """Writes the configuration into a run folder, unless a run can be resumed there.
-
-    Raises:
-        ValueError: The folder holds a run of another configuration or software, or files of
-            something else.
-    """
+    """Writes the configuration into a run folder, unless this run or another one is there."""
     file = folder / "config.yaml"
     ours = "config.yaml software.json best.ckpt log predictions.npz gaussians.ply radio_map.npz"
     names = [*ours.split(), "figures", "last.ckpt", "metrics.json"]
@@ -80,9 +73,7 @@ def stored_software(folder: Path) -> dict[str, str]:
 
 
 def warn_of_changes(folder: Path, model: dict) -> None:
-    """Warns if sources of a model's plug-ins have changed since its run: stored numbers then mean
-    something else.
-    """
+    """Warns if sources of a model's plug-ins have changed: stored numbers mean something else."""
     there = stored_software(folder)
     changed = [key for key, digest in digests(model).items() if there.get(key, digest) != digest]
     if changed:
@@ -121,9 +112,7 @@ def is_configuration(file: Path) -> bool:
 
 
 def check_same_links(there: dict, here: dict, path: Path) -> None:
-    """Checks that a training is resumed with its own links, so that no test link has been trained
-    on.
-    """
+    """Raises a ``ValueError`` unless a resumed training has its own links and split."""
     parts = ("train", "validation", "test")
     has_split = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
     has_scene = are_alike(there.get("scene"), here.get("scene"))
@@ -135,9 +124,7 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
 
 
 def fingerprint(links: Links) -> str:
-    """A digest of queries, receivers, and labels in memory; labels in files would have to be
-    decoded.
-    """
+    """A digest of queries, receivers and labels, of these only in memory: decoding is slow."""
     parts = [links.query.transmitters, links.query.receivers]
     for receiver in links.receivers:
         parts += [receiver.pose.position, receiver.pose.rotation, receiver.array.elements]

@@ -32,8 +32,7 @@ def train(
     progress: bool = True,
     **options,
 ) -> Model:
-    """Trains a model on links as the command line does, by the preset of the model and the links'
-    task.
+    """Trains a model on links as the command line does, by the preset of model and task.
 
     Args:
         model: Name of a registered model, or ``"auto"``, the default, which tries several and takes
@@ -112,11 +111,7 @@ def _made(model: str | Model) -> Model | None:
 def _configuration(
     model: str | Model, made: Model | None, links: Links, overrides: Sequence[str], options: dict
 ) -> dict:
-    """The configuration of a training on links that exist, of a model that may exist.
-
-    Raises:
-        ValueError: Overrides or options are of what exists.
-    """
+    """The configuration of a training on links that exist, of a model that may exist."""
     name = model if made is None else configuration_of(made)["name"]
     if experiments := [word for word in overrides if word.startswith("+experiment=")]:
         raise ValueError(

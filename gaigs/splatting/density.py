@@ -34,9 +34,6 @@ def prune(
         gone: True for each Gaussian to remove.
         follower: Its parameters that follow the Gaussians lose rows, too.
 
-    Raises:
-        ValueError: All Gaussians would be removed.
-
     Source: Kerbl et al., 2023, section 5.2.
     """
     if gone.all():

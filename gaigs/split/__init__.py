@@ -52,9 +52,6 @@ def part(
         seed: Seed of all random numbers.
         train: Groups to train and validate on; None for all that do not test.
         rows: As of ``drawn``.
-
-    Raises:
-        ValueError: An option is out of range, or there are too few groups.
     """
     check("test", test, 0 <= test < 1, "in [0, 1)")
     check_validation(validation)

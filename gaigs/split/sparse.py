@@ -9,8 +9,7 @@ from gaigs.split import part, places_of, rows_of
 def sparse(
     links: Links, train: int, test: float = 0.2, validation: float | None = None, seed: int = 0
 ) -> Split:
-    """Few random places train and validate, fewer as a subset of more; test places are the places
-    of ``random``.
+    """Few random places train and validate, nested; test places are those of ``random``.
 
     Args:
         train: Places to train and validate on. Other options and errors are as for

@@ -29,9 +29,6 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
             at 4 elements and 5 subcarriers, the direct wave and noise.
         carrier: Carrier of all links [Hz], with a bandwidth of 0.5 GHz; spectra then come from 3 x
             3 patches half a wavelength apart. None if unknown.
-
-    Raises:
-        ValueError: There is no such task here.
     """
     generator = torch.Generator().manual_seed(0)
     places = torch.rand(24, 3, generator=generator) * torch.tensor([6.0, 4.0, 2.0])  # (24, 3) [m]

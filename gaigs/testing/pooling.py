@@ -156,10 +156,7 @@ def _check_directions(
 def _check_hard_maps(
     pooling: Pooling, image: Float[Tensor, "b c rows columns"], query: Query
 ) -> None:
-    """Levels and their gradients are finite.
-
-    They are float32 where the map is of half precision, whose steps are 0.06 dB.
-    """
+    """Levels and their gradients are finite, and float32 where the map is of half precision."""
     decades = torch.linspace(-6, 6, image[0].numel()).reshape(image.shape[1:]).to(image)
     maps = {
         "a silent map": 0 * image,
@@ -192,10 +189,7 @@ def rows_of(received: Tensor | ReceivedPaths, rows: slice) -> Tensor | ReceivedP
 def example_paths(
     receiver: Receiver, query: Query, dtype: torch.dtype, n: int = 9
 ) -> ReceivedPaths:
-    """Random paths to a receiver, partly coherent over a band of 0.4 GHz.
-
-    They are at the carriers of the query, or else at 5 GHz.
-    """
+    """Random paths, partly coherent over 0.4 GHz, at the query's carriers or else at 5 GHz."""
     generator = torch.Generator().manual_seed(1)
     device = query.transmitters.device
     b = len(query)

@@ -137,10 +137,7 @@ def _check_refusals(task: Task, labels: Tensor, values: Tensor) -> None:
 
 
 def _check_thinning(task: Task, options: dict) -> None:
-    """Checks that labels and directions are thinned alike.
-
-    Each label is the number of its pixel.
-    """
+    """Checks that labels, each the number of its pixel, and directions are thinned alike."""
     thin = task.thinning(**options)
     count = max(1, int(np.prod(task.shape)))
     numbers = torch.arange(count, dtype=torch.float64).reshape(task.shape).expand(2, *task.shape)

@@ -27,10 +27,7 @@ class MeanScores:
             self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
 
     def over_processes(self, strategy) -> dict[str, float]:
-        """The mean of each score, as ``Task.logged`` gives it.
-
-        Every process has to call it with Lightning's strategy.
-        """
+        """The mean of each score, as ``Task.logged`` gives it; every process has to call it."""
         numbers = [self.count, *self.sums.values()]
         totals = torch.tensor(numbers, dtype=torch.float64, device=strategy.root_device)
         count, *sums = strategy.reduce(totals, reduce_op="sum").tolist()

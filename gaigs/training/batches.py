@@ -85,9 +85,7 @@ class Batches:
 
 
 class InOrder:
-    """One pass over links in their order, ``size`` links a batch; each process gets every
-    ``world_size``-th of them.
-    """
+    """One pass over links in order, ``size`` a batch; each process gets every ``world_size``-th."""
 
     def __init__(self, links: Links, index: Int[Tensor, " k"], size: int):
         self.links = links

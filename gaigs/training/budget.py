@@ -167,9 +167,7 @@ def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
 
 
 def seconds(option: str, duration: object) -> float:
-    """A duration [s] as Lightning's ``Timer`` reads it: DD:HH:MM:SS, or a mapping such as
-    ``{minutes: 3}``.
-    """
+    """A duration [s] as Lightning's ``Timer`` reads it: DD:HH:MM:SS, or ``{minutes: 3}``."""
     length = None
     with contextlib.suppress(MisconfigurationException, TypeError):
         if isinstance(duration, str | dict):
@@ -205,9 +203,7 @@ def _budgets(trainer) -> list[Budget]:
 
 
 def share_done(trainer) -> Callable[[int], float]:
-    """The share of a training done after a number of steps: of its steps or of its time, whichever
-    is more.
-    """
+    """The share of a training done after some steps: of steps or time, whichever is more."""
 
     def share(step: int) -> float:
         by_steps = step / trainer.max_steps if trainer.max_steps > 0 else 0.0

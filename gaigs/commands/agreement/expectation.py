@@ -68,17 +68,12 @@ def on_split(
 
 
 class NearestLinks(NamedTuple):
-    """The nearest known link of each test link.
+    """The nearest known link of each test link."""
 
-    Attributes:
-        distances: To the nearest known link of the same receiver and carrier [m].
-        separations: To the same link, in measurements.
-        missing: Number of test links without one.
-    """
-
+    # To the nearest known link of the same receiver and carrier [m].
     distances: Float[ndarray, " k"]
-    separations: ndarray
-    missing: int
+    separations: ndarray  # to the same link, in measurements
+    missing: int  # number of test links without one
 
 
 def nearest_known(links: Links) -> NearestLinks:

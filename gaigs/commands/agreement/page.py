@@ -16,20 +16,14 @@ from gaigs.report.table import markdown
 
 
 class Cell(NamedTuple):
-    """Pairs of labels of similar distance and separation.
+    """Pairs of labels of similar distance and separation."""
 
-    Attributes:
-        distance: Distance of their places, from and to below [m]; 0 and 0 for one place.
-        separation: Measurements between them, from and to.
-        pairs: Number of pairs.
-        compared: Number of pairs whose labels were compared.
-        quantiles: 10th percentile, median and 90th percentile of the score.
-    """
-
+    # Distance of their places, from and to below [m]; 0 and 0 for one place.
     distance: tuple[float, float]
-    separation: tuple[int, float]
-    pairs: int
-    compared: int
+    separation: tuple[int, float]  # measurements between them, from and to
+    pairs: int  # number of pairs
+    compared: int  # number of pairs whose labels were compared
+    # 10th percentile, median and 90th percentile of the score.
     quantiles: tuple[float, float, float]
 
     def text(self, score: str) -> str:
@@ -46,16 +40,7 @@ def write(
     split: str,
     remarks: Sequence[str],
 ) -> str:
-    """Writes ``agreement.md`` and ``agreement.png``, and returns the page.
-
-    Args:
-        folder: Gets the files.
-        task: Task of the labels.
-        cells: Cells with pairs.
-        rows: Metrics by predictor.
-        split: Name of the split.
-        remarks: Sentences below the tables.
-    """
+    """Writes ``agreement.md`` and ``agreement.png``, and returns the page."""
     score = task.pair_score
     parts = [
         f"Median {score} of two labels, 10th to 90th percentile, and number of pairs, "

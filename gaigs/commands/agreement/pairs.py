@@ -20,27 +20,17 @@ from gaigs.split import rows_of
 
 @dataclass(frozen=True)
 class Agreement:
-    """Scores of pairs of labels, in cells of distance (rows) and separation (columns).
+    """Scores of pairs of labels, in cells of distance (rows) and separation (columns)."""
 
-    Attributes:
-        distances: Upper edges of the rows [m]; the first row holds pairs at one place, and its edge
-            is next to 0.
-        separations: Last separations of the columns but the last, ascending; in measurements.
-        pairs: Number of pairs in each cell.
-        share: Share of the pairs that were counted.
-        scores: Scores of the compared pairs by cell (row times columns plus column) and by the
-            score's name.
-        step: Median distance from a measurement to the next [m].
-        apart: Median distance of two random measurements [m].
-    """
-
+    # Upper edges of the rows [m]; the first row holds pairs at one place, its edge is next to 0.
     distances: ndarray
-    separations: ndarray
-    pairs: Int[ndarray, "rows columns"]
-    share: float
+    separations: ndarray  # last separations of the columns but the last, ascending; in measurements
+    pairs: Int[ndarray, "rows columns"]  # number of pairs in each cell
+    share: float  # share of the pairs that were counted
+    # Scores of the compared pairs by cell (row times columns plus column) and by the score's name.
     scores: dict[int, dict[str, Tensor]]
-    step: float
-    apart: float
+    step: float  # median distance from a measurement to the next [m]
+    apart: float  # median distance of two random measurements [m]
 
     @property
     def has_order(self) -> bool:
@@ -111,9 +101,6 @@ def measure(
         block: Number of distances in memory at a time.
         most: Largest number of pairs of a cell whose labels are compared; at least 30 of large
             labels.
-
-    Raises:
-        ValueError: No two links share receiver and carrier, or all transmitters stand at one point.
     """
     places = links.query.transmitters.double().numpy()
     groups = groups_of(links)
@@ -191,7 +178,6 @@ class Reservoir:
 
     Args:
         cells: Number of cells. Pairs of a further cell are never kept.
-        most: Largest number of pairs of a cell.
     """
 
     def __init__(self, cells: int, most: int):
@@ -220,23 +206,13 @@ class Reservoir:
 def draw(
     agreement: Agreement,
     places: Float[ndarray, "n 3"],
-    order: Int[ndarray, " n"],
-    groups: Sequence[ndarray],
+    order: Int[ndarray, " n"],  # measurement of each link, see ``visits``
+    groups: Sequence[ndarray],  # links of one receiver and carrier, see ``groups_of``
     most: int,
     block: int,
     random: np.random.Generator,
 ) -> tuple[Int[ndarray, " cells"], dict[int, Int[ndarray, "k 2"]]]:
-    """Number of pairs in each cell, and random pairs of each cell: earlier and later link.
-
-    Args:
-        agreement: Edges of the cells.
-        places: Transmitters of the links [m].
-        order: Measurement of each link, see ``visits``.
-        groups: Links of one receiver and carrier, see ``groups_of``.
-        most: Largest number of drawn pairs of a cell.
-        block: Number of distances in memory at a time.
-        random: Draws the pairs.
-    """
+    """Number of pairs in each cell, and random pairs of each cell: earlier and later link."""
     size = agreement.pairs.size
     counts = np.zeros(size + 1, int)  # the last cell holds links that are not a pair
     reservoir = Reservoir(size, most)

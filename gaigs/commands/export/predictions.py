@@ -27,18 +27,12 @@ log = logging.getLogger(__name__)
 
 
 class Labels(NamedTuple):
-    """The links to predict, and their test labels.
-
-    Attributes:
-        task: Task of the values; of held-out subcarriers their own.
-        measured: Labels of links' test; None for places.
-        subcarriers: Held-out subcarriers [Hz]; None without any.
-    """
+    """The links to predict, and their test labels."""
 
     query: Query
-    task: Task
-    measured: Tensor | None
-    subcarriers: Tensor | None
+    task: Task  # task of the values; of held-out subcarriers their own
+    measured: Tensor | None  # labels of links' test; None for places
+    subcarriers: Tensor | None  # held-out subcarriers [Hz]; None without any
 
 
 def write_predictions(
@@ -52,9 +46,6 @@ def write_predictions(
         frequency: Carrier of positions [Hz]; None: the only known one.
         interval: Probability with which an interval holds the label. A model without intervals
             gives values alone.
-
-    Raises:
-        ValueError: There is no place, or a place, frequency or probability is impossible.
     """
     scene = model.scene
     query, task, measured, subcarriers = _to_predict(scene, places, frequency)
@@ -134,11 +125,10 @@ def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -
 def tabulate(
     query: Query, scene: Scene, task: Task, estimate: Estimate, measured: Tensor | None
 ) -> dict[str, Variable]:
-    """Columns of links, axes of labels, and values by links and axes.
-
-    Complex values have a real and an imaginary part.
-    """
-    axes = axes_of(task)
+    """Columns of links, axes of labels, and values by links and axes, complex ones in parts."""
+    axes = {}
+    for name, axis in task.axes().items():
+        axes[name] = Variable((name,), axis.values, {"units": axis.unit} if axis.unit else {})
     variables = _link_columns(query, scene) | axes
     parts = {
         "value": estimate.value,
@@ -186,22 +176,10 @@ def _link_columns(query: Query, scene: Scene) -> dict[str, Variable]:
     return columns
 
 
-def axes_of(task: Task) -> dict[str, Variable]:
-    """The axes of a label."""
-    variables = {}
-    for name, axis in task.axes().items():
-        units = {"units": axis.unit} if axis.unit else {}
-        variables[name] = Variable((name,), axis.values, units)
-    return variables
-
-
 def _rows(
     variables: Mapping[str, Variable], absent: Bool[np.ndarray, " n *shape"]
 ) -> Iterator[Sequence[str]]:
-    """A heading, and a row for each number of each link that is not absent.
-
-    Columns describe the link, then the axes, then the values.
-    """
+    """A heading, and a row for each number that is not absent: link, axes, then values."""
     of_link = ("x", "y", "z", "easting", "northing", "receiver", "frequency")
     axes: dict[str, list] = {}
     links: dict[str, list] = {}

@@ -1,6 +1,4 @@
-"""Learnt rooms for 3-D programs, as glTF and Wavefront OBJ, and for ray tracers, as scenes of
-Mitsuba.
-"""
+"""Learnt rooms as glTF, as Wavefront OBJ, and as scenes of Mitsuba for ray tracers."""
 
 import cmath
 import hashlib
@@ -42,12 +40,6 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
             folder beside it.
         frequency: Carrier of a scene's materials [Hz]; None for the training links' or, of several
             carriers, the middle one.
-
-    Returns:
-        The files.
-
-    Raises:
-        ValueError: The model has no planes, or a scene's carrier is unknown or impossible.
     """
     mirrored = mirrored_of("a learnt room", model)
     placement = mirrored.placement
@@ -158,10 +150,7 @@ def itu_bsdf(material: Material, frequency: float) -> Bsdf:
 
 
 def sheet_bsdf(sheet: Sheet) -> Bsdf:
-    """A sheet of obstacles, which reflects nothing.
-
-    All of that energy is scattered, which Sionna RT leaves out.
-    """
+    """A sheet of obstacles, which scatters what it does not transmit: Sionna RT leaves it out."""
     thickness = 1e-5  # [m]; thin against the wavelength, so that only the conductance counts
     impedance = 376.73  # of free space [ohm]
     properties = (
@@ -176,11 +165,7 @@ def sheet_bsdf(sheet: Sheet) -> Bsdf:
 def write_scene(
     file: Path, meshes: Sequence[Mesh], bsdfs: Sequence[Bsdf], comments: Sequence[str] = ()
 ) -> list[Path]:
-    """Writes a scene of Mitsuba for Sionna RT, and a mesh ``.ply`` of each surface beside it.
-
-    Returns:
-        The files.
-    """
+    """Writes a scene of Mitsuba for Sionna RT, and a mesh ``.ply`` of each surface beside it."""
     scene = ElementTree.Element("scene", version="2.1.0")
     for comment in ("Learnt by gaigs; metres, z up.", *comments):
         scene.append(ElementTree.Comment(f" {re.sub('-+', '-', comment)} "))

@@ -29,17 +29,8 @@ def write_scenario(
 ) -> list[Path]:
     """Writes the paths of mirrored channels from places to all receivers, without kriging.
 
-    Args:
-        folder: A missing or empty one.
-        places, frequency: As for ``gaigs.commands.export.predictions.write_predictions``; places
-            are the users.
-
-    Returns:
-        The folder.
-
-    Raises:
-        ValueError: The channels are not sums of mirrored paths, there is no place, or the folder is
-            not empty.
+    ``places`` are the users, as for ``gaigs.commands.export.predictions.write_predictions``. The
+    folder is missing or empty.
     """
     mirrored = mirrored_of("a scenario", model)
     if not mirrored.has_margins:

@@ -16,17 +16,11 @@ from gaigs.kriging.links import distances, folds_of
 
 
 class Candidates(NamedTuple):
-    """Candidate places, before anything is received.
+    """Candidate places, before anything is received."""
 
-    Attributes:
-        places: (g, 3) [m].
-        prior: Logarithm of each candidate's probability (g,).
-        density: Logarithm of the prior density there, but for a constant (g,).
-    """
-
-    places: Float[Tensor, "g 3"]
-    prior: Float[Tensor, " g"]
-    density: Float[Tensor, " g"]
+    places: Float[Tensor, "g 3"]  # [m]
+    prior: Float[Tensor, " g"]  # logarithm of each candidate's probability
+    density: Float[Tensor, " g"]  # logarithm of the prior density there, but for a constant
 
     def nearest(self, places: Float[Tensor, "n 3"]) -> Int[Tensor, " n"]:
         """Number of the candidate nearest to each place."""
@@ -44,21 +38,13 @@ def even_candidates(
 
 @dataclass(frozen=True)
 class PlaceDensity:
-    """Prior density of transmitters: normal ones about known places, and an even one in their box.
+    """Prior density of transmitters: normal about each known place, and even in their box."""
 
-    Attributes:
-        places: Known places (k, 3) [m].
-        folds: Fold of each of them (k,).
-        edges: Edges of the box [m]; 0 across separate floors.
-        floors: Heights of separate floors [m]; empty for one floor.
-        elsewhere: Prior probability that a transmitter is not near a known place but anywhere in
-            the box.
-    """
-
-    places: Float[Tensor, "k 3"]
-    folds: Int[Tensor, " k"]
-    edges: Float[Tensor, "3"]
-    floors: Float[Tensor, " f"]
+    places: Float[Tensor, "k 3"]  # known places [m]
+    folds: Int[Tensor, " k"]  # fold of each of them
+    edges: Float[Tensor, "3"]  # edges of the box [m]; 0 across separate floors
+    floors: Float[Tensor, " f"]  # heights of separate floors [m]; empty for one floor
+    # Prior probability that a transmitter is not near a known place but anywhere in the box.
     elsewhere: float = 0.1
 
     @property

@@ -20,16 +20,12 @@ from gaigs.report import style
 
 
 class Cells(NamedTuple):
-    """Cells of a map.
+    """Cells of a map."""
 
-    Attributes:
-        x, y: Their edges [m].
-        places: Places on the map (g, 2) [m].
-    """
-
+    # Their edges [m].
     x: Float[ndarray, " columns1"]
     y: Float[ndarray, " rows1"]
-    places: Float[ndarray, "g 2"]
+    places: Float[ndarray, "g 2"]  # places on the map [m]
 
     def sums(self, weights: Float[ndarray, " g"]) -> Float[ndarray, "rows columns"]:
         """Sum of the weights of the places in each cell."""

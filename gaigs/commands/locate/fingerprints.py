@@ -19,18 +19,13 @@ from gaigs.split import rows_of
 
 
 class LocatedFold(NamedTuple):
-    """Held-out fingerprints of a fold, located in the map of a model that does not know them.
+    """Held-out fingerprints of a fold, located in the map of a model that does not know them."""
 
-    Attributes:
-        candidates: Candidates of this map.
-        likelihoods: Logarithms there, with known and with unknown power (2, n, g); the likelihood
-            is chosen without these fingerprints.
-        truth: Places of the fingerprints (n, 3) [m].
-    """
-
-    candidates: Candidates
+    candidates: Candidates  # candidates of this map
+    # Logarithms there, with known and with unknown power; the likelihood is chosen without these
+    # fingerprints.
     likelihoods: Float[Tensor, "2 n g"]
-    truth: Float[Tensor, "n 3"]
+    truth: Float[Tensor, "n 3"]  # places of the fingerprints [m]
 
 
 @dataclass(frozen=True, repr=False)
@@ -109,15 +104,11 @@ class Fingerprints:
 
 
 class Transmissions(NamedTuple):
-    """Fingerprints of transmissions, and where these were sent.
+    """Fingerprints of transmissions, and where these were sent."""
 
-    Attributes:
-        values: Labels as ``Task.fingerprint`` gives them, NaN where a receiver has none (n, r, m).
-        places: (n, 3) [m].
-    """
-
+    # Labels as ``Task.fingerprint`` gives them, NaN where a receiver has none.
     values: Float[Tensor, "n r m"]
-    places: Float[Tensor, "n 3"]
+    places: Float[Tensor, "n 3"]  # [m]
 
 
 def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor, " k"]:

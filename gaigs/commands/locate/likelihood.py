@@ -36,19 +36,13 @@ def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor,
 
 
 class Mismatch(NamedTuple):
-    """Differences of n values from the predictions at g candidates.
+    """Differences of n values from the predictions at g candidates."""
 
-    Attributes:
-        squares: Sum of squared errors over squared deviations (n, g).
-        log_deviations: Sum of the logarithms of the deviations (n, g).
-        counts: Number of receivers that tell of the place (n,).
-        reception: Logarithm of the probability that these receivers receive the value and no other
-            does (n, g); 0 for unknown power.
-    """
-
-    squares: Float[Tensor, "n g"]
-    log_deviations: Float[Tensor, "n g"]
-    counts: Float[Tensor, " n"]
+    squares: Float[Tensor, "n g"]  # sum of squared errors over squared deviations
+    log_deviations: Float[Tensor, "n g"]  # sum of the logarithms of the deviations
+    counts: Float[Tensor, " n"]  # number of receivers that tell of the place
+    # Logarithm of the probability that these receivers receive the value and no other does; 0 for
+    # unknown power.
     reception: Float[Tensor, "n g"]
 
 
@@ -149,17 +143,11 @@ def log_likelihood(difference: Mismatch, degrees: float, temper: float) -> Float
 
 
 class UnseenPrints(NamedTuple):
-    """Held-out fingerprints, compared with the map of a model that does not know them.
+    """Held-out fingerprints, compared with the map of a model that does not know them."""
 
-    Attributes:
-        prints: The map.
-        differences: With known and with unknown power.
-        truth: Places of the fingerprints (n, 3) [m].
-    """
-
-    prints: Fingerprints
-    differences: Sequence[Mismatch]
-    truth: Float[Tensor, "n 3"]
+    prints: Fingerprints  # the map
+    differences: Sequence[Mismatch]  # with known and with unknown power
+    truth: Float[Tensor, "n 3"]  # places of the fingerprints [m]
 
     def score(self, degrees: float, temper: float, draws: int = 128) -> float:
         """Sum of the energy scores of the posteriors by a likelihood [m].
@@ -191,8 +179,6 @@ def choose_likelihood(
     each fold the other folds choose.
 
     Args:
-        prints: The map.
-        trials: Held-out fingerprints of each fold.
         degrees: Degrees of freedom to choose from, the heaviest tails first.
         half_octaves: Integers i; the tempers to choose from are 2^(i / 2).
         fewest: Number of fingerprints below which the degrees are not chosen: so few hardly show

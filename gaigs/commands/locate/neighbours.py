@@ -31,8 +31,6 @@ def neighbours(
     Args:
         asked: Fingerprints to locate. A receiver that has not received a transmission counts as the
             least known value.
-        known: Known fingerprints.
-        places: Their places [m].
         groups: Groups of known fingerprints that are left out together.
         most: Largest number of known transmissions that choose the number of neighbours.
     """

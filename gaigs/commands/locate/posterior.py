@@ -99,8 +99,6 @@ def excess_of(
     """Largest excess of readings over the range of all predictions; None if it is plausible.
 
     Args:
-        asked: Readings.
-        prints: Predictions.
         deviations: Largest plausible number of standard deviations; half the range of the
             predictions is plausible, too.
     """
@@ -198,11 +196,8 @@ def geometric_median(
     """Places with the least mean distance from the candidates, for each row of probabilities.
 
     Args:
-        places: Candidates [m].
-        probabilities: Weights of the candidates.
         tolerance: Largest last change of a coordinate, and least distance that counts: a candidate
             may be the place itself [m].
-        steps: Largest number of steps.
 
     Source: Weiszfeld, Sur le point pour lequel la somme des distances de n points donnés est
     minimum, 1937.

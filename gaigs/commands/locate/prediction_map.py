@@ -124,15 +124,10 @@ def affordable_points(
 
 
 class Predicted(NamedTuple):
-    """Predictions of a model at places, for all receivers.
+    """Predictions of a model at places, for all receivers."""
 
-    Attributes:
-        values: As ``Task.fingerprint`` gives them (g, r, m).
-        deviations: Standard deviations of labels of one number (g, r); else 1.
-    """
-
-    values: Float[Tensor, "g r m"]
-    deviations: Float[Tensor, "g r"]
+    values: Float[Tensor, "g r m"]  # as ``Task.fingerprint`` gives them
+    deviations: Float[Tensor, "g r"]  # standard deviations of labels of one number; else 1
 
 
 def predicted(model: Model, places: Float[Tensor, "g 3"], frequency: float | None) -> Predicted:
@@ -163,21 +158,13 @@ def predicted(model: Model, places: Float[Tensor, "g 3"], frequency: float | Non
 
 @dataclass(frozen=True)
 class MapMaker:
-    """Makes maps of models that know all or some of the same links.
+    """Makes maps of models that know all or some of the same links."""
 
-    Attributes:
-        box: Corners of the box of the candidates [m].
-        is_region: True if transmitters are anywhere in the box alike.
-        points: Number of candidates.
-        frequency: Carrier [Hz]; None if unknown.
-        links: Links with a split; None for a map of the model alone.
-    """
-
-    box: Float[Tensor, "2 3"]
-    is_region: bool
-    points: int
-    frequency: float | None
-    links: Links | None = None
+    box: Float[Tensor, "2 3"]  # corners of the box of the candidates [m]
+    is_region: bool  # True if transmitters are anywhere in the box alike
+    points: int  # number of candidates
+    frequency: float | None  # carrier [Hz]; None if unknown
+    links: Links | None = None  # links with a split; None for a map of the model alone
 
     def make(self, model: Model, known: Int[Tensor, " k"]) -> Fingerprints:
         """The map of a model that knows some links, along the numbers of a label."""
@@ -221,19 +208,12 @@ class MapMaker:
 
 
 class PrintFold(NamedTuple):
-    """Held-out fingerprints of one fold.
+    """Held-out fingerprints of one fold."""
 
-    Attributes:
-        prints: Map of a model that does not know them.
-        values: Their values (n, r, m).
-        truth: Their places (n, 3) [m].
-        errors: Values less predictions at known places, of these and others (k, r, m).
-    """
-
-    prints: Fingerprints
-    values: Float[Tensor, "n r m"]
-    truth: Float[Tensor, "n 3"]
-    errors: Float[Tensor, "k r m"]
+    prints: Fingerprints  # map of a model that does not know them
+    values: Float[Tensor, "n r m"]  # their values
+    truth: Float[Tensor, "n 3"]  # their places [m]
+    errors: Float[Tensor, "k r m"]  # values less predictions at known places, of these and others
 
     def half(self, number: int) -> "PrintFold":
         """Every second fingerprint."""
@@ -242,22 +222,13 @@ class PrintFold(NamedTuple):
 
 def held_out_folds(
     maker: MapMaker,
-    model: Model,
-    known: Int[Tensor, " k"],
-    most: int = 500,
-    located: int = 200,
-    enough: int = 300,
+    model: Model,  # the model that knows all
+    known: Int[Tensor, " k"],  # known links at the carrier of the map
+    most: int = 500,  # largest number of fingerprints of a fold whose errors give the axes
+    located: int = 200,  # largest number of them that are located
+    enough: int = 300,  # number of located fingerprints after which no fold is added
 ) -> list[PrintFold]:
-    """Folds of known links with the maps of models that do not know them.
-
-    Args:
-        maker: Makes the maps.
-        model: The model that knows all.
-        known: Known links at the carrier of the map.
-        most: Largest number of fingerprints of a fold whose errors give the axes.
-        located: Largest number of them that are located.
-        enough: Number of located fingerprints after which no fold is added.
-    """
+    """Folds of known links with the maps of models that do not know them."""
     links = maker.links
     folds: list[PrintFold] = []
     for one, part, others in stages.track(model.unseen(links), "folds", model.fold_count):

@@ -43,8 +43,6 @@ def track(
     """An even part of the candidates, and the logarithms of a track's posterior there.
 
     Args:
-        candidates: Candidates of single values.
-        logarithms: Logarithms of their posteriors.
         step, is_received: As for ``smoothed``.
         spread: Number of candidates over which the posterior of a single value still spreads. The
             candidates that ``smoothed`` links then hold it: regions of tracks reach far beyond the
@@ -109,8 +107,6 @@ def smoothed(
     """Posterior of each place of a track given all values, from those given each value alone.
 
     Args:
-        logarithms: Posteriors given each value alone.
-        places: Candidate places [m].
         step: Standard deviation of a move along each axis [m].
         is_received: True for values that a receiver has received. The track is near
             ``straight_lines`` where it is False.

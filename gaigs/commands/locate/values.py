@@ -22,13 +22,7 @@ def as_fingerprints(
     """Fingerprints of received values, NaN where a receiver has received nothing.
 
     Args:
-        value: Labels of each receiver, see ``locate``.
-        prints: The map in which they are looked up.
         is_track: True if values may be received by no receiver.
-
-    Raises:
-        ValueError: The values have another shape or type than the labels, are out of range, or
-            nothing was received.
     """
     if isinstance(value, Mapping):
         value = in_order(value, prints)

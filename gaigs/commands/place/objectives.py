@@ -102,8 +102,7 @@ class LocationError:
 def choose(
     rule: Coverage | LocationError, standing: int, count: int
 ) -> tuple[Int[Tensor, " n"], Float[Tensor, "n1 g"]]:
-    """Receivers that together are best beside the first ones, which stand; and the quality of each
-    place before and after each of them.
+    """Receivers that are best beside the first, which stand; the qualities before and after each.
 
     Each is the best beside those before it; then single ones are exchanged as long as that helps.
     Coverage and mean level are monotone and submodular, so they gain at least 1 - 1/e of what the
@@ -131,9 +130,7 @@ def extend(
     count: int,
     most: int = 4_000_000,
 ) -> tuple[Int[Tensor, " n"], float]:
-    """A set with so many candidates more, each the best beside those before it, and its mean
-    quality, negative where lower is better; ``most`` factors are held at a time.
-    """
+    """A set with ``count`` candidates more, each the best beside those before it, and its score."""
     score = -torch.inf
     for _ in track(range(count), "receivers to place"):
         free = candidates[~torch.isin(candidates, members)]

@@ -12,14 +12,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.commands.place.objectives import Coverage, LocationError, MeanLevel, choose
-from gaigs.commands.survey.plan import survey_places, table_row
+from gaigs.commands.survey.plan import survey_places, write_places
 from gaigs.core.geometry import Frame
 from gaigs.core.query import as_positions
 from gaigs.core.radio_maps import scalar_scene
 from gaigs.core.results import plot
 from gaigs.core.scene import Scene
 from gaigs.core.stages import track, with_progress
-from gaigs.io.tables import write_table
 from gaigs.model import Model
 from gaigs.registry import check_type, suggest
 
@@ -81,16 +80,11 @@ class SitePlan:
         return f"{subject} the {what} {start}to {last} {self.score_unit}".rstrip()
 
     def save(self, path: str | Path) -> None:
-        """Writes a CSV table: receivers that stand, then places, with the score after each place;
-        with a ``frame`` easting and northing too.
-        """
-        on_map = [] if self.frame is None else ["easting", "northing"]
-        rows = [["use", "x", "y", "z", *on_map, self.objective]]
-        for place in self.standing.tolist():
-            rows.append(table_row("stands", place, self.frame, ""))
-        for place, score in zip(self.places.tolist(), self.scores[1:].tolist(), strict=True):
-            rows.append(table_row("place", place, self.frame, f"{score:.6g}"))
-        write_table(Path(path), rows)
+        """Writes a CSV table: receivers that stand, then places, each with the score after it."""
+        rows = [("stands", place, None) for place in self.standing.tolist()]
+        pairs = zip(self.places.tolist(), self.scores[1:].tolist(), strict=True)
+        rows += [("place", *pair) for pair in pairs]
+        write_places(Path(path), self.objective, rows, self.frame)
 
 
 @with_progress

@@ -15,10 +15,7 @@ from gaigs.runs import load
 
 
 def run(config: dict, folder: Path) -> None:
-    """Plans a survey, by the model of a finished run if there is one.
-
-    Writes ``survey.csv`` and ``survey.png`` into a folder.
-    """
+    """Plans a survey, by a finished run if there is one, in ``survey.csv`` and ``survey.png``."""
     model = None if config["folder"] is None else load(config["folder"], config["trust"])
     options = dict(config["survey"])
     if isinstance(options["candidates"], str):

@@ -30,9 +30,6 @@ def read_area(file: Path, model: Model | None, count: int = 1000) -> Float[Tenso
     the map; else metres of the room. The height is the third number of the positions, or that of
     the model's training transmitters: each floor, or half-way between the lowest and the highest.
 
-    Raises:
-        ValueError: The file is no GeoJSON, has no polygon, or a height is missing.
-
     Source: RFC 7946.
     """
     frame = None if model is None else model.scene.frame

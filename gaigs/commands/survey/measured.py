@@ -15,37 +15,23 @@ from gaigs.kriging.links import distances
 
 
 class Measured(NamedTuple):
-    """Measured places and their worth.
+    """Measured places and their worth."""
 
-    Attributes:
-        places: (k, 3) [m].
-        error: Mean error with all of them.
-        losses: Its rise without each of them (k,).
-        superfluous: Places that together raise it by little (k,).
-    """
-
-    places: Float[Tensor, "k 3"]
-    error: float
-    losses: Float[Tensor, " k"]
-    superfluous: Bool[Tensor, " k"]
+    places: Float[Tensor, "k 3"]  # [m]
+    error: float  # mean error with all of them
+    losses: Float[Tensor, " k"]  # its rise without each of them
+    superfluous: Bool[Tensor, " k"]  # places that together raise it by little
 
 
 class ReceiverReadings(NamedTuple):
-    """Readings of one receiver, and its process at the asked places.
-
-    Attributes:
-        process: The process.
-        rows: Numbers of the readings (n,).
-        places: Number of each reading's measured place (n,).
-        variances: Variances of the process at the asked places without any reading (g,).
-        chances: Probability that the receiver receives the asked places (g,).
-    """
+    """Readings of one receiver, and its process at the asked places."""
 
     process: Process
-    rows: Int[Tensor, " n"]
-    places: Int[Tensor, " n"]
+    rows: Int[Tensor, " n"]  # numbers of the readings
+    places: Int[Tensor, " n"]  # number of each reading's measured place
+    # Variances of the process at the asked places without any reading.
     variances: Float[Tensor, " g"]
-    chances: Float[Tensor, " g"]
+    chances: Float[Tensor, " g"]  # probability that the receiver receives the asked places
 
     def deviations(self, whitened: Float[Tensor, "n g"]) -> Float[Tensor, " g"]:
         """Standard deviations of new readings, from ``Process.whitened`` of the known ones."""
@@ -70,22 +56,15 @@ class ReceiverReadings(NamedTuple):
 
 def measured_places(
     processes: Sequence[Process],
-    asked: Float[Tensor, "g d"],
-    factor: float,
-    most: int = 1500,
-    tolerated: float = 1.05,
+    asked: Float[Tensor, "g d"],  # places over which the error is the mean
+    factor: float,  # mean absolute error of a label over its standard deviation
+    most: int = 1500,  # largest number of readings of a receiver that count, an even part of more
+    tolerated: float = 1.05,  # largest factor on the mean error without the superfluous places
 ) -> Measured:
     """The measured places, and how much each lowers the mean error at the asked places.
 
     Superfluous are the places of the least losses that may all be left out while the mean error
     stays below ``tolerated`` times its value.
-
-    Args:
-        processes: Processes of the receivers.
-        asked: Places over which the error is the mean.
-        factor: Mean absolute error of a label over its standard deviation.
-        most: Largest number of readings of a receiver that count, an even part of more.
-        tolerated: Largest factor on the mean error without the superfluous places.
     """
     rows = []
     places = []

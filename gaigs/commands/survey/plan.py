@@ -1,7 +1,7 @@
 """The next places to measure, chosen one by one for the least mean variance."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -92,31 +92,27 @@ class SurveyPlan:
         )
 
     def save(self, path: str | Path) -> None:
-        """Writes a CSV table: places to measure, each with the error after it, then measured ones
-        to leave out.
+        """Writes a CSV table: places to measure with the error after each, then those to leave out.
 
         With a ``frame`` it has easting and northing too. Without a model errors are empty.
         """
-        on_map = [] if self.frame is None else ["easting", "northing"]
-        rows = [["use", "x", "y", "z", *on_map, "mean_error"]]
-        errors = [""] * len(self.places)
-        if self.errors is not None:
-            errors = [f"{error:.6g}" for error in self.errors[1:].tolist()]
-        for place, error in zip(self.places.tolist(), errors, strict=True):
-            rows.append(table_row("measure", place, self.frame, error))
+        errors = [None] * len(self.places) if self.errors is None else self.errors[1:].tolist()
+        rows = [("measure", *row) for row in zip(self.places.tolist(), errors, strict=True)]
         losses = self.losses[self.superfluous].tolist()
         for place, loss in zip(self.known[self.superfluous].tolist(), losses, strict=True):
-            without = f"{self.known_error + loss:.6g}"
-            rows.append(table_row("leave out", place, self.frame, without))
-        write_table(Path(path), rows)
+            rows.append(("leave out", place, self.known_error + loss))
+        write_places(Path(path), "mean_error", rows, self.frame)
 
 
-def table_row(use: str, place: Sequence[float], frame: Frame | None, value: str) -> list[str]:
-    """A row of a table of places, with easting and northing if there is a frame."""
-    numbers = [*place]
-    if frame is not None:
-        numbers += [frame.x + place[0], frame.y + place[1]]
-    return [use, *(f"{number:.3f}" for number in numbers), value]
+def write_places(file: Path, title: str, rows: Iterable[tuple], frame: Frame | None) -> None:
+    """Writes uses, places and numbers or None, with easting and northing if there is a frame."""
+    on_map = [] if frame is None else ["easting", "northing"]
+    lines = [["use", "x", "y", "z", *on_map, title]]
+    for use, place, number in rows:
+        numbers = [*place] if frame is None else [*place, frame.x + place[0], frame.y + place[1]]
+        end = "" if number is None else f"{number:.6g}"
+        lines.append([use, *(f"{coordinate:.3f}" for coordinate in numbers), end])
+    write_table(file, lines)
 
 
 @with_progress
@@ -131,8 +127,7 @@ def survey(
     *,
     progress: bool = True,
 ) -> SurveyPlan:
-    """The next places to measure: each lowers the mean variance over a region most, at all
-    receivers together.
+    """The next places to measure: each lowers the mean variance over a region and receivers most.
 
     A receiver counts at a place as much as it is likely to hear it, by the measured places around.
     Labels do not enter beyond the fitted process, so a plan is made before anything is measured.
@@ -198,7 +193,7 @@ def survey(
         centres = model.scene.positions(asked)
     spacing = Spacing(processes, asked[: len(places.candidates)])
     pairs = zip(processes, centres, strict=True)
-    processes = [with_trend(process, centre) for process, centre in pairs]
+    processes = [with_trend(*pair) for pair in pairs]
     factor = error_factor(model)
     selection = Selection(processes, asked, places, factor)
     scatter = selection.scatter()
@@ -221,15 +216,10 @@ def survey(
 
 
 class SurveyPlaces(NamedTuple):
-    """Places of a survey.
+    """Places of a survey."""
 
-    Attributes:
-        candidates: Places that can be measured (c, 3) [m].
-        others: Places over which the error is stated (e, 3) [m]; if empty, it is stated over the
-            candidates.
-    """
-
-    candidates: Float[Tensor, "c 3"]
+    candidates: Float[Tensor, "c 3"]  # places that can be measured [m]
+    # Places over which the error is stated [m]; if empty, it is stated over the candidates.
     others: Float[Tensor, "e 3"]
 
     @property
@@ -255,7 +245,7 @@ def survey_places(model: Model | None, region: object, candidates: object) -> Su
                 "region must be two corners [[x, y, z], [x, y, z]] [m], "
                 f"got {len(box)} points{advice}"
             )
-        even = grid(box[0], box[1])
+        even = even_places(box[0], box[1], 1000)
     elif candidates is None:
         if model is None:
             raise ValueError(
@@ -268,19 +258,9 @@ def survey_places(model: Model | None, region: object, candidates: object) -> Su
     return SurveyPlaces(as_positions("candidates", candidates).reshape(-1, 3), even)
 
 
-def grid(
-    lower: Float[Tensor, "3"],
-    upper: Float[Tensor, "3"],
-    floors: Sequence[float] | Tensor = (),
-    count: int = 1000,
-) -> Float[Tensor, "g 3"]:
-    """Even places in a box, as candidates or for the mean error over it."""
-    return even_places(lower, upper, count, floors)
-
-
 def training_grid(model: Model) -> Float[Tensor, "g 3"]:
-    """Even places in the box of the training transmitters, or on their floors."""
-    return grid(model.scene.lower, model.scene.upper, model.scene.floors)
+    """A thousand even places in the box of the training transmitters, or on their floors."""
+    return even_places(model.scene.lower, model.scene.upper, 1000, model.scene.floors)
 
 
 def check_memory(candidates: int, receivers: int, limit: float = 2e9) -> None:
@@ -323,9 +303,6 @@ class Selection:
     """Covariances of all receivers at places, given the readings and the chosen candidates.
 
     Args:
-        processes: Processes of the receivers.
-        asked: Coordinates of all places.
-        places: The places.
         factor: Mean absolute error of a label over its standard deviation.
     """
 
@@ -346,9 +323,7 @@ class Selection:
     def choose(
         self, count: int, spacing: "Spacing | None" = None, enough: float = -math.inf
     ) -> tuple[list[int], Float[Tensor, " n1"]]:
-        """Numbers of so many candidates, or all, until the error is ``enough``; and the errors
-        before and after each.
-        """
+        """Numbers of the best candidates, until the error is ``enough``; the errors around each."""
         numbers = []
         errors = [self.error()]
         for _ in track(range(min(count, len(self.is_free))), "places to measure"):

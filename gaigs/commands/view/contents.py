@@ -27,16 +27,11 @@ from gaigs.splatting.gaussians import SH_DC, Gaussians
 
 
 class Shown(NamedTuple):
-    """Predictions on the CPU.
-
-    Attributes:
-        value: Values.
-        std: Their deviations; None if the model states none.
-        snr_db: Expected signal-to-noise ratio of channels [dB]; None if the model states none.
-    """
+    """Predictions on the CPU."""
 
     value: Tensor
-    std: Tensor | None
+    std: Tensor | None  # their deviations; None if the model states none
+    # Expected signal-to-noise ratio of channels [dB]; None if the model states none.
     snr_db: Tensor | None
 
 
@@ -94,10 +89,7 @@ class Contents:
             return self.links.labels[self.tests], torch.cat([part.cpu() for part in batches])
 
     def facts(self) -> dict:
-        """Axes and units, room, Gaussians, receivers, and errors of links.
-
-        They do not depend on the transmitter.
-        """
+        """Axes, units, room, Gaussians, receivers and errors of links, whatever the transmitter."""
         quantity = with_unit(self.task.quantity, self.task.unit)
         with self.lock:
             gaussians = self.model.primitives
@@ -307,10 +299,7 @@ def plain(values: Any) -> Any:
 
 
 def grey(image: Float[Tensor, "rows columns"], step: int = 1) -> dict:
-    """An image as bytes, 255 for an amplitude of 1.
-
-    They are stored by their changes from pixel to pixel, which pack well.
-    """
+    """An image as bytes, 255 for an amplitude of 1: changes from pixel to pixel, to pack well."""
     levels = (255 * image[::step, ::step].clamp(0, 1)).round().to(torch.uint8).numpy()
     changes = np.diff(levels.ravel(), prepend=np.uint8(0))
     return {

@@ -133,9 +133,6 @@ class Task(ABC):
     def summarise(self, scores: dict[str, Tensor]) -> dict[str, float]:
         """The numbers of a table by name, in the order of ``metrics``.
 
-        Args:
-            scores: Result of ``scores``.
-
         Raises:
             ValueError: There is no sample.
         """
@@ -224,10 +221,7 @@ class Task(ABC):
     def stored(
         self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]
     ) -> dict[str, np.ndarray]:
-        """Arrays of a model for ``predictions.npz``, by default all scores.
-
-        Keys are those before ``_<model>``.
-        """
+        """Arrays of a model for ``predictions.npz`` by start of name; by default all scores."""
         return {name: score.numpy() for name, score in scores.items()}
 
 

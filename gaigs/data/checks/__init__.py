@@ -1,6 +1,4 @@
-"""Checks of data against their own geometry: units, axes, signs and orders in which they may have
-been written.
-"""
+"""Checks of data against their geometry: other units, axes, signs and orders that explain them."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -15,11 +13,7 @@ __all__ = ["Finding", "check"]
 
 
 def check(links: Any) -> Iterator[Finding]:
-    """What is probably wrong with ``Links``, with or without a split.
-
-    Raises:
-        ValueError: All spectra are constant, or too small for SSIM.
-    """
+    """What is probably wrong with ``Links``, with or without a split."""
     yield from check_places(links)
     yield from check_edges(links)
     yield from check_arrays(links)

@@ -31,21 +31,13 @@ from gaigs.data.checks.waves import (
 
 
 class Measure(NamedTuple):
-    """A measure of how well geometry explains channels.
+    """A measure of how well geometry explains channels."""
 
-    Attributes:
-        measure: Share from 0 to 1 of a sample.
-        least: Smallest share that tells a convention.
-        enough: Share above which the data need no other convention.
-        sentence: What the share means, with a place for it.
-        meaning: The same in short.
-    """
-
-    measure: Callable[[Sample], float]
-    least: float
-    enough: float
-    sentence: str
-    meaning: str
+    measure: Callable[[Sample], float]  # share from 0 to 1 of a sample
+    least: float  # smallest share that tells a convention
+    enough: float  # share above which the data need no other convention
+    sentence: str  # what the share means, with a place for it
+    meaning: str  # the same in short
 
 
 def check_channels(links: Any) -> Iterator[Finding]:
@@ -187,10 +179,8 @@ def best_convention(sample: Sample, score: Measure) -> Finding | None:
     if not tried:
         return None
     likely = sorted((share for share, _ in tried), reverse=True)[:8]
-    fitting = []
-    for share, convention in tried:
-        if share >= likely[-1]:
-            fitting.append((score.measure(convention.change(sample)), convention))
+    kept = [convention for share, convention in tried if share >= likely[-1]]
+    fitting = [(score.measure(convention.change(sample)), convention) for convention in kept]
     fits = max(share for share, _ in fitting)
     is_better = fits > 1.5 * read + 0.05 or 1 - fits < (1 - read) / 2
     if fits < score.least or not is_better:

@@ -11,15 +11,10 @@ from gaigs.data.checks.hypotheses import Sample
 
 
 class Law(NamedTuple):
-    """Levels of each receiver as a + b log10(distance), with b from -60 to 0 dB a decade.
+    """Levels of each receiver as a + b log10(distance), with b from -60 to 0 dB a decade."""
 
-    Attributes:
-        slopes: b of each receiver [dB per decade].
-        errors: Levels less the law [dB].
-    """
-
-    slopes: Float[Tensor, "*h r"]
-    errors: Float[Tensor, "*h n"]
+    slopes: Float[Tensor, "*h r"]  # b of each receiver [dB per decade]
+    errors: Float[Tensor, "*h n"]  # levels less the law [dB]
 
 
 class Gain(NamedTuple):

@@ -13,27 +13,17 @@ from gaigs.core.query import evenly
 
 @dataclass(frozen=True)
 class Sample:
-    """Some links, evenly spread, in the form that hypotheses change.
+    """Some links, evenly spread, in the form that hypotheses change."""
 
-    Attributes:
-        index: Numbers of the links among all.
-        transmitters: Positions of the links' transmitters [m].
-        receivers: Number of each link's receiver.
-        positions: Positions of the receivers [m].
-        rotations: The receivers' axes in the world frame, as columns.
-        elements: Offsets of each receiver's elements along its own axes [m].
-        frequencies: Subcarriers of channels [Hz]; empty for other tasks.
-        labels: One a link, of the task's shape.
-    """
-
-    index: Int[Tensor, " n"]
-    transmitters: Float[Tensor, "n 3"]
-    receivers: Int[Tensor, " n"]
-    positions: Float[Tensor, "r 3"]
-    rotations: Float[Tensor, "r 3 3"]
+    index: Int[Tensor, " n"]  # numbers of the links among all
+    transmitters: Float[Tensor, "n 3"]  # positions of the links' transmitters [m]
+    receivers: Int[Tensor, " n"]  # number of each link's receiver
+    positions: Float[Tensor, "r 3"]  # positions of the receivers [m]
+    rotations: Float[Tensor, "r 3 3"]  # the receivers' axes in the world frame, as columns
+    # Offsets of each receiver's elements along its own axes [m].
     elements: tuple[Float[Tensor, "_ 3"], ...]
-    frequencies: Float[Tensor, " s"]
-    labels: Tensor
+    frequencies: Float[Tensor, " s"]  # subcarriers of channels [Hz]; empty for other tasks
+    labels: Tensor  # one a link, of the task's shape
 
     @property
     def local(self) -> Float[Tensor, "n 3"]:

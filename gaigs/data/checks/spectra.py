@@ -26,11 +26,7 @@ from gaigs.data.checks.places import scale_of
 
 
 def check_spectra(links: Any) -> Iterator[Finding]:
-    """Findings about spectra.
-
-    Raises:
-        ValueError: All spectra are constant, or too small for SSIM.
-    """
+    """Findings about spectra; a ``ValueError`` if all are constant, or too small for SSIM."""
     yield from check_extremes(links)
     yield from check_directions(links)
 
@@ -67,27 +63,18 @@ def check_extremes(links: Any) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class Limits:
-    """What it takes to name another convention.
+    """What it takes to name another convention."""
 
-    Attributes:
-        fewest: Fewest spectra that are checked.
-        near: Fewest spectra that show whether near places are alike.
-        most: Most spectra that are read.
-        pixels: Most rows and columns that are compared; an array resolves fewer.
-        better: Least excess of the score over the score of the data as read.
-        share: The same as a share of the score.
-        known: Score of the data as read above which two faults at once are not sought.
-        of_others, of_axes, of_pairs: The excess in standard errors. Axes that point the other way
-            need more, as reflections look like them; hundreds of pairs need most.
-    """
-
-    fewest: int = 16
-    near: int = 32
-    most: int = 160
+    fewest: int = 16  # fewest spectra that are checked
+    near: int = 32  # fewest spectra that show whether near places are alike
+    most: int = 160  # most spectra that are read
+    # Most rows and columns that are compared; an array resolves fewer.
     pixels: tuple[int, int] = (45, 90)
-    better: float = 0.08
-    share: float = 0.35
-    known: float = 0.2
+    better: float = 0.08  # least excess of the score over the score of the data as read
+    share: float = 0.35  # the same as a share of the score
+    known: float = 0.2  # score of the data as read above which two faults at once are not sought
+    # The excess in standard errors. Axes that point the other way need more, as reflections look
+    # like them; hundreds of pairs need most.
     of_others: float = 3.0
     of_axes: float = 4.0
     of_pairs: float = 4.5
@@ -140,17 +127,11 @@ class Scored(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """Conventions to compare.
-
-    Attributes:
-        conventions: The conventions.
-        deviations: Least excess of the best score [standard errors].
-        step: 1 to compare at every link, 2 at every other one.
-    """
+    """Conventions to compare."""
 
     conventions: list[Hypothesis]
-    deviations: float
-    step: int
+    deviations: float  # least excess of the best score [standard errors]
+    step: int  # 1 to compare at every link, 2 at every other one
 
 
 def trials(
@@ -354,9 +335,7 @@ def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sa
     # The columns of ``crossed`` (k, 3, 3) are e x u; the equations are in s and t.
     equations = torch.cat((crossed * sample.transmitters[links, None], crossed), 2)  # (k, 3, 6)
     generator = torch.Generator().manual_seed(0)
-    threes = []
-    for _ in range(draws):
-        threes.append(torch.randperm(len(links), generator=generator)[:3])
+    threes = [torch.randperm(len(links), generator=generator)[:3] for _ in range(draws)]
     threes = torch.stack(threes)
     systems = equations[threes].flatten(1, 2)  # (draws, 9, 6)
     solutions = torch.linalg.svd(systems).Vh[:, -1]  # (draws, 6)

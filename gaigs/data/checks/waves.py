@@ -29,10 +29,7 @@ class Turned(NamedTuple):
 
 
 def direct_distances(sample: Sample) -> Float[Tensor, "n e"]:
-    """Distances of transmitters from the elements of their receivers [m].
-
-    Elements that an array lacks are in its middle.
-    """
+    """Distances of transmitters from their receivers' elements, lacking ones in the middle [m]."""
     elements = pad_sequence([*sample.elements], batch_first=True)  # (r, e, 3)
     places = sample.positions[:, None] + torch.einsum("rwa,rea->rew", sample.rotations, elements)
     return (sample.transmitters[:, None] - places[sample.receivers]).norm(dim=-1)

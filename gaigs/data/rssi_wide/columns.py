@@ -38,19 +38,12 @@ WEAK = -20.0
 
 
 class Columns(NamedTuple):
-    """Columns of gateways and what else the table has.
+    """Columns of gateways and what else the table has."""
 
-    Attributes:
-        gateways: Numbers of the gateways' columns.
-        marks: Values that mean "not heard".
-        silent: Names of gateways that received nothing.
-        ignored: Names of other columns.
-    """
-
-    gateways: list[int]
-    marks: list[float]
-    silent: list[str]
-    ignored: list[str]
+    gateways: list[int]  # numbers of the gateways' columns
+    marks: list[float]  # values that mean "not heard"
+    silent: list[str]  # names of gateways that received nothing
+    ignored: list[str]  # names of other columns
 
 
 class Axes(NamedTuple):
@@ -76,11 +69,7 @@ def plain_name(name: str) -> tuple[str, float | None]:
 
 
 def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
-    """Factors of x, y and z to metres, or of x and y to the unit of the system.
-
-    Raises:
-        ValueError: A heading's unit differs from the system's.
-    """
+    """Factors of x, y and z to metres, or of x and y to the unit of the system, by headings."""
     columns = [axes.x, axes.y, axes.z if axes.z >= 0 else axes.x]
     units = [plain_name(table.names[column])[1] for column in columns]
     metres = 1.0 if epsg is None else metres_of(epsg)

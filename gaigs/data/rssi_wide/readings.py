@@ -14,25 +14,15 @@ from gaigs.io import tables
 
 
 class Pivoted(NamedTuple):
-    """A table with a place a row: coordinates first, then a gateway a column.
+    """A table with a place a row: coordinates first, then a gateway a column."""
 
-    Attributes:
-        table: The table; a place with repeated readings of a gateway has several rows.
-        axes: Its columns of coordinates.
-        ignored: Names of other columns of the table with a reading a row.
-    """
-
-    table: tables.Table
-    axes: Axes
-    ignored: list[str]
+    table: tables.Table  # the table; a place with repeated readings of a gateway has several rows
+    axes: Axes  # its columns of coordinates
+    ignored: list[str]  # names of other columns of the table with a reading a row
 
 
 def pivoted(table: tables.Table, axes: Axes, receiver: str | None, level: str | None) -> Pivoted:
-    """A table with a gateway a column, of one with a reading a row.
-
-    Raises:
-        ValueError: One of the two columns is not named, or a reading has no gateway's name.
-    """
+    """A table with a gateway a column, of one with a reading a row."""
     if receiver is None or level is None:
         missing = "data.receiver" if receiver is None else "data.level"
         raise ValueError(
@@ -106,22 +96,14 @@ def refuse_readings(table: tables.Table, columns: Columns) -> None:
 
 
 class Survey(NamedTuple):
-    """Readings averaged at each place.
+    """Readings averaged at each place."""
 
-    Attributes:
-        places: Different places [m].
-        counts: Number of readings at each place and gateway.
-        means: Their means [dBm]; 0 without a reading.
-        repeats: Number of readings beyond the first of a place.
-        scatter: Standard deviation of repeated readings [dB].
-        noises: Standard deviation of each mean [dB]; None without repetitions.
-    """
-
-    places: Float[ndarray, "p 3"]
-    counts: Float[ndarray, "p g"]
-    means: Float[ndarray, "p g"]
-    repeats: int
-    scatter: float
+    places: Float[ndarray, "p 3"]  # different places [m]
+    counts: Float[ndarray, "p g"]  # number of readings at each place and gateway
+    means: Float[ndarray, "p g"]  # their means [dBm]; 0 without a reading
+    repeats: int  # number of readings beyond the first of a place
+    scatter: float  # standard deviation of repeated readings [dB]
+    # Standard deviation of each mean [dB]; None without repetitions.
     noises: Float[Tensor, " n"] | None
 
 

@@ -93,9 +93,7 @@ def furnished_room(
 
 
 def default_room(order: int, receivers: int | None = None) -> SimulatedRoom:
-    """The default room with paths of at most ``order`` reflections, and so many receivers; None:
-    one array, four gateways.
-    """
+    """The default room with paths of at most ``order`` reflections; None: its own receivers."""
     poses: tuple[Pose, ...] = (POSE,)
     gateways = [gateway(name, position) for name, position in GATEWAYS.items()]
     if receivers is not None:
@@ -155,10 +153,7 @@ def respond_in_parts(
     offsets: Float[Tensor, " f"],
     order: int,
 ) -> Iterator[Complex[Tensor, "part elements f"]]:
-    """``respond`` for the paths of at most ``order`` reflections in any room.
-
-    ``PLACES_AT_A_TIME`` transmitters [m] are taken at a time.
-    """
+    """``respond`` in any room for ``PLACES_AT_A_TIME`` transmitters [m] at a time."""
     for part in transmitters.split(PLACES_AT_A_TIME):
         paths = trace(room, part, receiver.pose.position, frequency, order)
         yield respond(paths, receiver, frequency, offsets)
@@ -180,12 +175,7 @@ def spectra(
     bandwidth: float,
     order: int,
 ) -> Float[Tensor, "n rows columns"]:
-    """Spectra of transmitters [m] in any room, float32 in [0, 1]; the options are those of
-    ``furnished_room``.
-
-    Raises:
-        ValueError: An option is out of range, or a transmitter does not stand free in the room.
-    """
+    """Spectra of transmitters [m] in any room, in [0, 1], by options of ``furnished_room``."""
     offsets = spectrum_offsets(
         spectrum, lambda width: frequency_offsets(room, width, order), bandwidth
     )

@@ -1,6 +1,4 @@
-"""The image-source method in a furnished box room, in float64; docs/data.md has the formulas and
-their limits.
-"""
+"""The image-source method in a furnished box room, in float64; docs/data.md has its formulas."""
 
 import itertools
 import math
@@ -40,41 +38,27 @@ TABULATED = {
 
 @dataclass(frozen=True)
 class Box:
-    """A piece of furniture: a cuboid along the room's axes that dims every wave passing through it.
-
-    Attributes:
-        lower, upper: Opposite corners, world frame [m].
-        loss_db: Penetration loss of one passage of any length [dB].
-    """
+    """A piece of furniture: a cuboid along the room's axes that dims waves passing through it."""
 
     name: str
+    # Opposite corners, world frame [m].
     lower: tuple[float, float, float]
     upper: tuple[float, float, float]
-    loss_db: float
+    loss_db: float  # penetration loss of one passage of any length [dB]
 
 
 @dataclass(frozen=True)
 class Room:
-    """A box room with one corner at the world's origin.
+    """A box room with one corner at the world's origin."""
 
-    Attributes:
-        size: Extent along x, y and z [m].
-        walls: Materials of the walls at x = 0, x = size, y = 0, y = size, of the floor and of the
-            ceiling.
-    """
-
-    size: tuple[float, float, float]
+    size: tuple[float, float, float]  # extent along x, y and z [m]
+    # Materials of the walls at x = 0, x = size, y = 0, y = size, of the floor and of the ceiling.
     walls: tuple[str, str, str, str, str, str]
     furniture: tuple[Box, ...] = ()
 
 
 def permittivity(material: str, frequency: float) -> complex:
-    """Complex relative permittivity of a material at a frequency [Hz].
-
-    The time dependence is exp(+j omega t).
-
-    Raises:
-        ValueError: The material is unknown, or the frequency is outside the tables.
+    """Complex relative permittivity of a material at a frequency [Hz], for exp(+j omega t).
 
     Source: ITU-R P.2040-3, section 2.1.4.
     """
@@ -138,16 +122,11 @@ def passes(
 
 @dataclass(frozen=True)
 class Paths:
-    """Paths from transmitters to one receiver point, each replaced by a straight one from an image.
+    """Paths from transmitters to one receiver point, each straight from an image."""
 
-    Attributes:
-        images: Mirrored transmitters, world frame (b, p, 3) [m]; the first is the transmitter
-            itself.
-        gains: Product of the path's reflection coefficients and penetration losses (b, p); free
-            space has 1.
-    """
-
+    # Mirrored transmitters, world frame [m]; the first is the transmitter itself.
     images: Float[Tensor, "b p 3"]
+    # Product of the path's reflection coefficients and penetration losses; free space has 1.
     gains: Complex[Tensor, "b p"]
 
 
@@ -163,10 +142,6 @@ def trace(
     Gains are those at a frequency [Hz]. The field is vertically polarised: TE at the four walls, TM
     at floor and ceiling. The furniture is mirrored with the room, so a path is the straight line
     from the receiver to an image.
-
-    Raises:
-        ValueError: A transmitter or the receiver is outside the room or inside furniture; the order
-            is negative; a material is unknown or not tabulated at the frequency.
 
     Source: Allen and Berkley, Image method for efficiently simulating small-room acoustics, 1979;
     ITU-R P.2040-3.
@@ -251,9 +226,6 @@ def respond(
     The phase follows a spherical wave from each image to each element. Gains and the elements'
     pattern belong to paths to the array's centre at the carrier; ``offsets`` are relative to it
     [Hz].
-
-    Raises:
-        ValueError: A frequency is not positive.
     """
     frequencies = frequency + offsets.double()
     if frequencies.min() <= 0:

@@ -13,9 +13,6 @@ class MeanError(ABC):
 
     Args:
         task: Task of the labels.
-
-    Raises:
-        ValueError: The labels are complex.
     """
 
     def __init__(self, task: Task):

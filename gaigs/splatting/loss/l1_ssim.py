@@ -61,9 +61,6 @@ def find_window(loss: str, directions: Directions | None, pitch: float, pixels: 
         directions: The thinned grid.
         pitch: Angle between neighbouring rows of the label's own grid [rad].
         pixels: Edge of the window on the label's own grid, odd; its angle is kept.
-
-    Raises:
-        ValueError: The directions are a list, or fewer than 3 x 3.
     """
     if not isinstance(directions, Grid):
         raise ValueError(

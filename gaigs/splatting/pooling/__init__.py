@@ -50,9 +50,6 @@ def sphere(option: str, shape: Sequence[int]) -> Grid:
     Args:
         option: The option, for errors.
         shape: Rows and columns of the map over the full sphere.
-
-    Raises:
-        ValueError: There are not two numbers.
     """
     if len(shape) != 2:
         raise ValueError(f"{option} must be [rows, columns], got {list(shape)}")

@@ -17,15 +17,11 @@ from gaigs.core.task.spectrum import MIN_MAX
 
 
 class LagFit(NamedTuple):
-    """Covariances at an array's lags, fitted to labels.
+    """Covariances at an array's lags, fitted to labels."""
 
-    Attributes:
-        lags: Covariance at each of ``array.lags``, up to a factor for each label.
-        unexplained: Share of each label's squared norm that the fit leaves.
-    """
-
+    # Covariance at each of ``array.lags``, up to a factor for each label.
     lags: Complex[Tensor, "b l"]
-    unexplained: Float[Tensor, " b"]
+    unexplained: Float[Tensor, " b"]  # share of each label's squared norm that the fit leaves
 
 
 class Beamformer:
@@ -40,9 +36,6 @@ class Beamformer:
     Args:
         owner: Component named in errors.
         scene: Its task has the directions and the normalisation, its receivers the arrays.
-
-    Raises:
-        ValueError: The labels are no spectra scaled to [0, 1], or an array has a single element.
 
     Source: GAI-GS, eq. (4); Bartlett, Smoothing periodograms from time series with continuous
     spectra, 1948; the spectra of NeRF².

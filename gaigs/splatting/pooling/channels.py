@@ -21,20 +21,13 @@ class ChannelPooling(Pooling):
     Args:
         scene: Its task has the subcarriers, its receivers the elements.
         name: Registered name, for errors.
-
-    Attributes:
-        strength: Amplitude of the channels relative to free space.
-        sign: Sign with which phases follow the direct distance, -1 for the time dependence exp(+j
-            omega t) or 1; 0 for neither, as without a common clock that the data do not declare.
-        array_sign: Sign between the elements and subcarriers of a link, -1 or 1.
-
-    Raises:
-        ValueError: The labels are no channels, or the arrays do not have their elements.
     """
 
-    strength: Tensor
+    strength: Tensor  # amplitude of the channels relative to free space
+    # Sign with which phases follow the direct distance, -1 for the time dependence exp(+j omega t)
+    # or 1; 0 for neither, as without a common clock that the data do not declare.
     sign: Tensor
-    array_sign: Tensor
+    array_sign: Tensor  # sign between the elements and subcarriers of a link, -1 or 1
 
     def __init__(self, scene: Scene, name: str):
         super().__init__()

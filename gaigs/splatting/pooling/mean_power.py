@@ -64,11 +64,7 @@ class MeanPower(Pooling):
 
 
 def noise_amplitude(floor_db: float) -> float:
-    """Amplitude of a receiver's noise from its level [dB].
-
-    Raises:
-        ValueError: The level is out of range.
-    """
+    """Amplitude of a receiver's noise from its level [dB], which is checked."""
     if not -300 <= floor_db <= 0:
         raise ValueError(f"pooling option floor_db must lie between -300 and 0 dB, got {floor_db}")
     return 10 ** (floor_db / 20)

@@ -78,17 +78,12 @@ class LagPooling(PathPooling):
     Args:
         scene: Its receivers have planar arrays.
 
-    Attributes:
-        least_spread: Least standard deviation of a path's direction cosines where powers add: the
-            one of a pixel of 24 x 48.
-
-    Raises:
-        ValueError: An array is not planar.
-
     Source: Van Trees, Optimum Array Processing, 2002, section 5.2, for covariances by lags; the
     partial coherence is ours.
     """
 
+    # Least standard deviation of a path's direction cosines where powers add: the one of a pixel of
+    # 24 x 48.
     least_spread: float = Grid.sphere(24, 48).pitch / math.sqrt(12)
 
     def __init__(self, scene: Scene):
@@ -175,17 +170,11 @@ class _Steering:
 
 
 class _Seen(NamedTuple):
-    """Gaussians as an array sees them.
+    """Gaussians as an array sees them."""
 
-    Attributes:
-        points: Centres in the array's frame [m].
-        wavenumbers: 2 pi / lambda of each query [rad/m].
-        across: Semi-axes across the way, as angles at the middle of the array times the wavenumber
-            [rad/m].
-    """
-
-    points: Float[Tensor, "b n 3"]
-    wavenumbers: Float[Tensor, "b 1 1"]
+    points: Float[Tensor, "b n 3"]  # centres in the array's frame [m]
+    wavenumbers: Float[Tensor, "b 1 1"]  # 2 pi / lambda of each query [rad/m]
+    # Semi-axes across the way, as angles at the middle of the array times the wavenumber [rad/m].
     across: Float[Tensor, "b n 3 3"]
 
 
@@ -245,15 +234,10 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
 
 
 class _PathDifferences(NamedTuple):
-    """Ways to the elements beside the way to the middle.
+    """Ways to the elements beside the way to the middle."""
 
-    Attributes:
-        differences: |p - x| - |p| [m].
-        ratios: |p| / |p - x|, each at least ``NEAREST``.
-    """
-
-    differences: Float[Tensor, "b n e"]
-    ratios: Float[Tensor, "b n e"]
+    differences: Float[Tensor, "b n e"]  # |p - x| - |p| [m]
+    ratios: Float[Tensor, "b n e"]  # |p| / |p - x|, each at least ``NEAREST``
 
 
 def _path_differences(
@@ -274,26 +258,18 @@ def _path_differences(
 
 
 def _sum_by_series(
-    lengths: Float[Tensor, "b n"],
-    longer: Float[Tensor, "b n e"],
-    waves: Complex[Tensor, "b n e"],
-    rates: Float[Tensor, "b s"],
-    reach: float,
-    widest: float,
+    lengths: Float[Tensor, "b n"],  # from the transmitter to the middle of the array [m]
+    longer: Float[Tensor, "b n e"],  # further way to each element [m]
+    waves: Complex[Tensor, "b n e"],  # field of each path at each element, at the carrier
+    rates: Float[Tensor, "b s"],  # change of phase by delay at each frequency [rad/s]
+    reach: float,  # largest delay over the array [s]
+    widest: float,  # largest phase of the band over the array [rad]
 ) -> Complex[Tensor, "b e s"]:
     """Sum over the paths by one product of matrices, without a wave of each path and frequency.
 
         exp(j rate (t + dt)) = exp(j rate t) sum_k (j rate dt)^k / k!
 
     |dt| is at most the reach. Up to 3 rad the terms of the series stay small.
-
-    Args:
-        lengths: From the transmitter to the middle of the array [m].
-        longer: Further way to each element [m].
-        waves: Field of each path at each element, at the carrier.
-        rates: Change of phase by delay at each frequency [rad/s].
-        reach: Largest delay over the array [s].
-        widest: Largest phase of the band over the array [rad].
     """
     terms = [waves]
     size = widest

@@ -98,11 +98,7 @@ class Projection(ABC):
         """u repeats after this; None: it does not."""
 
     def check_sees(self, directions: Directions) -> None:
-        """Checks that no direction below the array's plane would fall on one above it.
-
-        Raises:
-            ValueError: The projection folds directions up.
-        """
+        """Raises a ``ValueError`` if directions below the array's plane fall on ones above it."""
         if not self.sees_below and directions.elevations.min() < 0:
             raise ValueError(
                 f"the grid reaches below the array's plane, which {name_of(self)} folds up; "

@@ -17,9 +17,6 @@ class Cylindrical(Projection):
         pixel: As for ``Projection`` [rad].
         limit_deg: Elevations are clamped to this absolute value [deg], in (0, 90): towards the pole
             the azimuth of a small step diverges as 1 / cos(elevation).
-
-    Raises:
-        ValueError: The limit is out of range.
     """
 
     period = 2 * math.pi

@@ -179,10 +179,6 @@ def _check_shapes(tensors: Mapping[str, Tensor]) -> set[int]:
 
     Returns:
         Numbers of transmitters in leading axes: none if no input has such an axis.
-
-    Raises:
-        TypeError: An input is no tensor with axes.
-        ValueError: Rows, columns, dtypes or numbers of transmitters do not fit.
     """
     if not all(isinstance(values, Tensor) and values.ndim for values in tensors.values()):
         raise TypeError(

@@ -7,11 +7,7 @@ import pyopencl as cl
 
 
 def devices() -> list[str]:
-    """Lists the OpenCL devices of this machine, each as "platform: device (kind)".
-
-    Raises:
-        RuntimeError: No driver lists a device.
-    """
+    """The OpenCL devices, each as "platform: device (kind)"; a ``RuntimeError`` without any."""
     return [name_of(device) for device in _devices()]
 
 
@@ -27,10 +23,7 @@ def _process() -> int:
 
 
 def is_forked() -> bool:
-    """True in a process forked from one that uses OpenCL.
-
-    It lacks the driver's threads, and would wait for ever.
-    """
+    """True in a fork of a process with OpenCL, which would wait for its threads for ever."""
     return _process() != os.getpid()
 
 
@@ -69,10 +62,6 @@ def open_queue(name: str | None) -> cl.CommandQueue:
 
     Args:
         name: As for ``OpenCLRasterizer``.
-
-    Raises:
-        RuntimeError: The process is forked, no driver works, or the device cannot be opened.
-        ValueError: No device has this name.
     """
     if is_forked():
         raise RuntimeError(

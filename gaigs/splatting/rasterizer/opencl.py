@@ -22,29 +22,20 @@ from gaigs.splatting.rasterizer.devices import cause_of, find_fault, is_forked, 
 
 @dataclass(frozen=True)
 class KernelLayout:
-    """Sizes that the kernels have too, and the largest shares of a work-item.
+    """Sizes that the kernels have too, and the largest shares of a work-item."""
 
-    Attributes:
-        rows, columns: Edges of a tile [pixels].
-        word: Splats in a word of bits.
-        block: Words in a block.
-        chunk: Entries of a list between two checkpoints.
-        geometry: Numbers in a splat's row of the geometry.
-        moments: Numbers in an entry's row of the moments.
-        group: Most transmitters of one work-item, where they share footprints; more would leave the
-            nearest cache.
-        channels: Channels composited at a time: the registers hold a row of each.
-    """
-
+    # Edges of a tile [pixels].
     rows: int = 16
     columns: int = 8
-    word: int = 32
-    block: int = 16
-    chunk: int = 32
-    geometry: int = 8
-    moments: int = 5
+    word: int = 32  # splats in a word of bits
+    block: int = 16  # words in a block
+    chunk: int = 32  # entries of a list between two checkpoints
+    geometry: int = 8  # numbers in a splat's row of the geometry
+    moments: int = 5  # numbers in an entry's row of the moments
+    # Most transmitters of one work-item, where they share footprints; more would leave the nearest
+    # cache.
     group: int = 8
-    channels: int = 8
+    channels: int = 8  # channels composited at a time: the registers hold a row of each
 
 
 LAYOUT = KernelLayout()

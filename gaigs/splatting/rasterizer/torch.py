@@ -96,10 +96,7 @@ class _Tiles:
             self.chunks = self._chunks(touches, triples // (len(opacities) * self.edge**2))
 
     def _find_touched(self, means: Tensor, factors: Tensor, opacities: Tensor) -> Tensor:
-        """True where a splat reaches a tile (tiles, n).
-
-        Comparisons with NaN keep the splat, so that NaN shows in the map.
-        """
+        """True where a splat reaches a tile (tiles, n), and for NaN: the map then shows it."""
         # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box
         # has these halves.
         reach = (2 * (opacities / ALPHA_MIN).log().clamp_min(0)).sqrt()  # (b, n)
@@ -213,24 +210,16 @@ class _SplatParts(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """One chunk composited, for b transmitters, t tiles, k splats a tile, y x pixels a tile.
+    """One chunk composited, for b transmitters, t tiles, k splats a tile, y x pixels a tile."""
 
-    Attributes:
-        s, y: (du, dv) of the pixels, in units of the splat's factor (1 or b, t, k, y or 1, x or 1).
-        footprint: G (b, t, k, y x).
-        alpha: A = a G within its bounds (b, t, k, y x).
-        live: True where a splat acts (b, t, k, y x).
-        transmittance: T, in front of each splat (b, t, k, y x).
-        remaining: Transmittance behind the last splat (b, t, y x).
-    """
-
+    # (du, dv) of the pixels, in units of the splat's factor (1 or b, t, k, y or 1, x or 1).
     s: Tensor
     y: Tensor
-    footprint: Tensor
-    alpha: Tensor
-    live: Tensor
-    transmittance: Tensor
-    remaining: Tensor
+    footprint: Tensor  # G (b, t, k, y x)
+    alpha: Tensor  # A = a G within its bounds (b, t, k, y x)
+    live: Tensor  # True where a splat acts (b, t, k, y x)
+    transmittance: Tensor  # T, in front of each splat (b, t, k, y x)
+    remaining: Tensor  # transmittance behind the last splat (b, t, y x)
 
 
 def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _SplatParts) -> _Weights:
@@ -319,23 +308,14 @@ class _Composite(torch.autograd.Function):
 
 
 def _differentiate(
-    w: _Weights,
-    k: Tensor,
-    inputs: _SplatParts,
-    towards: Tensor,
-    remaining_gradient: Tensor,
-    edge: int,
+    w: _Weights,  # the chunk composited; used up
+    k: Tensor,  # splats of each tile (t, k)
+    inputs: _SplatParts,  # all splats
+    towards: Tensor,  # gradient of the map's pixels (b, t, c, y x)
+    remaining_gradient: Tensor,  # gradient of the remaining transmittance (b, t, y x)
+    edge: int,  # edge of a tile [pixels]
 ) -> _SplatParts:
-    """Gradients of a chunk's splats (t, k).
-
-    Args:
-        w: The chunk composited; used up.
-        k: Splats of each tile (t, k).
-        inputs: All splats.
-        towards: Gradient of the map's pixels (b, t, c, y x).
-        remaining_gradient: Gradient of the remaining transmittance (b, t, y x).
-        edge: Edge of a tile [pixels].
-    """
+    """Gradients of a chunk's splats (t, k)."""
     blend = w.alpha * w.transmittance  # A T
     d_signal = blend @ towards.mT  # (b, t, k, c)
     d = inputs.signal[:, k] @ towards  # D, (b, t, k, y x)

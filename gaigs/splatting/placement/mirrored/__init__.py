@@ -1,3 +1,1 @@
-"""Mirrored Gaussians: each stands at an image of the transmitter in learnt planes, the walls of the
-room.
-"""
+"""Mirrored Gaussians: each stands at an image of the transmitter in the learnt walls."""

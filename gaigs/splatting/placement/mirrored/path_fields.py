@@ -20,17 +20,11 @@ from gaigs.splatting.placement.mirrored.reflections import Folded, fold, images,
 
 
 class FoldedLinks(NamedTuple):
-    """Links with their paths through a room; positions are from its middle [m].
+    """Links with their paths through a room; positions are from its middle [m]."""
 
-    Attributes:
-        seen: Images of the transmitters, see ``reflections.images``.
-        receivers: Position of each link's receiver.
-        paths: Through the room.
-    """
-
-    seen: list[Float[Tensor, "b n 3"]]
-    receivers: Float[Tensor, "b 3"]
-    paths: Folded
+    seen: list[Float[Tensor, "b n 3"]]  # images of the transmitters, see ``reflections.images``
+    receivers: Float[Tensor, "b 3"]  # position of each link's receiver
+    paths: Folded  # through the room
 
     @property
     def ways(self) -> Float[Tensor, "b n 3"]:
@@ -265,9 +259,7 @@ class PathFields(MovablePlanes):
         return torch.complex(gains, torch.zeros_like(gains) if phases is None else phases)
 
     def _common_gain(self, known: Tensor) -> Complex[Tensor, ""]:
-        """The gain of a receiver in general: of levels the mean of decibels; of channels that of
-        complex gains, whose phases may have nothing in common.
-        """
+        """The gain of a receiver in general: the mean of decibels, or of channels' amplitudes."""
         gains = self._receiver_gains[known]
         return gains.exp().mean().log() if self.is_complex else gains.mean()
 
@@ -311,9 +303,7 @@ def _filled(value: float, *shape: int) -> nn.Parameter:
 
 
 def boresight(receiver: Receiver, middle: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """Normal of a planar array in its own frame, towards a point of the world [m]; 0 for other
-    arrays.
-    """
+    """Normal of a planar array in its frame, towards a world point [m]; 0 for other arrays."""
     elements = receiver.array.elements.double()
     _, values, axes = torch.linalg.svd(elements - elements.mean(0), full_matrices=True)
     flat = 1e-6 * values[0]  # float32 places elements no better

@@ -20,8 +20,7 @@ from gaigs.splatting.placement.mirrored.reflections import fold, images
 
 @register("placement", "mirrored")
 class Mirrored(PathFields):
-    """Gaussians at p_k = V_k x ~V_k, with the transmitter x and the product V_k of at most
-    ``order`` plane vectors.
+    """Gaussians at p_k = V_k x ~V_k: transmitter x, products V_k of up to ``order`` planes.
 
     In projective geometric algebra a plane is a vector, and its sandwich product mirrors. All paths
     and receivers share the planes, so direction, path length and spreading follow from geometry;

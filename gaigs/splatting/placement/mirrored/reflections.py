@@ -15,24 +15,18 @@ class Folded(NamedTuple):
 
     Legs that start at the last bounces of all sequences come first, then those at the last but one,
     and so on, and at last those from the transmitter.
-
-    Attributes:
-        start, end: Ends of all legs [m].
-        path: Number of the sequence of each leg.
-        firsts: Number of the first sequence that has a last bounce, a last but one, and so on.
-        planes: Plane of each bounce, of all legs but the last n.
-        normals: Its normal.
-        cosines: Cosines of the angles of incidence.
-        exists: True if a path meets its planes in their order, from inside the room (b, n).
     """
 
+    # Ends of all legs [m].
     start: Float[Tensor, "b s 3"]
     end: Float[Tensor, "b s 3"]
-    path: Int[Tensor, " s"]
+    path: Int[Tensor, " s"]  # number of the sequence of each leg
+    # Number of the first sequence that has a last bounce, a last but one, and so on.
     firsts: list[int]
-    planes: Int[Tensor, " w"]
-    normals: Float[Tensor, "w 3"]
-    cosines: Float[Tensor, "b w"]
+    planes: Int[Tensor, " w"]  # plane of each bounce, of all legs but the last n
+    normals: Float[Tensor, "w 3"]  # its normal
+    cosines: Float[Tensor, "b w"]  # cosines of the angles of incidence
+    # True if a path meets its planes in their order, from inside the room.
     exists: Bool[Tensor, "b n"]
 
     @property
@@ -51,10 +45,7 @@ class Folded(NamedTuple):
     def parts(
         self, values: Inexact[Tensor, "b w *s"]
     ) -> Iterator[tuple[int, Inexact[Tensor, "b k *s"]]]:
-        """Values of the last bounces, of the last but one, and so on.
-
-        Each comes with the first sequence that has such a bounce.
-        """
+        """Values of the last bounces, the last but one, ..., each with its first sequence."""
         counts = [self.exists.shape[1] - first for first in self.firsts]
         return zip(self.firsts, values.split(counts, 1), strict=True)
 
@@ -241,9 +232,6 @@ def reflection_points(
 def polarised(
     normals: Float[Tensor, "*#n 3"], te: Complex[Tensor, "*n"], tm: Complex[Tensor, "*n"]
 ) -> Complex[Tensor, "*n"]:
-    """Reflection coefficients for vertical polarisation.
-
-    TE counts at upright planes, TM at level ones, a mean in between.
-    """
+    """Coefficients for vertical polarisation: TE at upright planes, TM at level, else a mean."""
     level = normals[..., 2].square()
     return (1 - level) * te + level * tm

@@ -84,10 +84,7 @@ def _faces(vertices: Float[Tensor, "v 3"], faces: Iterable[Face], shortest: floa
 def _merged(
     normals: Float[Tensor, "f 3"], points: Float[Tensor, "f 3"], sizes: Float[Tensor, " f"]
 ) -> Float[Tensor, "k 4"]:
-    """Coplanar faces as the plane of the largest of them, largest total area first.
-
-    Coplanar are faces within 0.02 rad and 0.02 m.
-    """
+    """Faces within 0.02 rad and 0.02 m as the plane of the largest, largest total area first."""
     sizes, order = sizes.sort(descending=True, stable=True)
     normals = functional.normalize(normals[order], dim=1)
     offsets = (normals * points[order]).sum(1)
