@@ -49,7 +49,10 @@ checked_calls = Counter()
 checking = {"scope": None, "most": 3}
 
 CHECKED = ("test_contracts", "hard_cases", "properties", "contracts")
-"""Modules and folders whose tests check twenty calls each: they call each part with all shapes."""
+"""Modules and folders whose tests check five calls each: they call each part with all shapes."""
+
+FITTED = {"kriging", "calibration", "commands", "data", "benchmarks"}
+"""Folders whose tests need hyperparameters of levels as a user has them."""
 
 
 def check_first_calls(function=None, *, typechecker):
@@ -83,12 +86,20 @@ jaxtyping.jaxtyped = jaxtyping._decorator.jaxtyped = check_first_calls
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Twenty calls are checked in each test of ``CHECKED``, else three in each module."""
+    """Five calls are checked in each test of ``CHECKED``, else three in each module; and processes of
+    levels are fitted in a few steps, but for ``FITTED``.
+    """
     is_each = not {*CHECKED}.isdisjoint(item.path.with_suffix("").parts)
     scope = item.nodeid if is_each else item.path
     if checking["scope"] != scope:
+        from gaigs.kriging.scalar import ScalarOptions, ScalarProcess
+
+        # Fits of levels to the last digit are most of a small run's time.
+        is_fitted = not FITTED.isdisjoint(item.path.parts)
+        quick = ScalarOptions(neighbours=8, iterations=4)
+        ScalarProcess.options = ScalarOptions() if is_fitted else quick
         checked_calls.clear()
-        checking.update(scope=scope, most=20 if is_each else 3)
+        checking.update(scope=scope, most=5 if is_each else 3)
 
 
 # Modules and tests stay: a search for garbage among them takes a fifth of their collection
