@@ -19,6 +19,8 @@ import pytest
 import torch
 from hypothesis import HealthCheck, Phase, settings
 
+ROOT = Path(__file__).parents[1]
+
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of these would compile all modules
@@ -42,11 +44,19 @@ settings.load_profile("gaigs")
 
 check_all_calls = jaxtyping.jaxtyped
 checked_calls = Counter()
-"""Calls that were checked in the current test, by the code of the function."""
+"""Calls that were checked in the current scope, a module or a test, by the code of the function."""
+
+checking = {"scope": None, "most": 3}
+
+CHECKED = ("test_contracts", "hard_cases", "properties", "contracts")
+"""Modules and folders whose tests check five calls each: they call each part with all shapes."""
+
+FITTED = {"kriging", "calibration", "commands", "data", "benchmarks"}
+"""Folders whose tests need hyperparameters of levels as a user has them."""
 
 
-def check_first_calls(function=None, *, typechecker, calls=20):
-    """``jaxtyping.jaxtyped`` for the first calls in each test, made when they come.
+def check_first_calls(function=None, *, typechecker):
+    """``jaxtyping.jaxtyped`` for the first calls alone, made when they come.
 
     A loop calls a function with the same shapes thousands of times; checking all of them takes as
     long as all else.
@@ -62,7 +72,7 @@ def check_first_calls(function=None, *, typechecker, calls=20):
     @functools.wraps(function)
     def checked_at_first(*args, **kwargs):
         nonlocal checked
-        if checked_calls[key] >= calls:
+        if checked_calls[key] >= checking["most"] or jaxtyping.config.jaxtyping_disable:
             return function(*args, **kwargs)
         checked_calls[key] += 1
         checked = checked or check_all_calls(function, typechecker=typechecker)
@@ -75,8 +85,21 @@ jaxtyping.jaxtyped = jaxtyping._decorator.jaxtyped = check_first_calls
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_runtest_setup():
-    checked_calls.clear()
+def pytest_runtest_setup(item):
+    """Five calls are checked in each test of ``CHECKED``, else three in each module; and processes of
+    levels are fitted in a few steps, but for ``FITTED``.
+    """
+    is_each = not {*CHECKED}.isdisjoint(item.path.with_suffix("").parts)
+    scope = item.nodeid if is_each else item.path
+    if checking["scope"] != scope:
+        from gaigs.kriging.scalar import ScalarOptions, ScalarProcess
+
+        # Fits of levels to the last digit are most of a small run's time.
+        is_fitted = not FITTED.isdisjoint(item.path.parts)
+        quick = ScalarOptions(neighbours=8, iterations=4)
+        ScalarProcess.options = ScalarOptions() if is_fitted else quick
+        checked_calls.clear()
+        checking.update(scope=scope, most=5 if is_each else 3)
 
 
 # Modules and tests stay: a search for garbage among them takes a fifth of their collection
@@ -90,12 +113,53 @@ def pytest_collection_finish():
 
 @pytest.fixture(scope="session", autouse=True)
 def quick_runs():
-    """Figures and times of a run take longer than all else; the report's tests and processes have
-    them.
+    """Figures, times and a thousand resamples take longer than all else of a run; the report's
+    tests and processes have them.
     """
+    from gaigs.report.paired import paired
+
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("gaigs.runs.evaluation.paired", functools.partial(paired, resamples=20))
         patch.setattr("gaigs.report.run_figures.write_figures", lambda *_: None)
         patch.setattr("gaigs.runs.evaluation.median_ms", lambda work: (work(), 1.0)[1])
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def searched_once():
+    """The plug-ins of this repository stay: each run looks for them ninety times."""
+    from gaigs.registry import discovery
+
+    search, found = discovery._dropped_holders, functools.cache(discovery._dropped_holders)
+
+    def once(kind=None):
+        if Path.cwd() != ROOT:
+            return search(kind)
+        holders, unreadable = found(kind)
+        return [*holders], [*unreadable]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(discovery, "_dropped_holders", once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def simulated_once():
+    """Copies of the built-in room's spectra at few places: a hundred runs have the same ones."""
+    from gaigs.data import synthetic
+
+    simulate, found = synthetic.simulate_spectra, {}
+
+    def once(room, spectrum, transmitters, *options):
+        key = (repr(room.respond), repr(room.poses), spectrum, transmitters, repr(options))
+        if not isinstance(transmitters, int) or transmitters > 40:
+            return simulate(room, spectrum, transmitters, *options)
+        if key not in found:
+            found[key] = simulate(room, spectrum, transmitters, *options)
+        return copy.deepcopy(found[key])
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthetic, "simulate_spectra", once)
         yield
 
 
@@ -116,12 +180,20 @@ def composed_once():
             element.path
             for element in GlobalHydra.instance().config_loader().get_search_path().get_path()
         ]
-        files = [(file, file.stat().st_mtime_ns) for file in Path.cwd().glob("plugins/**/*")]
+        written = () if Path.cwd() == ROOT else Path.cwd().glob("plugins/**/*")
+        files = [(file, file.stat().st_mtime_ns) for file in written]
         held = [(kind, *item) for kind in KINDS for item in registry(kind)._registered.items()]
         invented = [
             item for item in held if not str(item[2].__module__).startswith(("gaigs", "plugins"))
         ]
-        state = (*folders, *sys.path, *files, *invented, Path.cwd() if files else None, *words)
+        state = (
+            *folders,
+            *sys.path,
+            *files,
+            *invented,
+            Path.cwd() if files or Path.cwd() == ROOT else None,
+            *words,
+        )
         if state not in found:
             found[state] = compose(name, words)
         return copy.deepcopy(found[state])

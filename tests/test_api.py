@@ -450,6 +450,18 @@ def test_the_page_on_python_runs(tmp_path, monkeypatch, capsys):
         'links("synthetic", transmitters=20, order=0)',
         code,
     )
+    code = re.sub(
+        r'(links\("synthetic_rssi"), transmitters=\d+', r"\1, transmitters=40, order=0", code
+    )
+    code = code.replace("pitch=0.5", "pitch=2.0").replace("n_estimators=20", "n_estimators=2")
+    code = code.replace("gaigs.radio_map(model)", "gaigs.radio_map(model, pitch=1.0)")
+    code = code.replace('["path_loss", "knn", "mirrored"]', '["path_loss", "knn"]')
+    code = re.sub(
+        r'links\(\s+"synthetic"\s+\)', 'links("synthetic", transmitters=20, order=0)', code
+    )
+    code = code.replace("[6, 4, 2], (100, 3)", "[6, 4, 2], (40, 3)")
+    code = code.replace("range(80, 100)", "range(30, 40)").replace("cv=3", "cv=2")
+    code = code.replace("train(links, max_steps=1)", "train('gaigs', links, max_steps=1)")
     code = code.replace(
         '"+experiment=spectrum"', '"+experiment=spectrum", "data.transmitters=30", "data.order=0"'
     )

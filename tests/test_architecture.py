@@ -23,10 +23,10 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-    "lines of gaigs/": 46_057,
+    "lines of gaigs/": 46_059,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
-    "module constants": 108,
+    "module constants": 100,
     "rooms": 22,  # sklearn, whose name users know
     "files in an import chain": 23,
 }

@@ -4,15 +4,13 @@ import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
 from gaigs.core.geometry import Pose
-
-PATTERNS = ("isotropic", "cosine")
-"""Field patterns of an element; ``cosine``, of the angle to the array's normal, is 0 behind it."""
 
 
 def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"]]:
@@ -27,7 +25,8 @@ class Array:
 
     Attributes:
         elements: Positions in the array's own frame (e, 3) [m].
-        pattern: Field pattern of each element, one of ``PATTERNS``.
+        pattern: Field pattern of each element, ``isotropic``, or ``cosine``, of the angle to the
+            array's normal and 0 behind it.
 
     Example:
         >>> len(gaigs.Array.planar(4, 4, pitch=0.16)), len(gaigs.Array.single())
@@ -36,12 +35,12 @@ class Array:
 
     elements: Tensor
     pattern: str = "isotropic"
+    patterns: ClassVar[tuple[str, ...]] = ("isotropic", "cosine")
 
     def __post_init__(self) -> None:
-        if self.pattern not in PATTERNS:
-            raise ValueError(
-                f"an array's pattern must be one of {', '.join(PATTERNS)}, got {self.pattern!r}"
-            )
+        if self.pattern not in self.patterns:
+            one = ", ".join(self.patterns)
+            raise ValueError(f"an array's pattern must be one of {one}, got {self.pattern!r}")
         if self.elements.ndim != 2 or self.elements.shape[1] != 3 or not len(self.elements):
             raise ValueError(
                 "an array's elements must be (e, 3) positions [m], got "
@@ -59,7 +58,7 @@ class Array:
         Args:
             rows, columns: Numbers of elements along y and along x.
             pitch: Distance of neighbouring elements [m].
-            pattern: One of ``PATTERNS``.
+            pattern: As the attribute.
         """
         if rows < 1 or columns < 1 or not 0 < pitch < math.inf:
             raise ValueError(

@@ -13,9 +13,6 @@ TELLING = 5
 MANY = 30
 """Fewest links of a receiver that show random phases, or phases that geometry does not explain."""
 
-LEAST = 0.01
-"""Least share of power that the direct wave keeps in a mean over links, beside chance."""
-
 
 class StrangeParts(NamedTuple):
     """Parts of a receiver whose fixed phases or strengths geometry does not explain.
@@ -32,13 +29,14 @@ def phase_sign(
     channels: Complex[Tensor, "k e s"],
     waves: Complex[Tensor, "k e s"],
     receivers: Int[Tensor, " k"],
+    least_share: float = 0.01,
 ) -> int:
     """Sign with which the phases of channels follow the direct distance, -1 or 1; 0 for neither.
 
     Divided by free space, a direct path alone is the same number at all links of a receiver. For
     each sign, the mean over links keeps a share of the power, by chance about 1 / links. The larger
-    share wins if it exceeds 0.01 plus four times the share by chance: never with fewer than
-    ``TELLING`` links a receiver. ``waves`` are ``direct_waves`` of the same links with the sign -1.
+    share wins if it exceeds ``least_share`` plus four times the share by chance: never with fewer
+    than ``TELLING`` links a receiver. ``waves`` are the links' ``direct_waves`` with the sign -1.
     """
     received = max(1, int((channels.abs().amax((1, 2)) > 0).sum()))  # links with a signal
     shares = {}
@@ -50,7 +48,7 @@ def phase_sign(
         shares[sign] = float(sum(powers)) / received
     best = max(shares, key=shares.__getitem__)
     chance = len(receivers.unique()) / len(receivers)
-    return best if shares[best] > LEAST + 4 * chance else 0
+    return best if shares[best] > least_share + 4 * chance else 0
 
 
 def common_responses(
@@ -78,20 +76,21 @@ def strange_parts(
     frequencies: Float[Tensor, " s"],
     sign: int,
     common_share: float = 0.7,
+    least_share: float = 0.01,
 ) -> dict[int, StrangeParts]:
     """Receivers at which geometry does not explain fixed phases or strengths of the direct wave.
 
     A receiver counts with ``MANY`` links or more that have a direct wave. Its elements count if
     they resolve the directions of the waves: from one direction, reflections look the same.
     ``common_share`` is the least share of a response that elements or subcarriers share; calibrated
-    arrays have 0.99. Other arguments are as for ``phase_sign``.
+    arrays have 0.99. ``least_share`` is as in ``phase_sign``, and so are the other arguments.
     """
     strange = {}
     for receiver, response in common_responses(channels, waves, receivers, sign).items():
         at_receiver = receivers == receiver
         links = int(at_receiver.sum())
         share = response.abs().square().mean().item()
-        if links < MANY or share < LEAST + 4 / links:
+        if links < MANY or share < least_share + 4 / links:
             continue
         has_element = (waves[at_receiver] != 0).any(2).any(0)  # (e,)
         response = response[has_element]

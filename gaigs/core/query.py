@@ -250,8 +250,8 @@ class Query:
         Args:
             positions: Positions (..., 3) [m], anything that becomes a float tensor; or a whole
                 query.
-            receiver: Name or index of the receiver, or of that of each position; None: all
-                receivers.
+            receiver: Name or index of the receiver, or a list with one for each position; None:
+                all receivers.
             frequency: Carrier, one for all or one for each position [Hz]; None is the known one.
             names: Names of the scene's receivers.
             known: Different carriers of the training links, ascending [Hz]; empty if unknown.

@@ -131,7 +131,7 @@ def _coordinates(table: Table, x: Any, y: Any, z: Any) -> list[str] | None:
 
 
 def _in_python(text: str) -> str:
-    """A message with options as keywords, in place of those of a reader."""
+    """A message with keywords in place of a reader's options."""
     text = re.sub(r"data\.coordinates(=\[x,y\])?", "x=, y= and z=", text)
     text = text.replace("data.gateways", "receivers")
     return re.sub(r"data\.(\w+)=\[?(\w+)\]?", r"\1='\2'", text).replace("data.", "")

@@ -20,9 +20,6 @@ from gaigs.registry import suggest
 QUIETEST, LOUDEST = -150.0, 30.0
 """Bounds of readings [dBm]; others have another unit, a lost sign, or mean "not heard"."""
 
-ROUND = (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)
-"""Usual marks of "not heard" within these bounds."""
-
 
 def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiver:
     """A receiver without orientation at a position [m]: its axes are the world's."""
@@ -128,17 +125,18 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
 
 def _usual_marks(levels: Float[ndarray, "n k"], lowest: float) -> list[float]:
     """Usual values, or the lowest, that are far from other levels or far more frequent."""
+    usual = (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)  # marks of "not heard" [dBm]
     values, counts = np.unique(levels[~np.isnan(levels)], return_counts=True)
     marks = []
-    for value in values[np.isin(values, [*ROUND, lowest])].tolist():
+    for value in values[np.isin(values, [*usual, lowest])].tolist():
         count = counts[values == value][0]
         near = counts[(values != value) & (np.abs(values - value) < 5)]
         is_often = count >= max(3, 0.05 * counts.sum()) and count > 5 * near.max(initial=0)
         is_alone = (np.abs(values - value) <= 10).sum() == 1
         is_apart = False
-        if value == lowest == ROUND[0]:
+        if value == lowest == usual[0]:
             is_apart = count > 1 and is_alone
-        elif value == lowest and value in ROUND:
+        elif value == lowest and value in usual:
             is_apart = not len(near) and (count > 1 or is_alone)
         columns = (levels == value).any(0).sum()
         if is_apart or (is_often and columns >= min(2, levels.shape[1])):

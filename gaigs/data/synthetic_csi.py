@@ -24,9 +24,9 @@ def furnished_room_csi(
 ) -> Links:
     """Channels of transmitters at random places in the default room, at its array of 4 x 4.
 
-    Places, array and other options are those of ``synthetic``; unit and time dependence are those
-    of ``gaigs.data.simulation.simulate_channels``. The official split tests on the last fifth of
-    the places.
+    ``synthetic`` describes places, array and other options, and
+    ``gaigs.data.simulation.simulate_channels`` unit and time dependence. The official split tests
+    on the last fifth of the places.
 
     Args:
         bandwidth: From the lowest subcarrier to the highest, about the carrier [Hz].

@@ -51,8 +51,8 @@ class PathTerms(nn.Module):
         c0 + c1 log10 d + sum over q of (a_q cos q a + b_q sin q a)
         + c2 h + c3 sin e + c4 (3 sin² e - 1) / 2 + c5 max(0, log10 d - log10 d0).
 
-    Coefficients have a normal prior; that of a lobe falls with its harmonic. Terms (lobes, height,
-    break point) are added one by one, the same for all receivers.
+    Coefficients have a normal prior, for a lobe the narrower, the higher its harmonic. Terms
+    (lobes, height, break point) are added one by one, the same for all receivers.
 
     Source: Feuerstein et al., Path loss, delay spread, and outage models as functions of antenna
     height, 1994 (break point); Hoerl and Kennard, Ridge regression, 1970.

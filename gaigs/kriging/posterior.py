@@ -49,7 +49,7 @@ class Posterior(nn.Module):
         raise NotImplementedError
 
     def start_from(self, other: Any) -> None:
-        """Starts the next fit from that of another posterior, which saves time; by default does
+        """Starts the next fit where another posterior's ended, to save time; by default does
         nothing.
         """
 

@@ -140,12 +140,12 @@ class KNearestNeighbours(LookUp):
         return weights / weights.sum(1, keepdim=True)
 
     def _mean(self, near: Near, index: Int[Tensor, " k"]) -> Float[Tensor, " b"]:
-        """Labels of one number from those of the nearest known links."""
+        """Labels of one number from the labels of the nearest known links."""
         labels = self.links.labels[index]
         return (self._weights(near.apart).to(labels) * labels[near.rows]).sum(1)
 
     def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, " k"]) -> Tensor:
-        """Labels from those of known links and their distances."""
+        """Labels from the labels of known links and their distances."""
         weights = self._weights(apart)
         used = weights.any(0)
         labels, align = self.links.labels[index[used]], self.scene.task.align

@@ -100,7 +100,7 @@ class PlaceBlock(NamedTuple):
     """Numbers of neighbouring places at one receiver.
 
     Attributes:
-        rows: Of all numbers, those of a place in a row.
+        rows: Numbers of all places, a place a row.
         gaps: Distances of their places [m].
         each: Numbers of a place.
     """
@@ -244,8 +244,8 @@ class FieldFit:
     def krige(self, room: FieldRoom, waves: Complex[Tensor, "m n"]) -> Kriged:
         """Kriging by path of residuals beside a room.
 
-        The covariance of two numbers is that of their paths' fields, times the kernel of their
-        places.
+        The covariance of two numbers is the covariance of their paths' fields, times the kernel
+        of their places.
 
         Source: Dubrule, Cross validation of kriging in a unique neighborhood, 1983.
         """

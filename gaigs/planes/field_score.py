@@ -47,7 +47,7 @@ class FieldScore(Score[FieldRoom]):
     # --- ratings ---
 
     def rate(self, room: FieldRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
-        """Ratings over those of noise; of the grid with places in ``groups``."""
+        """Ratings over the ratings of noise, with places in ``groups``."""
         ratings = self._explain(room, grid.flatten(0, 1), self.groups)
         return GridRatings(
             ratings.view(grid.shape[:2]), lambda planes: self._explain(room, planes, 1)

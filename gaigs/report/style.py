@@ -83,7 +83,7 @@ MARKERS = [_marker(number) for number in range(25)]
 
 @contextmanager
 def shown() -> Iterator[None]:
-    """The style of all figures; those of ``new_figure`` belong to pyplot, which shows them."""
+    """The style of all figures; pyplot shows the figures of ``new_figure``."""
     token = _is_shown.set(True)
     try:
         with rc_context(STYLE):
@@ -173,7 +173,7 @@ def scaled_panels(
 
 
 def wrapped(label: str, width: int = 48) -> str:
-    """A text in lines of ``width`` letters, by default those of a figure of one column."""
+    """A text in lines of ``width`` letters, by default as wide as a figure of one column."""
     return textwrap.fill(label, width=width)
 
 

@@ -35,11 +35,10 @@ class Descent(lightning.LightningModule):
             the last step.
         density: Options of ``gaigs.training.density_control.DensityControl``; None: a fixed number
             of Gaussians.
-        links: Most links a step, drawn at random from those of its places; None: all.
+        links: Most links a step, drawn at random from the links of its places; None: all.
 
     Raises:
-        ValueError: An option is out of range, or parameter groups and penalties are not those of
-            the model.
+        ValueError: An option is out of range, or the model lacks a parameter group or penalty.
 
     Source: optimiser and schedules after the released configuration.
     """

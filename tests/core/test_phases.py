@@ -11,13 +11,13 @@ import torch
 import gaigs
 from gaigs.core.phases import array_sign, strange_parts, unknown_phase
 from gaigs.core.scene import direct_waves
-from gaigs.core.task.csi import PHASES, Csi
+from gaigs.core.task.csi import Csi
 from gaigs.data import divide
 from gaigs.model.kriging import Kriging
 from gaigs.registry import registry
 
 SPLIT = {"name": "random", "seed": 0}
-each = pytest.mark.parametrize("phase", PHASES)
+each = pytest.mark.parametrize("phase", Csi.phases)
 
 
 def simulated(phase, **options):
@@ -153,7 +153,7 @@ def trained(links):
     return Kriging(links.scene, model.eval(), {"name": "mean"})
 
 
-@pytest.mark.parametrize("phase", PHASES[1:])
+@pytest.mark.parametrize("phase", Csi.phases[1:])
 @pytest.mark.parametrize("name", ["friis", "knn", "mean", "gaussian_process", "kriging"])
 def test_what_is_unknown_of_the_training_links_changes_no_score(name, phase):
     links = simulated(phase)

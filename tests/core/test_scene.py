@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from gaigs.core.antenna import PATTERNS, Array, Receiver
+from gaigs.core.antenna import Array, Receiver
 from gaigs.core.geometry import Frame, Grid, Pose
 from gaigs.core.query import Query
 from gaigs.core.scene import Scene
@@ -102,7 +102,10 @@ def test_elements_hear_as_their_pattern_says():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Array(torch.zeros(1, 3), "parrot"), f"one of {', '.join(PATTERNS)}, got 'parrot'"),
+        (
+            lambda: Array(torch.zeros(1, 3), "parrot"),
+            f"one of {', '.join(Array.patterns)}, got 'parrot'",
+        ),
         (lambda: Array(torch.zeros(0, 3)), r"must be \(e, 3\) positions \[m\], got \(0, 3\)"),
         (lambda: Array(torch.zeros(3)), r"got \(3,\)"),
         (lambda: Array(torch.zeros(4, 2)), r"got \(4, 2\)"),

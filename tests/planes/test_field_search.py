@@ -13,6 +13,8 @@ from gaigs.data import Links, Split
 from gaigs.planes.field_room import FieldFit, Variation
 from gaigs.planes.field_search import FieldSearch
 
+pytestmark = pytest.mark.usefixtures("half_the_steps", "unchecked")
+
 FREQUENCY = 2.4e9
 WALLS = np.array([[0.8, 0.6, 0, -0.9], [-0.6, 0.8, 0, 2.8], [0, 0, 1.0, -0.2]])
 """Normals and offsets [m] of walls that stand at 37 degrees to the axes, and of the floor."""
@@ -32,7 +34,7 @@ def field(places, receiver):
     return total
 
 
-def room(count=240, receivers=1, is_noise=False):
+def room(count=170, receivers=1, is_noise=False):
     """Links of a room with one antenna and one carrier."""
     generator = np.random.default_rng(0)
     along = generator.uniform((-0.5, 0.3, 0.1), (2.4, 2.5, 1.8), (count, 3))
@@ -61,7 +63,6 @@ def links(request):
     return room(receivers=request.param)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_places_together_show_planes_of_a_turned_room(links):
     torch.manual_seed(0)
     search = FieldSearch(links, -1, 1, 4, torch.zeros(0, 4))
@@ -73,7 +74,6 @@ def test_places_together_show_planes_of_a_turned_room(links):
     assert len(planes) == len(WALLS)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_noise_has_no_planes():
     torch.manual_seed(0)
     found = FieldSearch(room(100, is_noise=True), -1, 2, 4, torch.zeros(0, 4)).run()

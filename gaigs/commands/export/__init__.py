@@ -1,5 +1,6 @@
 """Export for other programs: radio maps, predictions, the learnt room and its paths."""
 
+from itertools import chain
 from pathlib import Path
 
 from gaigs.commands.export import maps, predictions, rooms, scenarios
@@ -20,10 +21,12 @@ MAP_FILES = {
     ".png": maps.write_figures,
     ".pdf": maps.write_figures,
 }
-PREDICTIONS = ".csv", ".nc"
-ROOM_FILES = ".glb", ".gltf", ".obj", ".xml"
-SCENARIO = ".deepmimo"
-SUFFIXES = (*dict.fromkeys((*MAP_FILES, *PREDICTIONS, *ROOM_FILES, SCENARIO)),)
+
+OTHER_FILES = {
+    "predictions": (".csv", ".nc"),
+    "room": (".glb", ".gltf", ".obj", ".xml"),
+    "scenario": (".deepmimo",),
+}
 
 
 def export(
@@ -83,22 +86,27 @@ def export(
                 f"export takes a receiver [x, y, z] with places, or a radio map, got {receiver!r}"
             )
         model = model.at_receivers([new])
-    if suffix in ROOM_FILES:
+    if suffix in OTHER_FILES["room"]:
         return rooms.write_room(model, file, frequency)
-    if suffix == SCENARIO:
+    if suffix in OTHER_FILES["scenario"]:
         return scenarios.write_scenario(model, file, places, frequency)
-    if suffix in PREDICTIONS and (places is not None or suffix not in MAP_FILES):
+    if suffix in OTHER_FILES["predictions"] and (places is not None or suffix not in MAP_FILES):
         return predictions.write_predictions(model, file, places, frequency, interval)
     return MAP_FILES[suffix](
         file, radio_map(model, pitch, height, frequency=frequency), model.scene
     )
 
 
+def suffixes() -> tuple[str, ...]:
+    """All suffixes of exported files."""
+    return (*dict.fromkeys((*MAP_FILES, *chain.from_iterable(OTHER_FILES.values()))),)
+
+
 def check_suffix(file: Path) -> str:
     """The suffix of a file to be written; a ``ValueError`` for an unknown one."""
-    if (suffix := file.suffix.lower()) not in SUFFIXES:
+    if (suffix := file.suffix.lower()) not in suffixes():
         raise ValueError(
-            f"an exported file must end with one of {', '.join(SUFFIXES)}, got {file.name!r}"
+            f"an exported file must end with one of {', '.join(suffixes())}, got {file.name!r}"
         )
     return suffix
 
@@ -110,19 +118,15 @@ def run(config: dict, folder: Path) -> None:
     options = dict(config["export"])
     form, places = options.pop("format"), options.pop("places")
     if form is None:
-        raise ValueError(
-            f"command=export needs export.format, one of {', '.join(one[1:] for one in SUFFIXES)}"
-        )
+        forms = ", ".join(suffix[1:] for suffix in suffixes())
+        raise ValueError(f"command=export needs export.format, one of {forms}")
     suffix = check_suffix(Path(f"export.{form}"))
     model = load(config["folder"], config["trust"])
-    takes_places = suffix in (*PREDICTIONS, SCENARIO)
-    if (
-        places is None
-        and takes_places
-        and (suffix not in MAP_FILES or not model.scene.task.is_scalar)
-    ):
+    takes_places = suffix in OTHER_FILES["predictions"] + OTHER_FILES["scenario"]
+    has_map = suffix in MAP_FILES and model.scene.task.is_scalar
+    if places is None and takes_places and not has_map:
         places = "test"
-    if suffix in PREDICTIONS and places:
+    if suffix in OTHER_FILES["predictions"] and places:
         name = "predictions"
     else:
         name = "radio_map" if suffix in MAP_FILES else "room"

@@ -27,7 +27,7 @@ def read_area(file: Path, model: Model | None, count: int = 1000) -> Float[Tenso
     """About ``count`` even places [m] within the polygons of a GeoJSON file.
 
     Positions are longitude and latitude, or easting and northing, if the model knows its place on
-    the map; else metres of the room. The height is the third number of the positions, or that of
+    the map; else metres of the room. The height is the third number of the positions, or from
     the model's training transmitters: each floor, or half-way between the lowest and the highest.
 
     Source: RFC 7946.

@@ -347,7 +347,7 @@ class Selection:
         return self.factor * mean_of_received(deviations, self.chances[:, self.evaluated])
 
     def scatter(self) -> float:
-        """Mean error if the process were known: that of the noise of a reading."""
+        """Mean error if the process were known: the noise of a reading alone."""
         noises = self.chances.new_tensor(self.noises)[:, None].sqrt()  # (r, 1)
         chances = self.chances[:, self.evaluated]  # (r, e)
         return self.factor * mean_of_received(noises.expand_as(chances), chances)
@@ -381,8 +381,8 @@ class Spacing:
     Args:
         processes: Processes of the receivers, without their trends.
         asked: Coordinates of the candidates.
-        most: Largest mean correlation of two places of a plan; the default is that of half a
-            correlation length.
+        most: Largest mean correlation of two places of a plan; the default is
+            reached at half a correlation length.
     """
 
     def __init__(

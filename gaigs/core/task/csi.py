@@ -18,9 +18,6 @@ HIGHEST = 140.0
 A perfect prediction has no finite SNR.
 """
 
-PHASES = ("known", "per_link", "per_link_and_delay")
-"""Values of ``data.phase``."""
-
 
 @register("task", "csi")
 class Csi(Task):
@@ -55,6 +52,7 @@ class Csi(Task):
     monitor, higher_is_better = "sinad_db", True
     dtype = torch.complex64
     normalisation = "linear amplitude, in the data's own unit"
+    phases = ("known", "per_link", "per_link_and_delay")
 
     def __init__(
         self,
@@ -75,8 +73,8 @@ class Csi(Task):
             raise ValueError(
                 "subcarriers must have different frequencies, got one twice; leave it out"
             )
-        if phase not in PHASES:
-            raise ValueError(f"data.phase must be {' or '.join(PHASES)}, got {phase!r}")
+        if phase not in self.phases:
+            raise ValueError(f"data.phase must be {' or '.join(self.phases)}, got {phase!r}")
         self.elements = elements
         self.frequencies = frequencies
         self.phase = phase

@@ -31,8 +31,6 @@ HEIGHTS = AXIS_NAMES["z"] | {"alt", "altitude", "elevation", "height"}
 FLOORS = {"floor", "storey", "floorid"}
 NAMES = {"name", "gateway", "ap", "id", "mac", "bssid", "ssid", "station", "anchor", "beacon"}
 
-UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048}
-
 WEAK = -20.0
 """Upper bound of the median of a gateway's column [dBm]; larger numbers are something else."""
 
@@ -63,9 +61,10 @@ class Axes(NamedTuple):
 
 def plain_name(name: str) -> tuple[str, float | None]:
     """Name of a column in small letters and digits, and its unit [m]; None if it has no unit."""
+    metres = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048}
     unit = r"[\s_]*[\[(]?\s*(mm|cm|km|m|ft|feet|deg|°)?\s*[\])]?"
     match = re.fullmatch(rf"(?s)(.*?){unit}", name.strip().lower())
-    return re.sub(r"[\W_]", "", match[1]), UNITS.get(match[2])
+    return re.sub(r"[\W_]", "", match[1]), metres.get(match[2])
 
 
 def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:

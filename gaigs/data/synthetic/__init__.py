@@ -175,7 +175,13 @@ def spectra(
     bandwidth: float,
     order: int,
 ) -> Float[Tensor, "n rows columns"]:
-    """Spectra of transmitters [m] in any room, in [0, 1], by options of ``furnished_room``."""
+    """Spectra of transmitters [m] in any room, float32 in [0, 1].
+
+    ``furnished_room`` describes the options.
+
+    Raises:
+        ValueError: An option is out of range, or a transmitter does not stand free in the room.
+    """
     offsets = spectrum_offsets(
         spectrum, lambda width: frequency_offsets(room, width, order), bandwidth
     )

@@ -24,8 +24,8 @@ class Basis(Deformation):
     Args:
         scene: Its number of training places sets the width.
         count: Number of Gaussians.
-        tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens; those of
-            Gaussians are not read.
+        tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens; the
+            Gaussians' tokens are not read.
         channels: Signal channels of a Gaussian.
         width: Width of the network; None: ``suitable_width`` of the training places.
         layers: Residual layers after the first layer.
@@ -36,8 +36,8 @@ class Basis(Deformation):
     Raises:
         ValueError: An option is out of range, or the number of Gaussians is not fixed.
 
-    Source: ours, in place of GAI-GS, "Scene Mapping Network", eq. (11) and (12); the form is that
-    of Lu et al., DeepONet, 2021, with free weights for its branch network.
+    Source: ours, in place of GAI-GS, "Scene Mapping Network", eq. (11) and (12); the form is
+    DeepONet's (Lu et al., 2021), with free weights for its branch network.
     """
 
     follows = ("weights",)
