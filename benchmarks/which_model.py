@@ -27,8 +27,27 @@ SETS = {
     "built-in room, channels": ("synthetic_csi", {}),
     "built-in room, spectra": ("synthetic", {}),
     "ble-flat": ("nerf2_rssi", {"root": "ble-flat"}),
+    "uwb-apartment": (
+        "csi_npz",
+        {"file": "uwb-apartment/room.npz", "phase": "per_link_and_delay"},
+    ),
+    "powder-462": (
+        "rssi_wide",
+        {
+            "file": "powder-462/survey.csv",
+            "gateways": "powder-462/gateways.csv",
+            "frequency": 462.7e6,
+        },
+    ),
+    "rfid-s23": ("nerf2_spectrum", {"root": "rfid-s23"}),
+    "traced room, RSSI": ("sionna_rssi", {"room": "l_shape"}),
+    "traced room, spectra": ("sionna", {"room": "furnished"}),
+    "traced room, channels": ("sionna_csi", {"room": "l_shape"}),
 }
 """Reader and options of each set; paths are those below the folder of measurements."""
+
+PATHS = ("root", "file", "gateways")
+"""Options that are paths."""
 
 MARGINS = {"mae_db": 0.05, "ssim_median": 0.003, "snr_db_median": 0.5}
 """Largest loss against the best candidate that is wanted, by score."""
@@ -37,9 +56,9 @@ MARGINS = {"mae_db": 0.05, "ssim_median": 0.003, "snr_db_median": 0.5}
 def measure(name, places, data, steps, folder):
     """Test scores of the choice and of all candidates on one set, with some places or all."""
     reader, options = SETS[name]
-    paths = {key: str(data / value) for key, value in options.items()}
+    paths = {key: str(data / options[key]) for key in PATHS if key in options}
     split = {} if places is None else {"split": "sparse", "train": places}
-    links = gaigs.links(reader, **paths, **split)
+    links = gaigs.links(reader, **options | paths | split)
     began = time.process_time()
     options = {"max_steps": steps, "val_check_interval": min(50, steps), "seed": 0}
     chosen = gaigs.train(links, folder=folder, **options, **{"model.max_time": "00:02:00:00"})
@@ -111,7 +130,8 @@ def main():
         place.mkdir(parents=True, exist_ok=True)
         file = place / "row.json"
         if not file.is_file():
-            paths = [arguments.data / path for path in SETS[name][1].values()]
+            options = SETS[name][1]
+            paths = [arguments.data / options[key] for key in PATHS if key in options]
             if not all(path.exists() for path in paths):
                 print(f"left out, as not there: {name}")
                 continue
