@@ -1,11 +1,12 @@
 """Test scores of ``model=auto`` beside those of each of its candidates.
 
     python benchmarks/which_model.py --data DIR
-    python benchmarks/which_model.py --places 30 100 --sets "built-in room, RSSI" ...
+    python benchmarks/which_model.py --places 30 100 --seeds 0 1 --sets "built-in room, RSSI" ...
 
 DIR holds the sets of measurements by name; a missing one is left out. With ``--places`` so many
-random places are known (split ``sparse``). Trained candidates have ``--max-steps`` steps, so that
-scores depend little on the machine. ``--folder`` goes on with the rows that are missing there.
+random places are known (split ``sparse``). A seed is that of the split and of trainings. Trained
+candidates have ``--max-steps`` steps, so that scores depend little on the machine. ``--folder``
+goes on with the rows that are missing there.
 """
 
 import argparse
@@ -53,14 +54,15 @@ MARGINS = {"mae_db": 0.05, "ssim_median": 0.003, "snr_db_median": 0.5}
 """Largest loss against the best candidate that is wanted, by score."""
 
 
-def measure(name, places, data, steps, folder):
+def measure(name, places, seed, data, steps, folder):
     """Test scores of the choice and of all candidates on one set, with some places or all."""
     reader, options = SETS[name]
     paths = {key: str(data / options[key]) for key in PATHS if key in options}
     split = {} if places is None else {"split": "sparse", "train": places}
+    split |= {"split.seed": seed} if seed else {}
     links = gaigs.links(reader, **options | paths | split)
     began = time.process_time()
-    options = {"max_steps": steps, "val_check_interval": min(50, steps), "seed": 0}
+    options = {"max_steps": steps, "val_check_interval": min(50, steps), "seed": seed}
     chosen = gaigs.train(links, folder=folder, **options, **{"model.max_time": "00:02:00:00"})
     minutes = (time.process_time() - began) / 60
     config = gaigs.compose("model=auto", f"task={links.task.name}")
@@ -70,11 +72,12 @@ def measure(name, places, data, steps, folder):
         if checkpoint.is_file():  # of the trained ones, and of the chosen one
             models[candidate] = gaigs.load(checkpoint)
         else:
-            models[candidate] = gaigs.train(candidate, links)
+            models[candidate] = gaigs.train(candidate, links, seed=seed)
     scores = score(models, {}, links)
     summaries = {key: summary(links.task, values) for key, values in scores.items()}
     first, metric = headline(links.task.name, summaries)
     title = name if places is None else f"{name}, {places} places"
+    title += f", seed {seed}" if seed else ""
     row = {
         "set": title,
         "minutes": minutes,
@@ -120,12 +123,15 @@ def main():
     parser.add_argument("--max-steps", type=int, default=300)
     parser.add_argument("--sets", nargs="+", choices=SETS, default=[*SETS])
     parser.add_argument("--places", nargs="+", type=int, default=[None])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0])
     arguments = parser.parse_args()
     head = "set, score, links to train / validate / test, auto, chosen, path_loss, friis, knn, "
     head += "gaussian_process, mirrored, gaigs, behind the best, within the margin, processor [min]"
     lines = [head.split(", ")]
-    for name, places in itertools.product(arguments.sets, arguments.places):
+    cells = itertools.product(arguments.sets, arguments.places, arguments.seeds)
+    for name, places, seed in cells:
         folder = f"{name} {places or ''}".strip().replace(" ", "_").replace(",", "")
+        folder += f"_seed_{seed}" if seed else ""
         place = arguments.folder / folder
         place.mkdir(parents=True, exist_ok=True)
         file = place / "row.json"
@@ -135,7 +141,7 @@ def main():
             if not all(path.exists() for path in paths):
                 print(f"left out, as not there: {name}")
                 continue
-            row = measure(name, places, arguments.data, arguments.max_steps, place / "run")
+            row = measure(name, places, seed, arguments.data, arguments.max_steps, place / "run")
             file.write_text(json.dumps(row, indent=2))
         lines.append(line(json.loads(file.read_text())))
         print(" | ".join(lines[-1]), flush=True)
