@@ -52,6 +52,14 @@ def test_the_simplest_within_a_standard_error_is_chosen(simple, complex_, chosen
     assert pick(tried(simple=simple, complex=complex_), task).chosen.label == chosen
 
 
+def test_a_candidate_that_any_other_surely_leads_is_out():
+    task = gaigs.registries["task"].build({"name": "rssi"})
+    # The best mean scatters so much that the first is level with it, but behind the second.
+    three = tried(first=[1.0, 2, 3], second=[1.5, 2.6, 3.4], third=[0.0, 0, 9])
+    assert pick(three, task).chosen.label == "second"
+    assert pick(three[::2], task).chosen.label == "first"
+
+
 def test_only_places_that_all_have_count():
     task = gaigs.registries["task"].build({"name": "rssi"})
     one, other = tried(one=[-1.0, -1.0, -9.0], other=[-2.0, -2.0])

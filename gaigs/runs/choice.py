@@ -57,7 +57,7 @@ class ChosenModel(NamedTuple):
 
 
 def choose(links: Links, config: dict, folder: Path) -> Fitted:
-    """The simplest candidate that is level with the best, as a run of its own gives it, under the
+    """The simplest candidate that no other surely leads, as a run of its own gives it, under the
     name ``auto``.
 
     Look-ups are compared at all known places, by folds of which each is predicted from the others;
@@ -232,13 +232,14 @@ def place_gains(model: Model, links: Links, index: Int[Tensor, " k"]) -> dict[in
 
 
 def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
-    """The first candidate whose score is behind the best by at most a standard error of the
-    difference.
+    """The first candidate that no other is ahead of by more than a standard error.
 
-    Differences are paired: what is hard at a place is hard for both.
+    Differences are paired: what is hard at a place is hard for both. All pairs count, as the best
+    mean of few places is often that of the candidate whose scores scatter most.
 
     Source: Breiman, Friedman, Olshen and Stone, Classification and regression trees, 1984, section
-    3.4.3, the rule of one standard error.
+    3.4.3, the rule of one standard error; of all pairs as in Hansen, Lunde and Nason, The model
+    confidence set, 2011.
     """
     # The time limit may have left out folds of some.
     shared = set.intersection(*(set(one.gains) for one in tried))
@@ -247,18 +248,20 @@ def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
     gains = torch.tensor(rows).reshape(len(tried), len(keys))  # (c, p)
     means = gains.mean(1)
     best = int(means.argmax())
-    gaps = gains[best] - gains  # (c, p)
+    leads = gains[:, None] - gains  # (c, c, p), of the first over the second
     # One place tells no scatter: the best is taken.
-    scatter = gaps.std(1) / len(shared) ** 0.5 if len(shared) > 1 else 0 * means
-    chosen = int((gaps.mean(1) <= scatter).int().argmax())
+    scatter = leads.std(2) / len(shared) ** 0.5 if len(shared) > 1 else 0 * leads.mean(2)
+    is_beaten = (leads.mean(2) > scatter).any(0)  # (c,)
+    chosen = int(is_beaten.int().argmin())
     signed = means if task.higher_is_better else -means
     texts = [f"{one.label} {mean:.3g}" for one, mean in zip(tried, signed.tolist(), strict=True)]
     scores = f"mean {task.monitor} at {len(shared)} places: {', '.join(texts)}"
     if chosen == best:
         return ChosenModel(tried[best], f"{tried[best].label} is the best, {scores}")
+    lead = f"{leads[best, chosen].mean():.2g}, standard error {scatter[best, chosen]:.2g}"
     reason = (
-        f"{tried[chosen].label} is the simplest level with the best, {tried[best].label}, which is "
-        f"ahead by {gaps[chosen].mean():.2g}, standard error {scatter[chosen]:.2g}, {scores}"
+        f"{tried[chosen].label} is the simplest that none surely leads; {tried[best].label} is "
+        f"ahead by {lead}, {scores}"
     )
     return ChosenModel(tried[chosen], reason)
 
@@ -267,8 +270,7 @@ def _facts(tried: Sequence[Tried], chosen: Tried, reason: str, task: Task) -> di
     """Entry of ``metrics.json`` on the choice."""
     candidates = {}
     for one in tried:
-        score = statistics.fmean(one.gains.values())
-        score = score if task.higher_is_better else -score
+        score = statistics.fmean(one.gains.values()) * (1 if task.higher_is_better else -1)
         facts = {task.monitor: score, "places": len(one.gains), "seconds": one.seconds}
         candidates[one.label] = facts
     return {NAME: {"chosen": chosen.label, "reason": reason, "candidates": candidates}}

@@ -1,12 +1,18 @@
 """Links of data frames: the same as those of the files that they would be written to."""
 
+import contextlib
 import importlib
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from matplotlib import pyplot
 
 import gaigs
+
+README = Path(__file__).parents[2] / "README.md"
 
 RNG = np.random.default_rng(0)
 PLACES = RNG.uniform(0, 20, (60, 2)).round(3)
@@ -70,6 +76,25 @@ def test_a_reading_a_row_has_the_links_of_its_file(tmp_path):
     wide = gaigs.links(WIDE)
     assert len(filed) == len(wide)
     assert [receiver.name for receiver in filed.receivers] == [*APS]
+
+
+def test_eight_lines_of_the_readme_lead_from_a_survey_to_a_map_with_its_uncertainty(tmp_path):
+    fenced = re.findall(r"```python\n(.*?)```", README.read_text(), re.S)
+    (code,) = [block for block in fenced if "survey.csv" in block]
+    assert len([line for line in code.splitlines() if line]) <= 8
+    write_csv(tmp_path / "survey.csv", LONG)
+    pyplot.switch_backend("agg")
+    names = {}
+    with contextlib.chdir(tmp_path):
+        exec(code, names)
+    pyplot.close("all")
+    assert (tmp_path / "floor.png").stat().st_size > 10_000
+    assert np.load(tmp_path / "floor.npz")["deviations"].min() > 0
+    floor = names["floor"]
+    assert np.isfinite(floor.values).all()
+    for receiver in names["links"].receivers:
+        apart = receiver.pose.position - torch.tensor(APS[receiver.name])
+        assert apart[:2].norm() < 3
 
 
 def test_repeated_readings_of_a_row_each_are_averaged():
