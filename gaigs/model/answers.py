@@ -16,7 +16,7 @@ from gaigs.core.stages import timed
 from gaigs.data import Links
 from gaigs.kriging.links import single_readings
 from gaigs.model.base import Model
-from gaigs.registry import name_of, registry
+from gaigs.registry import name_of
 
 
 def batch_size(links: Links) -> int:
@@ -81,10 +81,7 @@ def at_new_receivers(
     from.
 
     Each receiver with links in turn has the mean of the others in place of what it has of its own.
-    Receivers err as a whole: the errors of one are a cluster. A room that was trained with a
-    receiver shares its level with it. So mean errors of levels scatter at most as those of a law of
-    distance, which forgets a receiver wholly, and links of validation receivers, if there are any,
-    tell how errors scatter about their mean.
+    Receivers err as a whole: the errors of one are a cluster.
 
     Args:
         model: A model with ``any_receiver``.
@@ -104,23 +101,18 @@ def at_new_receivers(
         asked = split.validation
     asked = single_readings(links, asked)
     chosen = evenly(of_links[asked].unique(), receivers)
-    if len(heard) < 3 or len(chosen) < 3:
+    rows, values = [], []
+    for receiver in chosen.tolist():
+        others = heard[heard != receiver]
+        if len(others) < 2:
+            return None
+        index = evenly(asked[of_links[asked] == receiver], most // len(chosen))
+        moved = model.at_receivers([links.receivers[receiver]], others)
+        first = replace(links.query, receivers=torch.zeros_like(of_links))
+        rows.append(index)
+        values.append(predicted(moved, replace(links, query=first), index))
+    if len(rows) < 3:
         return None
-    rows = [
-        evenly(asked[of_links[asked] == receiver], most // len(chosen))
-        for receiver in chosen.tolist()
-    ]
-    values = _without_own(model, links, rows, heard)
-    scatter = None
-    if links.task.is_scalar:
-        errors = _errors(links, rows, values)
-        scatter = random_effects(errors)
-        if model.is_trained:
-            own = scatter[0]
-            scatter = _scatter_of_rooms(links, rows, errors, heard)
-            shrunk = 1 - (scatter[0] / own).sqrt() if own > 0 else own
-            for value, error in zip(values, errors, strict=True):
-                value += (shrunk * error.mean()).to(value)
     index, answers = torch.cat(rows), torch.cat(values)
     query = links.query[index]
     alike = replace(query, receivers=torch.zeros_like(query.receivers))
@@ -134,50 +126,12 @@ def at_new_receivers(
         alike,
         clusters=query.receivers,
     )
-    return replace(calibration, scatter=scatter)
-
-
-def _without_own(
-    model: Model, links: Links, rows: Sequence[Int[Tensor, " k"]], heard: Int[Tensor, " h"]
-) -> list[Tensor]:
-    """Predictions of each receiver's links with the mean of the others that were heard."""
-    of_links = links.query.receivers
-    first = replace(links, query=replace(links.query, receivers=torch.zeros_like(of_links)))
-    values = []
-    for index in rows:
-        receiver = int(of_links[index[0]])
-        moved = model.at_receivers([links.receivers[receiver]], heard[heard != receiver])
-        values.append(predicted(moved, first, index))
-    return values
-
-
-def _errors(links: Links, rows: Sequence[Tensor], values: Sequence[Tensor]) -> list[Tensor]:
-    """Errors of each receiver's predictions, of labels of one number."""
-    return [
-        (links.labels[index] - value).double() for index, value in zip(rows, values, strict=True)
+    if not links.task.is_scalar:
+        return calibration
+    errors = [
+        (links.labels[part] - value).double() for part, value in zip(rows, values, strict=True)
     ]
-
-
-def _scatter_of_rooms(
-    links: Links,
-    rows: Sequence[Int[Tensor, " k"]],
-    errors: Sequence[Float[Tensor, " k"]],
-    heard: Int[Tensor, " h"],
-) -> Float[Tensor, "2"]:
-    """``random_effects`` of a trained model at new receivers, see ``at_new_receivers``."""
-    between, within = random_effects(errors)
-    trained = [index for index in rows if links.query.receivers[index[0]] in heard]
-    validating = [
-        error
-        for index, error in zip(rows, errors, strict=True)
-        if links.query.receivers[index[0]] not in heard
-    ]
-    if validating:
-        within = torch.maximum(within, random_effects(validating)[1])
-    law = registry("model").build({"name": "path_loss"}, scene=links.scene)
-    law.fit(replace(links, split=links.split.validating()))
-    of_law = random_effects(_errors(links, trained, _without_own(law, links, trained, heard)))
-    return torch.stack((torch.minimum(between, of_law[0]), within))
+    return replace(calibration, scatter=random_effects(errors))
 
 
 def random_effects(errors: Sequence[Tensor]) -> Float[Tensor, "2"]:
