@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Inexact
+from jaxtyping import Float, Inexact
 from torch import Tensor, nn
 
 
@@ -67,21 +67,10 @@ class Obstacles(nn.Module):
         """Attenuation at the centres [Np/m]."""
         return self.log_densities.exp()
 
-    def apart(self, point: Float[Tensor, "3"], least: float = 2.0) -> Bool[Tensor, " k"]:
-        """True for obstacles farther from a point than ``least`` of their widths."""
-        steps = (point - self.centres) / self.widths
-        return steps.square().sum(1) > least**2
-
     def forward(
-        self,
-        start: Float[Tensor, "*batch 3"],
-        end: Float[Tensor, "*batch 3"],
-        which: Bool[Tensor, " k"] | None = None,
+        self, start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]
     ) -> Inexact[Tensor, "*batch"]:
-        """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad].
-
-        ``which`` obstacles count; None: all.
-        """
+        """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad]."""
         starts = start.reshape(-1, 3)
         ends = end.reshape(-1, 3)
         size = len(starts) or 1
@@ -90,9 +79,7 @@ class Obstacles(nn.Module):
         columns = [self.densities]
         if self.turns is not None:
             columns = [self.densities, self.densities * self.turns]
-        matter = torch.stack(columns, 1)  # (k, 1 or 2)
-        matter = matter if which is None else matter * which[:, None]
-        shapes = (self.centres, self.log_widths, matter)
+        shapes = (self.centres, self.log_widths, torch.stack(columns, 1))
         parts = [
             _Depth.apply(*legs, *shapes)
             for legs in zip(starts.split(size), ends.split(size), strict=True)

@@ -64,7 +64,6 @@ class PathFields(MovablePlanes):
         is_bare: True while only the direct path counts, without obstacles.
         is_heard: True for receivers with training links (r,); others have the gain of a receiver in
             general.
-        is_free: True for receivers without training links, around which there is no matter (r,).
         known_blur: Logarithm of the standard deviation of a known path's phase at the start [rad].
         unknown_blur: The same for a path that adds as power, whose coherence is 0.
         faint: Largest share of a link's power, obstacles apart, of a path that skips the obstacles:
@@ -79,7 +78,6 @@ class PathFields(MovablePlanes):
     fewest_numbers = 8
     is_bare: Tensor
     is_heard: Tensor
-    is_free: Tensor
 
     def __init__(
         self,
@@ -131,7 +129,6 @@ class PathFields(MovablePlanes):
         self.directivity = _filled(0.0)
         self.receiver_phases = _filled(0.0, len(receivers)) if self.is_complex else None
         self.register_buffer("is_heard", torch.ones(len(receivers), dtype=torch.bool))
-        self.register_buffer("is_free", torch.zeros_like(self.is_heard))
         bandwidth = self.scene.bandwidth
         self.log_bandwidth = None
         if bandwidth != 0 and not self.is_complex:
@@ -147,7 +144,6 @@ class PathFields(MovablePlanes):
     def _load_from_state_dict(self, state_dict, prefix, *args):
         # Receivers without training links had gains of their own before.
         state_dict.setdefault(prefix + "is_heard", torch.ones_like(self.is_heard))
-        state_dict.setdefault(prefix + "is_free", torch.zeros_like(self.is_free))
         if self.path_phases is not None:  # channels of few numbers had none before
             state_dict.setdefault(prefix + "path_phases", torch.zeros_like(self.path_phases))
         super()._load_from_state_dict(state_dict, prefix, *args)
@@ -188,7 +184,7 @@ class PathFields(MovablePlanes):
         fields = torch.complex(gains.exp() * folded.exists, torch.zeros_like(gains))
         fields = folded.reflected(fields, self.coefficients(query, folded))
         if blocked and self.obstacles is not None and not self.is_bare:
-            fields = fields * (-self._depths(query, self.obstacles, folded, fields)).exp()
+            fields = fields * (-self._depths(self.obstacles, folded, fields)).exp()
         return fields
 
     def coefficients(self, query: Query, folded: Folded) -> Complex[Tensor, "b w"]:
@@ -208,11 +204,7 @@ class PathFields(MovablePlanes):
         return polarised(folded.normals, te, tm) * gains
 
     def _depths(
-        self,
-        query: Query,
-        obstacles: Obstacles,
-        folded: Folded,
-        strengths: Complex[Tensor, "b n"],
+        self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]
     ) -> Inexact[Tensor, "b n"]:
         """Depth of each path through the obstacles; 0 for no path and, of levels, a faint one."""
         depths = torch.zeros_like(strengths.real if obstacles.turns is None else strengths)
@@ -230,19 +222,7 @@ class PathFields(MovablePlanes):
         # Numbers of the legs' paths, of all links in a row.
         paths = folded.path + n * torch.arange(count, device=legs.device)[:, None]
         paths = paths.flatten()[legs]
-        at_free = self.is_free[query.receivers]  # (b,)
-        if not at_free.any():
-            through = obstacles(starts, ends)
-        else:
-            receivers = query.receivers[paths // n]
-            through = depths.new_zeros(len(legs))
-            for receiver in receivers.unique().tolist():
-                rows = receivers == receiver
-                # Antennas stand in free space: no link has told that there is no matter.
-                place = self.scene.positions(starts)[receiver] - self.middle
-                which = obstacles.apart(place) if self.is_free[receiver] else None
-                through[rows] = obstacles(starts[rows], ends[rows], which)
-        return depths.flatten().index_add(0, paths, through).view(count, n)
+        return depths.flatten().index_add(0, paths, obstacles(starts, ends)).view(count, n)
 
     def passing(self, query: Query) -> Float[Tensor, "b v"]:
         """Field over free space of the direct path, then at each plane; 0 for no path."""
@@ -271,7 +251,6 @@ class PathFields(MovablePlanes):
         super().fit(links)
         heard = links.query.receivers[links.split.train].unique().to(self.is_heard.device)
         self.is_heard.fill_(False)[heard] = True
-        self.is_free.copy_(~self.is_heard)
 
     def gains_at(self, receivers: Int[Tensor, " b"]) -> Complex[Tensor, " b"]:
         """Logarithms of the complex gains of receivers, without phases unless labels have some."""
@@ -301,7 +280,6 @@ class PathFields(MovablePlanes):
         if self.receiver_phases is not None:
             self.receiver_phases = nn.Parameter(gains.imag.contiguous())
         self.is_heard = torch.ones_like(gains.real, dtype=torch.bool)
-        self.is_free = self.is_heard.clone()
         self.boresights = self._boresights()
 
     def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
