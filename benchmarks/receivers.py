@@ -1,6 +1,6 @@
 """Errors and 90 % intervals at held-out receivers, with 0, 1, 3 and 10 readings there.
 
-    python benchmarks/receivers.py FOLDER    a run of signal strength with split=receivers
+    python benchmarks/receivers.py FOLDER...    runs of signal strength with split=receivers, such as all folds
 
 Readings are five random draws of each receiver's links; the score is of every third link of the rest. Prints
 a table in Markdown: mean absolute error [dB], share of links in intervals, and their width [dB]. docs/results.md
@@ -20,7 +20,19 @@ from gaigs.report.table import markdown
 DRAWS = 5
 
 
-def main(folder: str) -> None:
+def main(folders: list[str]) -> None:
+    scores: dict[int, list] = {count: [] for count in (0, 1, 3, 10)}
+    for folder in folders:
+        rate(folder, scores)
+    rows = [["readings", "MAE [dB]", "share", "width [dB]"]]
+    for count, parts in scores.items():
+        means = torch.stack(parts).mean(0).tolist()
+        rows.append([str(count), *[f"{mean:.2f}" for mean in means]])
+    print(markdown(rows))
+
+
+def rate(folder: str, scores: dict[int, list]) -> None:
+    """Adds error, share and width at each receiver and draw to the scores."""
     links = runs.links_of(folder, True)
     model = gaigs.load(folder)
     if model.calibration is None or model.calibration.elsewhere is None:  # left out by max_time
@@ -28,7 +40,6 @@ def main(folder: str) -> None:
         model.calibration = replace(new, widths=torch.zeros(len(links.receivers)), elsewhere=new)
     generator = torch.Generator().manual_seed(0)
     test = links.split.test
-    scores = {count: [] for count in (0, 1, 3, 10)}
     for receiver in links.query.receivers[test].unique().tolist():
         index = test[links.query.receivers[test] == receiver]
         for count, parts in scores.items():
@@ -48,12 +59,7 @@ def main(folder: str) -> None:
                 error = (found.value - asked).abs().mean()
                 width = (found.upper - found.lower).mean()
                 parts.append(torch.stack((error, holds.float().mean(), width)))
-    rows = [["readings", "MAE [dB]", "share", "width [dB]"]]
-    for count, parts in scores.items():
-        means = torch.stack(parts).mean(0).tolist()
-        rows.append([str(count), *[f"{mean:.2f}" for mean in means]])
-    print(markdown(rows))
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(sys.argv[1:])

@@ -141,6 +141,14 @@ def stage(
         opened.close()
 
 
+def portion(share: float) -> contextlib.AbstractContextManager[Stage]:
+    """A stage that has to end after a share of the time that is left."""
+    keeper = current()
+    if math.isinf(keeper.limit):
+        return stage()
+    return stage(until=1 - (keeper.left() - share * left()) / keeper.limit)
+
+
 @contextlib.contextmanager
 def timed(name: str) -> Iterator[None]:
     """A part of the current run whose time counts under a name; a part inside it counts alone."""

@@ -281,7 +281,7 @@ class ChannelData:
         return all_sequences(len(planes), self.order)
 
     def draw(
-        self, count: int, subcarriers: int | None = None, fewest: int = 8
+        self, count: int, subcarriers: int | None = None, fewest: int = 4
     ) -> list[ReceiverChannels]:
         """All receivers with about ``count`` random places together, ``fewest`` or more each."""
         each = max(fewest, count // len(self.receivers))
@@ -325,7 +325,9 @@ class ChannelData:
                 # power, and so a phase.
                 phases.append(self.fit_free(receiver, planes, 1e-2).strengths[:, 0].sgn())
                 continue
-            step = max(1, len(receiver.places) // 100)  # a hundred places suffice
+            # A hundred places in all suffice, with sixteen of each receiver.
+            count = len(receiver.places)
+            step = max(1, min(count // 16, count * len(receivers) // 100))
             thinned = receiver.at(slice(None, None, step))
             direct = self.fit_free(thinned, planes, 1e-4).strengths[:, 0]
             strong = direct.abs() >= direct.abs().median()

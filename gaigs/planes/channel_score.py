@@ -195,7 +195,7 @@ class ChannelScore(Score[SlabRoom]):
             phases = []
             for receiver, phase in zip(receivers, references, strict=True):
                 # Other links in each step: a stochastic gradient.
-                count = max(8, 40 // len(receivers))
+                count = max(4, 40 // len(receivers))
                 index = torch.randperm(len(receiver.places), generator=generator)[:count]
                 when = torch.randperm(len(receiver.frequencies), generator=generator)[:6]
                 parts.append(receiver.at(index, when).single())

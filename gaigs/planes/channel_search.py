@@ -77,7 +77,8 @@ class ChannelSearch:
 
     def find_room(self) -> SlabRoom:
         """The room of ``run`` in the frame."""
-        planes = self.find_free(self.start)
+        with stages.portion(0.6):  # planes that are not resolved are worth nothing
+            planes = self.find_free(self.start)
         best = SlabRoom(planes, planes[:, :3])
         if len(planes):
             best = self.prune(self.resolve(self.free.descend(planes, 300, 5e-3)))

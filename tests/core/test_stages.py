@@ -124,6 +124,16 @@ def test_a_stage_ends_at_its_share_of_the_limit(clock):
     assert math.isinf(stages.left())
 
 
+def test_a_portion_ends_after_a_share_of_what_is_left(clock):
+    with stages.portion(0.6):
+        assert math.isinf(stages.left())  # no limit
+    with stages.watched(100.0), stages.stage(until=0.5):
+        clock.now = 10.0
+        with stages.portion(0.6):
+            assert stages.left() == pytest.approx(24.0)  # of 40
+        assert stages.left() == pytest.approx(40.0)
+
+
 def test_what_cannot_be_shortened_is_announced(clock, caplog):
     model = gaigs.train("mean", example_links("rssi"))
     for limit in (40.0, 20.0):

@@ -162,6 +162,27 @@ def test_a_search_whose_time_is_up_gives_the_planes_that_it_has(monkeypatch):
     assert len(calls) == len(planes) == len(slabs) == 1
 
 
+def test_a_long_search_for_planes_leaves_time_to_resolve_them(monkeypatch):
+    own = search(room()[0])
+
+    def find_free(known):
+        assert 50 < stages.left() < 61  # [s]
+        raise InterruptedError
+
+    monkeypatch.setattr(own, "find_free", find_free)
+    with stages.watched(100.0, shown=False), pytest.raises(InterruptedError):
+        own.find_room()
+
+
+def test_many_receivers_need_no_more_places_together():
+    links, _ = room(receivers=2)
+    data = search(links).data
+    data.receivers = data.receivers * 5
+    assert sum(len(part.places) for part in data.draw(24)) == 40
+    phases = data.reference_phases(torch.zeros(0, 4).double(), data.receivers)
+    assert all((phase - phases[0]).abs() < 0.1 for phase in phases[::2])
+
+
 def test_no_plane_is_found_in_free_space():
     options = coarse(certain_share=1e-6, faint_share=1e-6)
     links, _ = room(walls=PLANES[:0])
