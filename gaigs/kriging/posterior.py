@@ -24,11 +24,13 @@ class Posterior(nn.Module):
         by_paths: True if strengths of paths are kriged, not labels.
         start: Choices of a fit to nearly the same links, from which the next one starts; None: no
             fit before.
+        seen: Links by which the fit has chosen; None: all.
     """
 
     chooses_weight = False
     by_paths = False
     start: Any = None
+    seen: Tensor | None = None
 
     def cleaned(self, links: Links) -> Links:
         """The links without those that would move the whole fit; by default all."""
@@ -47,6 +49,11 @@ class Posterior(nn.Module):
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
         """Takes the known links; ``residuals`` gives residuals of some rows (j, *shape)."""
         raise NotImplementedError
+
+    def coarsen(self) -> None:
+        """Lets the next ``solve`` be quick and less exact, for a model that tells errors alone; by
+        default does nothing.
+        """
 
     def start_from(self, other: Any) -> None:
         """Starts the next fit from that of another posterior, which saves time; by default does

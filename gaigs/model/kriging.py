@@ -74,6 +74,8 @@ class Kriging(Wrapper):
     weight: Tensor
     weights = (1.0, 0.75, 0.5, 0.25, 0.0)
     """Candidates of ``trend_weight`` and ``weight``; of equally good ones the first is taken."""
+    chosen_by: Tensor | None = None
+    """Links that chose the hyperparameters of a model of the training links alone; None: all."""
 
     def __init__(self, scene: Scene, trend: dict | Model, fallback: dict | None = None):
         super().__init__(scene)
@@ -247,8 +249,10 @@ class Kriging(Wrapper):
         model = Kriging(self.scene, self.trend, self.fallback_options)
         model._make_posterior(False)
         model._copy_choices(self)
+        model.chosen_by = self.posterior.seen
         model.weight.fill_(1.0)
         model.fallback.fit(training)
+        model.posterior.coarsen()
         model._solve(training, values[: len(split.train)])
         model.to(self.weight.device)
         if len(split.validation) and self.posterior.chooses_weight:
@@ -415,12 +419,22 @@ class Kriging(Wrapper):
     def fold_count(self) -> int:
         return 2
 
-    def unseen(self, links: Links) -> Iterator[Unseen]:
+    def unseen(self, links: Links, enough: int = 1000, most: int = 4000) -> Iterator[Unseen]:
         """Kriging of the training links with each half of the validation links, by whose other half
         its weights and hyperparameters are chosen; one group alone chooses, too.
+
+        A model of the training links alone asks the validation links that have chosen nothing in
+        place of these, if there are ``enough``; of labels of one number at most ``most``, as more
+        tell no more of quantiles.
         """
         if not len(links.split.validation):
             return
+        if self.chosen_by is not None:
+            held = links.split.validation
+            asked = single_readings(links, held[torch.isin(held, self.chosen_by, invert=True)])
+            if len(asked) >= enough:
+                yield Unseen(self, evenly(asked, most), links.split.train)
+                return
         for chooses, asked in validation_halves(links):
             if stages.is_up():
                 return
@@ -432,8 +446,8 @@ class Kriging(Wrapper):
             half = replace(links, split=links.split.choosing(chooses))
             kriged = kriged.krige(half, is_final=False, by_paths=self.by_paths)
             asked = single_readings(links, asked)
-            if links.task.is_scalar:  # more readings of one number tell no more of quantiles
-                asked = evenly(asked, 4000)
+            if links.task.is_scalar:
+                asked = evenly(asked, most)
             yield Unseen(kriged, asked, links.split.train)
 
     def take_hyperparameters(self, other: Model) -> None:
