@@ -36,11 +36,11 @@ class Tiles(nn.Module):
             not stored.
     """
 
-    core = 128
+    core = 64
     """Most readings of a tile's own."""
-    size = 512
+    size = 256
     """Readings of a tile; see docs/methods.md for the error that more would take away."""
-    neighbours = 64
+    neighbours = 32
     """Readings around each of a tile's own: as many as fill a tile where density is even."""
 
     stored = "readings", "values", "variances", "owners", "rows"
