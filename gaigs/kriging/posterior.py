@@ -50,11 +50,6 @@ class Posterior(nn.Module):
         """Takes the known links; ``residuals`` gives residuals of some rows (j, *shape)."""
         raise NotImplementedError
 
-    def coarsen(self) -> None:
-        """Lets the next ``solve`` be quick and less exact, for a model that tells errors alone; by
-        default does nothing.
-        """
-
     def start_from(self, other: Any) -> None:
         """Starts the next fit from that of another posterior, which saves time; by default does
         nothing.

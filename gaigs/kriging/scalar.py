@@ -92,7 +92,11 @@ class ScalarProcess(nn.Module):
         """Mean of z at some places."""
         if not self.is_solved:
             if len(places) * self.options.few < len(self.places):
-                return self._near(places, receivers, self.options.local).means
+                means = torch.empty_like(places[:, 0])
+                for part in torch.arange(len(places)).split(self.options.size // 4):
+                    near = self._near(places[part], receivers[part], self.options.local)
+                    means[part] = near.means
+                return means
             self._solve()
         means = places.new_zeros(len(places))
         scale = self._choice.scale
@@ -457,9 +461,6 @@ class ScalarPosterior(Posterior):
 
     def start_from(self, other: Any) -> None:
         self.start = other.process.logarithms, other.process.choice
-
-    def coarsen(self) -> None:
-        self.process.tiles.coarsen()
 
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
         index = links.split.known

@@ -65,12 +65,6 @@ class Tiles(nn.Module):
     def __len__(self) -> int:
         return len(self.rows)
 
-    def coarsen(self) -> None:
-        """Makes the next tiles small: a sixteenth of the time, and differences from the dense
-        solution that errors hide, see docs/methods.md.
-        """
-        self.core, self.size, self.neighbours = 32, 128, 16
-
     def clear(self) -> None:
         """Takes all tiles away."""
         for name in self.stored[:-1]:

@@ -179,8 +179,6 @@ class GaussianProcess(LookUp):
         known = coordinates(self.scene, query, 1.0), query.receivers
         folds = folds_of(links, index)
         is_large = not chooses and len(index) > process.options.large
-        if is_large:
-            process.tiles.coarsen()
 
         def residuals(trend: Model) -> Float[Tensor, " k"]:
             return (links.labels[index] - trend(Batch(query)).value).double()

@@ -253,7 +253,6 @@ class Kriging(Wrapper):
         model.chosen_by = self.posterior.seen
         model.weight.fill_(1.0)
         model.fallback.fit(training)
-        model.posterior.coarsen()
         model._solve(training, values[: len(split.train)])
         model.to(self.weight.device)
         if len(split.validation) and self.posterior.chooses_weight:
