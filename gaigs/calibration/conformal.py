@@ -1,7 +1,7 @@
 """Conformal intervals: quantiles of the errors at links that the predicting model has not seen."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -126,12 +126,18 @@ class Calibration:
 
     def estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
         """The interval of some predictions; raises a ``ValueError`` where it needs more links."""
+        return self.estimates(value, deviations, query, [level])[0]
+
+    def estimates(
+        self, value: Tensor, deviations: Tensor, query: Query, levels: Sequence[float]
+    ) -> list[Estimate]:
+        """``estimate`` of several levels, with one search for the known places nearest."""
         widths = query.receivers.new_zeros(len(query)).to(value.real)
         if self.widths is not None:
             widths = self.widths.to(widths)[query.receivers]  # (b,)
         is_new = widths > 0
         if not is_new.any():
-            return self._estimate(value, deviations, query, level)
+            return self._estimates(value, deviations, query, levels)
         if self.elsewhere is None:
             raise ValueError(
                 "no intervals at receivers without links: three receivers with held-out links "
@@ -141,24 +147,31 @@ class Calibration:
         # The model's own deviations are of receivers with links; NaN where an array lacks elements.
         usual = _shaped(usual_deviations(value) * widths, value)
         usual = usual.masked_fill(_shaped(deviations, value).isnan(), math.nan)
-        new = self.elsewhere._estimate(value, usual, query, level)
+        new = self.elsewhere._estimates(value, usual, query, levels)
         if is_new.all():
             return new
         # Groups are of receivers with links alone: the others get a value that does not count.
         receivers = torch.where(is_new, query.receivers[~is_new][0], query.receivers)
-        own = self._estimate(value, deviations, replace(query, receivers=receivers), level)
-        fields: list[Any] = []
-        for one, other in zip(new, own, strict=True):
-            if one is None:
-                fields.append(None)
-                continue
-            rows = is_new if one.ndim == 1 else is_new.reshape(shape)
-            fields.append(torch.where(rows, one, other))
-        return Estimate(*fields)
+        own = self._estimates(value, deviations, replace(query, receivers=receivers), levels)
 
-    def _estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
-        """``estimate`` at receivers with links."""
+        def joined(one: Tensor | None, other: Tensor | None) -> Tensor | None:
+            if one is None or other is None:
+                return None
+            return torch.where(is_new if one.ndim == 1 else is_new.reshape(shape), one, other)
+
+        return [Estimate(*map(joined, *pair)) for pair in zip(new, own, strict=True)]
+
+    def _estimates(
+        self, value: Tensor, deviations: Tensor, query: Query, levels: Sequence[float]
+    ) -> list[Estimate]:
+        """``estimates`` at receivers with links."""
         groups = self._groups_of(query)
+        return [self._estimate(value, deviations, groups, level) for level in levels]
+
+    def _estimate(
+        self, value: Tensor, deviations: Tensor, groups: Int[Tensor, " b"], level: float
+    ) -> Estimate:
+        """The interval of predictions of links in some groups."""
         self._check_counts(groups, level)
         cells = groups.reshape(-1, *[1] * (value.ndim - 1))
         amplitudes = self.amplitudes.to(value.real)

@@ -96,8 +96,9 @@ def calibrate(
             break
         asked.append(one.asked)
         answers.append(answer(one.model, one.asked))
-        known = links.query[one.known]
-        near.append(nearest(links.query[one.asked], known.transmitters, known.receivers))
+        if not answers[-1].are_stated:
+            known = links.query[one.known]
+            near.append(nearest(links.query[one.asked], known.transmitters, known.receivers))
     if stages.is_up() and len(asked) < count:
         stages.leave_out(f"{len(asked)} of {count} folds calibrate {name}")
     if not asked:
@@ -105,7 +106,7 @@ def calibrate(
     index = torch.cat(asked)
     values = torch.cat([part.values for part in answers])
     deviations = torch.cat([part.deviations for part in answers])
-    are_stated = all(part.are_stated for part in answers)
+    are_stated = not near
     return Calibration.of(
         links.task,
         links.labels[index],

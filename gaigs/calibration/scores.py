@@ -69,8 +69,7 @@ def scores_of_links(
     parts = []
     for rows in torch.arange(len(query)).split(size):
         arguments = links.values[rows], links.deviations[rows], query[rows]
-        half = calibration.estimate(*arguments, 0.5)
-        most = calibration.estimate(*arguments, 0.9)
+        half, most = calibration.estimates(*arguments, [0.5, 0.9])
         parts.append(interval_scores(links.labels[rows], half, most))
     scores = {}
     for name in parts[0]:
@@ -86,15 +85,14 @@ def shares_within(
     """Shares of labels within intervals of levels 0.05 to 0.95 (19,); NaN of too few links."""
     rows = evenly(torch.arange(len(query)), most)
     arguments = links.values[rows], links.deviations[rows], query[rows]
-    shares = []
-    for level in np.arange(1, 20) / 20:
-        if not calibration.gives(level):
-            shares.append(math.nan)
-            continue
-        estimate = calibration.estimate(*arguments, level)
+    levels = np.arange(1, 20) / 20
+    shares = np.full(len(levels), math.nan)
+    given = [number for number, level in enumerate(levels) if calibration.gives(level)]
+    estimates = calibration.estimates(*arguments, levels[given].tolist())
+    for number, estimate in zip(given, estimates, strict=True):
         exists = ~estimate.std.isnan()
-        shares.append(holds(estimate, links.labels[rows])[exists].double().mean().item())
-    return np.array(shares)
+        shares[number] = holds(estimate, links.labels[rows])[exists].double().mean().item()
+    return shares
 
 
 def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:

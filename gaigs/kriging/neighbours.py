@@ -85,6 +85,8 @@ class Readings(NamedTuple):
         last: tuple[Tensor, Tensor, Near] | None = None
         for receiver in receivers.unique().tolist():
             known = (self.receivers == receiver).nonzero()[:, 0]
+            if not len(known):
+                continue
             asked_rows = (receivers == receiver).nonzero()[:, 0]
             if own is None or folds is None:
                 ends = scaled(places[asked_rows], scale), scaled(self.places[known], scale)

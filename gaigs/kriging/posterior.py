@@ -24,11 +24,13 @@ class Posterior(nn.Module):
         by_paths: True if strengths of paths are kriged, not labels.
         start: Choices of a fit to nearly the same links, from which the next one starts; None: no
             fit before.
+        seen: Links by which the fit has chosen; None: all.
     """
 
     chooses_weight = False
     by_paths = False
     start: Any = None
+    seen: Tensor | None = None
 
     def cleaned(self, links: Links) -> Links:
         """The links without those that would move the whole fit; by default all."""

@@ -17,7 +17,13 @@ from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.kriging.gross_errors import without_gross_errors
 from gaigs.kriging.kernel import SMOOTHNESSES, Process, matern, resize
-from gaigs.kriging.likelihood import Choice, conditional, covariances
+from gaigs.kriging.likelihood import (
+    Choice,
+    Conditional,
+    conditional,
+    covariances,
+    expected_factors,
+)
 from gaigs.kriging.links import coordinates, distances, folds_of, scaled
 from gaigs.kriging.neighbours import HeldOutReadings, Nearest, Readings
 from gaigs.kriging.posterior import Posterior
@@ -48,12 +54,15 @@ class ScalarProcess(nn.Module):
         weights: Values over the covariances of their receiver's readings (k,); 0 at receivers with
             ``tiles``, and, where readings of one place are merged, at all but the first.
         tiles: Parts of the readings of receivers with more places than ``options.together``.
+        asked: Rows of the readings that the last ``fit`` held out.
+        is_solved: False before the readings of a lazy ``solve`` are weighted.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2 and
     5.4.2; Lange, Little and Taylor, Robust statistical modeling using the t distribution, 1989.
     """
 
     options = ScalarOptions()
+    is_solved = True
     logarithms: Tensor
     choice: Tensor
     places: Tensor
@@ -73,6 +82,7 @@ class ScalarProcess(nn.Module):
         for name in ("values", "variances", "weights"):
             self.register_buffer(name, empty.clone())
         self.tiles = Tiles()
+        self.asked = empty.long()
 
     # --- predictions ---
 
@@ -80,6 +90,14 @@ class ScalarProcess(nn.Module):
         self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
         """Mean of z at some places."""
+        if not self.is_solved:
+            if len(places) * self.options.few < len(self.places):
+                means = torch.empty_like(places[:, 0])
+                for part in torch.arange(len(places)).split(self.options.size // 4):
+                    near = self._near(places[part], receivers[part], self.options.local)
+                    means[part] = near.means
+                return means
+            self._solve()
         means = places.new_zeros(len(places))
         scale = self._choice.scale
         all_places = scaled(self.places, scale)
@@ -110,7 +128,8 @@ class ScalarProcess(nn.Module):
     ) -> Float[Tensor, " b"]:
         """Standard deviations of new readings: z given the known readings, plus noise."""
         variances = places.new_zeros(len(places))
-        is_many = self.receivers.bincount(minlength=len(self.logarithms)) > self.options.many
+        most = self.options.many if self.is_solved else 0
+        is_many = self.receivers.bincount(minlength=len(self.logarithms)) > most
         for receiver in receivers.unique().tolist():
             rows = (receivers == receiver).nonzero()[:, 0]
             process = self.at(receiver)
@@ -121,17 +140,26 @@ class ScalarProcess(nn.Module):
                 variances[part] += (signal - whitened.square().sum(0)).clamp_min(0)
         # All receivers together: those that hear the same places share a search.
         for part in is_many[receivers].nonzero()[:, 0].split(4 * self.options.size):
-            variances[part] += self._local_variances(places[part], receivers[part]).clamp_min(0)
+            near = self._near(places[part], receivers[part], self.options.around)
+            variances[part] += near.variances.clamp_min(0)
         return variances.sqrt()
 
-    def _local_variances(
-        self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
-    ) -> Float[Tensor, " b"]:
-        """Variances of z given the nearest readings."""
-        readings = self._readings._replace(count=self.options.around)
+    def _near(
+        self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"], count: int
+    ) -> Conditional:
+        """z at places given the ``count`` nearest readings."""
+        readings = self._readings._replace(count=count)
         around = readings.around(places, receivers, readings.nearest(places, receivers))
-        between = covariances(around, self.logarithms.exp(), self._choice)
-        return conditional(between, self.values[around.rows], self.variances[around.rows])[1]
+        hyperparameters, choice = self.logarithms.exp(), self._choice
+        between = covariances(around, hyperparameters, choice)  # (b, count + 1, count + 1)
+        values, variances = self.values[around.rows], self.variances[around.rows]  # (b, count)
+        if not self.is_solved and not math.isinf(choice.degrees):
+            noises = hyperparameters[receivers, 2].square()
+            of_readings = between[:, :-1, :-1]
+            rounds = self.options.rounds
+            factors = expected_factors(of_readings, values, noises, choice.degrees, rounds)
+            variances = noises[:, None] * factors
+        return conditional(between, values, variances)
 
     def at(self, receiver: int) -> Process:
         """The process of one receiver."""
@@ -189,6 +217,7 @@ class ScalarProcess(nn.Module):
             tried = self._maximise(values, few, choice, best.logarithms)
             best = min(best, tried, key=lambda fit: fit.cost)
         held = self._readings.held_out(every, folds, most)
+        self.asked = torch.cat((few.rows, held.rows))
         self._take(self._maximise(values, held, best.choice, best.logarithms, has_deviations=True))
         return index
 
@@ -253,14 +282,24 @@ class ScalarProcess(nn.Module):
         places: Float[Tensor, "k d"],
         receivers: Int[Tensor, " k"],
         values: Float[Tensor, " k"],
+        is_lazy: bool = False,
     ) -> None:
         """Takes residuals of known readings and weights them for predictions.
 
-        ``fit`` has chosen the hyperparameters before.
+        ``fit`` has chosen the hyperparameters before. With ``is_lazy`` readings are weighted when
+        many places are asked for; a few places have the readings around them.
         """
         self.places, self.receivers, self.values = places, receivers, values.clone()
-        noises = (2 * self.logarithms[receivers, 2]).exp()
-        self.variances = noises * self._factors(values)
+        self.variances = (2 * self.logarithms[receivers, 2]).exp()
+        self.is_solved = False
+        if not is_lazy:
+            self._solve()
+
+    def _solve(self) -> None:
+        """Weights the known readings."""
+        places, receivers, values = self.places, self.receivers, self.values
+        self.is_solved = True
+        self.variances = self.variances * self._factors(values)
         self.weights = torch.zeros_like(values)
         self.tiles.clear()
         for receiver in receivers.unique().tolist():
@@ -318,7 +357,9 @@ class ScalarProcess(nn.Module):
         factors = torch.ones_like(values)
         if math.isinf(choice.degrees):
             return factors
-        readings = self._readings._replace(count=self.options.neighbours + 1)
+        options = self.options
+        near = options.around if len(values) > options.large else options.neighbours
+        readings = self._readings._replace(count=near + 1)
         rows = torch.arange(len(values), device=values.device)
         every = readings.nearest(self.places, self.receivers)
         every.exists.logical_and_(every.rows != rows[:, None])  # not itself
@@ -393,6 +434,8 @@ class ScalarPosterior(Posterior):
             else:
                 logarithms, choice = self.start
             groups = process.hold_out(*known, folds, held)
+            rows = [process.asked, *(group.rows for group in groups)]
+            self.seen = index[torch.cat(rows).unique()]
 
             def refit(values: Tensor) -> float:
                 process.logarithms, process.choice = logarithms, choice

@@ -30,8 +30,13 @@ class ScalarOptions:
 
     Attributes:
         neighbours: Readings around a held-out one while a process is fitted.
-        around: Readings around a place whose variance is asked of many: those behind them lower it
-            by a hundredth.
+        around: Readings around a place whose variance is asked of many, and around each of more
+            than ``large`` whose noise has Student's t: those behind them lower a variance by a
+            hundredth.
+        local: Readings around a place whose mean is asked of a process that is not solved.
+        few: Known readings to each place asked at once, above which such a process stays so.
+        large: Known readings of which a fold keeps the hyperparameters of all: ten times as many as
+            a fit holds out.
         many: Readings of a receiver that all enter a variance; of more the nearest, which then take
             less time.
         together: Readings of a receiver that enter one covariance matrix; of more see ``Tiles``.
@@ -56,6 +61,9 @@ class ScalarOptions:
 
     neighbours: int = 32
     around: int = 16
+    local: int = 64
+    few: int = 16
+    large: int = 6000
     many: int = 300
     together: int = 1500
     scatter: tuple[float, float, float] = (0.25, 0.15, 0.15)

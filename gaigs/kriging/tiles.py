@@ -28,11 +28,11 @@ class Tiles(nn.Module):
     is that of the nearest reading. Tiles are solved when a place in them is first asked for.
     """
 
-    core = 128
+    core = 64
     """Most readings of a tile's own."""
-    size = 512
+    size = 256
     """Readings of a tile; see docs/methods.md for the error that more would take away."""
-    neighbours = 64
+    neighbours = 32
     """Readings around each of a tile's own: as many as fill a tile where density is even."""
 
     stored = "readings", "values", "variances", "owners", "rows"

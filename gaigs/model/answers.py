@@ -19,9 +19,13 @@ from gaigs.model.base import Model
 from gaigs.registry import name_of
 
 
-def batch_size(links: Links) -> int:
-    """Links predicted at a time; of labels of one number more, which take little memory."""
-    return 4096 if links.task.is_scalar else 64
+def batch_size(links: Links, model: Model | None = None) -> int:
+    """Links predicted at a time; of labels of one number more, which take little memory, and most
+    by a look-up, whose time grows with the receivers in each batch.
+    """
+    if not links.task.is_scalar:
+        return 64
+    return 4096 if model is None or model.is_trained else 2**16
 
 
 def predicted(
@@ -31,7 +35,7 @@ def predicted(
     frequencies: Float[Tensor, " s"] | None = None,
 ) -> Tensor:
     """Predictions of a model for some links, on the CPU, also at other subcarriers [Hz]."""
-    size = batch_size(links)
+    size = batch_size(links, model)
     values = model.predict_batches(links.query[index], batch_size=size, frequencies=frequencies)
     return torch.cat([part.cpu() for part in values])
 
@@ -39,7 +43,7 @@ def predicted(
 def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor) -> Tensor:
     """Deviations of some links, ``Model.spread``, on the CPU; ``values`` are their predictions."""
     directions, device = links.task.directions, model.device
-    size = batch_size(links)
+    size = batch_size(links, model)
     parts = []
     for query, part in zip(links.query[index].parts(size), values.split(size), strict=True):
         batch = Batch(query, directions).to(device)

@@ -483,6 +483,7 @@ class Model(Movable):
         scene = replace(self.scene, receivers=links.receivers)  # whose places may be estimated
         # Known links are large, and stay as they are.
         memo: dict[int, Any] = {id(self.links): self.links, id(self.scene): scene}
+        memo[id(self.calibration)] = self.calibration
         copied = copy.deepcopy(self, memo)
         copied.refit(links)
         return copied

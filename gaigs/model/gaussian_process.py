@@ -170,6 +170,7 @@ class GaussianProcess(LookUp):
         query = links.query[index]
         known = coordinates(self.scene, query, 1.0), query.receivers
         folds = folds_of(links, index)
+        is_large = not chooses and len(index) > process.options.large
 
         def residuals(trend: Model) -> Float[Tensor, " k"]:
             return (links.labels[index] - trend(Batch(query)).value).double()
@@ -183,9 +184,9 @@ class GaussianProcess(LookUp):
                     errors = residuals(trend) if terms is None else terms.unseen[index]
                     candidates.append(errors)
                 self.chosen = process.fit(*known, candidates, folds)
-            else:
+            elif not is_large:
                 process.refit(residuals(self.trend), process.hold_out(*known, folds))
-        process.solve(*known, residuals(self.trend))
+        process.solve(*known, residuals(self.trend), is_lazy=is_large)
 
     @property
     def trend(self) -> Model:

@@ -19,6 +19,7 @@ from gaigs.core.query import Batch, Query, evenly, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.data import Links
+from gaigs.kriging.blend import blend, is_surely_better, validation_scores
 from gaigs.kriging.field import FieldPosterior
 from gaigs.kriging.fit import FEWEST
 from gaigs.kriging.kernel import LIMIT, Process
@@ -73,6 +74,8 @@ class Kriging(Wrapper):
     weight: Tensor
     weights = (1.0, 0.75, 0.5, 0.25, 0.0)
     """Candidates of ``trend_weight`` and ``weight``; of equally good ones the first is taken."""
+    chosen_by: Tensor | None = None
+    """Links that chose the hyperparameters of a model of the training links alone; None: all."""
 
     def __init__(self, scene: Scene, trend: dict | Model, fallback: dict | None = None):
         super().__init__(scene)
@@ -245,6 +248,7 @@ class Kriging(Wrapper):
         model = Kriging(self.scene, self.trend, self.fallback_options)
         model._make_posterior(False)
         model._copy_choices(self)
+        model.chosen_by = self.posterior.seen
         model.weight.fill_(1.0)
         model.fallback.fit(training)
         model._solve(training, values[: len(split.train)])
@@ -411,12 +415,22 @@ class Kriging(Wrapper):
     def fold_count(self) -> int:
         return 2
 
-    def unseen(self, links: Links) -> Iterator[Unseen]:
+    def unseen(self, links: Links, enough: int = 1000, most: int = 4000) -> Iterator[Unseen]:
         """Kriging of the training links with each half of the validation links, by whose other half
         its weights and hyperparameters are chosen; one group alone chooses, too.
+
+        A model of the training links alone asks the validation links that have chosen nothing in
+        place of these, if there are ``enough``; of labels of one number at most ``most``, as more
+        tell no more of quantiles.
         """
         if not len(links.split.validation):
             return
+        if self.chosen_by is not None:
+            held = links.split.validation
+            asked = single_readings(links, held[torch.isin(held, self.chosen_by, invert=True)])
+            if len(asked) >= enough:
+                yield Unseen(self, evenly(asked, most), links.split.train)
+                return
         for chooses, asked in validation_halves(links):
             if stages.is_up():
                 return
@@ -428,8 +442,8 @@ class Kriging(Wrapper):
             half = replace(links, split=links.split.choosing(chooses))
             kriged = kriged.krige(half, is_final=False, by_paths=self.by_paths)
             asked = single_readings(links, asked)
-            if links.task.is_scalar:  # more readings of one number tell no more of quantiles
-                asked = evenly(asked, 4000)
+            if links.task.is_scalar:
+                asked = evenly(asked, most)
             yield Unseen(kriged, asked, links.split.train)
 
     def take_hyperparameters(self, other: Model) -> None:
@@ -468,28 +482,3 @@ class Kriging(Wrapper):
         weights = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
         room = {} if self.has_room else {"room": False}
         return self.trend.facts() | {"kriging": weights | room | dict(self.posterior.facts())}
-
-
-def validation_scores(links: Links, values: Tensor) -> Float[Tensor, " k"]:
-    """Monitored scores of predictions of the validation links, higher ones better."""
-    task = links.task
-    scores = task.scores(links.labels[links.split.validation], values)[task.monitor].double()
-    return scores if task.higher_is_better else -scores
-
-
-def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -> Tensor:
-    """weight one + (1 - weight) other, a tensor of its own; of channels of unknown phase, ``one``
-    is aligned to ``other``. A part without weight may be None: it is not read, since a NaN of it
-    would count.
-    """
-    if weight in (0, 1):
-        return (one if weight else other).clone()
-    return torch.add(weight * task.align(one, other), other, alpha=1 - weight)
-
-
-def is_surely_better(
-    one: Float[Tensor, " k"], other: Float[Tensor, " k"], *, errors: float = 2.0
-) -> bool:
-    """True if scores are higher by more than some standard errors; False of fewer than two."""
-    gain = one - other
-    return len(gain) > 1 and bool(gain.mean() > errors * gain.std() / math.sqrt(len(gain)))

@@ -37,7 +37,7 @@ class Movable(nn.Module):
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Any:
         """A copy of a model with ``any_frequency`` whose labels have other subcarriers [Hz]."""
         scene = self.scene.at_frequencies(frequencies)
-        other = copy.deepcopy(self)
+        other = self._copied()
         for part in other.modules():
             if hasattr(part, "scene"):
                 part.scene = scene
@@ -84,8 +84,7 @@ class Movable(nn.Module):
         room = torch.stack(self.scene.box)
         # No measurement tells the front end of a new receiver.
         scene = replace(self.scene, receivers=tuple(receivers), room=room, responses=None)
-        # Known links are large, and stay as they are.
-        other = copy.deepcopy(self, {id(self.links): self.links})
+        other = self._copied()
         for part in other.modules():
             if hasattr(part, "scene"):
                 part.scene = scene
@@ -97,6 +96,16 @@ class Movable(nn.Module):
                 part.take_receivers(scene, known)
         other.take_calibration(self)
         return other
+
+    def _copied(self) -> Any:
+        """A copy with the same known links, which are large, and the same scenes and calibration,
+        which never change.
+        """
+        memo = {id(self.links): self.links, id(self.calibration): self.calibration}
+        for part in self.modules():
+            if hasattr(part, "scene"):
+                memo[id(part.scene)] = part.scene
+        return copy.deepcopy(self, memo)
 
     @torch.no_grad()
     def adapt(self, links: Links) -> Any:

@@ -51,12 +51,16 @@ def paired(
     metric, title = headline(task.name, values)
     best = (max if title.higher_is_better else min)(names, key=lambda name: values[name][metric])
     order = groups.argsort(stable=True)
-    members = order.split(groups.bincount().tolist())  # links of each place
+    counts = groups.bincount().numpy()  # links of each place
+    firsts = counts.cumsum() - counts  # in the order
     random = np.random.default_rng(seed)
     gaps: dict[tuple[str, str], list[float]] = {}
     for _ in range(resamples):
-        drawn = random.integers(0, len(members), len(members)).tolist()
-        rows = torch.cat([members[place] for place in drawn])
+        drawn = random.integers(0, len(counts), len(counts))
+        lengths = counts[drawn]
+        # All links of the first drawn place, then all of the second, and so on.
+        shifts = firsts[drawn] - (lengths.cumsum() - lengths)
+        rows = order[shifts.repeat(lengths) + np.arange(lengths.sum())]
         summaries = {}
         for name, parts in scores.items():
             summaries[name] = task.summarise({key: part[rows] for key, part in parts.items()})

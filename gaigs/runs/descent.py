@@ -17,6 +17,7 @@ from torch import distributed
 from gaigs.core import stages
 from gaigs.data import Links
 from gaigs.model import Model, checkpoint
+from gaigs.model.answers import batch_size
 from gaigs.processes import STOPPING, Stopped
 from gaigs.registry import call, digests, registry
 from gaigs.runs.folder import ANOTHER, check_same_links, fingerprint
@@ -58,7 +59,9 @@ def descend(
     batches = Batches(links, links.split.train, module.batch_size, seed, steps)
     validation = None
     if len(links.split.validation):
-        validation = InOrder(links, links.split.validation, module.batch_size)
+        # Links of one number need little memory, and few large batches less time.
+        size = batch_size(links) if links.task.is_scalar else module.batch_size
+        validation = InOrder(links, links.split.validation, size)
     resumed = last if last.is_file() else None
     if resumed is not None:
         content = resumable(last, best)

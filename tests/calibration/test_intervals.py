@@ -464,6 +464,22 @@ def test_the_links_that_calibrate_kriging_did_not_choose_its_weights(monkeypatch
         assert not (places[own][:, None] == places[other]).all(-1).any(), "halves share no place"
 
 
+@pytest.mark.usefixtures("quick")
+def test_validation_links_that_chose_nothing_calibrate_kriging_as_it_is(monkeypatch):
+    links = gaigs.links("synthetic_rssi", transmitters=400, order=0, validation=0.5)
+    kriged = Kriging(links.scene, barely_trained(links))
+    model = kriged.krige(links)
+    monkeypatch.setattr(Kriging, "krige", None)
+    (one,) = model.unseen(links, enough=100, most=150)
+    held = links.split.validation
+    assert one.model is model
+    assert len(one.asked) == 150
+    assert torch.isin(one.asked, held).all()
+    assert torch.isin(model.chosen_by, held).any()
+    assert not torch.isin(one.asked, model.chosen_by).any()
+    assert kriged.chosen_by is None, "it has learnt from all validation links"
+
+
 @pytest.mark.parametrize(
     ("count", "level", "held"), [(9, 0.5, 5), (19, 0.9, 18), (19, 0.8, 16), (37, 0.9, 35)]
 )

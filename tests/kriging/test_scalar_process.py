@@ -14,7 +14,7 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.distance import cdist
 
 import gaigs
-from gaigs.core.query import Query
+from gaigs.core.query import Batch, Query
 from gaigs.data import Split
 from gaigs.kriging.likelihood import Choice, log_density
 from gaigs.kriging.links import coordinates, folds_of
@@ -208,6 +208,42 @@ def test_models_with_tiles_are_saved_and_loaded(tmp_path, monkeypatch):
     model.save(tmp_path / "used.ckpt")
     for name in ("fresh", "used"):
         assert torch.equal(gaigs.load(tmp_path / f"{name}.ckpt").predict(places), before)
+
+
+@pytest.mark.parametrize("degrees", [math.inf, 4.0])
+def test_few_places_of_a_lazy_solve_have_the_readings_around_them(degrees):
+    links = drawn((1.5, 0.8), noise=2.0, degrees=degrees, count=800)
+    process = fitted(links).scalar
+    asked = coordinates(links.scene, links.query[links.split.test], 1.0)
+    of = links.query.receivers[links.split.test]
+    solved = process(asked, of), process.deviations(asked, of)
+    process.solve(process.places, process.receivers, process.values, is_lazy=True)
+    few = len(asked) // 20
+    near = process(asked[:few], of[:few]), process.deviations(asked[:few], of[:few])
+    assert not process.is_solved
+    for one, other in zip(near, solved, strict=True):
+        assert (one - other[:few]).square().mean().sqrt() < 0.05 * solved[0].std()
+    # Many are worth the whole solution, which is then that of all.
+    assert torch.equal(process(asked, of), solved[0])
+    assert process.is_solved
+    assert torch.equal(process.deviations(asked, of), solved[1])
+
+
+def test_folds_of_many_readings_are_predicted_as_well(monkeypatch):
+    """Errors at held-out places, with and without a fit and a solution of each fold."""
+    links = drawn((1.5, 0.8), noise=2.0, degrees=4.0, count=1000)
+    model = fitted(links)
+    errors = []
+    for large in (10**6, 100):
+        options = ScalarOptions(neighbours=16, few=4, large=large)
+        monkeypatch.setattr(ScalarProcess, "options", options)
+        for one in model.unseen(links):
+            asked = one.asked[::2]
+            values = one.model(Batch(links.query[asked])).value
+            errors.append((values - links.labels[asked]).abs().mean())
+            assert one.model.scalar.is_solved == (large > 100)
+    whole, quick = torch.stack(errors).reshape(2, -1).mean(1)
+    assert abs(quick / whole - 1) < 0.02
 
 
 @pytest.mark.parametrize("together", [150, 60])

@@ -3,7 +3,6 @@
 import math
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gaigs.core.task import Metric, Task, check_values, need_samples
@@ -55,7 +54,9 @@ class Scalar(Task):
         """Mean, median and root of the mean square of the absolute error."""
         errors = scores[self.monitor]
         need_samples(errors)
-        numbers = (errors.mean(), torch.quantile(errors, 0.5), errors.square().mean().sqrt())
+        # A resampled test has thousands of medians: numpy's takes a tenth of the time of torch's.
+        median = np.median(errors.numpy())
+        numbers = (errors.mean(), median, errors.square().mean().sqrt())
         return dict(zip(self.metrics(), (number.item() for number in numbers), strict=True))
 
     def stored(
