@@ -67,7 +67,8 @@ class Movable(nn.Module):
         if not self.any_receiver:
             raise ValueError(
                 f"model {name_of(self)!r} predicts for its own receivers alone; for others take "
-                "mirrored, gaigs, friis, path_loss, mean, or gaussian_process of levels"
+                "mirrored, gaigs, nerf2, friis, path_loss, mean, gaussian_process of levels, or "
+                "knn where both ends move"
             )
         receivers = [receivers] if isinstance(receivers, Receiver) else [*receivers]
         for receiver in receivers:
