@@ -44,7 +44,7 @@ class Answers(NamedTuple):
 
 def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -> Iterator[Fold]:
     """Folds of the known links, of which at most so many are asked for; ends when time is up."""
-    index, receivers = links.split.known, links.query.receivers
+    index, receivers = links.split.known, links.scene.radio_of(links.query.receivers)
     folds = folds_of(links, index) % count
     asked = evenly(single_readings(links, index), most)
     for fold in range(count):
@@ -90,6 +90,7 @@ def calibrate(
         unseen: Models like the model, with links that they have not seen.
         answer: Function from a model and indices of links to its answers.
     """
+    query = links.scene.by_radio(links.query)
     asked, answers, near = [], [], []
     for one in stages.track(unseen, "intervals", count):
         if count > 1 and stages.is_up():  # it was fitted in haste
@@ -97,8 +98,8 @@ def calibrate(
         asked.append(one.asked)
         answers.append(answer(one.model, one.asked))
         if not answers[-1].are_stated:
-            known = links.query[one.known]
-            near.append(nearest(links.query[one.asked], known.transmitters, known.receivers))
+            known = query[one.known]
+            near.append(nearest(query[one.asked], known.transmitters, known.receivers))
     if stages.is_up() and len(asked) < count:
         stages.leave_out(f"{len(asked)} of {count} folds calibrate {name}")
     if not asked:
@@ -112,7 +113,7 @@ def calibrate(
         links.labels[index],
         values,
         deviations,
-        links.query[index],
+        query[index],
         None if are_stated else torch.cat(near),
-        links.query[links.split.known],
+        query[links.split.known],
     )

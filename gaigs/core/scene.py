@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
@@ -62,6 +62,8 @@ class Scene:
         responses: Factors of channels by each receiver's front end; None where none is learnt.
         room: Corners of the box of training transmitters and training receivers (2, 3) [m], if the
             receivers are others; None: they are the training's.
+        one_radio: True if the receivers are places of one radio that moves, or of radios alike,
+            which have one gain; a model then learns from all their links together.
 
     Example:
         >>> scene = gaigs.links("synthetic_rssi", transmitters=50).scene
@@ -83,10 +85,30 @@ class Scene:
     places: int = 0
     responses: Complex[Tensor, "receivers e s"] | None = None
     room: Float[Tensor, "2 3"] | None = None
+    one_radio: bool = False
 
     def positions(self, like: Tensor) -> Float[Tensor, "receivers 3"]:
         """Positions of the receivers [m], on the device and in the dtype of ``like``."""
-        return torch.stack([receiver.pose.position for receiver in self.receivers]).to(like)
+        return self._positions.to(like)
+
+    @functools.cached_property
+    def _positions(self) -> Float[Tensor, "receivers 3"]:
+        # A cached tensor of inference mode could not be saved for a backward pass.
+        with torch.inference_mode(False):
+            return torch.stack([receiver.pose.position.clone() for receiver in self.receivers])
+
+    @property
+    def radios(self) -> int:
+        """Number of different radios among the receivers."""
+        return 1 if self.one_radio else len(self.receivers)
+
+    def radio_of(self, receivers: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
+        """Numbers of the receivers' radios, which have gains and the like."""
+        return torch.zeros_like(receivers) if self.one_radio else receivers
+
+    def by_radio(self, query: Query) -> Query:
+        """Links with the numbers of radios in place of receivers."""
+        return replace(query, receivers=self.radio_of(query.receivers))
 
     @property
     def box(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
@@ -199,6 +221,8 @@ class Scene:
             state["responses"] = self.responses
         if self.room is not None:
             state["room"] = self.room
+        if self.one_radio:
+            state["one_radio"] = True
         state["frame"] = None
         if self.frame is not None:
             state["frame"] = int(self.frame.epsg), float(self.frame.x), float(self.frame.y)

@@ -97,6 +97,8 @@ class Links:
         noises: Standard deviation of each label by the scatter of repeated readings, less the more
             of them it is the mean of (n,), in the label's unit; None without repetitions.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
+        one_radio: True if the receivers are places of one radio that moves, or of radios alike,
+            with one gain; otherwise each has its own.
         front_ends: Responses of the receivers' front ends; None if none is learnt.
         remarks: Counts of links read and left out, with the reason.
         origin: Configurations of ``data`` and ``split``; empty for arrays in memory.
@@ -126,6 +128,7 @@ class Links:
         default_factory=lambda: torch.zeros(0, 2, 3, dtype=torch.float32)
     )
     front_ends: FrontEnds | None = None
+    one_radio: bool = False
     remarks: str = ""
     origin: Mapping = field(default_factory=dict)
 
@@ -188,6 +191,7 @@ class Links:
             responses=None if self.front_ends is None else self.front_ends.responses,
             floors=floors_of(train),
             places=len(train),
+            one_radio=self.one_radio,
         )
 
 
@@ -258,7 +262,7 @@ def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
     links = replace(links, split=parts)
     if links.frame is None:
         check_metres("transmitters", links.query.transmitters.unique(dim=0).double().numpy())
-    if links.uncertainties is not None:
+    if links.uncertainties is not None and not links.one_radio:
         links = with_places(only_trained(links))
     remarks = [links.remarks]
     if links.task.name == "csi" and isinstance(links.labels, Tensor):
@@ -396,7 +400,7 @@ def only_trained(links: Links) -> Links:
         raise ValueError(
             f"{len(links.receivers)} receivers have {len(links)} links, and those with test links "
             "none to train on: models are learnt for each receiver\n"
-            "give a fixed receiver one place for all its links, and the moving end as transmitters"
+            "give one_radio=True if both ends move, else the moving end as transmitters"
         )
     untrained = [links.receivers[old].name for old in (number < 0).nonzero()[:, 0].tolist()]
     remark = (

@@ -4,6 +4,7 @@ import inspect
 import logging
 import math
 import reprlib
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from gaigs.core.query import Query, as_numbers, as_positions, as_tensor, check_c
 from gaigs.core.task import Task, check_range
 from gaigs.data import Links, divide
 from gaigs.data.parts import check_parts
-from gaigs.data.readings import loud_remark, marks_of
+from gaigs.data.readings import are_one_radio, loud_remark, marks_of
 from gaigs.io.frames import is_frame, read_frame
 from gaigs.io.tables import number_places, shortened
 from gaigs.registry import check_instance, registry, suggest
@@ -40,6 +41,7 @@ def from_arrays(
     train_rows: Any = None,
     frame: Frame | None = None,
     height: float = 1.0,
+    one_radio: bool | None = None,
     **options: Any,
 ) -> Links:
     """Links of arrays in memory, or of values that torch converts, with their split.
@@ -70,6 +72,9 @@ def from_arrays(
         frame: Place of the positions' origin on a map, such as ``gaigs.Frame(32632, 450000.0,
             5400000.0)`` for UTM less that easting and northing; None if unknown.
         height: Height of positions (n, 2) or (k, 2) [m].
+        one_radio: True if the receivers are places of one radio that moves, or of radios alike,
+            with one gain. None: of one position a link, 12 places or more with fewer links each
+            than places.
 
     Raises:
         TypeError: An option has a wrong type.
@@ -115,6 +120,7 @@ def from_arrays(
         official=None if parts is None else (lambda: parts),
         uncertainties=ends.uncertainties if task.is_scalar else None,
         frame=frame,
+        one_radio=ends.are_one_radio(len(row), one_radio),
         remarks="; ".join(remarks),
     )
     links = divide(undivided, config)
@@ -143,9 +149,9 @@ def _check_options(bandwidth: Any, frame: Any) -> None:
 
 def _check_names(receivers: Sequence[Receiver]) -> None:
     """Raises a ``ValueError`` if two receivers have one name."""
-    names = [receiver.name for receiver in receivers]
-    for name in names:
-        if names.count(name) > 1:
+    names = Counter(receiver.name for receiver in receivers)
+    for name, count in names.items():
+        if count > 1:
             raise ValueError(f"receivers must have different names, got {name!r} more than once")
 
 
@@ -185,11 +191,20 @@ def split_configuration(
 
 
 class _Ends(NamedTuple):
-    """Receivers, the receiver of each link if known, and deviations of their places [m]."""
+    """Receivers, the receiver of each link if known, deviations of their places [m], and true if
+    each link has a position.
+    """
 
     receivers: tuple[Receiver, ...]
     index: Any
     uncertainties: Float[Tensor, " k"]
+    is_one_each: bool = False
+
+    def are_one_radio(self, links: int, given: bool | None) -> bool:
+        """True if so ``given``, or if each link has a position that says so."""
+        if given is None and not self.is_one_each:
+            return False
+        return are_one_radio(len(self.receivers), links, given)
 
 
 def _find_ends(
@@ -289,7 +304,9 @@ def _make_receivers(
     """
     positions = stands.positions
     uncertainties = torch.where(stands.is_known, 0.0, math.inf)
-    if is_one_a_place and stands.is_known.all() and len(positions) == len(places) > 1:
+    is_one_each = is_one_a_place and len(positions) == len(places) > 1
+    is_one_each &= bool(stands.is_known.all())
+    if is_one_each:
         distinct, index = number_places(positions.tolist())
         positions = torch.tensor(distinct)
         uncertainties = torch.zeros(len(distinct))
@@ -307,7 +324,8 @@ def _make_receivers(
         )
     poses = [Pose(position, torch.eye(3)) for position in positions]
     pairs = zip(names, poses, strict=True)
-    return _Ends(tuple(Receiver(name, pose, antenna) for name, pose in pairs), index, uncertainties)
+    receivers = tuple(Receiver(name, pose, antenna) for name, pose in pairs)
+    return _Ends(receivers, index, uncertainties, is_one_each)
 
 
 def _as_labels(labels: Any, task: Task) -> Tensor:

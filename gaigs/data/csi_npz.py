@@ -17,6 +17,7 @@ from gaigs.data import Links
 from gaigs.data.bands import hold_out_band
 from gaigs.data.impulse_responses import from_sionna
 from gaigs.data.parts import check_parts, join
+from gaigs.data.readings import are_one_radio
 from gaigs.io import FAR, WITHIN
 from gaigs.io.arrays import ArrayFile, array_format
 from gaigs.io.files import atomic_write
@@ -173,6 +174,7 @@ def _to_links(
     return Links(
         query=Query(transmitters, receivers, torch.full((len(rows),), carrier)),
         receivers=tuple(everyone[k] for k in present.tolist()),
+        one_radio=are_one_radio(len(present), len(rows)),
         labels=numbers["h"][has_signal],
         task=Csi(count, frequencies, phase),
         rows=rows,

@@ -6,9 +6,11 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from gaigs.data import Links, divide
-from gaigs.data.arrays import split_configuration
+from gaigs.data.arrays import from_arrays, split_configuration
+from gaigs.data.rssi_csv import COLUMNS
 from gaigs.data.rssi_wide import from_table
 from gaigs.data.rssi_wide.columns import FLOORS, HEIGHTS, plain_name
 from gaigs.io.frames import is_frame, read_frame
@@ -21,7 +23,7 @@ def from_frame(
     y: str | int | None = None,
     z: str | int | None = None,
     receivers: Any = None,
-    receiver: str | int | None = None,
+    receiver: str | int | Sequence[str | int] | None = None,
     level: str | int | None = None,
     ignore: str | Sequence[str] = (),
     not_heard: float | Sequence[float] | None = None,
@@ -36,8 +38,10 @@ def from_frame(
 
     The frame is of pandas, polars, pyarrow, or of another library with the PyCapsule or the
     interchange protocol; or a mapping of columns. It has a place a row and a receiver a column; or,
-    with ``receiver`` and ``level``, a reading a row. Columns and cells are understood, checked and
-    remarked on as by ``gaigs.data.rssi_wide.read``. NaN and None were not received.
+    with ``receiver`` and ``level``, a reading a row. Where both ends move, ``receiver`` lists the
+    columns of its place; the names of ``rssi_csv`` do so, too. Other columns and cells are
+    understood, checked and remarked on as by ``gaigs.data.rssi_wide.read``. NaN and None were not
+    received.
 
     Args:
         frame: The data frame.
@@ -49,7 +53,8 @@ def from_frame(
             columns ``name``, ``x``, ``y`` and optionally ``z``. A position of None and all others
             are estimated from the training links. A list of names has the columns of receivers.
             None: all columns that mostly hold low levels.
-        receiver: Column of the receivers' names, in a frame with a reading a row.
+        receiver: Column of the receivers' names, in a frame with a reading a row; or the two or
+            three columns of the receiver's place [m].
         level: Column of the readings of such a frame [dBm].
         ignore, not_heard, height, storey, epsg, frequency: As for ``gaigs.data.rssi_wide.read``.
         split: Name of a registered split, ``options`` are its own; None: ``random``.
@@ -67,8 +72,24 @@ def from_frame(
         (7, ['door', 'hall'])
     """
     config = split_configuration("data frames", from_frame, split, options)
+    table = read_frame(frame)
+    if {*COLUMNS} <= {*table.names} and receiver is level is x is None:
+        x, y, z, *receiver, level = COLUMNS
+    if isinstance(receiver, Sequence) and not isinstance(receiver, str):
+        place = [x or "x", y or "y", z]
+        moving = _places_of(table, [name for name in place if name is not None])
+        levels = table.numbers[:, table.column(str(level))]
+        marks = np.ravel([] if not_heard is None else not_heard)
+        return from_arrays(
+            "rssi",
+            moving,
+            np.where(np.isin(levels, marks), np.nan, levels),
+            _places_of(table, receiver),
+            frequency=frequency,
+            split=config,
+            height=height,
+        )
     try:
-        table = read_frame(frame)
         links = from_table(
             table,
             coordinates=_coordinates(table, x, y, z),
@@ -85,6 +106,12 @@ def from_frame(
     except ValueError as error:
         raise ValueError(_in_python(str(error))) from None
     return replace(links, remarks=_in_python(links.remarks))
+
+
+def _places_of(table: Table, names: Sequence) -> Float[np.ndarray, "n d"]:
+    """Positions of one end, a column a coordinate."""
+    columns = [table.column(str(name)) for name in names]
+    return table.numbers[:, columns]
 
 
 def _columns(table: Table, receivers: Any, ignore: list[str], is_long: bool) -> dict[str, Any]:

@@ -26,6 +26,14 @@ def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiv
     return Receiver(name, Pose(torch.as_tensor(position), torch.eye(3)))
 
 
+def are_one_radio(places: int, links: int, given: bool | None = None) -> bool:
+    """True if receivers at some places are one radio that moves, or radios alike.
+
+    Without a word of the user, 12 places or more are that have fewer links each than places.
+    """
+    return 12 <= places and links < places**2 if given is None else given
+
+
 def to_dbm(
     file: Path,
     rows: Rows,

@@ -9,7 +9,15 @@ import torch
 from gaigs.core.query import Query
 from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links
-from gaigs.data.readings import and_list, carriers_of, gateway, loud_remark, marks_given, to_dbm
+from gaigs.data.readings import (
+    and_list,
+    are_one_radio,
+    carriers_of,
+    gateway,
+    loud_remark,
+    marks_given,
+    to_dbm,
+)
 from gaigs.io import tables
 from gaigs.io.files import write_text
 from gaigs.registry import register
@@ -29,6 +37,7 @@ def read(
     fixed: str | None = None,
     not_heard: float | list[float] = -100.0,
     frequency: float | None = None,
+    one_radio: bool | None = None,
 ) -> Links:
     """A data set from a table with a heading, one reading a line: one link for each reading that
     was received.
@@ -49,6 +58,8 @@ def read(
         not_heard: Value, or values, of readings that were not received [dBm]; all others lie in
             [-200, 30].
         frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
+        one_radio: True if both ends move: all fixed places have one gain. None: see
+            ``are_one_radio``.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -76,9 +87,11 @@ def read(
     received = torch.tensor([value not in marks for value in dbm])
     present, receivers = at[received].unique(return_inverse=True)
     transmitters = torch.tensor(points[moving])[received]
+    one_radio = are_one_radio(len(present), len(transmitters), one_radio)
+    state = "moving" if one_radio else "fixed"
     remarks = (
         f"{len(transmitters)} readings of a moving {ENDS[moving]} at {len(present)} places of a "
-        f"fixed {ENDS[fixed]}; {int((~received).sum())} of {and_list(marks)} dBm were not heard "
+        f"{state} {ENDS[fixed]}; {int((~received).sum())} of {and_list(marks)} dBm were not heard "
         "and are left out"
     )
     silent = [f"{fixed}{k + 1}" for k in range(len(places)) if k not in present]
@@ -97,6 +110,7 @@ def read(
         task=Rssi(),
         rows=numbered[moving][1][received],
         edges=walls,
+        one_radio=one_radio,
         remarks=remarks,
     )
 

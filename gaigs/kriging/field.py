@@ -126,7 +126,7 @@ class FieldPosterior(Posterior):
         super().__init__()
         self.scene = scene
         self.register_buffer("hyperparameters", torch.full((3,), math.nan, dtype=torch.float64))
-        self.fields = nn.ModuleList(Field(scene) for _ in scene.receivers)
+        self.fields = nn.ModuleList(Field(scene) for _ in range(scene.radios))
 
     @property
     def process(self) -> Hyperparameters:
@@ -141,7 +141,8 @@ class FieldPosterior(Posterior):
             residuals = candidates[weight]
             if residuals.is_complex():
                 labels = thin_labels(links.labels[index])
-                factors = damping(residuals, labels, links.query.receivers[index])
+                radios = self.scene.radio_of(links.query.receivers[index])
+                factors = damping(residuals, labels, radios)
                 residuals = residuals * factors[:, None]
             return fit_hyperparameters(
                 self.scene, links, lambda part: residuals[rows[part]], most=most
@@ -158,31 +159,34 @@ class FieldPosterior(Posterior):
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
         index = links.split.known
         query, process = links.query[index], self.process
-        for receiver, field in enumerate(stages.track(self.fields, "kriging")):
-            rows = (query.receivers == receiver).nonzero()[:, 0]
+        radios = self.scene.radio_of(query.receivers)
+        for radio, field in enumerate(stages.track(self.fields, "kriging")):
+            rows = (radios == radio).nonzero()[:, 0]
             if not len(rows):
                 continue
             values = residuals(rows)  # (k, *shape)
             if values.is_complex():
                 labels = links.labels[index[rows]]
-                values = values * damping(values, labels, query.receivers[rows])[:, None, None]
+                values = values * damping(values, labels, radios[rows])[:, None, None]
             field.solve(self._places(query[rows]), values, process, self.share)
 
     def mean(self, batch: Batch, like: Tensor) -> Tensor:
         mean = torch.zeros_like(like)
-        for receiver in batch.query.receivers.unique().tolist():
-            is_asked = batch.query.receivers == receiver
+        radios = self.scene.radio_of(batch.query.receivers)
+        for radio in radios.unique().tolist():
+            is_asked = radios == radio
             places = self._places(batch.query[is_asked])
-            mean[is_asked] = self.fields[receiver](places, self.process.length, batch).to(mean)
+            mean[is_asked] = self.fields[radio](places, self.process.length, batch).to(mean)
         return mean
 
     def deviations(self, batch: Batch) -> Tensor:
         query, process = batch.query, self.process
         places = self._places(query)
         squares = places.new_zeros(len(query))
-        for receiver in query.receivers.unique().tolist():
-            is_asked = query.receivers == receiver
-            field: Any = self.fields[receiver]
+        radios = self.scene.radio_of(query.receivers)
+        for radio in radios.unique().tolist():
+            is_asked = radios == radio
+            field: Any = self.fields[radio]
             if not len(field.places):
                 continue
             squares[is_asked] = field.deviations(places[is_asked], process).square()

@@ -173,10 +173,11 @@ def hold_out(
     ``neighbours`` that predict it.
     """
     split, query = links.split, links.query
-    receiver = query.receivers[known[0]]
-    train = split.train[query.receivers[split.train] == receiver]
+    radios = scene.radio_of(query.receivers)
+    radio = radios[known[0]]
+    train = split.train[radios[split.train] == radio]
     train = train if len(train) else known
-    held = split.validation[query.receivers[split.validation] == receiver]
+    held = split.validation[radios[split.validation] == radio]
     if len(single_readings(links, split.validation)) < FEWEST:
         held = held[:0]
     asked = evenly(held if len(held) else train, most)

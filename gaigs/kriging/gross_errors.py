@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gaigs.data import Links
-from gaigs.kriging.links import distances
+from gaigs.kriging.links import coordinates, distances
 
 
 def without_gross_errors(links: Links, size: float = 6.0) -> Links:
@@ -29,19 +29,21 @@ def without_gross_errors(links: Links, size: float = 6.0) -> Links:
     if len(index) < 20:
         return links
     query, labels = links.query[index], links.labels[index].double()
-    positions = links.scene.positions(links.labels)[query.receivers]
+    scene = links.scene
+    places = coordinates(scene, query, 1.0) if scene.one_radio else query.transmitters
+    positions = scene.positions(links.labels)[query.receivers]
     lengths = (query.transmitters - positions).norm(dim=1).clamp_min(0.1)
     errors = torch.zeros_like(labels)
-    receivers = query.receivers.unique()
-    for receiver in receivers:
-        rows = query.receivers == receiver
+    radios = scene.radio_of(query.receivers)
+    for radio in radios.unique():
+        rows = radios == radio
         errors[rows] = errors_of_law(lengths[rows].double().log10(), labels[rows])
     common = robust_deviation(errors)
     is_kept = torch.ones_like(index, dtype=torch.bool)
-    for receiver in receivers:
-        rows = (query.receivers == receiver).nonzero()[:, 0]
+    for radio in radios.unique():
+        rows = (radios == radio).nonzero()[:, 0]
         most = size * torch.maximum(common, robust_deviation(errors[rows]))
-        is_kept[rows] = ~are_alone(query.transmitters[rows], errors[rows], most)
+        is_kept[rows] = ~are_alone(places[rows], errors[rows], most)
     parts = links.split.parts()
     train, validation = (
         parts[name][torch.isin(parts[name], index[is_kept])] for name in ("train", "validation")

@@ -21,9 +21,12 @@ PART = 256
 
 
 def known_links(links: Links, any_receiver: bool = False) -> list[Int[Tensor, " k"]]:
-    """Training and validation links of each receiver; raises a ``ValueError`` for a receiver
-    without, unless the split holds out receivers for a model of ``any_receiver``.
+    """Training and validation links of each receiver, of ``one_radio`` all together; raises a
+    ``ValueError`` for a receiver without, unless the split holds out receivers for a model of
+    ``any_receiver``.
     """
+    if links.one_radio:
+        return [links.split.known]
     known = [links.known(receiver) for receiver in range(len(links.receivers))]
     pairs = zip(links.receivers, known, strict=True)
     without = [receiver.name for receiver, index in pairs if not len(index)]
@@ -82,11 +85,13 @@ def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]
 
 def coordinates(scene: Scene, query: Query, scale: float | Tensor) -> Float[Tensor, "b d"]:
     """Points whose Euclidean distance is the distance of links, d² = |dx|² + (scale d ln f)²;
-    float64.
+    float64. Of ``one_radio`` |dx|² has both ends.
 
     ``scale`` [m] has no effect unless the training links have several carriers.
     """
     positions = query.transmitters.double()
+    if scene.one_radio:
+        positions = torch.cat((positions, scene.positions(positions)[query.receivers]), 1)  # (b, 6)
     if not scene.has_band:
         return positions
     half = (scene.frequencies[-1] / scene.frequencies[0]).double().log() / 2
@@ -96,7 +101,13 @@ def coordinates(scene: Scene, query: Query, scale: float | Tensor) -> Float[Tens
 
 def scaled(places: Float[Tensor, "k d"], scale: float) -> Float[Tensor, "k d"]:
     """The ``coordinates`` of a scale, from coordinates of scale 1."""
-    return torch.cat((places[:, :3], scale * places[:, 3:]), 1)
+    ends = edges_of(places)
+    return torch.cat((places[:, :ends], scale * places[:, ends:]), 1)
+
+
+def edges_of(places: Float[Tensor, "*k d"]) -> int:
+    """Number of ``coordinates`` that are edges in space: 3, or 6 where both ends move."""
+    return places.shape[-1] // 3 * 3
 
 
 def distances(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"]) -> Float[Tensor, "*c m n"]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from gaigs.core.query import evenly
 from gaigs.core.scene import Scene
-from gaigs.kriging.links import Near, distances, nearest_places, scale_bounds, scaled
+from gaigs.kriging.links import Near, distances, edges_of, nearest_places, scale_bounds, scaled
 
 
 class Nearest(NamedTuple):
@@ -128,10 +128,11 @@ class Readings(NamedTuple):
         points = torch.cat((self.places[nearest.rows], places[:, None]), 1)  # (m, j + 1, d)
         exists = torch.nn.functional.pad(nearest.exists, (0, 1), value=True)
         pairs = exists[:, :, None] & exists[:, None]
-        apart = distances(points[..., :3], points[..., :3]).where(pairs, 1e15)
+        edges = edges_of(points)
+        apart = distances(points[..., :edges], points[..., :edges]).where(pairs, 1e15)
         bands = None
         if self.scene.has_band:
-            bands = (points[..., 3:] - points[..., 3:].mT).square()
+            bands = (points[..., edges:] - points[..., edges:].mT).square()
         return Around(nearest.rows, nearest.exists, receivers, apart, bands)
 
     def held_out(

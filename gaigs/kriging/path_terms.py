@@ -74,9 +74,9 @@ class PathTerms(nn.Module):
         super().__init__()
         self.scene = scene
         self.register_buffer("used", torch.zeros(3, dtype=torch.bool))
-        breaks = torch.zeros(len(scene.receivers), dtype=torch.float64)
+        breaks = torch.zeros(scene.radios, dtype=torch.float64)
         self.register_buffer("breaks", breaks)
-        self.register_buffer("regions", breaks.clone())
+        self.register_buffer("regions", breaks.new_zeros(len(scene.receivers)))
         for name in ("coefficients", "deviations"):
             self.register_buffer(
                 name, breaks.new_zeros(len(breaks), self.options.harmonics * 2 + 6)
@@ -86,8 +86,9 @@ class PathTerms(nn.Module):
         self, transmitters: Float[Tensor, "b 3"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
         """Corrections in the label's unit."""
-        columns = self._columns(transmitters, receivers, self.breaks[receivers, None])  # (b, n)
-        return (columns * self.coefficients[receivers]).sum(1).to(transmitters)
+        radios = self.scene.radio_of(receivers)
+        columns = self._columns(transmitters, receivers, self.breaks[radios, None])  # (b, n)
+        return (columns * self.coefficients[radios]).sum(1).to(transmitters)
 
     def fit(self, links: Links, errors: Float[Tensor, " k"], chooses: bool) -> None:
         """Fits the coefficients to errors of a law at the known links; ``chooses`` the terms
@@ -101,15 +102,16 @@ class PathTerms(nn.Module):
         if chooses:
             self._choose(*known, folds_of(links, index))
             self.unseen = errors.new_zeros(len(links)).index_copy(0, index, self.unseen)
-        for receiver in known[1].unique().tolist():
-            rows = known[1] == receiver
+        radios = self.scene.radio_of(query.receivers)
+        for radio in radios.unique().tolist():
+            rows = radios == radio
             columns, candidates = self._candidates(*(part[rows] for part in known[:2]))
-            solution = self._solve(columns, errors[rows], 0 * known[1][rows], self.used)
-            self.breaks[receiver] = candidates[solution.numbers[0]]
-            self.coefficients[receiver] = solution.coefficients[0] * self.used.any()
+            solution = self._solve(columns, errors[rows], 0 * radios[rows], self.used)
+            self.breaks[radio] = candidates[solution.numbers[0]]
+            self.coefficients[radio] = solution.coefficients[0] * self.used.any()
             variances = solution.variances[0] * errors[rows].square().mean()
-            self.deviations[receiver] = variances.sqrt()
-        is_new = known[1].bincount(minlength=len(self.breaks)) == 0
+            self.deviations[radio] = variances.sqrt()
+        is_new = radios.bincount(minlength=len(self.breaks)) == 0
         for values in (self.breaks, self.coefficients, self.deviations):
             values[is_new] = values[~is_new].mean(0)
 
@@ -165,8 +167,9 @@ class PathTerms(nn.Module):
     ) -> Float[Tensor, " k"]:
         """Errors that terms leave over, fitted without the reading's fold."""
         left = errors.clone()
-        for receiver in receivers.unique().tolist():
-            rows = receivers == receiver
+        radios = self.scene.radio_of(receivers)
+        for radio in radios.unique().tolist():
+            rows = radios == radio
             columns, _ = self._candidates(transmitters[rows], receivers[rows])
             _, fold = folds[rows].unique(return_inverse=True)
             if not fold.any():

@@ -75,9 +75,9 @@ class ScalarProcess(nn.Module):
         super().__init__()
         self.scene = scene
         empty = torch.zeros(0, dtype=torch.float64)
-        self.register_buffer("logarithms", empty.new_zeros(len(scene.receivers), 3))
+        self.register_buffer("logarithms", empty.new_zeros(scene.radios, 3))
         self.register_buffer("choice", empty.new_tensor(Choice()))
-        self.register_buffer("places", empty.new_zeros(0, 3 + scene.has_band))
+        self.register_buffer("places", empty.new_zeros(0, 3 + scene.has_band + 3 * scene.one_radio))
         self.register_buffer("receivers", empty.long())
         for name in ("values", "variances", "weights"):
             self.register_buffer(name, empty.clone())
@@ -464,7 +464,7 @@ class ScalarPosterior(Posterior):
         return self.process(*self._coordinates(batch.query)).to(like)
 
     def knows(self, receivers: Int[Tensor, " b"]) -> Bool[Tensor, " b"]:
-        return torch.isin(receivers, self.process.receivers)
+        return torch.isin(self.scene.radio_of(receivers), self.process.receivers)
 
     def deviations(self, batch: Batch) -> Tensor:
         return self.process.deviations(*self._coordinates(batch.query))
@@ -479,4 +479,4 @@ class ScalarPosterior(Posterior):
         self.process.take(other.process)
 
     def _coordinates(self, query: Any) -> tuple[Float[Tensor, "b d"], Int[Tensor, " b"]]:
-        return coordinates(self.scene, query, 1.0), query.receivers
+        return coordinates(self.scene, query, 1.0), self.scene.radio_of(query.receivers)

@@ -120,7 +120,7 @@ class HeldOutCost:
     ):
         self.options, self.choice, self.prior = options, choice, prior
         self.has_deviations = has_deviations
-        self.count = len(scene.receivers)
+        self.count = scene.radios
         self.around = held.around
         self.asked = values[held.rows]
         self.readings = values[held.around.rows].where(held.around.exists, 0)

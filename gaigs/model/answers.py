@@ -67,7 +67,7 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
     with timed("intervals"):
         unseen = model.unseen(links)
         calibration = calibrate(links, name_of(model), model.fold_count, unseen, answer)
-        if calibration is None or not model.any_receiver:
+        if calibration is None or not model.any_receiver or links.one_radio:
             return calibration
         known = links.query.receivers[links.split.known].bincount(minlength=len(links.receivers))
         elsewhere = at_new_receivers(model, links)

@@ -369,7 +369,8 @@ class Model(Movable):
     def _estimate(self, batch: Batch, interval: float) -> Estimate:
         value = self._answer(batch)
         assert self.calibration is not None
-        return self.calibration.estimate(value, self.spread(batch, value), batch.query, interval)
+        query = self.scene.by_radio(batch.query)
+        return self.calibration.estimate(value, self.spread(batch, value), query, interval)
 
     @torch.no_grad()
     def spread(self, batch: Batch, value: Tensor) -> Tensor:

@@ -39,7 +39,7 @@ class Friis(Model):
     def __init__(self, scene: Scene):
         super().__init__(scene)
         self.task = check_elements("model 'friis'", scene, pads=True)
-        gains = torch.full((len(scene.receivers),), torch.nan, dtype=torch.complex64)
+        gains = torch.full((scene.radios,), torch.nan, dtype=torch.complex64)
         self.register_buffer("gains", gains)
         self.register_buffer("sign", torch.tensor(-1))
 
@@ -57,7 +57,7 @@ class Friis(Model):
         labels, query = links.labels[index].to(torch.complex128), links.query[index]
         waves = direct_waves(self.scene, query, self.frequencies)
         labels = self.scene.equalised(query, labels)
-        sign = self.task.phase_sign(labels, waves, query.receivers)
+        sign = self.task.phase_sign(labels, waves, self.scene.radio_of(query.receivers))
         self.sign.fill_(sign or -1)
         self.gains.zero_()
         has_gain = sign != 0 or len(index) < TELLING * len(known)
@@ -69,7 +69,8 @@ class Friis(Model):
 
     def forward(self, batch: Batch) -> Prediction:
         waves = self._waves(batch.query).to(self.gains)
-        return Prediction(self.gains[batch.query.receivers][:, None, None] * waves, {})
+        gains = self.gains[self.scene.radio_of(batch.query.receivers)]
+        return Prediction(gains[:, None, None] * waves, {})
 
     def _waves(self, query: Query) -> Complex[Tensor, "b e s"]:
         """The direct wave behind each element's front end, with a gain of 1."""

@@ -144,7 +144,8 @@ class GaussianProcess(LookUp):
         if self.scene.task.dtype.is_complex:
             index = torch.cat(self.known)
             residuals = torch.cat([*self._residuals(index)])
-            factors = damping(residuals, links.labels[index], links.query.receivers[index])
+            radios = self.scene.radio_of(links.query.receivers[index])
+            factors = damping(residuals, links.labels[index], radios)
             self.factors = torch.ones(len(links)).index_copy(0, index, factors)
 
         def thin_residuals(index: Int[Tensor, " k"]) -> Tensor:
@@ -168,7 +169,7 @@ class GaussianProcess(LookUp):
     def _fit_scalar(self, process: ScalarProcess, links: Links, chooses: bool) -> None:
         index = torch.cat(known_links(links, any_receiver=True))
         query = links.query[index]
-        known = coordinates(self.scene, query, 1.0), query.receivers
+        known = coordinates(self.scene, query, 1.0), self.scene.radio_of(query.receivers)
         folds = folds_of(links, index)
         is_large = not chooses and len(index) > process.options.large
 
@@ -209,10 +210,12 @@ class GaussianProcess(LookUp):
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
         """The last trend alone, of levels a law of distance: residuals at one receiver do not
-        correlate with those at others.
+        correlate with those at others. A process over both ends stays.
         """
-        if not self.any_receiver:
-            super().at_receivers(receivers)  # has the error
+        if self.scene.one_radio or not self.any_receiver:
+            moved = super().at_receivers(receivers)  # has the error
+            moved.trends = tuple(trend.at_receivers(receivers) for trend in self.trends)
+            return moved
         trend = self.trends[-1].at_receivers(receivers, known)
         trend.take_calibration(self)
         return trend
@@ -225,34 +228,36 @@ class GaussianProcess(LookUp):
 
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query
+        radios = self.scene.radio_of(query.receivers)
         trend = self.trend(Batch(query, self.scene.task.directions)).value
         if self.scalar is not None:
             # A receiver without links has the law of distance, as in ``at_receivers``.
             is_new = torch.tensor([not len(index) for index in self.known], device=trend.device)
             if is_new.any():
                 law = self.trends[-1](Batch(query)).value
-                trend = torch.where(is_new[query.receivers], law, trend)
-            levels = self.scalar(coordinates(self.scene, query, 1.0), query.receivers)
+                trend = torch.where(is_new[radios], law, trend)
+            levels = self.scalar(coordinates(self.scene, query, 1.0), radios)
             return Prediction(trend + levels.to(trend), {})
         added = torch.zeros_like(trend)
-        for receiver in query.receivers.unique().tolist():
-            is_asked = query.receivers == receiver
-            added[is_asked] = self._kriged(query[is_asked], receiver)
+        for radio in radios.unique().tolist():
+            is_asked = radios == radio
+            added[is_asked] = self._kriged(query[is_asked], radio)
         return Prediction(at_directions(trend + added, batch, self.scene), {})
 
     def deviations(self, batch: Batch) -> Tensor:
         """Standard deviations of the labels, means over a label's numbers."""
         query = batch.query
+        radios = self.scene.radio_of(query.receivers)
         if self.scalar is not None:
             places = coordinates(self.scene, query, 1.0)
-            return self.scalar.deviations(places, query.receivers)
+            return self.scalar.deviations(places, radios)
         places = self._places(query)
         deviations = torch.zeros_like(places[:, 0])
-        for receiver in query.receivers.unique().tolist():
-            is_asked = query.receivers == receiver
-            known = self._places(self.links.query[self.known[receiver]])
+        for radio in radios.unique().tolist():
+            is_asked = radios == radio
+            known = self._places(self.links.query[self.known[radio]])
             local = local_deviations(places[is_asked], known, self.process)
-            deviations[is_asked] = self.signals[receiver] * local
+            deviations[is_asked] = self.signals[radio] * local
         return deviations
 
     def process_at(self, receiver: int) -> Process:

@@ -73,6 +73,12 @@ class KNearestNeighbours(LookUp):
         self.power = usual_power if power is None else power
         self.chosen = self.k or 3
         self.scale = math.nan
+        self.home = scene
+
+    @property
+    def any_receiver(self) -> bool:  # type: ignore[override]
+        """True if neighbours are near at both ends."""
+        return self.scene.one_radio
 
     def fit(self, links: Links) -> None:
         """Keeps the links; chooses the scale of frequencies, and ``neighbours`` if it is None."""
@@ -88,6 +94,15 @@ class KNearestNeighbours(LookUp):
             held = [*self._held_out(folds)]
             self.chosen = min(COUNTS, key=lambda count: self._rank(count, held))
 
+    def get_extra_state(self) -> dict:
+        state = super().get_extra_state()
+        return state if self.home is self.scene else {**state, "home": self.home.state()}
+
+    def set_extra_state(self, state: dict) -> None:
+        super().set_extra_state(state)
+        if "home" in state:  # a copy at other receivers
+            self.home = Scene.from_state(state["home"])
+
     def facts(self) -> dict[str, float]:
         """``neighbours`` if they were chosen, and with several carriers ``frequency_scale_m``."""
         facts: dict[str, float] = {"neighbours": self.chosen} if self.k is None else {}
@@ -96,9 +111,10 @@ class KNearestNeighbours(LookUp):
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query
         labels = torch.empty(len(query), *self.scene.task.shape, dtype=self.scene.task.dtype)
-        for receiver in query.receivers.unique():
-            is_asked = query.receivers == receiver
-            index = self.known[receiver]
+        radios = self.scene.radio_of(query.receivers)
+        for radio in radios.unique():
+            is_asked = radios == radio
+            index = self.known[radio]
             if not self.scene.task.shape:
                 labels[is_asked] = self._levels(query[is_asked], index, self.chosen + 1)
                 continue
@@ -110,7 +126,7 @@ class KNearestNeighbours(LookUp):
         self, query: Query, index: Int[Tensor, " k"], scale: float
     ) -> Float[Tensor, "b k"]:
         asked = coordinates(self.scene, query, scale)
-        known = coordinates(self.scene, self.links.query[index], scale)
+        known = coordinates(self.home, self.links.query[index], scale)
         return distances(asked, known)
 
     def _levels(
@@ -120,7 +136,7 @@ class KNearestNeighbours(LookUp):
         the last that counts; at most ``size`` distances of these at a time.
         """
         asked = coordinates(self.scene, query, self.scale)
-        known = coordinates(self.scene, self.links.query[index], self.scale)
+        known = coordinates(self.home, self.links.query[index], self.scale)
         near = nearest_places(asked, known, count)
         labels = self._mean(near, index)
         if count < len(index):

@@ -192,7 +192,7 @@ class Kriging(Wrapper):
         began = time.monotonic()
         predicted(self.trend, links, sample)
         each = max(time.monotonic() - began, 1e-9) / len(sample)
-        return int(min(most, max(100, stages.left() / 9 / each / len(links.receivers))))
+        return int(min(most, max(100, stages.left() / 9 / each / self.scene.radios)))
 
     def _krige_labels(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` of labels; ``values`` are the trend's predictions of known links."""
@@ -406,7 +406,9 @@ class Kriging(Wrapper):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """The trend alone, or the fallback: no residuals are known at other receivers."""
+        """The trend alone, or the fallback: no residuals are known at others than one radio."""
+        if self.scene.one_radio and not self.by_paths:
+            return super().at_receivers(receivers)
         alone = self._alone.at_receivers(receivers, known)
         alone.take_calibration(self)
         return alone

@@ -49,9 +49,7 @@ class LookUp(Model):
         """Takes the state of a fitted look-up."""
         labels = [part / 255 if part.dtype == torch.uint8 else part for part in state["labels"]]
         self.links = Batch(Query(**state["query"]), None, torch.cat(labels))
-        receivers = self.links.query.receivers
-        self.known = [
-            (receivers == number).nonzero()[:, 0] for number in range(len(self.scene.receivers))
-        ]
+        radios = self.scene.radio_of(self.links.query.receivers)
+        self.known = [(radios == number).nonzero()[:, 0] for number in range(self.scene.radios)]
         for name in self.learnt:
             setattr(self, name, state[name])

@@ -24,7 +24,7 @@ class Mean(Model):
 
     def __init__(self, scene: Scene):
         super().__init__(scene)
-        shape = (len(scene.receivers), *scene.task.shape)
+        shape = (scene.radios, *scene.task.shape)
         self.register_buffer("means", torch.full(shape, torch.nan, dtype=scene.task.dtype))
 
     def fit(self, links: Links) -> None:
@@ -43,4 +43,5 @@ class Mean(Model):
         self.means[~is_known] = common_gain(self.means[is_known])
 
     def forward(self, batch: Batch) -> Prediction:
-        return Prediction(at_directions(self.means[batch.query.receivers], batch, self.scene), {})
+        means = self.means[self.scene.radio_of(batch.query.receivers)]
+        return Prediction(at_directions(means, batch, self.scene), {})

@@ -105,7 +105,8 @@ class MirroredSplatting(GaussianSplatting):
         if is_known and isinstance(self.pooling, PathRssi):
             wavelength = speed_of_light / carriers(self.scene, links.query).max().item()
             self.is_wide = self.placement.diagonal > self.widest * wavelength
-            if searches and not self.is_wide:
+            # A search by phases takes 20 links at a place of the receiver.
+            if searches and not self.is_wide and not self.scene.one_radio:
                 self._prepare_levels(links)
         task = self.scene.task
         if task.is_channel and isinstance(self.pooling, ChannelPooling) and self.trend is None:
@@ -194,8 +195,11 @@ class MirroredSplatting(GaussianSplatting):
         if not len(planes):
             return
         unit = pooling.strength.item() * search.data.wavelength / (4 * math.pi)
-        receivers = torch.tensor(search.data.numbers)
-        placement.start_strengths(room.gains, receivers, room.receivers / unit)
+        receivers = self.scene.radio_of(torch.tensor(search.data.numbers))
+        gains = room.receivers / unit
+        if self.scene.one_radio:
+            gains = gains.mean().expand_as(gains)
+        placement.start_strengths(room.gains, receivers, gains)
         placement.step.mul_(0.1)
 
     def _plan(self, planes: Tensor, slabs: Tensor, order: int | float = math.inf) -> None:
@@ -220,8 +224,9 @@ class MirroredSplatting(GaussianSplatting):
         0.1 where phases say nothing: a stronger start would be worse than nothing.
         """
         gains = []
-        for receiver in range(len(self.scene.receivers)):
-            rows = query.receivers == receiver
+        radios = self.scene.radio_of(query.receivers)
+        for radio in range(self.scene.radios):
+            rows = radios == radio
             gains.append(fit_gain(labels[rows], waves[rows]))
         each = torch.stack(gains) / pooling.strength.cpu()
         return torch.where((each != 0) & (int(pooling.sign) != 0), each, 0.1)
@@ -245,8 +250,9 @@ class MirroredSplatting(GaussianSplatting):
             return prune(placement, [train] if validation is None else [train, validation], loss)
         if number < 2 and not adds_waves:
             return "planes stay where they are"
-        if self.is_wide:
-            return "the box is too wide for phases, so powers add to the end"
+        if self.is_wide or (self.scene.one_radio and not adds_waves):
+            reason = "the box is too wide" if self.is_wide else "places have too few links"
+            return f"{reason} for phases, so powers add to the end"
         try:
             wavelength = speed_of_light / carriers(self.scene, train.query).mean().item()
         except ValueError:

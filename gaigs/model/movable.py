@@ -67,7 +67,8 @@ class Movable(nn.Module):
         if not self.any_receiver:
             raise ValueError(
                 f"model {name_of(self)!r} predicts for its own receivers alone; for others take "
-                "mirrored, gaigs, friis, path_loss, mean, or gaussian_process of levels"
+                "mirrored, gaigs, nerf2, friis, path_loss, mean, gaussian_process of levels, or "
+                "knn where both ends move"
             )
         receivers = [receivers] if isinstance(receivers, Receiver) else [*receivers]
         for receiver in receivers:
@@ -88,7 +89,7 @@ class Movable(nn.Module):
         for part in other.modules():
             if hasattr(part, "scene"):
                 part.scene = scene
-            for name in getattr(part, "of_receivers", ()):
+            for name in () if scene.one_radio else getattr(part, "of_receivers", ()):
                 values = getattr(part, name)
                 general = common_gain(values if known is None else values[known])
                 setattr(part, name, general.repeat(len(receivers), *[1] * general.ndim))
@@ -138,6 +139,11 @@ class Movable(nn.Module):
                 "adapt takes a model without readings at new receivers; give the trained model all "
                 "readings together"
             )
+        if self.scene.one_radio:
+            raise ValueError(
+                "adapt learns the level of a new receiver, and the model's receivers are places of "
+                "one radio, whose level it knows; train with all readings"
+            )
         moved = self.at_receivers(links.receivers)
         new = moved.calibration
         parts = [part for part in moved.modules() if hasattr(part, "of_level")]
@@ -162,7 +168,9 @@ class Movable(nn.Module):
         return moved
 
     def take_calibration(self, other: "Movable") -> None:
-        """Takes another model's calibration of receivers without links."""
-        if other.calibration is not None:
+        """Takes another model's calibration of receivers without links; of one radio, which has
+        links, its own."""
+        self.calibration = other.calibration
+        if other.calibration is not None and not self.scene.one_radio:
             widths = torch.ones(len(self.scene.receivers))
             self.calibration = other.calibration.at_receivers(widths)

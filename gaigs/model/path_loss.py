@@ -44,8 +44,8 @@ class PathLoss(Model):
                 "model 'path_loss' predicts one real number a link, not labels of task "
                 f"{scene.task.name!r}; take mean or knn"
             )
-        self.register_buffer("levels", torch.full((len(scene.receivers),), torch.nan))  # T [dBm]
-        self.register_buffer("exponents", torch.full((len(scene.receivers),), torch.nan))  # gamma
+        self.register_buffer("levels", torch.full((scene.radios,), torch.nan))  # T [dBm]
+        self.register_buffer("exponents", torch.full((scene.radios,), torch.nan))  # gamma
         # Deviations of estimated places [m].
         self.register_buffer("regions", torch.zeros(len(scene.receivers)))
 
@@ -82,9 +82,9 @@ class PathLoss(Model):
             own[~is_known] = fitted.mean().to(own)
 
     def forward(self, batch: Batch) -> Prediction:
-        receivers = batch.query.receivers
-        decades = self._decades(batch.query.transmitters, receivers)
-        return Prediction(self.levels[receivers] - 10 * self.exponents[receivers] * decades, {})
+        decades = self._decades(batch.query.transmitters, batch.query.receivers)
+        radios = self.scene.radio_of(batch.query.receivers)
+        return Prediction(self.levels[radios] - 10 * self.exponents[radios] * decades, {})
 
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
         """New receivers stand at known places."""

@@ -256,7 +256,9 @@ def test_moving_ends_are_transmitters():
         )
         == 20
     )
+    both = {"task": "rssi", "transmitters": moving + 1, "receivers": moving, "labels": levels}
+    assert gaigs.links(**both).one_radio
     with pytest.raises(
         ValueError, match="20 receivers have 20 links, and those with test links none to train on"
     ):
-        gaigs.links(task="rssi", transmitters=moving + 1, receivers=moving, labels=levels)
+        gaigs.links(**both, one_radio=False)

@@ -15,6 +15,7 @@ import torch
 from splatting import build, composed
 from torch import nn
 
+import gaigs
 from gaigs.core.geometry import Grid, Rays
 from gaigs.core.query import Batch
 from gaigs.testing import example_links
@@ -279,3 +280,17 @@ def test_little_is_evaluated_at_a_time(task, monkeypatch):
     model.chunk = 50
     torch.testing.assert_close(model.evaluate(batch), whole, rtol=1e-4, atol=1e-4)
     assert 8 <= max(pairs) <= 50
+
+
+def test_any_receiver_is_at_the_start_of_its_rays(tmp_path):
+    links = example_links("rssi")
+    model = make(links.scene)
+    model.fit(links)
+    known = links.receivers[1]
+    other = model.at_receivers([replace(known, name="new")])
+    places = links.query.transmitters[:3]
+    torch.testing.assert_close(other.predict(places)[:, 0], model.predict(places, receiver=1))
+    other.save(tmp_path / "moved.ckpt")  # rays are as long as those of the training
+    torch.testing.assert_close(
+        gaigs.load(tmp_path / "moved.ckpt").predict(places), other.predict(places)
+    )

@@ -4,6 +4,7 @@ import base64
 import math
 import threading
 import warnings
+from dataclasses import replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,7 +16,7 @@ from torch import Tensor
 
 from gaigs.core.antenna import Receiver
 from gaigs.core.geometry import ExtrapolationWarning
-from gaigs.core.query import Query, evenly
+from gaigs.core.query import Query, as_positions, evenly
 from gaigs.core.task import Task
 from gaigs.core.task.scalar import with_unit
 from gaigs.data import Links
@@ -71,6 +72,7 @@ class Contents:
         self.interval = None
         if model.calibration is not None and model.calibration.gives(0.5):
             self.interval = 0.5
+        self.last: tuple[tuple, Contents] | None = None  # receiver and position of ``moved``
         self.lock = threading.Lock()  # models hold what they compute for a moment
         self.tests = torch.zeros(0, dtype=torch.long)
         if links is not None and links.held_out is None:
@@ -109,6 +111,7 @@ class Contents:
             "box": plain(torch.stack((self.scene.lower, self.scene.upper))),
             "height": self.scene.height,
             "receivers": [receiver_facts(receiver) for receiver in self.scene.receivers],
+            "movable": bool(self.model.any_receiver),
             "edges": [],
             "places": [],
             "planes": [] if room is None else [plane_facts(plane) for plane in room.planes],
@@ -176,6 +179,35 @@ class Contents:
             {"points": plain(path.points), "power": plain(path.power_db)} for path in paths
         ]
         return answer | {"place": plain(place)}
+
+    def moved(self, receiver: int, position: list[float]) -> "Contents":
+        """The model with one receiver alone, which stands at another position [m].
+
+        Raises:
+            ValueError: The model predicts for its own receivers alone.
+        """
+        asked = receiver, *position
+        if self.last is None or self.last[0] != asked:
+            known = self.scene.receivers[receiver]
+            place = as_positions("receiver", position).to(known.pose.position)
+            one = replace(known, pose=replace(known.pose, position=place))
+            with self.lock:
+                model = self.model.at_receivers([one])
+            self.last = asked, Contents(model, points=self.points)
+        return self.last[1]
+
+    def answer_at(self, place: list[float], receiver: int, position: list[float]) -> dict:
+        """``answer`` with a receiver at another position [m]; the others stay."""
+        answer = self.moved(receiver, position).answer(place, 0)
+        if self.kind == "level":
+            own = self.answer(place, receiver)
+            for name in ("levels", "stds"):
+                values, new = own[name], answer[name]
+                if None in (values, new):
+                    answer[name] = None
+                else:
+                    answer[name] = [*values[:receiver], *new, *values[receiver + 1 :]]
+        return answer
 
     def slice(self, height: float, receiver: int) -> dict:
         """The radio map over the training transmitters and receivers at a height [m]."""

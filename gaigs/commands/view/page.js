@@ -3,7 +3,7 @@
 
 const ORANGE = [0.835, 0.369, 0], GREEN = [0, 0.62, 0.45], BLUE = [0, 0.447, 0.698], PURPLE = [0.42, 0.32, 0.64];
 
-const state = {place: null, receiver: 0, height: 0, camera: null, picked: null, since: 0};  // since: time of the last move
+const state = {place: null, receiver: 0, stand: null, height: 0, camera: null, picked: null, since: 0};  // since: time of the last move
 // What tests and benchmarks read: times from a drag to its picture [ms], and how many pictures were drawn.
 const viewer = window.viewer = {state, runs: [], latencies: [], pictures: 0, ready: false};
 
@@ -59,8 +59,9 @@ class Served {
     return answer;
   }
   snap(place) { return place; }
-  answer(run, place, receiver) { return this.get("answer", {run, place: place.join(), receiver}); }
-  slice(run, height, receiver) { return this.get("slice", {run, height, receiver}); }
+  get at() { return state.stand ? {at: state.stand.join()} : {}; }  // of a receiver that stands elsewhere
+  answer(run, place, receiver) { return this.get("answer", {run, place: place.join(), receiver, ...this.at}); }
+  slice(run, height, receiver) { return this.get("slice", {run, height, receiver, ...this.at}); }
   comparison(run, number) { return this.get("comparison", {run, number}); }
 }
 
@@ -299,7 +300,9 @@ class Run {
   }
 
   plotLevels(answer) {
-    const {facts} = this, row = 24, width = 370, left = 92, right = 96, shown = answer.levels.map((v, k) => k);
+    const {facts} = this, row = 24, width = 370, left = 92, right = 96, all = answer.levels.map((v, k) => k);
+    const others = all.filter(k => k !== state.receiver).sort((a, b) => answer.levels[b] - answer.levels[a]);
+    const shown = all.length > 16 ? [state.receiver, ...others.slice(0, 15)] : all;  // the chosen one, and the loudest
     const [canvas, pen] = this.paper(width, row * shown.length + 40);
     const stds = answer.stds || answer.levels.map(() => 0);
     const ends = [Math.min(...answer.levels.map((v, k) => v - stds[k])), Math.max(...answer.levels.map((v, k) => v + stds[k]))];
@@ -313,8 +316,8 @@ class Run {
       pen.textAlign = "center"; pen.fillText(minus(tick), at(tick), bottom + 13);
     }
     pen.fillText(facts.quantity + (answer.stds ? " ± standard deviation" : ""), (left + width - right) / 2, bottom + 27);
-    shown.forEach(k => {
-      const y = row * (k + 0.5) + 2, value = answer.levels[k], own = k === state.receiver;
+    shown.forEach((k, number) => {
+      const y = row * (number + 0.5) + 2, value = answer.levels[k], own = k === state.receiver;
       pen.font = `${own ? "600 " : ""}11px system-ui, sans-serif`;
       pen.textAlign = "right"; pen.fillStyle = own ? "#00664a" : "#444";
       pen.fillText(short(facts.receivers[k].name), left - 8, y + 4, left - 12);
@@ -413,6 +416,7 @@ class Run {
   listen() {
     const canvas = this.canvas, held = new Map();
     let grab = null, moved = 0, pinch = 0;
+    const onReceiver = (...spot) => viewer.movable && near(this.facts.receivers[state.receiver].place, ...spot) < 16;
     const at = event => { const box = canvas.getBoundingClientRect(); return [event.clientX - box.left, event.clientY - box.top, box.width, box.height]; };
     const near = (place, x, y, w, h) => { const [px, py, z] = state.camera.project(place, w, h); return z > 0 ? Math.hypot(px - x, py - y) : Infinity; };
     canvas.addEventListener("contextmenu", event => event.preventDefault());
@@ -422,18 +426,21 @@ class Run {
       held.set(event.pointerId, [x, y]);
       moved = 0;
       grab = held.size === 1 && event.button === 0 && this.place && near(this.place, x, y, w, h) < 22 ? "transmitter"
+        : held.size === 1 && event.button === 0 && onReceiver(x, y, w, h) ? "receiver"
         : held.size > 1 || event.button || event.shiftKey ? "pan" : "turn";
     });
     canvas.addEventListener("pointermove", event => {
       const [x, y, w, h] = at(event), last = held.get(event.pointerId), {camera} = state;
-      if (!last) { canvas.style.cursor = this.place && near(this.place, x, y, w, h) < 22 ? "move" : "grab"; return; }
+      if (!last) { canvas.style.cursor = this.place && near(this.place, x, y, w, h) < 22 || onReceiver(x, y, w, h) ? "move" : "grab"; return; }
       const [dx, dy] = [x - last[0], y - last[1]];
       held.set(event.pointerId, [x, y]);
       moved += Math.abs(dx) + Math.abs(dy);
-      if (grab === "transmitter") {
-        const ray = camera.ray(x, y, w, h), eye = camera.eye, t = (state.height - eye[2]) / ray[2];
+      if (grab === "transmitter" || grab === "receiver") {
+        const height = grab === "receiver" ? this.facts.receivers[state.receiver].place[2] : state.height;
+        const ray = camera.ray(x, y, w, h), eye = camera.eye, t = (height - eye[2]) / ray[2];
         if (!(t > 0)) return;
-        move([0, 1].map(k => Math.min(this.high[k], Math.max(this.low[k], eye[k] + t * ray[k]))).concat(state.height));
+        const spot = [0, 1].map(k => Math.min(this.high[k], Math.max(this.low[k], eye[k] + t * ray[k]))).concat(height);
+        if (grab === "receiver") stand(spot); else move(spot);
         return;
       }
       if (grab === "turn") {
@@ -503,6 +510,20 @@ function move(place) {
   if (heightChanged) updateMaps();
 }
 
+// Puts the chosen receiver at a place, or for null back to its own.
+function stand(place) {
+  state.stand = place;
+  state.since = performance.now();
+  viewer.runs.forEach(run => {
+    const receiver = run.facts.receivers[state.receiver];
+    receiver.home = receiver.home || receiver.place;
+    receiver.place = place || receiver.home;
+    run.drawReceivers();
+  });
+  $("stand").value = viewer.runs[0].facts.receivers[state.receiver].place.map(x => +x.toFixed(2)).join(", ");
+  update(); updateMaps();
+}
+
 const painted = () => new Promise(done => requestAnimationFrame(done));
 
 // Answers one place at a time; of the places since then only the last.
@@ -568,9 +589,19 @@ async function start() {
   $("receiver").append(...receivers.map((receiver, k) => element("option", {value: k, textContent: receiver.name})));
   $("receiver").parentElement.hidden = receivers.length < 2;
   $("receiver").addEventListener("change", event => {
+    if (state.stand) stand(null);
     state.receiver = +event.target.value;
-    viewer.runs.forEach(run => { run.drawReceivers(); run.drawTests(); });
-    update(); updateMaps();
+    viewer.runs.forEach(run => run.drawTests());
+    stand(null);
+  });
+  viewer.movable = !content.stored && content.runs.every(run => run.movable);
+  $("stand").parentElement.hidden = !viewer.movable;
+  $("stand").value = receivers[0].place.map(x => +x.toFixed(2)).join(", ");
+  $("stand").addEventListener("change", event => {
+    const place = event.target.value.split(/[\s,;]+/).filter(Boolean).map(Number);
+    if (place.length === 3 && place.every(Number.isFinite)) stand(place);
+    else if (!place.length) stand(null);
+    else fail(new Error("a receiver stands at three numbers: x, y, z [m]"));
   });
   const slider = $("height");
   const heights = content.stored ? content.stored.places.map(place => place[2]) : [first.low[2], first.high[2]];
@@ -584,7 +615,7 @@ async function start() {
     redraw();
   };
   $("reset").addEventListener("click", home);
-  $("hint").textContent = "drag the transmitter; elsewhere: turn, right button: shift, wheel: zoom";
+  $("hint").textContent = `drag the transmitter${viewer.movable ? ", or the receiver" : ""}; elsewhere: turn, right button: shift, wheel: zoom`;
   addEventListener("resize", redraw);
   home();
   show(viewer.source.snap([(box[0][0] + box[1][0]) / 2, (box[0][1] + box[1][1]) / 2, height]));

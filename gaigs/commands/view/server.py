@@ -20,18 +20,6 @@ def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServe
     machine alone: a page of a foreign name that is made to lead here reads nothing.
     """
 
-    def respond(path: str, asked: dict[str, Any]) -> str:
-        run = contents[int(asked["run"])]
-        match path:
-            case "/answer":
-                place = [float(x) for x in asked["place"].split(",")]
-                return json.dumps(run.answer(place, int(asked["receiver"])))
-            case "/slice":
-                return json.dumps(run.slice(float(asked["height"]), int(asked["receiver"])))
-            case "/comparison":
-                return json.dumps(run.comparison(int(asked["number"])))
-        raise ValueError(f"no answer at {path}")
-
     class Handler(BaseHTTPRequestHandler):
         protocol_version = "HTTP/1.1"  # one connection for all answers
 
@@ -49,7 +37,7 @@ def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServe
                 text = page
             else:
                 try:
-                    text = respond(url.path, dict(parse_qsl(url.query)))
+                    text = respond(contents, url.path, dict(parse_qsl(url.query)))
                 except Exception as error:  # the page shows it, and the server goes on
                     status = HTTPStatus.BAD_REQUEST
                     text = json.dumps({"error": str(error) or repr(error)})
@@ -64,3 +52,23 @@ def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServe
             """Requests are not logged: a drag makes many."""
 
     return ThreadingHTTPServer(("127.0.0.1", port), Handler)
+
+
+def respond(contents: list[Contents], path: str, asked: dict[str, Any]) -> str:
+    """The answer at a path, as JSON; ``at`` is a place of the receiver other than its own [m]."""
+    run = contents[int(asked["run"])]
+    receiver = int(asked.get("receiver", 0))
+    position = [float(x) for x in asked["at"].split(",")] if "at" in asked else None
+    match path:
+        case "/answer":
+            place = [float(x) for x in asked["place"].split(",")]
+            if position is not None:
+                return json.dumps(run.answer_at(place, receiver, position))
+            return json.dumps(run.answer(place, receiver))
+        case "/slice":
+            if position is not None:
+                run, receiver = run.moved(receiver, position), 0
+            return json.dumps(run.slice(float(asked["height"]), receiver))
+        case "/comparison":
+            return json.dumps(run.comparison(int(asked["number"])))
+    raise ValueError(f"no answer at {path}")

@@ -1,6 +1,5 @@
 """Checks of places, walls and arrays: other units, other frames, receivers in twos."""
 
-import itertools
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -8,6 +7,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from scipy.constants import speed_of_light
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gaigs.core.query import Query, evenly
@@ -18,7 +18,7 @@ def check_places(links: Any) -> Iterator[Finding]:
     """Findings about transmitters and receivers of any task."""
     yield from check_extent(links)
     receivers = links.receivers
-    if len(receivers) > 10 and len(links) < 1.5 * len(receivers):
+    if len(receivers) > 10 and len(links) < 1.5 * len(receivers) and not links.one_radio:
         yield Finding(
             "receivers that move",
             f"{len(receivers)} receivers have {len(links)} links: models are learnt for each",
@@ -27,16 +27,18 @@ def check_places(links: Any) -> Iterator[Finding]:
     sites = sites_of(links.query)
     given = _given(links)
     stands = _stands(links)
-    near = (torch.cdist(sites.double(), stands[given].double()) < 0.01).any(1)
-    if len(sites) > 1 and near.sum() > 1:  # one may be measured beside a receiver
+    tree = cKDTree(stands[given].double().numpy())
+    near = tree.query(sites.double().numpy())[0] < 0.01
+    # One may be measured beside a receiver; radios that move meet at the same places.
+    if len(sites) > 1 and near.sum() > 1 and not links.one_radio:
         text = f"{int(near.sum())} places are where a receiver stands"
         yield Finding("places at a receiver", text)
     # Antennas of one mast may share their place; levels show whether they do.
     if links.task.is_scalar:
         return
-    for a, b in itertools.combinations(given, 2):
-        turned = (receivers[a].pose.rotation - receivers[b].pose.rotation).norm()
-        if (stands[a] - stands[b]).norm() < 0.01 and turned < 0.01:
+    for one, other in sorted(tree.query_pairs(0.01)):
+        a, b = given[one], given[other]
+        if (receivers[a].pose.rotation - receivers[b].pose.rotation).norm() < 0.01:
             text = f"{receivers[a].name} and {receivers[b].name} stand at one place"
             yield Finding("receivers at one place", text)
 

@@ -103,6 +103,7 @@ class RayMarching(Model):
     """
 
     chunk = 2**12
+    any_receiver = True  # networks see places and directions in the world, not receivers
 
     def __init__(
         self, scene: Scene, samples: int, far: float | None, rays: list[int], frequency: float
@@ -114,8 +115,16 @@ class RayMarching(Model):
             raise ValueError(f"model.far must be positive [m] or null, got {far}")
         self.reading = make_reading(scene, rays, frequency)
         self.grid = self.reading.grid
-        self.step = (farthest(scene) if far is None else far) / samples
-        distances = self.step * (torch.arange(samples, dtype=torch.float64) + 0.5)
+        self.samples = samples
+        self._divide(farthest(scene) if far is None else far)
+        self.register_buffer("middle", (scene.lower + scene.upper) / 2)
+        self.register_buffer("unit", torch.ones(()))
+
+    def _divide(self, far: float) -> None:
+        """Puts samples evenly along the rays, up to a distance [m]."""
+        self.register_buffer("far", torch.tensor(far, dtype=torch.float64))
+        self.step = far / self.samples
+        distances = self.step * (torch.arange(self.samples, dtype=torch.float64) + 0.5)
         shifts = self.reading.shifts(distances).remainder(
             2 * math.pi
         )  # which float32 then resolves
@@ -125,8 +134,14 @@ class RayMarching(Model):
             ("shifts", shifts),
         ):
             self.register_buffer(name, values.float(), persistent=False)
-        self.register_buffer("middle", (scene.lower + scene.upper) / 2)
-        self.register_buffer("unit", torch.ones(()))
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        # Of a copy at other receivers the rays are as long as they were; checkpoints of before
+        # have no length.
+        far = state_dict.setdefault(f"{prefix}far", self.far)
+        if far != self.far:
+            self._divide(far.item())
+        super()._load_from_state_dict(state_dict, prefix, *args)
 
     @abstractmethod
     def sample(

@@ -152,6 +152,28 @@ def test_the_server_answers_and_says_what_is_wrong(levels):
         assert "must be finite" in json.load(error.value)["error"]
 
 
+def test_a_receiver_may_stand_elsewhere(levels, links):
+    place, elsewhere = [1.0, 1.2, 1.1], [3.0, 2.0, 2.0]
+    with serving(View([Contents(levels)])) as url:
+        at = "receiver=1&at=3,2,2"
+        own = json.load(urlopen(f"{url}answer?run=0&place=1,1.2,1.1&receiver=1"))["levels"]
+        moved = json.load(urlopen(f"{url}answer?run=0&place=1,1.2,1.1&{at}"))["levels"]
+        values = json.load(urlopen(f"{url}slice?run=0&height=1&{at}"))["values"]
+        with pytest.raises(HTTPError) as error:
+            urlopen(f"{url}answer?run=0&place=1,1,1&receiver=1&at=nan,1,1")
+        assert "must be finite" in json.load(error.value)["error"]
+    receiver = gaigs.Receiver("south", gaigs.Pose.at(elsewhere))
+    expected = levels.at_receivers([receiver])
+    assert moved[1] == pytest.approx(expected.predict(place).item(), abs=0.1)
+    assert abs(moved[1] - own[1]) > 0.5
+    assert moved[:1] + moved[2:] == own[:1] + own[2:]
+    assert values == Contents(expected).slice(1.0, 0)["values"]
+    knn = gaigs.train("knn", links["rssi"])
+    assert not Contents(knn).facts()["movable"]
+    with pytest.raises(ValueError, match="own receivers alone"):
+        Contents(knn).answer_at(place, 1, elsewhere)
+
+
 def test_the_server_answers_to_names_of_this_machine_alone(levels):
     """A page of another name, which its owner makes lead to this machine, must read nothing."""
     with serving(View([Contents(levels)])) as url:
@@ -271,6 +293,24 @@ def test_a_drag_changes_the_picture(is_served, browser, links, levels, tmp_path)
         place = pixel(browser, link)
         browser.drag(tuple(place), tuple(place))
         browser.wait("document.querySelector('.results').textContent.includes('measured')")
+    assert not [line for line in browser.log() if not line.startswith(("WARNING", "INFO"))]
+
+
+def test_the_map_follows_the_receiver(browser, levels):
+    with serving(gaigs.view(levels)) as url:
+        browser.open(url)
+        drawn = "viewer.runs[0].drawing.layers.get('map').numbers"
+        browser.wait(f"window.viewer && viewer.ready && {drawn}.length")
+        sums = f"[...{drawn}].reduce((a, b) => a + b)"
+        before = browser.run(f"return {sums}")
+        place = browser.run("return viewer.runs[0].facts.receivers[0].place")
+        x, y = pixel(browser, "viewer.runs[0].facts.receivers[0].place")
+        browser.drag((x, y), *((x + 20 * step, y) for step in range(1, 6)), pause=30)
+        browser.wait(f"viewer.state.stand && {sums} !== {before}")
+        assert browser.run("return viewer.runs[0].facts.receivers[0].place") != place
+        typed = "const field = document.getElementById('stand'); field.value = '3, 2, 1.5';"
+        browser.run(f"{typed} field.dispatchEvent(new Event('change'))")
+        assert browser.run("return viewer.state.stand") == [3, 2, 1.5]
     assert not [line for line in browser.log() if not line.startswith(("WARNING", "INFO"))]
 
 

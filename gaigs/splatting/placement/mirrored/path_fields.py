@@ -118,11 +118,11 @@ class PathFields(MovablePlanes):
         self.log_blurs = _filled(self.known_blur, paths)
 
     def _add_receiver_parameters(self) -> None:
-        receivers = self.scene.receivers
-        self.receiver_gains = _filled(0.0, len(receivers))
+        radios = self.scene.radios
+        self.receiver_gains = _filled(0.0, radios)
         self.directivity = _filled(0.0)
-        self.receiver_phases = _filled(0.0, len(receivers)) if self.is_complex else None
-        self.register_buffer("is_heard", torch.ones(len(receivers), dtype=torch.bool))
+        self.receiver_phases = _filled(0.0, radios) if self.is_complex else None
+        self.register_buffer("is_heard", torch.ones(radios, dtype=torch.bool))
         bandwidth = self.scene.bandwidth
         self.log_bandwidth = None
         if bandwidth != 0 and not self.is_complex:
@@ -243,7 +243,8 @@ class PathFields(MovablePlanes):
 
     def fit(self, links: Links) -> None:
         super().fit(links)
-        heard = links.query.receivers[links.split.train].unique().to(self.is_heard.device)
+        heard = self.scene.radio_of(links.query.receivers[links.split.train]).unique()
+        heard = heard.to(self.is_heard.device)
         self.is_heard.fill_(False)[heard] = True
 
     def gains_at(self, receivers: Int[Tensor, " b"]) -> Complex[Tensor, " b"]:
@@ -251,7 +252,7 @@ class PathFields(MovablePlanes):
         gains = self._receiver_gains
         if not self.is_heard.all():
             gains = torch.where(self.is_heard, gains, self._common_gain(self.is_heard))
-        return gains[receivers]
+        return gains[self.scene.radio_of(receivers)]
 
     @property
     def _receiver_gains(self) -> Complex[Tensor, " r"]:
@@ -266,8 +267,9 @@ class PathFields(MovablePlanes):
     @torch.no_grad()
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
         """Takes a scene with other receivers, whose gains are the mean of the ``known`` ones."""
-        gains = self._common_gain(self.is_heard if known is None else known)
-        gains = gains.repeat(len(scene.receivers))
+        is_known = self.is_heard if known is None or scene.one_radio else known
+        gains = self._common_gain(is_known)
+        gains = gains.repeat(scene.radios)
         self.receiver_gains = nn.Parameter(gains.real.contiguous())
         if self.receiver_phases is not None:
             self.receiver_phases = nn.Parameter(gains.imag.contiguous())
