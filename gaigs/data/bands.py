@@ -1,15 +1,20 @@
-"""Subcarriers held out for the test: other parts of the band, or another band."""
+"""Bands of channels: several ones, and subcarriers held out for the test."""
 
-from collections.abc import Sequence
+import itertools
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Complex, Float
 from torch import Tensor
 
-from gaigs.core.query import check_carrier
+from gaigs.core.antenna import Receiver
+from gaigs.core.query import Query, check_carrier
 from gaigs.core.task.csi import Csi
 from gaigs.data import Links, kept_links
+from gaigs.io.tables import number_places
 
 
 def hold_out_band(
@@ -50,6 +55,113 @@ def hold_out_band(
     carriers = torch.full((len(links),), (trained.min() + trained.max()).item() / 2)
     links = replace(links, query=replace(links.query, frequencies=carriers))
     return replace(_at(links, chosen), held_out=_at(links, others))
+
+
+class BandLinks(NamedTuple):
+    """Links of one receiver within one band.
+
+    Attributes:
+        receiver: Of that band.
+        transmitters: Places (k, 3) [m].
+        labels: Channels (k, e, h) at h of all subcarriers.
+        heard: True for these subcarriers (s,).
+    """
+
+    receiver: Receiver
+    transmitters: Float[Tensor, "k 3"]
+    labels: Complex[Tensor, "k e h"]
+    heard: Bool[Tensor, " s"]
+
+
+def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
+    """Channels of several bands, in which each receiver counts as one radio for each band.
+
+    Bands end where a frequency is more than ``gap`` times the one below. Links of one place share a
+    row.
+
+    Args:
+        parts: Channels of one site, such as of one band each; receivers at one place are the same.
+
+    Raises:
+        ValueError: Parts have different phases, or other subcarriers or arrays in one band.
+    """
+    frequencies = torch.cat([part.task.frequencies for part in parts]).unique()  # ascending (s,)
+    ends = (frequencies[1:] > gap * frequencies[:-1]).nonzero()[:, 0]
+    if len(parts) == 1 and not len(ends):
+        return parts[0]
+    phases = {part.task.phase for part in parts}
+    if len(phases) > 1:
+        raise ValueError(f"all bands must have one data.phase, got {sorted(phases)}")
+    # Half-way on a logarithmic scale, so that each frequency is in a band.
+    limits = [0.0, *(frequencies[ends] * frequencies[ends + 1]).sqrt().tolist(), math.inf]
+    pieces = []
+    for part, band in itertools.product(parts, itertools.pairwise(limits)):
+        pieces += list(_pieces(part, band, frequencies))
+    elements = max(piece.labels.shape[1] for piece in pieces)
+    names = _name([piece.receiver for piece in pieces], frequencies if len(ends) else None)
+    receivers: dict[str, Receiver] = {}
+    labels = []
+    for piece, name in zip(pieces, names, strict=True):
+        known = receivers.setdefault(name, replace(piece.receiver, name=name))
+        if not torch.equal(known.array.elements, piece.receiver.array.elements):
+            raise ValueError(f"{name} has two arrays in one band; give one of them another place")
+        count = len(piece.labels)
+        full = torch.zeros(count, elements, len(frequencies), dtype=piece.labels.dtype)
+        full[:, : piece.labels.shape[1], piece.heard] = piece.labels
+        labels.append(full)
+    transmitters = torch.cat([piece.transmitters for piece in pieces])
+    order = {name: number for number, name in enumerate(receivers)}
+    numbers = [
+        torch.full((len(one),), order[name]) for one, name in zip(labels, names, strict=True)
+    ]
+    carrier = (frequencies[0] + frequencies[-1]).item() / 2
+    remarks = [part.remarks for part in parts]
+    remarks.append(f"{len(ends) + 1} bands: {', '.join(receivers)}")
+    return Links(
+        query=Query(transmitters, torch.cat(numbers), torch.full((len(transmitters),), carrier)),
+        receivers=tuple(receivers.values()),
+        labels=torch.cat(labels),
+        task=Csi(elements, frequencies, phases.pop()),
+        rows=number_places(transmitters.tolist())[1],
+        remarks="; ".join(filter(None, remarks)),
+    )
+
+
+def _pieces(
+    part: Links, band: tuple[float, float], frequencies: Float[Tensor, " s"]
+) -> Iterator[BandLinks]:
+    """The links of each receiver of a part within a band."""
+    for number, antenna in enumerate(part.receivers):
+        receiver = replace(antenna, band=band)
+        own = receiver.hears(part.task.frequencies)
+        rows = (part.query.receivers == number).nonzero()[:, 0]
+        labels = part.labels[rows][..., own]  # (k, e, h)
+        if not labels.any():
+            continue
+        is_received = labels.flatten(1).any(1)
+        given = part.task.frequencies[own].sort()
+        heard = receiver.hears(frequencies)
+        if not torch.equal(given.values, frequencies[heard]):
+            raise ValueError(
+                f"files of one band must have the same subcarriers, got {len(given.values)} of "
+                f"{int(heard.sum())} near {given.values[0] / 1e9:.4g} GHz; join their arrays, or "
+                "leave the others out"
+            )
+        labels = labels[is_received][..., given.indices]
+        yield BandLinks(receiver, part.query.transmitters[rows][is_received], labels, heard)
+
+
+def _name(receivers: Sequence[Receiver], frequencies: Float[Tensor, " s"] | None) -> list[str]:
+    """Names of receivers by their places and, with frequencies [Hz], by their bands."""
+    places = [receiver.pose.position.tolist() for receiver in receivers]
+    names = []
+    for receiver, place in zip(receivers, number_places(places)[1], strict=True):
+        name = f"rx{place}"
+        if frequencies is not None:
+            middle = frequencies[receiver.hears(frequencies)].mean().item()
+            name += f" {middle / 1e9:.4g} GHz"
+        names.append(name)
+    return names
 
 
 def _within(task: Csi, option: str, band: Sequence[float]) -> Bool[Tensor, " s"]:

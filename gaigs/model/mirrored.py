@@ -170,7 +170,7 @@ class MirroredSplatting(GaussianSplatting):
         start = placement.planes[placement.used if placement.walls else placement.used[:0]].cpu()
         gains = self._receiver_gains(links.labels[train], query, waves, pooling)
         placement.start_from_free_space(gains.conj() if sign > 0 else gains)
-        placement.enable_phases(speed_of_light / task.frequencies.mean().item())
+        placement.enable_phases(speed_of_light / self.scene.middles.max().item())
         if placement.fixed or not placement.order:
             return
         is_known = task.phase == "known" and sign != 0
@@ -212,9 +212,12 @@ class MirroredSplatting(GaussianSplatting):
         placement.found.fill_(True)
         if not len(planes):
             return
-        unit = pooling.strength.item() * search.data.wavelength / (4 * math.pi)
+        wavelengths = torch.tensor([receiver.wavelength for receiver in search.data.receivers])
+        unit = pooling.strength.item() * wavelengths / (4 * math.pi)
         receivers = torch.tensor(search.data.numbers)
-        placement.start_strengths(room.gains, receivers, room.receivers / unit)
+        gains = room.gains.new_ones(len(placement.bands), len(planes))
+        gains[placement.band_numbers[receivers]] = room.gains[search.score.fit.band_numbers]
+        placement.start_strengths(gains, receivers, room.receivers / unit)
         placement.step.mul_(0.1)
 
     def _receiver_gains(

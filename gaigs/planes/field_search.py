@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gaigs.data import Links
@@ -109,12 +109,16 @@ class FieldSearch:
         """The room with the best plane of the first grid that has one; None without any."""
         score = self.score
         for grid in [self._make_axes(room), *grids]:
-            score.groups = grid.groups
             normals = grid.normals.to(self.frame.points)
             lines = self.frame.grid(normals, grid.offsets, self.data.options.margin)
             shift = grid.shift / self.frame.diagonal
             search = PlaneSearch(self.frame, score, grid.turn / 2, shift / 2)
-            larger = search.extend(room, lines)
+            trials = []
+            for rated in self._rated():
+                score.groups = grid.groups
+                score.rated = rated
+                trials += search.list_extensions(room, lines)
+            larger = min(trials, key=score.error, default=None)
             if larger is None:
                 continue
             larger = score.refine(larger)
@@ -126,6 +130,15 @@ class FieldSearch:
                 score.fit.choose_variation(larger)
                 return larger
         return None
+
+    def _rated(self) -> list[Bool[Tensor, " bands"]]:
+        """Bands that rate planes: all together, and of several each alone.
+
+        Shadows and lengths of waves differ: what one band shows clearly may be noise in the others.
+        """
+        alone = torch.eye(len(self.score.fit.bands), dtype=torch.bool)
+        together = torch.ones_like(alone[:1])
+        return [*together, *(alone if len(alone) > 1 else alone[:0])]
 
     # --- grids ---
 

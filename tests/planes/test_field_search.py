@@ -83,7 +83,7 @@ def test_noise_has_no_planes():
 def test_kriging_leaves_what_other_places_do_not_explain(links):
     search = FieldSearch(links, -1, 1, 4, torch.from_numpy(WALLS))
     fit = FieldFit(search.data, largest=1000)
-    fit.variation = Variation(0.5, 1.0, 0.3)
+    fit.variations = [Variation(0.5, 1.0, 0.3)]
     start = fit.start(search.start)
     waves = fit.waves(start.planes, start)
     rest = fit.residual(start, waves)
@@ -91,7 +91,7 @@ def test_kriging_leaves_what_other_places_do_not_explain(links):
     # Without the first number, as kriging from the others of its receiver predicts it.
     own = fit.owner == 0
     gaps = torch.cdist(search.data.receivers[0].places, search.data.receivers[0].places)
-    gains = torch.cat((start.gains, torch.ones(1)))
+    gains = torch.cat((start.gains[0], torch.ones(1)))
     order = torch.tensor([-1, 0, 1, 2])
     fields = waves[own] * gains[order] * start.receivers[0]
     covariance = 0.25 * (-gaps).exp() * (fields @ fields.mH) + 0.09 * torch.eye(int(own.sum()))

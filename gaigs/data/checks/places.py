@@ -36,7 +36,8 @@ def check_places(links: Any) -> Iterator[Finding]:
         return
     for a, b in itertools.combinations(given, 2):
         turned = (receivers[a].pose.rotation - receivers[b].pose.rotation).norm()
-        if (stands[a] - stands[b]).norm() < 0.01 and turned < 0.01:
+        is_near = (stands[a] - stands[b]).norm() < 0.01
+        if is_near and turned < 0.01 and receivers[a].band == receivers[b].band:
             text = f"{receivers[a].name} and {receivers[b].name} stand at one place"
             yield Finding("receivers at one place", text)
 
