@@ -4,11 +4,11 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Complex, Float
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gaigs.core.antenna import Receiver
 from gaigs.core.query import Query, check_carrier
@@ -57,22 +57,6 @@ def hold_out_band(
     return replace(_at(links, chosen), held_out=_at(links, others))
 
 
-class BandLinks(NamedTuple):
-    """Links of one receiver within one band.
-
-    Attributes:
-        receiver: Of that band.
-        transmitters: Places (k, 3) [m].
-        labels: Channels (k, e, h) at h of all subcarriers.
-        heard: True for these subcarriers (s,).
-    """
-
-    receiver: Receiver
-    transmitters: Float[Tensor, "k 3"]
-    labels: Complex[Tensor, "k e h"]
-    heard: Bool[Tensor, " s"]
-
-
 def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
     """Channels of several bands, in which each receiver counts as one radio for each band.
 
@@ -98,29 +82,29 @@ def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
     for part, band in itertools.product(parts, itertools.pairwise(limits)):
         pieces += list(_pieces(part, band, frequencies))
     elements = max(piece.labels.shape[1] for piece in pieces)
-    names = _name([piece.receiver for piece in pieces], frequencies if len(ends) else None)
+    names = _name([piece.receivers[0] for piece in pieces], frequencies if len(ends) else None)
     receivers: dict[str, Receiver] = {}
-    labels = []
     for piece, name in zip(pieces, names, strict=True):
-        known = receivers.setdefault(name, replace(piece.receiver, name=name))
-        if not torch.equal(known.array.elements, piece.receiver.array.elements):
+        receiver = piece.receivers[0]
+        known = receivers.setdefault(name, replace(receiver, name=name))
+        if not torch.equal(known.array.elements, receiver.array.elements):
             raise ValueError(f"{name} has two arrays in one band; give one of them another place")
-        count = len(piece.labels)
-        full = torch.zeros(count, elements, len(frequencies), dtype=piece.labels.dtype)
-        full[:, : piece.labels.shape[1], piece.heard] = piece.labels
-        labels.append(full)
-    transmitters = torch.cat([piece.transmitters for piece in pieces])
-    order = {name: number for number, name in enumerate(receivers)}
-    numbers = [
-        torch.full((len(one),), order[name]) for one, name in zip(labels, names, strict=True)
-    ]
+    transmitters = torch.cat([piece.query.transmitters for piece in pieces])
+    numbers = torch.tensor([[*receivers].index(name) for name in names])
+    counts = torch.tensor([*map(len, pieces)])
     carrier = (frequencies[0] + frequencies[-1]).item() / 2
     remarks = [part.remarks for part in parts]
     remarks.append(f"{len(ends) + 1} bands: {', '.join(receivers)}")
     return Links(
-        query=Query(transmitters, torch.cat(numbers), torch.full((len(transmitters),), carrier)),
+        query=Query(
+            transmitters,
+            numbers.repeat_interleave(counts),
+            torch.full((len(transmitters),), carrier),
+        ),
         receivers=tuple(receivers.values()),
-        labels=torch.cat(labels),
+        labels=torch.cat(
+            [pad(piece.labels, (0, 0, 0, elements - piece.labels.shape[1])) for piece in pieces]
+        ),
         task=Csi(elements, frequencies, phases.pop()),
         rows=number_places(transmitters.tolist())[1],
         remarks="; ".join(filter(None, remarks)),
@@ -129,16 +113,15 @@ def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
 
 def _pieces(
     part: Links, band: tuple[float, float], frequencies: Float[Tensor, " s"]
-) -> Iterator[BandLinks]:
-    """The links of each receiver of a part within a band."""
+) -> Iterator[Links]:
+    """The links of each receiver of a part within a band, with labels at all subcarriers."""
     for number, antenna in enumerate(part.receivers):
         receiver = replace(antenna, band=band)
         own = receiver.hears(part.task.frequencies)
-        rows = (part.query.receivers == number).nonzero()[:, 0]
-        labels = part.labels[rows][..., own]  # (k, e, h)
-        if not labels.any():
+        is_received = (part.labels[..., own] != 0).flatten(1).any(1)
+        links = kept_links(part, is_received & (part.query.receivers == number))
+        if not len(links):
             continue
-        is_received = labels.flatten(1).any(1)
         given = part.task.frequencies[own].sort()
         heard = receiver.hears(frequencies)
         if not torch.equal(given.values, frequencies[heard]):
@@ -147,8 +130,9 @@ def _pieces(
                 f"{int(heard.sum())} near {given.values[0] / 1e9:.4g} GHz; join their arrays, or "
                 "leave the others out"
             )
-        labels = labels[is_received][..., given.indices]
-        yield BandLinks(receiver, part.query.transmitters[rows][is_received], labels, heard)
+        labels = links.labels.new_zeros(*links.labels.shape[:2], len(frequencies))
+        labels[..., heard] = links.labels[..., own][..., given.indices]
+        yield replace(links, receivers=(receiver,), labels=labels)
 
 
 def _name(receivers: Sequence[Receiver], frequencies: Float[Tensor, " s"] | None) -> list[str]:
