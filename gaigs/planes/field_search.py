@@ -63,6 +63,8 @@ class FieldSearch:
         start: Planes known before (w, 4).
         options: Options of the search.
         smallest: Fewest places of a group.
+        fewest: Fewest numbers of a search: ten for each plane of a box. Of 22, a false plane
+            explained more than its price.
 
     Source: ours.
     """
@@ -76,6 +78,7 @@ class FieldSearch:
         start: Float[Tensor, "w 4"],
         options: ChannelOptions | None = None,
         smallest: int = 16,
+        fewest: int = 60,
     ):
         self.data = ChannelData(links, sign, True, order, options or ChannelOptions())
         self.score = FieldScore(self.data)
@@ -83,6 +86,7 @@ class FieldSearch:
         self.most = most
         self.start = self.frame.from_world(start)
         self.smallest = smallest
+        self.fewest = fewest
 
     @torch.no_grad()
     def run(self) -> FieldRoom:
@@ -90,6 +94,9 @@ class FieldSearch:
         fit = self.score.fit
         room = fit.start(self.start)
         fit.choose_variation(room)
+        if fit.count < self.fewest:
+            log.info("%d numbers tell no planes; a search takes %d", fit.count, self.fewest)
+            return room
         grids = [grid for grid in (self._make_upright(), self._make_tilted()) if grid is not None]
         largest = max([grid.size for grid in grids], default=0)
         log.info(

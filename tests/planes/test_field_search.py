@@ -82,6 +82,14 @@ def test_noise_has_no_planes():
     assert not len(found.planes)
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_few_places_tell_no_planes(caplog):
+    caplog.set_level("INFO")
+    found = FieldSearch(room(40), -1, 2, 4, torch.zeros(0, 4)).run()
+    assert not len(found.planes)
+    assert "40 numbers tell no planes; a search takes 60" in caplog.text
+
+
 def test_kriging_leaves_what_other_places_do_not_explain(links):
     search = FieldSearch(links, -1, 1, 4, torch.from_numpy(WALLS))
     fit = FieldFit(search.data, largest=1000)
