@@ -23,9 +23,8 @@ from gaigs.data import Links, load
 from gaigs.data.simulation import simulate_channels
 from gaigs.data.synthetic import ROOM, default_room
 from gaigs.planes.channel_links import SLABS, ChannelData, ChannelOptions
-from gaigs.planes.field_room import FieldFit, FieldRoom, Variation, multiply_gains
+from gaigs.planes.field_room import FieldFit, FieldRoom, Variation
 from gaigs.report.table import markdown
-from gaigs.splatting.placement.mirrored.reflections import all_sequences
 
 
 def write_built_in(frequency: float, file: Path) -> None:
@@ -63,8 +62,9 @@ def best_room(data: ChannelData, fit: FieldFit, walls: torch.Tensor) -> FieldRoo
     rooms = []
     for slab in (SLABS[1], torch.tensor([0.0, math.log(1e6), 0.0]).double()):
         for sign in (1, -1):
-            gains = torch.full((6,), 0.7 * sign, dtype=torch.complex128)
-            room = FieldRoom(planes, slab.repeat(6, 1), gains, start.receivers)
+            gains = torch.full((1, 6), 0.7 * sign, dtype=torch.complex128)
+            uses = torch.ones(1, 6, dtype=torch.bool)
+            room = FieldRoom(planes, slab.repeat(6, 1), gains, start.receivers, uses)
             rooms.append(fit.fit_gains(room, 30))
     return min(rooms, key=lambda room: fit.mean_log(fit.residual(room)).item())
 
@@ -74,7 +74,6 @@ def scores(links: Links, walls: torch.Tensor, order: int) -> list[str]:
     data, fit = fit_of(links, links.split.known, order)
     test_data, test = fit_of(links, links.split.test, order)
     room = best_room(data, fit, walls)
-    sequences = all_sequences(6, order)
     waves = fit.waves(room.planes, room)
     planes = test_data.frame.from_world(walls)
     raw = test.values / test.scale
@@ -94,13 +93,13 @@ def scores(links: Links, walls: torch.Tensor, order: int) -> list[str]:
         strengths = torch.linalg.solve(gram, own.mH @ fit.values[fit.owner == number])
         rows = test.owner == number
         free[rows] = test_waves[rows] @ strengths
-    products = multiply_gains(room.gains, sequences).products
+    products = fit.products(room)[0]
     fields = waves * products * room.receivers[fit.owner, None]
     test_fields = test_waves * products * room.receivers[test.owner, None]
     shared = test_fields.sum(1)
     fit.choose_variation(room)
     kriged = shared + krige(
-        fit, test, fit.variation, fields, test_fields, fit.residual(room, waves)
+        fit, test, fit.variations[0], fields, test_fields, fit.residual(room, waves)
     )
     return [str(order), cell(free), cell(shared), cell(kriged)]
 

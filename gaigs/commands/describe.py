@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -105,9 +106,11 @@ def mean_levels(links: Links, index: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
     if not labels.is_complex():
         return labels.double().mean(1)
     power = labels.abs().double().square().mean(1)
-    if links.task.is_channel:  # over the elements that arrays have
-        absent = lacking(links.receivers, links.query.receivers[index], links.task.elements)
-        power = power / (1 - absent.double().mean(1))
+    if links.task.is_channel:  # over the elements and subcarriers that receivers have
+        task: Any = links.task
+        receivers = links.query.receivers[index]
+        absent = lacking(links.receivers, receivers, task.elements, task.frequencies)
+        power = power / (1 - absent.double().mean((1, 2)))
     return 10 * power.clamp_min(1e-300).log10()
 
 

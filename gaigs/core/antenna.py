@@ -110,6 +110,10 @@ class Array:
 class Receiver:
     """An antenna array or gateway: its name in files and tables, its pose in the room, its antenna.
 
+    Attributes:
+        band: Lowest frequency that it hears, and the lowest above it that it does not [Hz]. Other
+            subcarriers of its channels are 0. By default it hears all.
+
     Example:
         >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])
         >>> len(gaigs.Receiver("door", pose, gaigs.Array.planar(4, 4, pitch=0.16)).array)
@@ -119,8 +123,15 @@ class Receiver:
     name: str
     pose: Pose
     array: Array = field(default_factory=Array.single)
+    band: tuple[float, float] = (0.0, math.inf)
 
     def __post_init__(self) -> None:
+        low, high = self.band
+        if not 0 <= low < high:
+            raise ValueError(
+                f"the band of receiver {self.name!r} must be two ascending frequencies [Hz], got "
+                f"{self.band}"
+            )
         axes = self.pose.rotation.double()
         # NaN is no rotation either, nor a mirror, whose determinant is -1.
         if not (
@@ -132,10 +143,20 @@ class Receiver:
                 f"the pose of receiver {self.name!r} must have {wanted}, got {axes.tolist()}"
             )
 
+    def hears(self, frequencies: Float[Tensor, " s"]) -> Bool[Tensor, " s"]:
+        """True for frequencies within its band [Hz]."""
+        return (frequencies >= self.band[0]) & (frequencies < self.band[1])
+
 
 def lacking(
-    receivers: Sequence[Receiver], index: Int[Tensor, " b"], count: int
-) -> Bool[Tensor, "b e"]:
-    """True for each of ``count`` elements that the array of a link's receiver lacks."""
-    sizes = torch.tensor([len(receiver.array) for receiver in receivers], device=index.device)
-    return torch.arange(count, device=index.device) >= sizes[index.long()][:, None]
+    receivers: Sequence[Receiver],
+    index: Int[Tensor, " b"],
+    count: int,
+    frequencies: Float[Tensor, " s"],
+) -> Bool[Tensor, "b e s"]:
+    """True for each of ``count`` elements that a link's receiver lacks, and subcarriers [Hz] too."""
+    sizes = torch.tensor([len(receiver.array) for receiver in receivers])
+    hears = torch.stack([receiver.hears(frequencies.cpu()) for receiver in receivers])  # (r, s)
+    exists = torch.arange(count) < sizes[:, None]  # (r, e)
+    absent = ~(exists[..., None] & hears[:, None])  # (r, e, s)
+    return absent.to(index.device)[index.long()]

@@ -92,9 +92,11 @@ def strange_parts(
         share = response.abs().square().mean().item()
         if links < MANY or share < least_share + 4 / links:
             continue
-        has_element = (waves[at_receiver] != 0).any(2).any(0)  # (e,)
-        response = response[has_element]
-        turns = waves[at_receiver][:, has_element].sgn()  # (links, e, s)
+        own = (waves[at_receiver] != 0).any(0)  # (e, s)
+        has_element = own.any(1)
+        is_heard = own.any(0)
+        response = response[has_element][:, is_heard]
+        turns = waves[at_receiver][:, has_element][..., is_heard].sgn()  # (links, e, s)
         # The power of the mean response without the part that chance leaves in it.
         by_chance = (1 - share) / links / share
         power = response.abs().square().mean() * (1 - by_chance)
@@ -109,7 +111,8 @@ def strange_parts(
         subcarriers = bool(over_subcarriers < common_share * power)
         delay = None
         if subcarriers:
-            rates = 2 * math.pi * (frequencies - frequencies.mean())
+            heard = frequencies[is_heard]
+            rates = 2 * math.pi * (heard - heard.mean())
             late = _best_delays(response.sum(0), rates)
             aligned = response * torch.polar(torch.ones_like(rates), late * rates)
             if aligned.mean().abs().square() > common_share * power:

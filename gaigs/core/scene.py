@@ -2,6 +2,7 @@
 
 import functools
 import logging
+import math
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from jaxtyping import Complex, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from gaigs.core.antenna import Array, Receiver
+from gaigs.core.antenna import Array, Receiver, lacking
 from gaigs.core.geometry import Frame, Pose
 from gaigs.core.propagation import free_space
 from gaigs.core.query import Query
@@ -158,6 +159,13 @@ class Scene:
         return float(self.frequencies[len(self.frequencies) // 2])
 
     @property
+    def middles(self) -> Float[Tensor, " r"]:
+        """Mean frequency of the subcarriers in each receiver's band [Hz]."""
+        frequencies = self.task.frequencies
+        heard = [frequencies[receiver.hears(frequencies)] for receiver in self.receivers]
+        return torch.stack([(part if len(part) else frequencies).mean() for part in heard])
+
+    @property
     def has_band(self) -> bool:
         """True if the training links have several carriers."""
         return len(self.frequencies) > 1
@@ -212,6 +220,7 @@ class Scene:
                     "rotation": receiver.pose.rotation,
                     "elements": receiver.array.elements,
                     "pattern": receiver.array.pattern,
+                    "band": receiver.band,
                 }
             )
         state = {"receivers": receivers, "task": self.task.state()}
@@ -235,7 +244,8 @@ class Scene:
         for entry in state["receivers"]:
             pose = Pose(entry["position"], entry["rotation"])
             array = Array(entry["elements"], entry["pattern"])
-            receivers.append(Receiver(entry["name"], pose, array))
+            band = tuple(entry.get("band", (0.0, math.inf)))  # of a checkpoint from before bands
+            receivers.append(Receiver(entry["name"], pose, array, band))
         frame = None
         try:
             frame = state.get("frame") and Frame(*state["frame"])
@@ -246,9 +256,9 @@ class Scene:
 
 
 def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
-    """Frequency of each link [Hz]: the query's, the data's only one, or a channel's middle one."""
+    """Frequency of each link [Hz]: the query's, the data's only one, or its receiver's middle one."""
     if scene.task.is_channel:
-        return scene.task.frequencies.mean().to(query.transmitters).expand(len(query))
+        return scene.middles.to(query.transmitters)[query.receivers]
     if query.frequencies is not None:
         return query.frequencies
     if len(scene.frequencies) != 1:
@@ -298,7 +308,8 @@ def direct_waves(
 ) -> Complex[Tensor, "b e s"]:
     """Free space from each transmitter to its receiver's elements, or to its middle (e = 1).
 
-    It is 0 at elements that other receivers' arrays have alone. ``sign`` is as for ``free_space``.
+    It is 0 at elements that other receivers' arrays have alone, and outside a receiver's band.
+    ``sign`` is as for ``free_space``.
     """
     # Some metres from the origin float32 would round an element's place by 1e-6 m, at 6 GHz by
     # 1e-4 rad.
@@ -309,12 +320,12 @@ def direct_waves(
         elements = receiver.array.elements.double().cpu()
         positions.append(pose.world(elements) if at_elements else pose.position[None])
     device = query.transmitters.device
-    counts = torch.tensor([*map(len, positions)], device=device)[query.receivers]  # (b,)
     places = pad_sequence(positions, batch_first=True).to(device)[query.receivers]  # (b, e, 3)
     distances = (query.transmitters.double()[:, None] - places).norm(dim=-1)  # (b, e)
     waves = free_space(distances[..., None], frequencies.to(device), sign)  # (b, e, s)
-    exists = torch.arange(places.shape[1], device=device) < counts[:, None]  # (b, e)
-    return waves * exists[..., None]
+    if not at_elements:  # one point, which all receivers have
+        return waves
+    return waves * ~lacking(scene.receivers, query.receivers, places.shape[1], frequencies)
 
 
 def direct_gains(scene: Scene, query: Query) -> Float[Tensor, " b"]:

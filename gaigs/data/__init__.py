@@ -303,7 +303,7 @@ def _check_split(split: Split, count: int) -> None:
 def check_elements(links: Links) -> None:
     """Raises a ``ValueError`` if channels do not have the elements of their receivers' arrays.
 
-    Channels are 0 at elements that an array lacks.
+    Channels are 0 at elements that an array lacks, and outside a receiver's band.
     """
     count = links.task.shape[0]
     sizes = [len(receiver.array) for receiver in links.receivers]
@@ -312,17 +312,18 @@ def check_elements(links: Links) -> None:
             f"the task has {count} elements, and the largest array of the receivers {max(sizes)}; "
             "give Csi the number of elements of the largest one"
         )
-    for part in torch.arange(len(links) if min(sizes) < count else 0).split(1024):
+    everyone = torch.arange(len(sizes))
+    absent = lacking(links.receivers, everyone, count, links.task.frequencies)  # (r, e, s)
+    for part in torch.arange(len(links) if absent.any() else 0).split(1024):
         receivers = links.query.receivers[part]
-        is_set = (links.labels[part] != 0).any(2)  # (k, e)
-        beyond = is_set & lacking(links.receivers, receivers, count)
+        beyond = (links.labels[part] != 0) & absent[receivers.long()]
         if beyond.any():
-            link, element = beyond.nonzero()[0].tolist()
+            link, element, subcarrier = beyond.nonzero()[0].tolist()
             receiver = int(receivers[link])
             raise ValueError(
-                f"labels must be 0 at elements that an array lacks; that of link {int(part[link])} "
-                f"is not at element {element}, and {links.receivers[receiver].name} has "
-                f"{sizes[receiver]} elements"
+                "labels must be 0 at elements that an array lacks and outside a receiver's band; "
+                f"that of link {int(part[link])} is not at element {element} and subcarrier "
+                f"{subcarrier}, and {links.receivers[receiver].name} has {sizes[receiver]} elements"
             )
 
 

@@ -1,15 +1,20 @@
-"""Subcarriers held out for the test: other parts of the band, or another band."""
+"""Bands of channels: several ones, and subcarriers held out for the test."""
 
-from collections.abc import Sequence
+import itertools
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
-from gaigs.core.query import check_carrier
+from gaigs.core.antenna import Receiver
+from gaigs.core.query import Query, check_carrier
 from gaigs.core.task.csi import Csi
 from gaigs.data import Links, kept_links
+from gaigs.io.tables import number_places
 
 
 def hold_out_band(
@@ -49,6 +54,97 @@ def hold_out_band(
     carriers = torch.full((len(links),), (trained.min() + trained.max()).item() / 2)
     links = replace(links, query=replace(links.query, frequencies=carriers))
     return replace(_at(links, chosen), held_out=_at(links, others))
+
+
+def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
+    """Channels of several bands, in which each receiver counts as one radio for each band.
+
+    Bands end where a frequency is more than ``gap`` times the one below. Links of one place share a
+    row.
+
+    Args:
+        parts: Channels of one site, such as of one band each; receivers at one place are the same.
+
+    Raises:
+        ValueError: Parts have different phases, or other subcarriers or arrays in one band.
+    """
+    frequencies = torch.cat([part.task.frequencies for part in parts]).unique()  # ascending (s,)
+    ends = (frequencies[1:] > gap * frequencies[:-1]).nonzero()[:, 0]
+    if len(parts) == 1 and not len(ends):
+        return parts[0]
+    phases = {part.task.phase for part in parts}
+    if len(phases) > 1:
+        raise ValueError(f"all bands must have one data.phase, got {sorted(phases)}")
+    # Half-way on a logarithmic scale, so that each frequency is in a band.
+    limits = [0.0, *(frequencies[ends] * frequencies[ends + 1]).sqrt().tolist(), math.inf]
+    pieces = []
+    for part, band in itertools.product(parts, itertools.pairwise(limits)):
+        pieces += list(_pieces(part, band, frequencies))
+    elements = max(piece.labels.shape[1] for piece in pieces)
+    names = _name([piece.receivers[0] for piece in pieces], frequencies if len(ends) else None)
+    receivers: dict[str, Receiver] = {}
+    for piece, name in zip(pieces, names, strict=True):
+        receiver = piece.receivers[0]
+        known = receivers.setdefault(name, replace(receiver, name=name))
+        if not torch.equal(known.array.elements, receiver.array.elements):
+            raise ValueError(f"{name} has two arrays in one band; give one of them another place")
+    transmitters = torch.cat([piece.query.transmitters for piece in pieces])
+    numbers = torch.tensor([[*receivers].index(name) for name in names])
+    counts = torch.tensor([*map(len, pieces)])
+    carrier = (frequencies[0] + frequencies[-1]).item() / 2
+    remarks = [part.remarks for part in parts]
+    remarks.append(f"{len(ends) + 1} bands: {', '.join(receivers)}")
+    return Links(
+        query=Query(
+            transmitters,
+            numbers.repeat_interleave(counts),
+            torch.full((len(transmitters),), carrier),
+        ),
+        receivers=tuple(receivers.values()),
+        labels=torch.cat(
+            [pad(piece.labels, (0, 0, 0, elements - piece.labels.shape[1])) for piece in pieces]
+        ),
+        task=Csi(elements, frequencies, phases.pop()),
+        rows=number_places(transmitters.tolist())[1],
+        remarks="; ".join(filter(None, remarks)),
+    )
+
+
+def _pieces(
+    part: Links, band: tuple[float, float], frequencies: Float[Tensor, " s"]
+) -> Iterator[Links]:
+    """The links of each receiver of a part within a band, with labels at all subcarriers."""
+    for number, antenna in enumerate(part.receivers):
+        receiver = replace(antenna, band=band)
+        own = receiver.hears(part.task.frequencies)
+        is_received = (part.labels[..., own] != 0).flatten(1).any(1)
+        links = kept_links(part, is_received & (part.query.receivers == number))
+        if not len(links):
+            continue
+        given = part.task.frequencies[own].sort()
+        heard = receiver.hears(frequencies)
+        if not torch.equal(given.values, frequencies[heard]):
+            raise ValueError(
+                f"files of one band must have the same subcarriers, got {len(given.values)} of "
+                f"{int(heard.sum())} near {given.values[0] / 1e9:.4g} GHz; join their arrays, or "
+                "leave the others out"
+            )
+        labels = links.labels.new_zeros(*links.labels.shape[:2], len(frequencies))
+        labels[..., heard] = links.labels[..., own][..., given.indices]
+        yield replace(links, receivers=(receiver,), labels=labels)
+
+
+def _name(receivers: Sequence[Receiver], frequencies: Float[Tensor, " s"] | None) -> list[str]:
+    """Names of receivers by their places and, with frequencies [Hz], by their bands."""
+    places = [receiver.pose.position.tolist() for receiver in receivers]
+    names = []
+    for receiver, place in zip(receivers, number_places(places)[1], strict=True):
+        name = f"rx{place}"
+        if frequencies is not None:
+            middle = frequencies[receiver.hears(frequencies)].mean().item()
+            name += f" {middle / 1e9:.4g} GHz"
+        names.append(name)
+    return names
 
 
 def _within(task: Csi, option: str, band: Sequence[float]) -> Bool[Tensor, " s"]:

@@ -14,7 +14,7 @@ from gaigs.core.geometry import Pose
 from gaigs.core.query import CARRIERS, Query, unit_hint
 from gaigs.core.task.csi import Csi
 from gaigs.data import Links
-from gaigs.data.bands import hold_out_band
+from gaigs.data.bands import hold_out_band, in_bands
 from gaigs.data.impulse_responses import from_sionna
 from gaigs.data.parts import check_parts, join
 from gaigs.data.readings import are_one_radio
@@ -63,7 +63,7 @@ RESPONSES = {
 
 @register("data", "csi_npz", task="csi", split="random")
 def read(
-    file: str | Path,
+    file: str | Path | Sequence[str | Path],
     arrays: Mapping[str, str | list] | None = None,
     phase: str = "known",
     band_train: Sequence[float] | None = None,
@@ -77,9 +77,14 @@ def read(
     links are left out; the remarks count them. The middle of the subcarriers' band counts as the
     carrier. There is no official split.
 
+    Frequencies more than a fifth apart are of different bands: a receiver is then one radio for
+    each, such as ``rx0 2.412 GHz``, whose links are 0 in other bands; see
+    ``gaigs.data.bands.in_bands``.
+
     Args:
-        file: Arrays ``tx`` (n, 3), positions of the transmitters [m]; ``rx`` (k, 3), positions of
-            the receivers [m]; ``rx_index`` (n,), receiver of each link, from 0, not needed with one
+        file: One file, or a list of files of one site, such as of a band each. Arrays ``tx``
+            (n, 3), positions of the transmitters [m]; ``rx`` (k, 3), positions of the receivers
+            [m]; ``rx_index`` (n,), receiver of each link, from 0, not needed with one
             receiver; ``frequencies`` (s,), subcarriers [Hz]; ``h`` (n, e, s), complex channels,
             linear amplitude; optionally ``elements`` (e, 3), offsets of an array's elements from
             its receiver's position along the world's axes [m], by default 0. With (k, e, 3) each
@@ -99,7 +104,8 @@ def read(
         ImportError: The file needs h5py.
         ValueError: The file has a defect; the message names array, row and value.
     """
-    file = find_file(file, "a file of channels")
+    several = not isinstance(file, str | Path)
+    files = [find_file(one, "a file of channels") for one in (file if several else [file])]
     arrays = arrays or {}
     known = ARRAYS | RESPONSES
     if unknown := [suggest(name, known) for name in arrays if name not in known]:
@@ -109,8 +115,15 @@ def read(
             "data.parts must be first or last, the axis of real and imaginary part, or null, "
             f"got {parts!r}"
         )
-    links = to_links(file, *_load(file, arrays, parts), phase)
-    return hold_out_band(links, band_train, band_test)
+    if len(files) != 1 and not (files and band_train is None and band_test is None):
+        raise ValueError(
+            f"data.file must be one file where data.band_train is given, else one or more, got "
+            f"{len(files)}"
+        )
+    links = [to_links(one, *_load(one, arrays, parts), phase) for one in files]
+    if band_train is None and band_test is None:
+        return in_bands(links)
+    return hold_out_band(links[0], band_train, band_test)
 
 
 def to_links(

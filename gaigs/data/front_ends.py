@@ -6,8 +6,10 @@ import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
 
+from gaigs.core.antenna import Receiver
 from gaigs.core.front_ends import FrontEnd, FrontEndFit, FrontEndOptions
 from gaigs.core.scene import Scene, direct_gains, direct_waves
+from gaigs.core.task.csi import Csi
 
 
 class FrontEnds(NamedTuple):
@@ -33,19 +35,20 @@ def learn_responses(links: Any, options: FrontEndOptions | None = None) -> Front
     errors = torch.zeros(shape)
     sentences = []
     for receiver, antenna in enumerate(links.receivers):
+        heard = antenna.hears(task.frequencies)
         rows = train[links.query.receivers[train] == receiver]
         rows = rows[links.labels[rows].abs().amax((1, 2)) > 0]
         places = links.query[rows].transmitters.unique(dim=0, return_inverse=True)[1]
         count = len(antenna.array)
-        if len(places.unique()) < options.fewest_places or count * shape[2] < 2:
+        if len(places.unique()) < options.fewest_places or count * heard.sum() < 2:
             continue
-        fit = _better_sign(links, rows, count, options)
+        fit = _better_sign(links, rows, antenna, options)
         chosen = fit.choose(places)
         if chosen is None:
             continue
         front_end, freedom, before, after = chosen
-        responses[receiver, :count] = front_end.response
-        errors[receiver, :count] = front_end.errors
+        responses[receiver, :count, heard] = front_end.response.to(responses)
+        errors[receiver, :count, heard] = front_end.errors.to(errors)
         sentences.append(
             f"{antenna.name} has a response of its front end, {freedom}: "
             f"{task.monitor} of free space at places left out {before:.1f} -> {after:.1f}, "
@@ -56,15 +59,21 @@ def learn_responses(links: Any, options: FrontEndOptions | None = None) -> Front
     return FrontEnds(responses, errors, "; ".join(sentences))
 
 
-def _better_sign(links: Any, rows: Tensor, count: int, options: FrontEndOptions) -> FrontEndFit:
-    """The fit with the sign of the phases that explains more links."""
+def _better_sign(
+    links: Any, rows: Tensor, antenna: Receiver, options: FrontEndOptions
+) -> FrontEndFit:
+    """The fit with the sign of the phases that explains more links, within the receiver's band."""
+    count = len(antenna.array)
+    heard = antenna.hears(links.task.frequencies)
+    task = Csi(links.task.elements, links.task.frequencies[heard], links.task.phase)
+    labels = links.labels[rows, :count][..., heard]
     query = links.query[rows]
-    scene = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, links.task)
+    scene = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
     fits = []
     for sign in (-1, 1):
-        waves = direct_waves(scene, query, links.task.frequencies, sign)
+        waves = direct_waves(scene, query, task.frequencies, sign)
         waves = direct_gains(scene, query)[:, None, None] * waves
-        fits.append(FrontEndFit(links.labels[rows, :count], waves[:, :count], links.task, options))
+        fits.append(FrontEndFit(labels, waves[:, :count], task, options))
     return max(fits, key=lambda fit: fit.likeness())
 
 

@@ -32,7 +32,7 @@ from gaigs.model.requests import (
     as_new_receiver,
     check_interval,
     is_same,
-    lacks_elements,
+    lacks_numbers,
     usual_batch_size,
 )
 from gaigs.registry import check_type
@@ -378,15 +378,18 @@ class Model(Movable):
         calibration scales it.
 
         Without ``deviations`` it is 1, of channels the root mean square of each link's value. It is
-        NaN at elements that a receiver's array lacks, which have no error.
+        NaN at elements that a receiver's array lacks and outside its band, where there is no error.
         """
         deviations = self.deviations(batch)
         if deviations is None:
             deviations = usual_deviations(value)
-        if not lacks_elements(self.scene):
+        if not lacks_numbers(self.scene):
             return deviations
+        task: Any = self.scene.task
         receivers = batch.query.receivers
-        absent = lacking(self.scene.receivers, receivers, value.shape[1])[..., None]  # (b, e, 1)
+        absent = lacking(
+            self.scene.receivers, receivers, task.elements, task.frequencies
+        )  # (b, e, s)
         if deviations.ndim == 1:  # over all numbers, of which those that are absent are 0
             present = 1 - absent.to(deviations).mean((1, 2))  # (b,)
             deviations = (deviations / present.sqrt())[:, None, None]

@@ -162,7 +162,7 @@ class MirroredSplatting(GaussianSplatting):
         start = placement.planes[placement.used if placement.walls else placement.used[:0]].cpu()
         gains = self._receiver_gains(links.labels[train], query, waves, pooling)
         placement.start_from_free_space(gains.conj() if sign > 0 else gains)
-        placement.enable_phases(speed_of_light / task.frequencies.mean().item())
+        placement.enable_phases(speed_of_light / self.scene.middles.max().item())
         if placement.fixed or not placement.order:
             return
         is_known = task.phase == "known" and sign != 0
@@ -194,12 +194,15 @@ class MirroredSplatting(GaussianSplatting):
         self._plan(planes, room.slabs, search.data.order)
         if not len(planes):
             return
-        unit = pooling.strength.item() * search.data.wavelength / (4 * math.pi)
-        receivers = self.scene.radio_of(torch.tensor(search.data.numbers))
-        gains = room.receivers / unit
+        wavelengths = torch.tensor([receiver.wavelength for receiver in search.data.receivers])
+        unit = pooling.strength.item() * wavelengths / (4 * math.pi)  # (r,)
+        numbers = torch.tensor(search.data.numbers)
+        gains = room.gains.new_ones(len(placement.bands), len(planes))
+        gains[placement.band_numbers[numbers]] = room.gains[search.score.fit.band_numbers]
+        of_receivers = room.receivers / unit
         if self.scene.one_radio:
-            gains = gains.mean().expand_as(gains)
-        placement.start_strengths(room.gains, receivers, gains)
+            of_receivers = of_receivers.mean().expand_as(of_receivers)
+        placement.start_strengths(gains, self.scene.radio_of(numbers), of_receivers)
         placement.step.mul_(0.1)
 
     def _plan(self, planes: Tensor, slabs: Tensor, order: int | float = math.inf) -> None:

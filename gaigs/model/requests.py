@@ -73,11 +73,12 @@ class Request(NamedTuple):
 
     def asked(self, scene: Scene, name: str | None = None) -> Asked:
         """Names and coordinates of the answer's axes; of its part at receiver ``name``."""
-        task = scene.task
-        if self.subcarriers.exchanged is not None:
-            task = task.at_frequencies(self.subcarriers.exchanged)
-        elif self.subcarriers.columns is not None:
-            task = task.at_frequencies(task.frequencies[self.subcarriers.columns])
+        task = self._task(scene)
+        known = [receiver.name for receiver in scene.receivers]
+        one = self.receiver if name is None else name
+        if task.is_channel and one is not None and not np.ndim(one):
+            heard = scene.receivers[int(as_receivers(one, known))].hears(task.frequencies)
+            task = task if heard.all() else task.at_frequencies(task.frequencies[heard])
         if isinstance(self.directions, Grid):
             task = copy.copy(task)
             task.directions = self.directions
@@ -85,7 +86,7 @@ class Request(NamedTuple):
         if isinstance(self.directions, Rays):
             shape = self.directions.shape
             axes = {f"direction_{k}": Axis(np.arange(size)) for k, size in enumerate(shape)}
-        names = np.array([receiver.name for receiver in scene.receivers])
+        names = np.array(known)
         places = self.axes[:-1] if self.receiver is None else self.axes
         positions = self.query.transmitters[:: self.each].reshape(*places, 3)
         has_axis = self.receiver is None and name is None
@@ -94,6 +95,15 @@ class Request(NamedTuple):
         elif not has_axis:
             names = names[self.query.receivers.cpu()].reshape(places)
         return Asked(positions, names, has_axis, axes, task.quantity, task.unit)
+
+    def _task(self, scene: Scene) -> Any:
+        """The task at the subcarriers that are asked for."""
+        task = scene.task
+        if self.subcarriers.exchanged is not None:
+            return task.at_frequencies(self.subcarriers.exchanged)
+        if self.subcarriers.columns is not None:
+            return task.at_frequencies(task.frequencies[self.subcarriers.columns])
+        return task
 
     def estimates(self, fields: Sequence, scene: Scene) -> Any:
         """Estimates of arranged fields; by receiver where these are dictionaries."""
@@ -120,18 +130,21 @@ class Request(NamedTuple):
     def arranged(self, values: Tensor, scene: Scene, axes: tuple[int, ...] | None = None) -> Any:
         """Values of links (b, ...) with the axes of the answer, or with other ones.
 
-        Where arrays have different numbers of elements, a dictionary by receiver or, of one
-        receiver, the elements of its array.
+        Where receivers have different elements or bands, a dictionary by receiver or, of one
+        receiver, the elements of its array and the subcarriers in its band.
         """
         axes = self.axes if axes is None else axes
         receivers = scene.receivers
         values = values.reshape((*axes, *values.shape[1:]))
-        if not lacks_elements(scene):
+        if not lacks_numbers(scene):
             return values
         is_channel = values.ndim > len(axes)
+        task = self._task(scene)
 
         def of_array(part: Tensor, receiver: Receiver) -> Tensor:
-            return part[..., : len(receiver.array), :] if is_channel else part
+            if not is_channel:
+                return part
+            return part[..., : len(receiver.array), :][..., receiver.hears(task.frequencies)]
 
         if self.receiver is None:
             parts = values.unbind(len(axes) - 1)
@@ -193,11 +206,15 @@ def _kind_of(values: Any) -> tuple[str, tuple[int, ...]]:
     return array.dtype.kind, array.shape
 
 
-def lacks_elements(scene: Scene) -> bool:
-    """True for channels if an array has fewer elements than another one."""
+def lacks_numbers(scene: Scene) -> bool:
+    """True for channels if a receiver lacks elements or subcarriers that another one has."""
     if not scene.task.is_channel:
         return False
-    return min(len(receiver.array) for receiver in scene.receivers) < scene.task.elements
+    return any(
+        len(receiver.array) < scene.task.elements
+        or not receiver.hears(scene.task.frequencies).all()
+        for receiver in scene.receivers
+    )
 
 
 def as_known_subcarriers(frequencies: object, scene: Scene, any_frequency: bool) -> Subcarriers:

@@ -126,7 +126,8 @@ class ReceiverChannels:
         train = links.split.train
         rows = train[query.receivers[train] == number]
         which = evenly(torch.arange(len(receiver.array)), elements)
-        when = evenly(torch.arange(len(task.frequencies)), subcarriers)
+        heard = receiver.hears(task.frequencies).nonzero()[:, 0]
+        when = evenly(heard, subcarriers)
         channels = links.labels[rows][:, which][:, :, when].to(torch.complex128)  # (b, e, s)
         is_received = channels.abs().amax((1, 2)) > 0
         pose = receiver.pose.to(torch.zeros((), dtype=torch.float64))
@@ -137,6 +138,11 @@ class ReceiverChannels:
             pose.world(receiver.array.elements[which].double()),
             task.frequencies[when],
         )
+
+    @property
+    def wavelength(self) -> float:
+        """At the middle frequency [m]."""
+        return speed_of_light / float(self.frequencies.mean())
 
     def about(self, middle: Float[Tensor, "3"]) -> "ReceiverChannels":
         """The same seen from a point."""
@@ -268,7 +274,7 @@ class ChannelData:
             ends += [receiver.places, receiver.position[None]]
         self.frame = RoomFrame(torch.cat(ends))
         self.receivers = [receiver.about(self.frame.middle) for receiver in received]
-        self.wavelength = speed_of_light / float(self.receivers[0].frequencies.mean())
+        self.wavelength = min(receiver.wavelength for receiver in self.receivers)
         bands = [
             float(receiver.frequencies.max() - receiver.frequencies.min())
             for receiver in self.receivers

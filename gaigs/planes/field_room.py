@@ -6,7 +6,7 @@ from functools import partial
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Complex, Float, Int
+from jaxtyping import Bool, Complex, Float, Int
 from torch import Tensor
 
 from gaigs.planes.channel_links import SLABS, ChannelData, SlabRoom
@@ -17,28 +17,37 @@ class FieldRoom(NamedTuple):
     """Planes in the frame, their slabs as in ``SLABS``, and gains over the slabs' reflections.
 
     A path's strength is the product of its planes' gains and the receiver's: a few planes explain
-    many paths.
+    many paths. Bands share the planes, but each has gains of its own, which stay 0 where a band
+    does not use the plane.
     """
 
     planes: Float[Tensor, "w 4"]
     slabs: Float[Tensor, "w 3"]
-    gains: Complex[Tensor, " w"]
+    gains: Complex[Tensor, "bands w"]
     receivers: Complex[Tensor, " r"]
+    uses: Bool[Tensor, "bands w"]
 
-    def with_plane(self, plane: Float[Tensor, "4"], slab: Float[Tensor, "3"]) -> "FieldRoom":
+    def with_plane(
+        self, plane: Float[Tensor, "4"], slab: Float[Tensor, "3"], uses: Bool[Tensor, " bands"]
+    ) -> "FieldRoom":
         """The room with a plane behind the others, as yet without a gain."""
         return FieldRoom(
             torch.cat((self.planes, plane[None])),
             torch.cat((self.slabs, slab[None])),
-            torch.cat((self.gains, self.gains.new_zeros(1))),
+            torch.cat((self.gains, self.gains.new_zeros(len(self.gains), 1)), 1),
             self.receivers,
+            torch.cat((self.uses, uses[:, None]), 1),
         )
 
     def without_plane(self, number: int) -> "FieldRoom":
         """The room without one plane."""
         others = torch.arange(len(self.planes)) != number
         return FieldRoom(
-            self.planes[others], self.slabs[others], self.gains[others], self.receivers
+            self.planes[others],
+            self.slabs[others],
+            self.gains[:, others],
+            self.receivers,
+            self.uses[:, others],
         )
 
 
@@ -103,11 +112,13 @@ class PlaceBlock(NamedTuple):
         rows: Numbers of all places, a place a row.
         gaps: Distances of their places [m].
         each: Numbers of a place.
+        band: Number of the receiver's band.
     """
 
     rows: Int[Tensor, " c"]
     gaps: Float[Tensor, "c c"]
     each: int
+    band: int
 
 
 class FieldFit:
@@ -142,13 +153,16 @@ class FieldFit:
         self.scale = torch.cat(scales)  # (m,)
         self.values = torch.cat(values) * self.scale  # (m,), mean power 1 for each receiver
         self.owner = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
-        self.variation = Variation.choices()[0]
+        wavelengths = torch.tensor([receiver.wavelength for receiver in self.receivers])
+        self.bands, self.band_numbers = wavelengths.unique(return_inverse=True)
+        self.band = self.band_numbers[self.owner]  # (m,)
+        self.variations = [Variation.choices()[0]] * len(self.bands)
         self.blocks = list(self._divide(largest))
 
     def _divide(self, largest: int) -> Iterator[PlaceBlock]:
         """Numbers of neighbouring places at one receiver, at most ``largest`` together."""
         first = 0
-        for receiver in self.receivers:
+        for receiver, band in zip(self.receivers, self.band_numbers.tolist(), strict=True):
             b, k = receiver.flat.shape
             rows = first + torch.arange(b * k).view(b, k)
             first += b * k
@@ -158,7 +172,7 @@ class FieldFit:
                 own = groups == group
                 gaps = torch.cdist(receiver.places[own], receiver.places[own])
                 gaps = gaps.repeat_interleave(k, 0).repeat_interleave(k, 1)
-                yield PlaceBlock(rows[own].flatten(), gaps, k)
+                yield PlaceBlock(rows[own].flatten(), gaps, k, band)
 
     @property
     def count(self) -> int:
@@ -167,10 +181,11 @@ class FieldFit:
 
     def start(self, planes: Float[Tensor, "w 4"]) -> FieldRoom:
         """Known planes as half-spaces; without any it is free space alone."""
-        gains = torch.ones(len(planes), dtype=torch.complex128)
+        gains = torch.ones(len(self.bands), len(planes), dtype=torch.complex128)
         receivers = torch.ones(len(self.receivers), dtype=torch.complex128)
         slabs = SLABS[1].repeat(len(planes), 1)
-        return self.fit_gains(FieldRoom(planes.double(), slabs, gains, receivers), 12)
+        uses = torch.ones_like(gains.real, dtype=torch.bool)
+        return self.fit_gains(FieldRoom(planes.double(), slabs, gains, receivers, uses), 12)
 
     def waves(self, planes: Float[Tensor, "w 4"], room: FieldRoom) -> Complex[Tensor, "m n"]:
         """Scaled waves of all paths after reflection by slabs, for each number."""
@@ -219,9 +234,15 @@ class FieldFit:
         whiten: Operator,
     ) -> FieldRoom:
         """The room after one damped step of all gains (Levenberg and Marquardt)."""
-        changes = multiply_gains(room.gains, all_sequences(len(room.planes), self.order))
-        unit = waves @ changes.products  # (m,)
-        by_gain = room.receivers[self.owner, None] * (waves @ changes.derivatives)  # (m, w)
+        sequences = all_sequences(len(room.planes), self.order)
+        unit = torch.zeros_like(self.values)  # (m,)
+        by_gain = waves.new_zeros(len(waves), *room.gains.shape)  # (m, bands, w)
+        for number, gains in enumerate(room.gains):
+            own = self.band == number
+            changes = multiply_gains(gains, sequences)
+            unit[own] = waves[own] @ changes.products
+            by_gain[own, number] = (waves[own] @ changes.derivatives) * room.uses[number]
+        by_gain = room.receivers[self.owner, None] * by_gain.flatten(1)  # (m, bands w)
         is_own = self.owner[:, None] == torch.arange(len(self.receivers))
         jacobian = whiten(torch.cat((by_gain, unit[:, None] * is_own), 1))  # (m, w + r)
         weights = 1 / (rest.abs().square() + self.floor)
@@ -229,16 +250,27 @@ class FieldFit:
         size = gram.diagonal().real
         gram = gram + torch.diag(damping * size + 1e-6 * size.mean())
         change = torch.linalg.solve(gram, jacobian.mH @ (weights * rest))
-        gains, receivers = change.split((len(room.gains), len(self.receivers)))
-        return room._replace(gains=room.gains + gains, receivers=room.receivers + receivers)
+        gains, receivers = change.split((room.gains.numel(), len(self.receivers)))
+        gains = room.gains + gains.view_as(room.gains)
+        return room._replace(gains=gains, receivers=room.receivers + receivers)
 
     def residual(
         self, room: FieldRoom, waves: Complex[Tensor, "m n"] | None = None
     ) -> Complex[Tensor, " m"]:
         """Scaled errors of all numbers, without deviations of paths."""
         waves = self.waves(room.planes, room) if waves is None else waves
-        products = multiply_gains(room.gains, all_sequences(len(room.planes), self.order)).products
-        return self.values - room.receivers[self.owner] * (waves @ products)
+        products = self.products(room)
+        # One product of matrices a band: of each number with its own would take their memory.
+        total = torch.zeros_like(self.values)
+        for number, of_band in enumerate(products):
+            own = self.band == number
+            total = torch.where(own, waves @ of_band, total)
+        return self.values - room.receivers[self.owner] * total
+
+    def products(self, room: FieldRoom) -> Complex[Tensor, "bands n"]:
+        """Products of the gains of each path in each band."""
+        sequences = all_sequences(len(room.planes), self.order)
+        return torch.stack([multiply_gains(gains, sequences).products for gains in room.gains])
 
     @torch.no_grad()
     def krige(self, room: FieldRoom, waves: Complex[Tensor, "m n"]) -> Kriged:
@@ -249,17 +281,17 @@ class FieldFit:
 
         Source: Dubrule, Cross validation of kriging in a unique neighborhood, 1983.
         """
-        if not self.variation.share:
+        if not any(variation.share for variation in self.variations):
             return Kriged(lambda rest: rest, lambda rest: rest)
-        products = multiply_gains(room.gains, all_sequences(len(room.planes), self.order)).products
-        fields = waves * (room.receivers[self.owner, None] * products)
+        fields = waves * (room.receivers[self.owner, None] * self.products(room)[self.band])
         whitening = []
         unseen = []
         for block in self.blocks:
+            variation = self.variations[block.band]
             own = fields[block.rows].to(torch.complex64)
-            kernel = self.variation.share**2 * (-block.gaps / self.variation.length).exp()
+            kernel = variation.share**2 * (-block.gaps / variation.length).exp()
             covariance = kernel.float() * (own @ own.mH)
-            covariance = covariance + self.variation.noise**2 * torch.eye(len(own))
+            covariance = covariance + variation.noise**2 * torch.eye(len(own))
             factor = torch.linalg.cholesky(covariance)
             root = torch.linalg.solve_triangular(
                 factor, torch.eye(len(own)).to(factor), upper=False
@@ -267,7 +299,7 @@ class FieldFit:
             by_place = (root.mH @ root).unflatten(0, (-1, block.each))  # (b, k, c)
             of_place = by_place.unflatten(2, (-1, block.each)).diagonal(dim1=0, dim2=2)  # (k, k, b)
             left = torch.linalg.solve(of_place.movedim(2, 0), by_place)
-            whitening.append(self.variation.noise * root.to(torch.complex128))
+            whitening.append(variation.noise * root.to(torch.complex128))
             unseen.append(left.flatten(0, 1).to(torch.complex128))
         return Kriged(partial(self._apply, whitening), partial(self._apply, unseen))
 
@@ -284,14 +316,17 @@ class FieldFit:
         return self.krige(room, waves).unseen(self.residual(room, waves))
 
     def choose_variation(self, room: FieldRoom) -> None:
-        """Takes the variation with which the places of a room predict each other best."""
+        """Takes the variation with which a room's places predict each other best in each band."""
         waves = self.waves(room.planes, room)
         rest = self.residual(room, waves)
-        errors = {}
+        errors = []
         for variation in Variation.choices():
-            self.variation = variation
-            errors[variation] = self.mean_log(self.krige(room, waves).unseen(rest)).item()
-        self.variation = min(errors, key=errors.__getitem__)
+            self.variations = [variation] * len(self.bands)
+            unseen = self.krige(room, waves).unseen(rest)
+            logs = (unseen.abs().square() + self.floor).log()
+            errors.append(logs.new_zeros(len(self.bands)).index_add(0, self.band, logs))
+        best = torch.stack(errors).argmin(0).tolist()
+        self.variations = [Variation.choices()[number] for number in best]
 
     def mean_log(self, rest: Complex[Tensor, " m"]) -> Float[Tensor, ""]:
         """Mean logarithm of squared errors over the mean power, with the floor."""

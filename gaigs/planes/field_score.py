@@ -1,5 +1,6 @@
 """The score of planes by fields of few numbers a place: coherent over places."""
 
+import itertools
 import math
 from collections.abc import Iterator
 
@@ -37,6 +38,7 @@ class FieldScore(Score[FieldRoom]):
         self.price = price / self.fit.count
         self.chunk = chunk
         self.groups = 1
+        self.rated = torch.ones(len(self.fit.bands), dtype=torch.bool)
         # Metal, which reflects alike at all angles.
         self.mirror = torch.tensor([0.0, math.log(1e6), 0.0], dtype=torch.float64)
 
@@ -47,7 +49,7 @@ class FieldScore(Score[FieldRoom]):
     # --- ratings ---
 
     def rate(self, room: FieldRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
-        """Ratings over the ratings of noise, with places in ``groups``."""
+        """Ratings over those of noise in the ``rated`` bands; of the grid with places in groups."""
         ratings = self._explain(room, grid.flatten(0, 1), self.groups)
         return GridRatings(
             ratings.view(grid.shape[:2]), lambda planes: self._explain(room, planes, 1)
@@ -62,6 +64,8 @@ class FieldScore(Score[FieldRoom]):
         rest = rest / (power + power.mean())
         total = torch.zeros(len(planes))
         for number, receiver in enumerate(self.data.receivers):
+            if not self.rated[self.fit.band_numbers[number]]:
+                continue
             own = self.fit.owner == number
             power = rest[own].abs().square().mean()
             shape = receiver.flat.shape
@@ -112,11 +116,13 @@ class FieldScore(Score[FieldRoom]):
         # Without a gain the new plane changes no covariance.
         kriged = self.fit.krige(room, self.fit.waves(room.planes, room))
         trials = []
-        for plane in self._readings(room, candidate.plane):
-            if self.data.frame.is_like(room.planes, plane).any():
-                continue
-            for slab in (SLABS[1], self.mirror):
-                larger = self.fit.fit_gains(room.with_plane(plane, slab), 5, kriged=kriged)
+        # A plane that some bands show may have a part in the others.
+        uses = [self.rated] if self.rated.all() else [self.rated, torch.ones_like(self.rated)]
+        readings = self._readings(room, candidate.plane)
+        for plane, slab, used in itertools.product(readings, (SLABS[1], self.mirror), uses):
+            if not self.data.frame.is_like(room.planes, plane).any():
+                start = room.with_plane(plane, slab, used)
+                larger = self.fit.fit_gains(start, 5, kriged=kriged)
                 rest = kriged.unseen(self.fit.residual(larger))
                 trials.append((self.fit.mean_log(rest).item(), larger))
         trials.sort(key=lambda trial: trial[0])
@@ -127,12 +133,13 @@ class FieldScore(Score[FieldRoom]):
     def _readings(self, room: FieldRoom, plane: Float[Tensor, "4"]) -> list[Float[Tensor, "4"]]:
         """A plane, and planes by whose reflection after or before a known one it would be found.
 
-        An image of second order of a single receiver is as good as one in a plane of its own.
+        An image of second order of a single receiver, of one band or several, is as good as one in
+        a plane of its own.
         """
         readings = [plane]
-        if len(self.data.receivers) > 1:
-            return readings
         position = self.data.receivers[0].position
+        if any((receiver.position != position).any() for receiver in self.data.receivers):
+            return readings
         image = reflect(position, plane[:3], plane[3])
         for known in room.planes:
             normal, offset = known[:3], known[3]

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gaigs.data import Links
@@ -54,6 +54,8 @@ class FieldSearch:
         start: Planes known before (w, 4).
         options: Options of the search.
         smallest: Fewest places of a group.
+        fewest: Fewest numbers of a search: ten for each plane of a box. Of 22, a false plane
+            explained more than its price.
 
     Source: ours.
     """
@@ -67,6 +69,7 @@ class FieldSearch:
         start: Float[Tensor, "w 4"],
         options: ChannelOptions | None = None,
         smallest: int = 16,
+        fewest: int = 60,
     ):
         self.data = ChannelData(links, sign, True, order, options or ChannelOptions())
         self.score = FieldScore(self.data)
@@ -74,6 +77,7 @@ class FieldSearch:
         self.most = most
         self.start = self.frame.from_world(start)
         self.smallest = smallest
+        self.fewest = fewest
 
     @torch.no_grad()
     def run(self) -> FieldRoom:
@@ -81,6 +85,9 @@ class FieldSearch:
         fit = self.score.fit
         room = fit.start(self.start)
         fit.choose_variation(room)
+        if fit.count < self.fewest:
+            log.info("%d numbers tell no planes; a search takes %d", fit.count, self.fewest)
+            return room
         grids = [grid for grid in (self._make_upright(), self._make_tilted()) if grid is not None]
         largest = max([grid.size for grid in grids], default=0)
         log.info(
@@ -100,12 +107,16 @@ class FieldSearch:
         """The room with the best plane of the first grid that has one; None without any."""
         score = self.score
         for grid in [self._make_axes(room), *grids]:
-            score.groups = grid.groups
             normals = grid.normals.to(self.frame.points)
             lines = self.frame.grid(normals, grid.offsets, self.data.options.margin)
             shift = grid.shift / self.frame.diagonal
             search = PlaneSearch(self.frame, score, grid.turn / 2, shift / 2)
-            larger = search.extend(room, lines)
+            trials = []
+            for rated in self._rated():
+                score.groups = grid.groups
+                score.rated = rated
+                trials += search.list_extensions(room, lines)
+            larger = min(trials, key=score.error, default=None)
             if larger is None:
                 continue
             larger = score.refine(larger)
@@ -117,6 +128,15 @@ class FieldSearch:
                 score.fit.choose_variation(larger)
                 return larger
         return None
+
+    def _rated(self) -> list[Bool[Tensor, " bands"]]:
+        """Bands that rate planes: all together, and of several each alone.
+
+        Shadows and lengths of waves differ: what one band shows clearly may be noise in the others.
+        """
+        alone = torch.eye(len(self.score.fit.bands), dtype=torch.bool)
+        together = torch.ones_like(alone[:1])
+        return [*together, *(alone if len(alone) > 1 else alone[:0])]
 
     # --- grids ---
 

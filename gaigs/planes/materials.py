@@ -45,7 +45,8 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
     """
     sequences = placement.sequences[placement.kept]
     normals = placement.normals
-    gains = placement.path_gains[placement.kept] - placement.path_gains[0]
+    own = placement.of_bands(placement.path_gains, query).mean(0)
+    gains = own[placement.kept] - own[0]
     gains = (gains / (sequences >= 0).sum(1).clamp_min(1)).exp()  # of each bounce
     compared = torch.abs if placement.path_phases is not None else torch.Tensor.clone
     options = _list_slabs(placement, frequency)

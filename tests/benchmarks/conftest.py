@@ -7,4 +7,8 @@ import sys
 from pathlib import Path
 
 TESTS = Path(__file__).parents[1]
-sys.path += [str(TESTS / "report"), str(TESTS.parent / "benchmarks")]
+sys.path += [
+    str(TESTS / "report"),
+    str(TESTS.parent / "benchmarks"),
+    str(TESTS.parent / "examples"),
+]

@@ -479,3 +479,62 @@ def test_real_and_imaginary_part_have_one_shape(tmp_path):
             {"name": "csi_npz", "file": str(tmp_path / "parts.npz"), "arrays": {"h": ["re", "im"]}},
             RANDOM,
         )
+
+
+def in_band(frequency, seed):
+    """Five places to two receivers with one element at two subcarriers."""
+    draw = np.random.default_rng(seed)
+    return {
+        "tx": draw.uniform(-3, 3, (5, 3)).repeat(2, 0),
+        "rx": np.array([[0.0, 0.0, 2.5], [4.0, 1.0, 2.25]]),
+        "rx_index": np.tile([0, 1], 5),
+        "frequencies": frequency + np.array([1e6, 0.0]),
+        "h": draw.normal(size=(10, 1, 2)) + 1j * draw.normal(size=(10, 1, 2)),
+    }
+
+
+def test_files_of_two_bands_have_a_radio_for_each(tmp_path):
+    low, high = in_band(2.4e9, 0), in_band(5.8e9, 1)
+    high["rx"] = high["rx"][::-1]  # the same receivers in another order
+    files = [save(tmp_path / "low.npz", low), save(tmp_path / "high.npz", high)]
+    links = load({"name": "csi_npz", "file": [str(file) for file in files]}, RANDOM)
+    names = [receiver.name for receiver in links.receivers]
+    assert names == ["rx0 2.401 GHz", "rx1 2.401 GHz", "rx1 5.801 GHz", "rx0 5.801 GHz"]
+    assert links.task.frequencies.tolist() == [2.4e9, 2.401e9, 5.8e9, 5.801e9]
+    for content, receivers, own in ((low, (0, 1), slice(0, 2)), (high, (2, 3), slice(2, 4))):
+        for number, receiver in enumerate(receivers):
+            rows = links.query.receivers == receiver
+            expected = content["h"][number::2][..., ::-1].astype(np.complex64)
+            np.testing.assert_array_equal(links.labels[rows][..., own], expected)
+            assert links.labels[rows].count_nonzero() == expected.size
+            places = content["tx"][number::2].astype(np.float32)
+            np.testing.assert_array_equal(links.query.transmitters[rows], places)
+    check_data(links)
+
+
+def test_one_file_of_two_bands_is_divided(tmp_path):
+    low = in_band(2.4e9, 0)
+    high = in_band(5.8e9, 1)
+    low["h"][:4] = 0  # these links are measured in the other band alone
+    both = low | {
+        "h": np.concatenate((low["h"], high["h"]), 2),
+        "frequencies": np.concatenate((low["frequencies"], high["frequencies"])),
+    }
+    links = read(save(tmp_path / "both.npz", both))
+    assert links.query.receivers.bincount().tolist() == [3, 3, 5, 5]
+    assert len(links.rows.unique()) == 5
+    model = gaigs.train("friis", links)
+    predicted = model.predict([[1.0, 1.0, 1.0]])
+    assert {name: part.shape for name, part in predicted.items()} == {
+        receiver.name: (1, 1, 2) for receiver in links.receivers
+    }
+    one = model.predict([[1.0, 1.0, 1.0]], receiver="rx0 5.801 GHz")
+    assert torch.equal(one, predicted["rx0 5.801 GHz"])
+    assert one.abs().min() > 0
+
+
+def test_subcarriers_of_one_band_must_agree(tmp_path):
+    contents = in_band(2.4e9, 0), in_band(2.42e9, 1)
+    files = [save(tmp_path / f"{k}.npz", content) for k, content in enumerate(contents)]
+    with pytest.raises(ValueError, match=r"same subcarriers, got 2 of 4 near 2.4 GHz"):
+        load({"name": "csi_npz", "file": [str(file) for file in files]}, RANDOM)

@@ -1,5 +1,7 @@
 """The search for planes in fields of one number a place, of an invented room made by numpy."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -20,17 +22,17 @@ WALLS = np.array([[0.8, 0.6, 0, -0.9], [-0.6, 0.8, 0, 2.8], [0, 0, 1.0, -0.2]])
 """Normals and offsets [m] of walls that stand at 37 degrees to the axes, and of the floor."""
 
 
-def field(places, receiver):
+def field(places, receiver, frequency=FREQUENCY, reflection=-0.5):
     """Direct wave and images of the first order (b,), each reflected by half."""
 
     def wave(points):
         lengths = np.linalg.norm(points - receiver, axis=1)
-        return np.exp(-2j * np.pi * FREQUENCY / speed_of_light * lengths) / lengths
+        return np.exp(-2j * np.pi * frequency / speed_of_light * lengths) / lengths
 
     total = wave(places)
     for *normal, offset in WALLS:
         images = places - 2 * (places @ normal - offset)[:, None] * normal
-        total = total - 0.5 * wave(images)
+        total = total + reflection * wave(images)
     return total
 
 
@@ -80,10 +82,18 @@ def test_noise_has_no_planes():
     assert not len(found.planes)
 
 
+@pytest.mark.usefixtures("unchecked")
+def test_few_places_tell_no_planes(caplog):
+    caplog.set_level("INFO")
+    found = FieldSearch(room(40), -1, 2, 4, torch.zeros(0, 4)).run()
+    assert not len(found.planes)
+    assert "40 numbers tell no planes; a search takes 60" in caplog.text
+
+
 def test_kriging_leaves_what_other_places_do_not_explain(links):
     search = FieldSearch(links, -1, 1, 4, torch.from_numpy(WALLS))
     fit = FieldFit(search.data, largest=1000)
-    fit.variation = Variation(0.5, 1.0, 0.3)
+    fit.variations = [Variation(0.5, 1.0, 0.3)]
     start = fit.start(search.start)
     waves = fit.waves(start.planes, start)
     rest = fit.residual(start, waves)
@@ -91,10 +101,42 @@ def test_kriging_leaves_what_other_places_do_not_explain(links):
     # Without the first number, as kriging from the others of its receiver predicts it.
     own = fit.owner == 0
     gaps = torch.cdist(search.data.receivers[0].places, search.data.receivers[0].places)
-    gains = torch.cat((start.gains, torch.ones(1)))
+    gains = torch.cat((start.gains[0], torch.ones(1)))
     order = torch.tensor([-1, 0, 1, 2])
     fields = waves[own] * gains[order] * start.receivers[0]
     covariance = 0.25 * (-gaps).exp() * (fields @ fields.mH) + 0.09 * torch.eye(int(own.sum()))
     weights = torch.linalg.solve(covariance[1:, 1:], covariance[1:, :1]).mH
     expected = rest[own][0] - weights[0] @ rest[own][1:]
     torch.testing.assert_close(found[0], expected, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_bands_share_planes_and_have_gains_of_their_own():
+    """One receiver at two bands; places of both bands differ."""
+    low = room(160)
+    high = room(320)
+    both = low.query.transmitters, high.query.transmitters[160:]
+    receiver = low.receivers[0]
+    radios = [replace(receiver, name="low", band=(0.0, 3e9)), replace(receiver, band=(3e9, 9e9))]
+    labels = torch.zeros(320, 1, 2, dtype=torch.complex64)
+    labels[:160, 0, 0] = low.labels[:, 0, 0]
+    at = receiver.pose.position.double().numpy()
+    labels[160:, 0, 1] = torch.from_numpy(field(np.float64(both[1]), at, 3.6e9, -0.2))
+    links = Links(
+        query=Query(torch.cat(both), torch.arange(2).repeat_interleave(160)),
+        receivers=tuple(radios),
+        labels=labels,
+        task=Csi(1, torch.tensor([FREQUENCY, 3.6e9]).double()),
+        split=Split("all", torch.arange(320), torch.arange(0), torch.arange(0)),
+    )
+    torch.manual_seed(0)
+    search = FieldSearch(links, -1, 1, 4, torch.zeros(0, 4))
+    found = search.run()
+    planes = search.frame.to_world(found.planes).numpy()
+    for wall in WALLS:
+        gaps = np.abs(planes * np.sign(planes[:, :3] @ wall[:3])[:, None] - wall).max(1)
+        assert gaps.min() < 0.02
+    # Wavelengths ascend: the first gains are the high band's, whose reflections are weaker.
+    shown = found.uses.all(0)
+    assert shown.sum() >= 2
+    assert (found.gains[0].abs() < 0.7 * found.gains[1].abs())[shown].all()

@@ -61,8 +61,10 @@ def write_predictions(
         estimate = Estimate(values, None, None, None)  # type: ignore[arg-type]
     absent = torch.tensor(False).expand(len(query), *task.shape)
     if task.is_channel:
-        lacks = lacking(scene.receivers, query.receivers.cpu(), task.elements)  # (n, elements)
-        absent = lacks[..., None].expand_as(absent)
+        numbers: Any = task
+        absent = lacking(
+            scene.receivers, query.receivers.cpu(), numbers.elements, numbers.frequencies
+        )
         estimate = Estimate(*(_blank(part, absent) for part in estimate))
         measured = _blank(measured, absent)
     variables = tabulate(query, scene, task, estimate, measured)

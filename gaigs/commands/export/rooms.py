@@ -105,7 +105,7 @@ def traced_gains(model: MirroredSplatting, rest: float) -> Complex[Tensor, " rec
         rest: Loss that no sheet has, of ``fit_sheets`` [Np].
     """
     placement = model.placement
-    nepers = placement.receiver_gains + placement.path_gains[0] + rest
+    nepers = placement.receiver_gains + placement.path_gains[..., 0].mean() + rest
     amplitudes = nepers.exp() * model.pooling.strength
     return torch.polar(amplitudes, placement.receiver_phases)
 

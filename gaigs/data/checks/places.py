@@ -38,7 +38,8 @@ def check_places(links: Any) -> Iterator[Finding]:
         return
     for one, other in sorted(tree.query_pairs(0.01)):
         a, b = given[one], given[other]
-        if (receivers[a].pose.rotation - receivers[b].pose.rotation).norm() < 0.01:
+        turned = (receivers[a].pose.rotation - receivers[b].pose.rotation).norm()
+        if turned < 0.01 and receivers[a].band == receivers[b].band:
             text = f"{receivers[a].name} and {receivers[b].name} stand at one place"
             yield Finding("receivers at one place", text)
 

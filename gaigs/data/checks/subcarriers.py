@@ -26,12 +26,14 @@ def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
     # Most subcarriers are channels, which few links show.
     for index in (few, torch.arange(len(links))):
         values = links.labels[index]
-        absent = lacking(links.receivers, links.query.receivers[index], values.shape[1])  # (n, e)
+        receivers = links.query.receivers[index]
+        absent = lacking(links.receivers, receivers, values.shape[1], links.task.frequencies)
+        absent = absent[..., chosen]  # (n, e, k)
         strengths = values.abs().amax((1, 2))[:, None, None]
         values = values[..., chosen]
-        # Of a link that has the element (e, k).
-        first = values[absent.int().argmin(0), torch.arange(values.shape[1])]
-        is_same = ((values == first) | absent[..., None]).all(0).all(0)
+        # Of a link that has the element and the subcarrier (1, e, k).
+        first = values.gather(0, absent.int().argmin(0, keepdim=True))
+        is_same = ((values == first) | absent).all(0).all(0)
         is_faint = (values.abs() <= 1e-6 * strengths).all(0).all(0)  # 0 but for rounding
         chosen = chosen[is_same | is_faint]
         if not len(chosen) or len(index) < 5:

@@ -48,9 +48,14 @@ class ChannelPooling(Pooling):
     def received(
         self, query: Query, channels: Complex[Tensor, "b e s"]
     ) -> Complex[Tensor, "b most s"]:
-        """Channels behind the front ends, 0 at the elements of other receivers' arrays alone."""
+        """Channels behind the front ends, 0 at the elements of other receivers' arrays alone, and
+        outside a receiver's band.
+        """
         missing = self.task.elements - channels.shape[1]
-        return self.scene.received(query, torch.nn.functional.pad(channels, (0, 0, 0, missing)))
+        channels = torch.nn.functional.pad(channels, (0, 0, 0, missing))
+        hears = [receiver.hears(self.frequencies) for receiver in self.scene.receivers]
+        heard = torch.stack(hears).to(query.receivers.device)[query.receivers, None]  # (b, 1, s)
+        return self.scene.received(query, channels * heard)
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:

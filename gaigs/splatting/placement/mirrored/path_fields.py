@@ -43,7 +43,8 @@ class PathFields(MovablePlanes):
     with
 
     * F: the element's pattern towards the image, times a learnt power of the cosine;
-    * g_k: the gain of a path; except of channels of many numbers, phi_k: its phase;
+    * g_k: the gain of a path; except of channels of many numbers, phi_k: its phase; where receivers
+      have several bands, both are of each band;
     * g_r: the gain of a receiver; of channels, phi_r: its phase;
     * g_w: the gain of a plane, which falls off as a Gaussian about the plane's middle;
     * Gamma_w: Fresnel's reflection with a learnt permittivity, of channels at a slab with a learnt
@@ -55,6 +56,7 @@ class PathFields(MovablePlanes):
 
     Attributes:
         is_complex: True for channels.
+        bands: Different bands of the receivers [Hz].
         is_bare: True while only the direct path counts, without obstacles.
         is_heard: True for receivers with training links (r,); others have the gain of a receiver in
             general.
@@ -85,7 +87,9 @@ class PathFields(MovablePlanes):
         super().__init__(scene, planes, order, walls, fixed)
         self._check_number("obstacles", obstacles, 0)
         self.is_complex = scene.task.dtype.is_complex
-        numbers = math.prod(scene.task.shape)
+        self.bands = sorted({receiver.band for receiver in scene.receivers})
+        self._number_bands()
+        numbers = math.prod(scene.task.shape) // len(self.bands)
         self.has_few_numbers = self.is_complex and numbers < self.fewest_numbers
         self._add_plane_parameters(planes)
         self._add_path_parameters(planes)
@@ -106,11 +110,12 @@ class PathFields(MovablePlanes):
 
     def _add_path_parameters(self, planes: int) -> None:
         paths = len(self.sequences)
-        self.path_gains = _filled(0.0, paths)
+        strengths = (len(self.bands), paths) if len(self.bands) > 1 else (paths,)
+        self.path_gains = _filled(0.0, *strengths)
         # Channels of many numbers locate planes by their phases: a free phase would only hide a
         # plane half a wavelength off.
         is_free = not self.is_complex or self.has_few_numbers
-        self.path_phases = _filled(0.0, paths) if is_free else None
+        self.path_phases = _filled(0.0, *strengths) if is_free else None
         # [m]; a metre is a half-space.
         self.log_thicknesses = _filled(0.0, planes) if self.is_complex else None
         # [rad], far below the resolution of small arrays.
@@ -174,7 +179,8 @@ class PathFields(MovablePlanes):
 
         ``blocked`` is False for the field without obstacles.
         """
-        gains = self.path_gains[self.kept] + self.gains_at(query.receivers).real[:, None]
+        own = self.of_bands(self.path_gains, query)
+        gains = own[..., self.kept] + self.gains_at(query.receivers).real[:, None]
         fields = torch.complex(gains.exp() * folded.exists, torch.zeros_like(gains))
         fields = folded.reflected(fields, self.coefficients(query, folded))
         if blocked and self.obstacles is not None and not self.is_bare:
@@ -239,6 +245,25 @@ class PathFields(MovablePlanes):
         share = 1 - field.abs() / free.abs().clamp_min(torch.finfo(field.real.dtype).tiny)
         return (share * field + 0.1 * free) * self.patterns(query, links.ways)
 
+    # --- bands ---
+
+    def _number_bands(self) -> None:
+        """Numbers the band of each receiver; a new receiver must have one of the known bands."""
+        for receiver in self.scene.receivers:
+            if receiver.band not in self.bands:
+                raise ValueError(
+                    f"receiver {receiver.name!r} must have a band of the training, one of "
+                    f"{self.bands} [Hz]; give it, as in gaigs.Receiver(NAME, POSE, ARRAY, BAND)"
+                )
+        numbers = [self.bands.index(receiver.band) for receiver in self.scene.receivers]
+        self.register_buffer("band_numbers", torch.tensor(numbers), persistent=False)
+
+    def of_bands(self, strengths: Float[Tensor, "*bands n"], query: Query) -> Float[Tensor, "c n"]:
+        """Gains or phases of all paths in the band of each link's receiver, c = 1 or b."""
+        if len(self.bands) == 1:
+            return strengths[None]
+        return strengths[self.band_numbers[query.receivers]]
+
     # --- receivers ---
 
     def fit(self, links: Links) -> None:
@@ -275,6 +300,7 @@ class PathFields(MovablePlanes):
             self.receiver_phases = nn.Parameter(gains.imag.contiguous())
         self.is_heard = torch.ones_like(gains.real, dtype=torch.bool)
         self.boresights = self._boresights()
+        self._number_bands()
 
     def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
         """Field gain of a receiver's elements in its frame; of arrays times the learnt cos^q."""

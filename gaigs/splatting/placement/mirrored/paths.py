@@ -132,23 +132,24 @@ class Mirrored(PathFields):
     @torch.no_grad()
     def start_strengths(
         self,
-        gains: Complex[Tensor, " w"],
+        gains: Complex[Tensor, "bands w"],
         receivers: Int[Tensor, " r"],
         receiver_gains: Complex[Tensor, " r"],
     ) -> None:
         """Starts paths of the first planes from these planes' gains over their slabs' reflections.
 
         Args:
-            gains: Complex gains of the first planes.
+            gains: Complex gains of the first planes in each of ``bands``.
             receivers: Numbers of receivers.
             receiver_gains: Their gains over the pooling's unit.
         """
         least = 1e-3  # a logarithm needs some gain
-        ones = gains.new_ones(len(self.origin) + 1 - len(gains))
-        factors = torch.cat((gains, ones))[self.sequences]  # (n, order); 1 for no plane
-        self.path_gains.copy_(factors.abs().clamp_min(least).log().sum(1))
+        ones = gains.new_ones(len(gains), len(self.origin) + 1 - gains.shape[1])
+        factors = torch.cat((gains, ones), 1)[:, self.sequences]  # (bands, n, order); 1: no plane
+        strengths = factors.abs().clamp_min(least).log().sum(2)  # (bands, n)
+        self.path_gains.copy_(strengths.view_as(self.path_gains))
         if self.path_phases is not None:
-            self.path_phases.copy_(factors.angle().sum(1))
+            self.path_phases.copy_(factors.angle().sum(2).view_as(self.path_phases))
         self.receiver_gains[receivers] = receiver_gains.abs().clamp_min(least).log().float()
         if self.receiver_phases is not None:
             self.receiver_phases[receivers] = receiver_gains.angle().float()
@@ -209,7 +210,7 @@ class Mirrored(PathFields):
         turns = lengths / (speed_of_light / carriers(self.scene, query).to(lengths))[:, None]
         phases = -2 * math.pi * (turns - turns.detach().round())
         if self.path_phases is not None:
-            phases = phases + self.path_phases[self.kept]
+            phases = phases + self.of_bands(self.path_phases, query)[..., self.kept]
         if self.receiver_phases is not None:
             phases = phases + self.gains_at(query.receivers).imag[:, None]
         return torch.polar(torch.ones_like(phases), phases)
