@@ -256,7 +256,7 @@ class Scene:
 
 
 def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
-    """Frequency of each link [Hz]: the query's, the data's only one, or its receiver's middle one."""
+    """Frequency of each link [Hz]: the query's, the only one, or its receiver's middle one."""
     if scene.task.is_channel:
         return scene.middles.to(query.transmitters)[query.receivers]
     if query.frequencies is not None:
