@@ -154,7 +154,7 @@ def lacking(
     count: int,
     frequencies: Float[Tensor, " s"],
 ) -> Bool[Tensor, "b e s"]:
-    """True for each of ``count`` elements a receiver lacks, and for subcarriers outside its band."""
+    """True for elements, of ``count``, that a receiver lacks, and subcarriers outside its band."""
     sizes = torch.tensor([len(receiver.array) for receiver in receivers])
     hears = torch.stack([receiver.hears(frequencies.cpu()) for receiver in receivers])  # (r, s)
     exists = torch.arange(count) < sizes[:, None]  # (r, e)
