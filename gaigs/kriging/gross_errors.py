@@ -53,7 +53,7 @@ def without_gross_errors(links: Links, size: float = 6.0) -> Links:
 
 
 def are_alone(
-    places: Float[Tensor, "k 3"],
+    places: Float[Tensor, "k d"],
     errors: Float[Tensor, " k"],
     most: Float[Tensor, ""],
     neighbours: int = 5,

@@ -217,9 +217,8 @@ def test_channels_have_the_elements_of_their_arrays():
     channels[5, 0] = np.nan
     assert len(gaigs.links(**arrays, labels=channels)) == 23
     channels[3, 0, 2] = 1
-    with pytest.raises(
-        ValueError, match="that of link 6 is not at element 2, and a1 has 2 elements"
-    ):
+    message = "that of link 6 is not at element 2 and subcarrier 0, and a1 has 2 elements"
+    with pytest.raises(ValueError, match=message):
         gaigs.links(**arrays, labels=channels)
     with pytest.raises(
         ValueError, match="the task has 4 elements, and the largest array of the receivers 2"
