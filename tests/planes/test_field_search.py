@@ -113,21 +113,21 @@ def test_kriging_leaves_what_other_places_do_not_explain(links):
 @pytest.mark.usefixtures("unchecked")
 def test_bands_share_planes_and_have_gains_of_their_own():
     """One receiver at two bands; places of both bands differ."""
-    low = room(160)
-    high = room(320)
-    both = low.query.transmitters, high.query.transmitters[160:]
+    low = room(100)
+    high = room(200)
+    both = low.query.transmitters, high.query.transmitters[100:]
     receiver = low.receivers[0]
     radios = [replace(receiver, name="low", band=(0.0, 3e9)), replace(receiver, band=(3e9, 9e9))]
-    labels = torch.zeros(320, 1, 2, dtype=torch.complex64)
-    labels[:160, 0, 0] = low.labels[:, 0, 0]
+    labels = torch.zeros(200, 1, 2, dtype=torch.complex64)
+    labels[:100, 0, 0] = low.labels[:, 0, 0]
     at = receiver.pose.position.double().numpy()
-    labels[160:, 0, 1] = torch.from_numpy(field(np.float64(both[1]), at, 3.6e9, -0.2))
+    labels[100:, 0, 1] = torch.from_numpy(field(np.float64(both[1]), at, 3.6e9, -0.2))
     links = Links(
-        query=Query(torch.cat(both), torch.arange(2).repeat_interleave(160)),
+        query=Query(torch.cat(both), torch.arange(2).repeat_interleave(100)),
         receivers=tuple(radios),
         labels=labels,
         task=Csi(1, torch.tensor([FREQUENCY, 3.6e9]).double()),
-        split=Split("all", torch.arange(320), torch.arange(0), torch.arange(0)),
+        split=Split("all", torch.arange(200), torch.arange(0), torch.arange(0)),
     )
     torch.manual_seed(0)
     search = FieldSearch(links, -1, 1, 4, torch.zeros(0, 4))
