@@ -9,8 +9,6 @@ Source: Brehmer et al., Geometric Algebra Transformer, 2023; Spinner et al., Lor
 Geometric Algebra Transformers, 2024, for signatures with negative squares.
 """
 
-import math
-
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -184,29 +182,23 @@ class GeometricAttention(nn.Module):
         return self._read(mixed.movedim(-3, -2))
 
     def look(
-        self, multivectors: Multivectors, scalars: Scalars, groups: tuple[int, int]
+        self, multivectors: Multivectors, scalars: Scalars, count: int
     ) -> tuple[Multivectors, Scalars]:
-        """Attention of the first token of each group to its group and to common tokens.
+        """Attention of the token behind the first ``count``, once for each of these.
 
-        Args:
-            multivectors, scalars: One group after the other, then any tokens common to all groups.
-            groups: Number of groups, and of tokens in each.
+        It sees one of them, itself and all tokens that follow; the result has ``count`` tokens.
         """
-        query, key, value = self._project(multivectors, scalars)  # (heads, tokens, f) each
-        end = math.prod(groups)
-        count = key.shape[1] - end  # of common tokens
-        query = query[:, :end].unflatten(1, groups)[:, :, 0]  # (heads, groups, f)
-        keys = key[:, :end].unflatten(1, groups)  # (heads, groups, size, f)
-        values = value[:, :end].unflatten(1, groups)
+        query, key, value = self._project(multivectors, scalars)  # (*batch, heads, tokens, f)
         # eq. (8): softmax of the logits over the root of their number of features.
-        to_group = (keys @ query[..., None]).squeeze(-1)  # (heads, groups, size)
-        to_common = query @ key[:, end:].mT  # (heads, groups, count)
-        logits = torch.cat((to_group, to_common), -1)
-        weights = (logits * query.shape[-1] ** -0.5).softmax(-1)
-        grouped, common = weights.split((groups[1], count), -1)
-        mixed = (grouped[..., None, :] @ values).squeeze(-2)  # (heads, groups, f)
-        mixed = mixed + common @ value[:, end:]
-        return self._read(mixed.movedim(0, 1))
+        query = query[..., count, :, None] * query.shape[-1] ** -0.5  # (*batch, heads, f, 1)
+        sizes = (count, key.shape[-2] - count)
+        own, common = (key @ query).squeeze(-1).split(sizes, -1)  # (*batch, heads, tokens)
+        values, others = value.split(sizes, -2)
+        # exp a / (exp a + sum exp c) = sigmoid(a - log sum exp c): the share of one more token.
+        share = (own - common.logsumexp(-1, keepdim=True)).sigmoid()[..., None]
+        mean = common.softmax(-1)[..., None, :] @ others  # (*batch, heads, 1, f)
+        mixed = mean + share * (values - mean)
+        return self._read(mixed.movedim(-3, -2))
 
     def _project(
         self, multivectors: Multivectors, scalars: Scalars
@@ -251,8 +243,11 @@ def equivariant_norm(
     2023.
     """
     metric = algebra.table("metric", multivectors)
-    by_grade = (algebra.table("grades", multivectors) * metric).mT  # (k, n + 1)
-    sizes = (multivectors.square() @ by_grade).abs().sum(-1)  # (..., c)
+    if algebra.q:
+        by_grade = (algebra.table("grades", multivectors) * metric).mT  # (k, n + 1)
+        sizes = (multivectors.square() @ by_grade).abs().sum(-1)  # (..., c)
+    else:  # no square is negative, so the sum over grades is one over blades
+        sizes = multivectors.square() @ metric  # (..., c)
     size = sizes.mean(-1)  # (...)
     multivectors = multivectors * torch.rsqrt(size + floor)[..., None, None]
     return multivectors, functional.layer_norm(scalars, scalars.shape[-1:])
@@ -296,19 +291,13 @@ class GATrBlock(nn.Module):
         return self.transform(multivectors + attended, scalars + attended_scalars, reference)
 
     def look(
-        self, multivectors: Multivectors, scalars: Scalars, groups: tuple[int, int]
+        self, multivectors: Multivectors, scalars: Scalars, count: int
     ) -> tuple[Multivectors, Scalars]:
-        """The block's first half for the first token of each group alone.
-
-        Args:
-            multivectors, scalars, groups: As for ``GeometricAttention.look``.
-        """
+        """The block's first half for one token alone; see ``GeometricAttention.look``."""
         normal = equivariant_norm(self.algebra, multivectors, scalars)
-        attended, attended_scalars = self.attention.look(*normal, groups)  # (groups, ...)
-        end = math.prod(groups)
-        first = multivectors[:end].unflatten(0, groups)[:, :1]  # (groups, 1, c, k)
-        first_scalars = scalars[:end].unflatten(0, groups)[:, :1]  # (groups, 1, s)
-        return first + attended[:, None], first_scalars + attended_scalars[:, None]
+        attended, attended_scalars = self.attention.look(*normal, count)
+        multivectors = multivectors[..., count : count + 1, :, :] + attended
+        return multivectors, scalars[..., count : count + 1, :] + attended_scalars
 
     def transform(
         self, multivectors: Multivectors, scalars: Scalars, reference: Float[Tensor, "... k"]

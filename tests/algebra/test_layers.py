@@ -194,28 +194,29 @@ def test_a_linear_map_in_mixed_precision_is_that_of_its_weights():
 
 
 @algebras
-@pytest.mark.parametrize("groups", [(3, 2), (1, 4), (2, 1), (0, 2)], ids=str)
-@pytest.mark.parametrize("alike", [0, 1, 5])
-def test_the_first_token_of_a_group_sees_its_group_and_the_common_tokens(algebra, groups, alike):
-    """Against the whole attention over each group with the common tokens."""
+@pytest.mark.parametrize("batch", [(), (3,)], ids=str)
+@pytest.mark.parametrize("count", [0, 1, 4])
+@pytest.mark.parametrize("alike", [0, 5])
+def test_a_token_looks_at_one_of_the_first_and_at_all_behind(algebra, batch, count, alike):
+    """Against the whole attention over the tokens that it sees, far from and near all logits."""
     block = GATrBlock(algebra, C, 4, heads=2).double()
-    b, size = groups
-    multivectors = torch.randn(b * size + alike, C, algebra.size).double().requires_grad_()
-    scalars = torch.randn(b * size + alike, 4).double().requires_grad_()
-    expected = [[], []]
-    for i in range(b):
-        own = [
-            torch.cat((x[i * size : (i + 1) * size], x[b * size :]))
-            for x in (multivectors, scalars)
-        ]
-        attended = block.attention(*equivariant_norm(algebra, *own))
-        for parts, token, change in zip(expected, own, attended, strict=True):
-            parts.append((token + change)[:1])
-    found = block.look(multivectors, scalars, groups)
-    assert [part.shape for part in found] == [(b, 1, C, algebra.size), (b, 1, 4)]
-    if not b:
+    shape = (*batch, count + 1 + alike)
+    multivectors = 3 * torch.randn(*shape, C, algebra.size).double()
+    scalars = 3 * torch.randn(*shape, 4).double()
+    for x in (multivectors, scalars):
+        x.requires_grad_()
+    found = block.look(multivectors, scalars, count)
+    assert [part.shape for part in found] == [(*batch, count, C, algebra.size), (*batch, count, 4)]
+    if not count:
         return
-    expected = [torch.stack(parts) for parts in expected]
+    expected = [[], []]
+    for i in range(count):
+        seen = torch.tensor([count, i, *range(count + 1, count + 1 + alike)])
+        own = multivectors.index_select(-3, seen), scalars.index_select(-2, seen)
+        attended = block.attention(*equivariant_norm(algebra, *own))
+        expected[0].append((own[0] + attended[0])[..., :1, :, :])
+        expected[1].append((own[1] + attended[1])[..., :1, :])
+    expected = [torch.cat(expected[0], -3), torch.cat(expected[1], -2)]
     weights = [torch.randn_like(part) for part in expected]
     wanted = (multivectors, scalars, *block.attention.parameters())
     gradients = [torch.autograd.grad(parts, wanted, weights) for parts in (found, expected)]

@@ -17,7 +17,7 @@ from gaigs.splatting.gaussians import Placed, Tokens
 class GATokenizer(nn.Module):
     """CLS of a Geometric Algebra Transformer (GATr) over CLS, transmitter and anchors.
 
-    Tokens are [CLS, TX, anchors]: CLS is a learnable point; anchors are the centres of the most
+    Tokens are [TX, CLS, anchors]: CLS is a learnable point; anchors are the centres of the most
     opaque Gaussians, chosen at every call, without a gradient. Each is a multivector with two
     scalars for its type; for data with several carriers a third scalar has the carrier's position
     in the band. There are no position embeddings.
@@ -110,25 +110,22 @@ class GATokenizer(nn.Module):
         anchors = (anchors - self.middle) / self.scale
         transmitters = (query.transmitters - self.middle) / self.scale  # (b, 3)
         *blocks, final = self.blocks
-        # With a single block anchors stay the same for all queries: their outputs are not read.
+        # With a single block CLS and anchors are the same for all queries until CLS looks.
         is_shared = len(anchors) == 1 and not blocks and not self.scene.has_band
-        groups = (b, 2 if is_shared else 2 + m)  # queries, and the tokens of each
-        points, types = self._tokens(query, transmitters, anchors, groups)
+        points, types = self._tokens(query, transmitters, anchors, is_shared)
+        count = b if is_shared else 1  # of the transmitters, which come first
 
-        points = self.embed(points)  # (tokens, k)
-        multivectors, scalars = self.first(points[:, None], types)  # (tokens, channels, k)
+        points = self.embed(points)  # (b + 1 + m, k), or (b, 2 + m, k)
+        multivectors, scalars = self.first(points[..., None, :], types)
         # The transmitter moves with the room, as the reference of joins has to.
-        reference = points[: b * groups[1]].unflatten(0, groups)[:, 1]  # (b, k)
-        if blocks:
-            multivectors = multivectors.unflatten(0, groups)  # (b, tokens, channels, k)
-            scalars = scalars.unflatten(0, groups)
-            for block in blocks:
-                multivectors, scalars = block(multivectors, scalars, reference)
-            multivectors = multivectors.flatten(0, 1)
-            scalars = scalars.flatten(0, 1)
+        reference = points[:b] if is_shared else points[:, 0]  # (b, k)
+        for block in blocks:
+            multivectors, scalars = block(multivectors, scalars, reference)
         # Only CLS is read, so the final block computes CLS alone, eq. (8).
-        first = final.look(multivectors, scalars, groups)
-        multivectors, scalars = final.transform(*first, reference)
+        multivectors, scalars = final.look(multivectors, scalars, count)
+        multivectors = multivectors.reshape(b, 1, *multivectors.shape[-2:])  # (b, 1, channels, k)
+        scalars = scalars.reshape(b, 1, scalars.shape[-1])
+        multivectors, scalars = final.transform(multivectors, scalars, reference)
         multivectors, scalars = self.last(multivectors, scalars)  # (b, 1, 1, k), (b, 1, 2)
         read = torch.cat((multivectors.flatten(1), scalars.flatten(1)), -1)  # (b, k + 2)
         no_gaussians = means.new_zeros(means.shape[1], 0)
@@ -140,29 +137,23 @@ class GATokenizer(nn.Module):
         query: Query,
         transmitters: Float[Tensor, "b 3"],
         anchors: Float[Tensor, "sets m 3"],
-        groups: tuple[int, int],
-    ) -> tuple[Float[Tensor, "tokens 3"], Float[Tensor, "tokens d"]]:
-        """Points and type scalars of all tokens: one group a query, then any shared anchors.
+        is_shared: bool,
+    ) -> tuple[Float[Tensor, "*b tokens 3"], Float[Tensor, "*b tokens d"]]:
+        """Points and type scalars of [TX, CLS, anchors] of each query.
 
         Args:
             query: The links.
             transmitters, anchors: Positions relative to the box, of order one.
-            groups: Number of queries, and of tokens in the group of each; with 2 in a group the
-                anchors are shared.
+            is_shared: True for all transmitters before one CLS and one set of anchors.
         """
-        b, size = groups
-        m = anchors.shape[1]
-        anchor_types = self.types[2:].expand(m, 2)
-        points = [self.cls.expand(b, 1, 3), transmitters[:, None]]
-        if size > 2:
-            points.append(anchors.expand(b, m, 3))
-        tokens = torch.cat(points, 1).flatten(0, 1)  # (b size, 3)
-        types = torch.cat((self.types[:2], anchor_types))[:size]  # (size, 2)
-        types = types.expand(b, size, 2).flatten(0, 1)  # (b size, 2)
-        if size == 2:
-            tokens = torch.cat((tokens, anchors[:1].flatten(0, 1)))  # (b size + m, 3)
-            types = torch.cat((types, anchor_types))
+        b, m = len(query), anchors.shape[1]
+        cls, transmitter, anchor = self.types.split(1)  # (1, 2) each
+        if is_shared:
+            types = torch.cat((transmitter.expand(b, 2), cls, anchor.expand(m, 2)))
+            return torch.cat((transmitters, self.cls[None], anchors[0])), types
+        points = (transmitters[:, None], self.cls.expand(b, 1, 3), anchors.expand(b, m, 3))
+        types = torch.cat((transmitter, cls, anchor.expand(m, 2))).expand(b, -1, 2)
         if self.scene.has_band:
-            band = self.scene.band_positions(query).repeat_interleave(size)
-            types = torch.cat((types, band[:, None]), 1)  # (b size, 3)
-        return tokens, types
+            band = self.scene.band_positions(query)[:, None, None]  # (b, 1, 1)
+            types = torch.cat((types, band.expand(b, 2 + m, 1)), -1)  # (b, 2 + m, 3)
+        return torch.cat(points, 1), types
