@@ -130,8 +130,15 @@ def read(
     if one_radio is not None:
         links = [replace(one, one_radio=one_radio) for one in links]
     if band_train is None and band_test is None:
-        return in_bands(links, band_gap)
-    return hold_out_band(links[0], band_train, band_test)
+        return _with_remark(in_bands(links, band_gap), one_radio)
+    return _with_remark(hold_out_band(links[0], band_train, band_test), one_radio)
+
+
+def _with_remark(links: Links, one_radio: bool | None) -> Links:
+    if one_radio and not links.one_radio:
+        raise ValueError("data.one_radio=true takes channels of one band; leave it out")
+    added = "; the receivers are places of one radio" if links.one_radio else ""
+    return replace(links, remarks=links.remarks + added)
 
 
 def to_links(
@@ -193,7 +200,6 @@ def _to_links(
     if ignored:
         remarks.append(f"arrays ignored: {', '.join(ignored)}")
     one_radio = are_one_radio(len(present), len(rows), len(places))
-    remarks += ["the receivers are places of one radio"] * one_radio
     return Links(
         query=Query(transmitters, receivers, torch.full((len(rows),), carrier)),
         receivers=tuple(everyone[k] for k in present.tolist()),

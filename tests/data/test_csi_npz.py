@@ -567,3 +567,5 @@ def test_arrays_that_move_hear_a_few_beacons(tmp_path):
     assert links.one_radio
     assert "places of one radio" in links.remarks
     assert not load(config | {"one_radio": False}, RANDOM).one_radio
+    with pytest.raises(ValueError, match="channels of one band"):
+        load(config | {"one_radio": True, "band_gap": 1.01}, RANDOM)
