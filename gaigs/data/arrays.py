@@ -73,8 +73,7 @@ def from_arrays(
             5400000.0)`` for UTM less that easting and northing; None if unknown.
         height: Height of positions (n, 2) or (k, 2) [m].
         one_radio: True if the receivers are places of one radio that moves, or of radios alike,
-            with one gain. None: of one position a link, 12 places or more with fewer links each
-            than places.
+            with one gain. None: of one position a link, see ``gaigs.data.readings.are_one_radio``.
 
     Raises:
         TypeError: An option has a wrong type.
@@ -120,7 +119,7 @@ def from_arrays(
         official=None if parts is None else (lambda: parts),
         uncertainties=ends.uncertainties if task.is_scalar else None,
         frame=frame,
-        one_radio=ends.are_one_radio(len(row), one_radio),
+        one_radio=ends.are_one_radio(sites[row], one_radio, remarks),  # before they are joined
         remarks="; ".join(remarks),
     )
     links = divide(undivided, config)
@@ -200,11 +199,18 @@ class _Ends(NamedTuple):
     uncertainties: Float[Tensor, " k"]
     is_one_each: bool = False
 
-    def are_one_radio(self, links: int, given: bool | None) -> bool:
-        """True if so ``given``, or if each link has a position that says so."""
-        if given is None and not self.is_one_each:
-            return False
-        return are_one_radio(len(self.receivers), links, given)
+    def are_one_radio(
+        self, sent: Int[Tensor, " n"], given: bool | None, remarks: list[str]
+    ) -> bool:
+        """True if so ``given``, or if each link has a position that says so, with a remark.
+
+        ``sent`` are numbers of the links' places of transmitters.
+        """
+        if given is not None or not self.is_one_each:
+            return bool(given)
+        is_one = are_one_radio(len(self.receivers), len(sent), len(sent.unique()))
+        remarks += ["the receivers are places of one radio; one_radio=False parts them"] * is_one
+        return is_one
 
 
 def _find_ends(

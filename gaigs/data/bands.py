@@ -59,8 +59,8 @@ def hold_out_band(
 def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
     """Channels of several bands, in which each receiver counts as one radio for each band.
 
-    Bands end where a frequency is more than ``gap`` times the one below. Links of one place share a
-    row.
+    Bands end where a frequency is more than ``gap`` times the one below, but not within four or
+    more evenly spaced ones of a part. Links of one place share a row.
 
     Args:
         parts: Channels of one site, such as of one band each; receivers at one place are the same.
@@ -69,7 +69,14 @@ def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
         ValueError: Parts have different phases, or other subcarriers or arrays in one band.
     """
     frequencies = torch.cat([part.task.frequencies for part in parts]).unique()  # ascending (s,)
-    ends = (frequencies[1:] > gap * frequencies[:-1]).nonzero()[:, 0]
+    is_end = frequencies[1:] > gap * frequencies[:-1]  # (s - 1,)
+    for part in parts:
+        own = part.task.frequencies.sort().values
+        steps = own.diff()
+        # Coarse steps of one sweep, such as of an ultra-wideband sounder, are one band.
+        if len(own) > 3 and steps.max() < 1.01 * steps.min():
+            is_end &= (frequencies[1:] <= own[0]) | (frequencies[:-1] >= own[-1])
+    ends = is_end.nonzero()[:, 0]
     if len(parts) == 1 and not len(ends):
         return parts[0]
     phases = {part.task.phase for part in parts}

@@ -2,6 +2,7 @@
 
 import reprlib
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -69,6 +70,8 @@ def read(
     band_train: Sequence[float] | None = None,
     band_test: Sequence[float] | None = None,
     parts: str | None = None,
+    band_gap: float = 1.2,
+    one_radio: bool | None = None,
 ) -> Links:
     """A data set from an ``.npz``, ``.mat`` or HDF5 file: one link for each channel.
 
@@ -77,9 +80,9 @@ def read(
     links are left out; the remarks count them. The middle of the subcarriers' band counts as the
     carrier. There is no official split.
 
-    Frequencies more than a fifth apart are of different bands: a receiver is then one radio for
-    each, such as ``rx0 2.412 GHz``, whose links are 0 in other bands; see
-    ``gaigs.data.bands.in_bands``.
+    Frequencies more than a fifth apart, unless four or more are evenly spaced, are of different
+    bands: a receiver is then one radio for each, such as ``rx0 2.412 GHz``, whose links are 0 in
+    other bands; see ``gaigs.data.bands.in_bands``.
 
     Args:
         file: One file, or a list of files of one site, such as of a band each. Arrays ``tx``
@@ -98,6 +101,9 @@ def read(
             ``gaigs.data.bands.hold_out_band`` [Hz].
         parts: Axis of 2, ``first`` or ``last``, along which a real ``h`` has real and imaginary
             part. None: ``h`` is complex, or two arrays.
+        band_gap: Ratio of neighbouring frequencies above which a band ends.
+        one_radio: True if the receivers are places of one radio. None: see
+            ``gaigs.data.readings.are_one_radio``.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -121,9 +127,18 @@ def read(
             f"{len(files)}"
         )
     links = [to_links(one, *_load(one, arrays, parts), phase) for one in files]
+    if one_radio is not None:
+        links = [replace(one, one_radio=one_radio) for one in links]
     if band_train is None and band_test is None:
-        return in_bands(links)
-    return hold_out_band(links[0], band_train, band_test)
+        return _with_remark(in_bands(links, band_gap), one_radio)
+    return _with_remark(hold_out_band(links[0], band_train, band_test), one_radio)
+
+
+def _with_remark(links: Links, one_radio: bool | None) -> Links:
+    if one_radio and not links.one_radio:
+        raise ValueError("data.one_radio=true takes channels of one band; leave it out")
+    added = "; the receivers are places of one radio" if links.one_radio else ""
+    return replace(links, remarks=links.remarks + added)
 
 
 def to_links(
@@ -184,10 +199,11 @@ def _to_links(
         )
     if ignored:
         remarks.append(f"arrays ignored: {', '.join(ignored)}")
+    one_radio = are_one_radio(len(present), len(rows), len(places))
     return Links(
         query=Query(transmitters, receivers, torch.full((len(rows),), carrier)),
         receivers=tuple(everyone[k] for k in present.tolist()),
-        one_radio=are_one_radio(len(present), len(rows)),
+        one_radio=one_radio,
         labels=numbers["h"][has_signal],
         task=Csi(count, frequencies, phase),
         rows=rows,

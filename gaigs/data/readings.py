@@ -26,12 +26,17 @@ def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiv
     return Receiver(name, Pose(torch.as_tensor(position), torch.eye(3)))
 
 
-def are_one_radio(places: int, links: int, given: bool | None = None) -> bool:
+def are_one_radio(places: int, links: int, sent: int, given: bool | None = None) -> bool:
     """True if receivers at some places are one radio that moves, or radios alike.
 
-    Without a word of the user, 12 places or more are that have fewer links each than places.
+    Without a word of the user, 12 places or more are that have fewer than 12 links each. A place of
+    a survey hears several access points: of ``sent`` places of transmitters each has fewer than two
+    links, or they are beacons, at most a quarter of the receivers' places.
     """
-    return 12 <= places and links < places**2 if given is None else given
+    if given is not None:
+        return given
+    are_pairs = links < 2 * sent or 4 * sent <= places
+    return 12 <= places and links < 12 * places and are_pairs
 
 
 def to_dbm(

@@ -87,7 +87,9 @@ def read(
     received = torch.tensor([value not in marks for value in dbm])
     present, receivers = at[received].unique(return_inverse=True)
     transmitters = torch.tensor(points[moving])[received]
-    one_radio = are_one_radio(len(present), len(transmitters), one_radio)
+    one_radio = are_one_radio(
+        len(present), len(transmitters), len(transmitters.unique(dim=0)), one_radio
+    )
     state = "moving" if one_radio else "fixed"
     remarks = (
         f"{len(transmitters)} readings of a moving {ENDS[moving]} at {len(present)} places of a "

@@ -292,8 +292,14 @@ class ScalarProcess(nn.Module):
         self.places, self.receivers, self.values = places, receivers, values.clone()
         self.variances = (2 * self.logarithms[receivers, 2]).exp()
         self.is_solved = False
+        self.tiles.clear()  # of former readings
         if not is_lazy:
             self._solve()
+
+    def _save_to_state_dict(self, *args):
+        if not self.is_solved:  # what loads it takes it for solved
+            self._solve()
+        super()._save_to_state_dict(*args)
 
     def _solve(self) -> None:
         """Weights the known readings."""
@@ -301,7 +307,6 @@ class ScalarProcess(nn.Module):
         self.is_solved = True
         self.variances = self.variances * self._factors(values)
         self.weights = torch.zeros_like(values)
-        self.tiles.clear()
         for receiver in receivers.unique().tolist():
             known = (receivers == receiver).nonzero()[:, 0]
             readings = Merged(known, self.values[known], self.variances[known])

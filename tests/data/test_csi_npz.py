@@ -538,3 +538,34 @@ def test_subcarriers_of_one_band_must_agree(tmp_path):
     files = [save(tmp_path / f"{k}.npz", content) for k, content in enumerate(contents)]
     with pytest.raises(ValueError, match=r"same subcarriers, got 2 of 4 near 2.4 GHz"):
         load({"name": "csi_npz", "file": [str(file) for file in files]}, RANDOM)
+
+
+@pytest.mark.parametrize(
+    ("frequencies", "options"),
+    [(np.linspace(3.1e9, 10.6e9, 8), {}), (np.array([2.4e9, 5.8e9]), {"band_gap": 3.0})],
+)
+def test_sweeps_and_carriers_of_one_channel_are_one_band(tmp_path, frequencies, options):
+    content = in_band(2.4e9, 0) | {"frequencies": frequencies, "h": np.ones((10, 1, 1)) + 0j}
+    content["h"] = content["h"].repeat(len(frequencies), 2)
+    file = save(tmp_path / "sweep.npz", content)
+    links = load({"name": "csi_npz", "file": str(file), **options}, RANDOM)
+    assert [receiver.name for receiver in links.receivers] == ["rx0", "rx1"]
+    assert links.labels.all()
+
+
+def test_arrays_that_move_hear_a_few_beacons(tmp_path):
+    draw = np.random.default_rng(0)
+    content = {
+        "tx": draw.uniform(-3, 3, (4, 3)).repeat(20, 0),
+        "rx": draw.uniform(-3, 3, (20, 3)),
+        "rx_index": np.tile(np.arange(20), 4),
+        "frequencies": np.array([2.4e9, 2.5e9]),
+        "h": draw.normal(size=(80, 1, 2)) + 1j,
+    }
+    config = {"name": "csi_npz", "file": str(save(tmp_path / "a.npz", content))}
+    links = load(config, RANDOM)
+    assert links.one_radio
+    assert "places of one radio" in links.remarks
+    assert not load(config | {"one_radio": False}, RANDOM).one_radio
+    with pytest.raises(ValueError, match="channels of one band"):
+        load(config | {"one_radio": True, "band_gap": 1.01}, RANDOM)

@@ -210,6 +210,25 @@ def test_models_with_tiles_are_saved_and_loaded(tmp_path, monkeypatch):
         assert torch.equal(gaigs.load(tmp_path / f"{name}.ckpt").predict(places), before)
 
 
+def test_a_lazy_solve_of_fewer_readings_is_saved_whole(monkeypatch):
+    """Tiles and weights of the readings before are not stored beside the new ones."""
+    options = replace(ScalarOptions(), together=60, iterations=4)
+    monkeypatch.setattr(ScalarProcess, "options", options)
+    monkeypatch.setattr(Tiles, "core", 16)
+    monkeypatch.setattr(Tiles, "size", 32)
+    links = drawn((1.5, 0.8), noise=1.0, count=400)
+    process = fitted(links).scalar
+    few = slice(0, 2 * len(process.places) // 3)
+    known = process.places[few], process.receivers[few], process.values[few]
+    loaded = ScalarProcess(links.scene)
+    process.solve(*known, is_lazy=True)
+    loaded.load_state_dict(process.state_dict())
+    process.solve(*known)
+    assert len(process.tiles)
+    asked = known[0][:9], known[1][:9]
+    torch.testing.assert_close(loaded(*asked), process(*asked))
+
+
 @pytest.mark.parametrize("degrees", [math.inf, 4.0])
 def test_few_places_of_a_lazy_solve_have_the_readings_around_them(degrees):
     links = drawn((1.5, 0.8), noise=2.0, degrees=degrees, count=800)

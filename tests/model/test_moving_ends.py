@@ -131,6 +131,23 @@ def test_readers_tell_moving_ends_from_fixed_ones(tmp_path):
     assert torch.equal(other.labels, few.labels)
 
 
+@pytest.mark.parametrize(
+    ("stations", "places", "links"), [(12, 8, 96), (30, 20, 600), (50, 1500, 1500)]
+)
+def test_fixed_stations_of_a_survey_do_not_move(stations, places, links):
+    """A walk among all stations, few places of many stations, and a drive that logs one cell."""
+    rng = np.random.default_rng(0)
+    at = np.arange(links)
+    arrays = {
+        "transmitters": rng.uniform(0, 9, (places, 3))[at % places],
+        "receivers": rng.uniform(0, 9, (stations, 3))[at * stations // links],
+        "labels": rng.uniform(-90, -40, links),
+    }
+    links = gaigs.links(task="rssi", **arrays)
+    assert not links.one_radio
+    assert len(links.receivers) == stations
+
+
 def test_adapt_says_that_one_radio_is_known(links):
     model = gaigs.train("path_loss", links)
     with pytest.raises(ValueError, match="one radio"):
