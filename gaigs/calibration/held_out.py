@@ -81,14 +81,17 @@ def calibrate(
     unseen: Iterable[Unseen],
     answer: Callable[[Any, Int[Tensor, " k"]], Answers],
 ) -> Calibration | None:
-    """The calibration of a model by errors at links that it has not seen; None without such links.
+    """Calibrates a model's intervals by its errors at links that it has not seen.
 
     Args:
         links: Links with the split of the model.
-        name: Name of the model, for the log.
-        count: Most models of ``unseen``.
-        unseen: Models like the model, with links that they have not seen.
-        answer: Function from a model and indices of links to its answers.
+        name: Name of the model, for messages.
+        count: Number of models that ``unseen`` gives when time suffices.
+        unseen: The model fitted without some links, and these links.
+        answer: Function from a model and indices of links to its predictions.
+
+    Returns:
+        The calibration; None if ``unseen`` gives no model.
     """
     query = links.scene.by_radio(links.query)
     asked, answers, near = [], [], []

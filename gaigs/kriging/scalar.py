@@ -240,14 +240,15 @@ class ScalarProcess(nn.Module):
         held: Int[Tensor, " h"] | None = None,
         most: int = 300,
     ) -> list[HeldOutReadings]:
-        """Readings that fits of ``refit`` hold out.
+        """Chooses the readings that the fits of ``refit`` predict from the others.
 
         Args:
             places, receivers: Known readings, as for ``fit``.
-            folds: Readings of the first fit are held out with all of their fold.
-            held: Rows of the readings that a second fit holds out, given all others, such as the
-                validation links; None for one fit.
-            most: Largest number of held-out readings of a fit.
+            folds: Fold of each reading. The first fit predicts a reading from the other folds.
+            held: Rows of the readings that a second fit predicts from all others, such as the
+                validation links. None: no second fit.
+            most: About the number of readings that a fit predicts; up to four times as many where
+                each receiver would have fewer than 16.
         """
         self.places, self.receivers = places, receivers
         every = torch.arange(len(places))

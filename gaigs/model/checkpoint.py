@@ -169,7 +169,14 @@ def described(model: nn.Module) -> dict:
 
 
 def update(path: Path, model: nn.Module, trained: str | None = None) -> None:
-    """Gives a checkpoint its model's calibration, or another model with a ``trained`` part."""
+    """Rewrites what a checkpoint says of its model, and its weights if the model now wraps another.
+
+    Args:
+        path: Checkpoint of a training.
+        model: The trained model, or an ensemble or kriged model that contains it.
+        trained: Prefix of the trained model in ``model.state_dict()``, such as ``"trend"``; the
+            weights of the whole ``model`` are stored. None: the weights stay as they are.
+    """
     content = read(path)
     content[KEY] |= described(model)
     if trained is not None:

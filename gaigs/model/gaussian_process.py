@@ -114,8 +114,12 @@ class GaussianProcess(LookUp):
         report_terms(self.trend)
 
     def refit(self, links: Links) -> None:
-        """As ``fit``, for some of the known links: hyperparameters stay; of labels of one number
-        kernel, noise and the choice of the trend."""
+        """Fits to some of the known links with the choices of ``fit``.
+
+        For vector labels all hyperparameters stay. For scalar labels the kernel, the noise and the
+        chosen trend stay; length scales and deviations are fitted anew, unless there are more than
+        ``options.large`` of the process.
+        """
         self._fit(links, chooses=False)
 
     def take_hyperparameters(self, other: Model) -> None:

@@ -113,7 +113,10 @@ class MirroredSplatting(GaussianSplatting):
             self._fit_channels(links, task, self.pooling)
 
     def _search_spectra(self, links: Links, pooling: PathSpectrum) -> None:
-        """Puts planes where ``LagSearch`` finds them, if arrays explain their spectra."""
+        """Moves the planes to where ``LagSearch`` finds them and keeps only the paths at these.
+
+        Changes nothing if no receiver's array explains its spectra.
+        """
         placement = self.placement
         frequencies = carriers(self.scene, links.query)
         search = LagSearch(links, frequencies, pooling.beamformer.lags, placement.order)

@@ -128,10 +128,11 @@ class Request(NamedTuple):
         return {name: labelled(part, name) for name, part in answer.items()}
 
     def arranged(self, values: Tensor, scene: Scene, axes: tuple[int, ...] | None = None) -> Any:
-        """Values of links (b, ...) with the axes of the answer, or with other ones.
+        """Reshapes values of links (b, ...) to the axes of the answer, or to other ones.
 
-        Where receivers have different elements or bands, a dictionary by receiver or, of one
-        receiver, the elements of its array and the subcarriers in its band.
+        Channels are padded to the largest array and all subcarriers. Where receivers differ in
+        these, the padding is cut: all receivers give a dictionary of tensors by name, one receiver
+        gives the tensor of its own elements and subcarriers.
         """
         axes = self.axes if axes is None else axes
         receivers = scene.receivers

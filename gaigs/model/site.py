@@ -125,7 +125,13 @@ class Site(Model):
 def shared_coefficients(
     columns: Float[Tensor, "k c"], lengths: Float[Tensor, " k"], receivers: Tensor
 ) -> Float[Tensor, " f"]:
-    """Coefficients of 0 or more of the last columns, beside each receiver's level and exponent."""
+    """Non-negative coefficients of features, fitted with a level and exponent of each receiver.
+
+    The first column is the level of each link [dBm], the others are its features. A feature that
+    level and exponent explain has the coefficient 0.
+
+    Source: Frisch and Waugh, Partial time regressions as compared with individual trends, 1933.
+    """
     columns = columns.clone()
     decades = lengths.clamp_min(0.1).log10()
     # What level and exponent explain is taken off first (Frisch and Waugh, 1933).

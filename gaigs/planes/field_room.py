@@ -106,12 +106,12 @@ def multiply_gains(gains: Complex[Tensor, " w"], sequences: Int[Tensor, "n order
 
 
 class PlaceBlock(NamedTuple):
-    """Numbers of neighbouring places at one receiver.
+    """Channel values of neighbouring places at one receiver, whose residuals are correlated.
 
     Attributes:
-        rows: Numbers of all places, a place a row.
-        gaps: Distances of their places [m].
-        each: Numbers of a place.
+        rows: Rows of the values, a place after the other.
+        gaps: Distances of the values' places [m].
+        each: Number of values of a place.
         band: Number of the receiver's band.
     """
 
@@ -160,7 +160,10 @@ class FieldFit:
         self.blocks = list(self._divide(largest))
 
     def _divide(self, largest: int) -> Iterator[PlaceBlock]:
-        """Numbers of neighbouring places at one receiver, at most ``largest`` together."""
+        """Blocks of channel values of neighbouring places at one receiver, about ``largest`` each.
+
+        Values are in the order of ``self.values``: receiver by receiver, b places of k values.
+        """
         first = 0
         for receiver, band in zip(self.receivers, self.band_numbers.tolist(), strict=True):
             b, k = receiver.flat.shape

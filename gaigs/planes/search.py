@@ -60,9 +60,10 @@ class Score(Generic[R]):
     """
 
     def error(self, room: R) -> float:
-        """What a room leaves unexplained: usually the mean over links of the log of a share.
+        """Cost of a room, which the search minimises.
 
-        The search takes the room with the least error, so a price of each plane belongs to it.
+        Usually the mean over links of the log of the unexplained share of a label's power. A
+        penalty for each plane avoids needless ones.
         """
         raise NotImplementedError
 

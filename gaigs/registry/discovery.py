@@ -38,7 +38,7 @@ ROOMS = {
 
 @dataclass(frozen=True)
 class Holder:
-    """The owner of a name."""
+    """The file or distribution that provides a named component, found without importing it."""
 
     kind: str
     name: str
@@ -113,9 +113,10 @@ class Holder:
 
 
 def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:
-    """The holders of a kind's names, or of one name: gaigs, installed packages, ./plugins.
+    """Finds who provides components of a kind: gaigs, installed packages, and ./plugins.
 
-    The second list has the unreadable files, each with the cause.
+    With a ``name``, only its providers. The second list has the files that cannot be read, each
+    with the cause.
     """
     installed = _installed_holders(kind)
     dropped, unreadable = _dropped_holders(kind)

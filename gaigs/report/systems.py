@@ -39,9 +39,10 @@ class System(NamedTuple):
 def find_systems(
     runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapping, names: Mapping
 ) -> list[System]:
-    """Rows of the table. Runs that differ in the seed alone are one row.
+    """Rows of the comparison table, one for all runs that differ only in the seed.
 
-    They are in the order of ``names``. Baselines that are not systems come last.
+    Rows are in the order of ``names``, which has readers' names by models' registered names. Then
+    come baselines, without those whose printed scores equal those of a run of the same model.
     """
     systems = [_system(group, shared, names) for group in by_seed(runs)]
     order = {model: place for place, model in enumerate(names)}

@@ -111,7 +111,12 @@ def _try_each(
     folder: Path,
     end: float,
 ) -> list[Tried]:
-    """Tries the candidates that some work is for, one by one until a time of the clock."""
+    """Tries either the look-ups or the trained candidates, in their order, until the time is up.
+
+    ``work`` is ``look_up`` for candidates without a training, else ``train_candidate``. After
+    ``end``, a reading of ``time.monotonic`` [s], no other candidate starts; the first look-up is
+    always tried.
+    """
     tried: list[Tried] = []
     shown = stages.current().shown
     for number, (label, config) in enumerate(configs.items()):

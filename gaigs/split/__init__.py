@@ -1,7 +1,8 @@
 """Splits of links into training, validation and test.
 
-Only official parts may separate links of one row. Fractions count places, not readings: all links
-of one place, receiver and carrier count as one.
+Links of one row, that is one transmission to several receivers or at several frequencies, stay in
+one part; only a split that comes with the data (``official``) may separate them. Fractions count
+places, not readings: all links of one place, receiver and carrier count as one.
 """
 
 from typing import NamedTuple

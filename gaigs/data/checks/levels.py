@@ -61,7 +61,10 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 
 
 def _linear_unit(known: tuple[Sample, list[str]] | None, text: str, middle: float) -> Finding:
-    """The finding for levels whose logarithm counts; ``middle`` is the median's."""
+    """The finding that levels are linear (volts, watts, mW) instead of decibels, with its mend.
+
+    ``middle`` is the decimal logarithm of the median level.
+    """
     score = "share of the spread that the distance explains"
     read = fits = slope = 0.0
     if known:

@@ -318,11 +318,13 @@ def scaling_changes(sample: Sample, grid: Grid) -> list[Hypothesis]:
 
 
 def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sample], Sample]]:
-    """Positive scales s and offsets t of the axes by random threes of a receiver's links.
+    """Functions that undo a scaling of the transmitters, from random triples of links.
 
-    The direction u of a link's brightest pixel and its position x obey u x (s x + t) = 0, six
-    equations of three links for s and t but for a common factor. Threes are many, as a reflection
-    may be the brightest.
+    Each triple of links to the receiver with the most links gives one candidate: positive scales s
+    and offsets t of the axes. The direction u of a link's brightest pixel is that of s x + t, x
+    being the stored transmitter, so u x (s x + t) = 0. This is linear in (s, t) and leaves two
+    independent equations a link: three links fix the six unknowns up to a common factor. Many
+    triples are drawn because a reflection may be a link's brightest pixel.
     """
     receiver = int(sample.receivers.bincount().argmax())
     links = (sample.receivers == receiver).nonzero()[:, 0]

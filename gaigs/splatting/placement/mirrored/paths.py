@@ -119,9 +119,10 @@ class Mirrored(PathFields):
 
     @torch.no_grad()
     def start_from_free_space(self, gains: Complex[Tensor, " receivers"]) -> None:
-        """Keeps only the direct path, without obstacles and spread.
+        """Reduces the model to the direct path, without obstacles and without angular spread.
 
-        Gains are over the pooling's unit, not 0.
+        ``enable_reflections`` restores the other paths. ``gains`` are the complex gains of the
+        receivers over the pooling's unit; none is 0.
         """
         self.planned.copy_(self.kept)
         self.kept.copy_(self.sequences_of(self.used[:0]))
