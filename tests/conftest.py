@@ -54,6 +54,9 @@ CHECKED = ("test_contracts", "hard_cases", "properties", "contracts")
 FITTED = {"kriging", "calibration", "commands", "data", "benchmarks"}
 """Folders whose tests need hyperparameters of levels as a user has them."""
 
+LEARNT = {"test_front_ends"}
+"""Modules whose tests need responses of front ends as a user has them."""
+
 
 def check_first_calls(function=None, *, typechecker):
     """``jaxtyping.jaxtyped`` for the first calls alone, made when they come.
@@ -86,14 +89,21 @@ jaxtyping.jaxtyped = jaxtyping._decorator.jaxtyped = check_first_calls
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Five calls are checked in each test of ``CHECKED``, else three in each module; and processes of
-    levels are fitted in a few steps, but for ``FITTED``.
+    """Five calls are checked in each test of ``CHECKED``, else three in each module; processes of
+    levels are fitted in a few steps, but for ``FITTED``; and responses of front ends are looked for
+    in a few turns, but for ``LEARNT``.
     """
     is_each = not {*CHECKED}.isdisjoint(item.path.with_suffix("").parts)
     scope = item.nodeid if is_each else item.path
     if checking["scope"] != scope:
+        from gaigs import data
+        from gaigs.core.front_ends import FrontEndOptions
+        from gaigs.data.front_ends import learn_responses
         from gaigs.kriging.scalar import ScalarOptions, ScalarProcess
 
+        # All channels that are read are searched for a response, which few tests have put there.
+        brief = functools.partial(learn_responses, options=FrontEndOptions(folds=2, rounds=2))
+        data.learn_responses = learn_responses if item.path.stem in LEARNT else brief
         # Fits of levels to the last digit are most of a small run's time.
         is_fitted = not FITTED.isdisjoint(item.path.parts)
         quick = ScalarOptions(neighbours=8, iterations=4)
