@@ -221,8 +221,10 @@ def files_read_once():
     read, found = ConfigRepository.load_config, {}
 
     def written(source, name):
+        if source.scheme() != "file" or source.path.startswith(str(ROOT)):
+            return None  # files of this repository stay
         file = Path(source.path, name).with_suffix(".yaml")
-        return file.stat().st_mtime_ns if source.scheme() == "file" and file.exists() else None
+        return file.stat().st_mtime_ns if file.exists() else None
 
     def once(self, config_path):
         states = ((source.path, written(source, config_path)) for source in self.sources)
