@@ -24,6 +24,7 @@ ROOT = Path(__file__).parents[1]
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of these would compile all modules
+sys.dont_write_bytecode = False  # nor does each run compile all modules and tests
 signal.signal(
     signal.SIGINT, signal.default_int_handler
 )  # ignored where a shell runs the tests in the background
