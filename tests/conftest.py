@@ -24,6 +24,7 @@ ROOT = Path(__file__).parents[1]
 torch.set_num_threads(1)
 os.environ["OMP_NUM_THREADS"] = "1"  # of the processes that tests start
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each of these would compile all modules
+sys.dont_write_bytecode = False  # nor does each run compile all modules and tests
 signal.signal(
     signal.SIGINT, signal.default_int_handler
 )  # ignored where a shell runs the tests in the background
@@ -53,6 +54,9 @@ CHECKED = ("test_contracts", "hard_cases", "properties", "contracts")
 
 FITTED = {"kriging", "calibration", "commands", "data", "benchmarks"}
 """Folders whose tests need hyperparameters of levels as a user has them."""
+
+LEARNT = {"test_front_ends"}
+"""Modules whose tests need responses of front ends as a user has them."""
 
 
 def check_first_calls(function=None, *, typechecker):
@@ -86,14 +90,21 @@ jaxtyping.jaxtyped = jaxtyping._decorator.jaxtyped = check_first_calls
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    """Five calls are checked in each test of ``CHECKED``, else three in each module; and processes of
-    levels are fitted in a few steps, but for ``FITTED``.
+    """Five calls are checked in each test of ``CHECKED``, else three in each module; processes of
+    levels are fitted in a few steps, but for ``FITTED``; and responses of front ends are looked for
+    in a few turns, but for ``LEARNT``.
     """
     is_each = not {*CHECKED}.isdisjoint(item.path.with_suffix("").parts)
     scope = item.nodeid if is_each else item.path
     if checking["scope"] != scope:
+        from gaigs import data
+        from gaigs.core.front_ends import FrontEndOptions
+        from gaigs.data.front_ends import learn_responses
         from gaigs.kriging.scalar import ScalarOptions, ScalarProcess
 
+        # All channels that are read are searched for a response, which few tests have put there.
+        brief = functools.partial(learn_responses, options=FrontEndOptions(folds=2, rounds=2))
+        data.learn_responses = learn_responses if item.path.stem in LEARNT else brief
         # Fits of levels to the last digit are most of a small run's time.
         is_fitted = not FITTED.isdisjoint(item.path.parts)
         quick = ScalarOptions(neighbours=8, iterations=4)
@@ -211,8 +222,10 @@ def files_read_once():
     read, found = ConfigRepository.load_config, {}
 
     def written(source, name):
+        if source.scheme() != "file" or source.path.startswith(str(ROOT)):
+            return None  # files of this repository stay
         file = Path(source.path, name).with_suffix(".yaml")
-        return file.stat().st_mtime_ns if source.scheme() == "file" and file.exists() else None
+        return file.stat().st_mtime_ns if file.exists() else None
 
     def once(self, config_path):
         states = ((source.path, written(source, config_path)) for source in self.sources)

@@ -4,6 +4,7 @@ import contextlib
 import csv
 import functools
 import importlib
+import itertools
 import json
 import os
 import pkgutil
@@ -238,10 +239,24 @@ def together():
     return found
 
 
+@functools.cache
+def telling():
+    """The choices that have a word, or an option beside a word, that no other ones have."""
+    known, kept = set(), set()
+    for choice, words in sorted(together().items(), key=lambda item: -len(item[1])):
+        options = words.keys() - {word.partition("=")[0] for word in choice}
+        facts = {*choice, *itertools.product(choice, options)} or {()}
+        if not facts <= known:
+            kept.add(choice)
+            known |= facts
+    return kept
+
+
 @page_by_page
 def test_commands_compose(page, composed):
     for line in composable_lines(page):
-        composed(*together()[chosen(line)].values())
+        if chosen(line) in telling():
+            composed(*together()[chosen(line)].values())
 
 
 @pytest.mark.parametrize("command", ["gaigs +experiment", "pytest"])

@@ -2,7 +2,6 @@
 
 import functools
 import logging
-import math
 from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
@@ -213,16 +212,17 @@ class Scene:
         """The scene in plain tensors, lists and strings, for a checkpoint."""
         receivers = []
         for receiver in self.receivers:
-            receivers.append(
-                {
-                    "name": receiver.name,
-                    "position": receiver.pose.position,
-                    "rotation": receiver.pose.rotation,
-                    "elements": receiver.array.elements,
-                    "pattern": receiver.array.pattern,
-                    "band": receiver.band,
-                }
-            )
+            entry = {
+                "name": receiver.name,
+                "position": receiver.pose.position,
+                "rotation": receiver.pose.rotation,
+                "elements": receiver.array.elements,
+                "pattern": receiver.array.pattern,
+            }
+            # Runs of one band go on that were begun before receivers had bands.
+            if receiver.band != Receiver.band:
+                entry["band"] = receiver.band
+            receivers.append(entry)
         state = {"receivers": receivers, "task": self.task.state()}
         for name in ("lower", "upper", "spacing", "frequencies", "bandwidth", "floors", "places"):
             state[name] = getattr(self, name)
@@ -244,7 +244,7 @@ class Scene:
         for entry in state["receivers"]:
             pose = Pose(entry["position"], entry["rotation"])
             array = Array(entry["elements"], entry["pattern"])
-            band = tuple(entry.get("band", (0.0, math.inf)))  # of a checkpoint from before bands
+            band = tuple(entry.get("band", Receiver.band))
             receivers.append(Receiver(entry["name"], pose, array, band))
         frame = None
         try:

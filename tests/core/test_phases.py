@@ -2,6 +2,7 @@
 for random.
 """
 
+import functools
 import logging
 from dataclasses import replace
 
@@ -20,8 +21,9 @@ SPLIT = {"name": "random", "seed": 0}
 each = pytest.mark.parametrize("phase", Csi.phases)
 
 
-def simulated(phase, **options):
-    return gaigs.links("synthetic_csi", transmitters=60, subcarriers=8, phase=phase, **options)
+@functools.cache  # tests change copies
+def simulated(phase):
+    return gaigs.links("synthetic_csi", transmitters=60, subcarriers=8, phase=phase)
 
 
 def undeclared(links, labels=None):

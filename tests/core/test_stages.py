@@ -190,12 +190,12 @@ SMALL = (
 def unlimited(tmp_path_factory):
     folder = tmp_path_factory.mktemp("unlimited")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ScalarProcess, "options", ScalarOptions(iterations=2))
+        patch.setattr(ScalarProcess, "options", ScalarOptions(neighbours=8, iterations=2))
         return folder, runs.run(gaigs.compose(*SMALL), folder)
 
 
 def test_a_limit_that_is_far_changes_nothing(unlimited, clock, monkeypatch, tmp_path):
-    monkeypatch.setattr(ScalarProcess, "options", ScalarOptions(iterations=2))
+    monkeypatch.setattr(ScalarProcess, "options", ScalarOptions(neighbours=8, iterations=2))
     folder, before = unlimited
     metrics = runs.run(gaigs.compose(*SMALL, "max_time=00:01:00:00"), tmp_path)
     assert metrics["left_out"] == []

@@ -75,6 +75,11 @@ def measured(folder, phase, response, transmitters=48, is_divided=True):
     return gaigs.links("csi_npz", file=file, phase=phase)
 
 
+@pytest.fixture(scope="module")
+def links(tmp_path_factory):
+    return measured(tmp_path_factory.mktemp("known"), "known", invented())
+
+
 def score(model, links):
     return gaigs.evaluate(gaigs.train(model, links), links, baselines=[]).models[model]
 
@@ -108,8 +113,7 @@ def test_without_a_filter_nothing_is_learnt(tmp_path):
     assert "responses" not in links.scene.state()
 
 
-def test_checkpoints_keep_responses_and_other_subcarriers_interpolate_them(tmp_path):
-    links = measured(tmp_path, "known", invented())
+def test_checkpoints_keep_responses_and_other_subcarriers_interpolate_them(links, tmp_path):
     model = gaigs.train("friis", links)
     model.save(tmp_path / "room.ckpt")
     loaded = gaigs.load(tmp_path / "room.ckpt")
@@ -123,8 +127,7 @@ def test_checkpoints_keep_responses_and_other_subcarriers_interpolate_them(tmp_p
 
 
 @pytest.mark.parametrize("model", ["gaigs", "mirrored"])
-def test_channels_of_models_stand_behind_the_front_end(model, tmp_path):
-    links = measured(tmp_path, "known", invented())
+def test_channels_of_models_stand_behind_the_front_end(model, links):
     options = {"max_steps": 1, "enable_progress_bar": False}
     if model == "mirrored":
         options["order"] = 0  # without a search for planes
@@ -155,8 +158,7 @@ def test_guard_carriers_of_one_constant_are_left_out(tmp_path):
     assert links.front_ends.responses.shape == (1, ELEMENTS, SUBCARRIERS - 8)
 
 
-def test_the_figure_has_a_row_of_a_receiver_with_a_response(tmp_path):
-    links = measured(tmp_path, "known", invented())
+def test_the_figure_has_a_row_of_a_receiver_with_a_response(links):
     learnt, errors, _ = links.front_ends
     responses = torch.cat((torch.ones_like(learnt), learnt)).numpy()
     deviations = torch.cat((torch.zeros_like(errors), errors)).numpy()

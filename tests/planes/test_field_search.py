@@ -62,13 +62,13 @@ def room(count=170, receivers=1, is_noise=False):
 
 @pytest.fixture(params=[1, 2], ids=["one receiver", "two"])
 def links(request):
-    return room(receivers=request.param)
+    return room(120, receivers=request.param)
 
 
-def search_walls(links, most):
-    """The room that a search finds, each wall within ``most`` of a plane."""
+def search_walls(links, most, count=4):
+    """The room that a search of so many planes finds, each wall within ``most`` of a plane."""
     torch.manual_seed(0)
-    search = FieldSearch(links, -1, 1, 4, torch.zeros(0, 4))
+    search = FieldSearch(links, -1, 1, count, torch.zeros(0, 4))
     found = search.run()
     planes = search.frame.to_world(found.planes).numpy()
     for wall in WALLS:
@@ -135,7 +135,7 @@ def test_bands_share_planes_and_have_gains_of_their_own():
         task=Csi(1, torch.tensor([FREQUENCY, 3.6e9]).double()),
         split=Split("all", torch.arange(200), torch.arange(0), torch.arange(0)),
     )
-    found = search_walls(links, 0.02)
+    found = search_walls(links, 0.02, len(WALLS))
     # Wavelengths ascend: the first gains are the high band's, whose reflections are weaker.
     shown = found.uses.all(0)
     assert shown.sum() >= 2
