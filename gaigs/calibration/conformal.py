@@ -196,7 +196,7 @@ class Calibration:
         if len(amplitudes):
             cells = cells * (len(amplitudes) + 1) + torch.bucketize(value.contiguous(), amplitudes)
         scale = _shaped(deviations, value)
-        rank = math.ceil(level * self.steps - 1e-9)
+        rank = math.ceil(level * self.steps - 1e-9)  # of the next stored level
         half = scale * self.quantiles[..., rank].flatten().to(scale).take(cells)
         std = scale * self.sizes.flatten().to(scale).take(cells)
         if not value.is_complex():

@@ -60,6 +60,7 @@ def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -
         if not len(part):
             continue
         rest = replace(links, split=links.split.only(index[is_known]))
+        # Estimated places of receivers are estimated anew, without the fold.
         if links.uncertainties is not None and links.uncertainties.any():
             is_estimated = links.uncertainties > 0
             unknown = torch.where(is_estimated, math.inf, 0.0)

@@ -186,6 +186,7 @@ def _best_delays(cross: Complex[Tensor, "*k s"], rates: Float[Tensor, " s"]) -> 
     delays = grid[(cross @ steering).abs().argmax(-1)]
     for _ in range(4):  # Newton's method on half the square of the magnitude
         turned = cross * torch.polar(torch.ones_like(cross.real), delays[..., None] * rates)
+        # Derivatives of the sum, then of |sum|² / 2.
         value = turned.sum(-1)
         slope = (1j * rates * turned).sum(-1)
         bend = ((1j * rates) ** 2 * turned).sum(-1)

@@ -119,6 +119,7 @@ def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Modul
         _check_finite("scene", scene)
         with only_recorded(None if trust else {**recorded, **content[KEY].get("plugins", {})}):
             model = registry("model").build(content[KEY]["model"], scene=Scene.from_state(scene))
+        # Buffers that a new model does not set, such as gains before a fit, may be NaN in the file.
         fresh = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         unset = {name for name, value in fresh.items() if not value.isfinite().all()}
         model.load_state_dict(weights)
@@ -144,7 +145,10 @@ def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Modul
 
 
 def trained_weights(content: dict) -> dict:
-    """The weights of the training module in a checkpoint, before and after ``update``."""
+    """Weights of the trained model in a checkpoint, by their names in the training module.
+
+    ``update`` may have stored them within a model that wraps the trained one.
+    """
     weights = content["state_dict"]
     if "trained" not in content[KEY]:
         return weights

@@ -221,6 +221,7 @@ class LevelSearch:
             sums = values.new_zeros(len(places)).index_add(0, which, values[rows])
             levels = sums / which.bincount()
             powers = 10 ** ((levels - levels.median()) / 10)
+            # A single point: its only lag is the power.
             array = group.receiver.array
             point = replace(array, elements=array.elements.new_zeros(1, 3))
             lags = powers[:, None].to(torch.complex64)

@@ -156,6 +156,7 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: flo
     before = [loss(batch) for batch in batches]
 
     def suffices(kept: Bool[Tensor, " n"]) -> bool:
+        """Keeps these paths; True if no batch's loss rises by 0.1 %."""
         placement.kept.copy_(kept)
         return all(
             loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True)
@@ -163,7 +164,8 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: flo
 
     best = placement.kept.clone()
     shares = torch.stack([_path_shares(placement, batch) for batch in batches]).amax(0)
-    best[best.nonzero()[:, 0][shares < negligible * shares.max()]] = False
+    paths_in_use = best.nonzero()[:, 0]
+    best[paths_in_use[shares < negligible * shares.max()]] = False
     for plane in reversed(sort_by_strength(placement, batches[0])):
         without = best & ~(placement.sequences == plane).any(1)
         best = without if suffices(without) else best

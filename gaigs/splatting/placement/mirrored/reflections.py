@@ -133,6 +133,7 @@ def fold(
     exist. Nor does a path with an end on the plane, so no path meets two coincident planes in a
     row.
     """
+    # Where each path has arrived on its way back from the receiver (b, n, 3).
     here = receivers[:, None].expand(-1, len(sequences), -1)
     numbers = torch.arange(len(sequences), device=here.device)
     exists = torch.ones(here.shape[:2], dtype=torch.bool, device=here.device)
@@ -148,13 +149,14 @@ def fold(
         plane = sequences[first:, -back]
         n = normals[plane]
         d = offsets[plane]
+        # The line to the image in all planes that are not folded back yet crosses this plane.
         begin = here[:, first:]
         way = seen[-back][:, first:] - begin  # (b, sequences, 3)
-        height = (begin * n).sum(-1) - d
+        height = (begin * n).sum(-1) - d  # of the beginning over the plane
         rise = (way * n).sum(-1)
         length = way.norm(dim=-1)
         with torch.no_grad():
-            beyond = height + rise
+            beyond = height + rise  # height of the image
             # An end within 4 roundings of the distances of both ends and of the plane is on the
             # plane.
             least = 4 * rounding * (begin.norm(dim=-1) + length + d.abs())
