@@ -454,7 +454,7 @@ class Model(Movable):
         raise ValueError("the model has no paths of channels; ask has_margins first")
 
     def refit(self, links: Links) -> None:
-        """Fits to some of the links of an earlier fit, whose choices may stay to save time."""
+        """Fits to some of the links of an earlier fit, whose choices may stay: it may be faster."""
         self.fit(links)
 
     def take_hyperparameters(self, other: "Model") -> None:
@@ -480,9 +480,8 @@ class Model(Movable):
             yield Unseen(self, asked, links.split.train)
 
     def _refitted(self, links: Links) -> "Model":
-        """A copy of this model after ``refit``."""
-        # Estimated places of receivers may differ.
-        scene = replace(self.scene, receivers=links.receivers)
+        """A copy that is fitted to some of the links of an earlier fit."""
+        scene = replace(self.scene, receivers=links.receivers)  # whose places may be estimated
         # Known links are large, and stay as they are.
         memo: dict[int, Any] = {id(self.links): self.links, id(self.scene): scene}
         memo[id(self.calibration)] = self.calibration

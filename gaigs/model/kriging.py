@@ -199,7 +199,7 @@ class Kriging(Wrapper):
         return int(min(most, max(100, stages.left() / 9 / link_time / self.scene.radios)))
 
     def _krige_labels(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
-        """``krige`` by labels; ``values`` are the trend's predictions of the known links."""
+        """``krige`` of labels; ``values`` are the trend's predictions of known links."""
         self._make_posterior(False)
         held = links.split.validation
         is_unlearnt = False
@@ -243,7 +243,7 @@ class Kriging(Wrapper):
     ) -> "Kriging":
         """Fits weights and hyperparameters; returns a model that knows the training links alone.
 
-        The trend weight is one of the argument ``weights``; None: of the attribute.
+        The trend weight is chosen among some; None: among ``weights``.
         """
         split = links.split
         candidates = self._candidates(links, values, weights or self.weights)

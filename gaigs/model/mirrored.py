@@ -65,8 +65,8 @@ class MirroredSplatting(GaussianSplatting):
     widest = 1000.0
     is_wide = False  # True if the box is larger; set by fit
 
-    places: Query | None = None  # links for the report of paths; set by fit
-    levels: LevelSearch | None = None  # search by phases that ``revise`` runs; set by fit
+    places: Query | None = None  # set by fit
+    levels: LevelSearch | None = None
 
     def __init__(
         self,

@@ -81,11 +81,11 @@ class Obstacles(nn.Module):
         if self.turns is not None:
             columns = [self.densities, self.densities * self.turns]
         shapes = (self.centres, self.log_widths, torch.stack(columns, 1))
-        chunks = [
+        parts = [
             _Depth.apply(*legs, *shapes)
             for legs in zip(starts.split(size), ends.split(size), strict=True)
         ]
-        depths = torch.cat(chunks)  # (segments, 1 or 2)
+        depths = torch.cat(parts)  # (segments, 1 or 2)
         depths = depths[:, 0] if self.turns is None else torch.view_as_complex(depths)
         return depths.view(start.shape[:-1])
 
