@@ -114,8 +114,8 @@ class GeometricAttention(nn.Module):
 
     The logit of a query and a key is their inner product plus the product of their scalars. The
     inner product ignores components with e0, and with them the positions of projective points. So
-    in that algebra the logit also has minus the squared distance of two points, -w(g) w(h) |g y - h
-    x|² for trivectors with e123 of g and h and other components x and y, with w(h) = h / (h² +
+    in that algebra minus the squared distance of two points is added: for trivectors (x, g) and
+    (y, h), with g and h the components of e123, it is -w(g) w(h) |g y - h x|² with w(h) = h / (h² +
     floor).
 
     Args:

@@ -79,7 +79,7 @@ class ChannelSearch:
         """The room of ``run`` in the frame."""
         with stages.portion(0.6):  # planes that are not resolved are worth nothing
             planes = self.find_free(self.start)
-        best = SlabRoom(planes, planes[:, :3])
+        best = SlabRoom(planes, planes[:, :3])  # kept if it is empty
         if len(planes):
             best = self.prune(self.resolve(self.free.descend(planes, 300, 5e-3)))
         if stages.is_up():

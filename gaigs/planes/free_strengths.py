@@ -176,10 +176,10 @@ class _ProfileTable:
         self, receiver: ReceiverChannels, profile: Float[Tensor, "b e t 2"], longest: float
     ):
         self.count = profile.shape[2]
-        self.rate = (self.count - 1) * speed_of_light / longest  # [1/s]
+        self.rate = (self.count - 1) * speed_of_light / longest  # entries for each second of delay
         self.carrier = float(receiver.frequencies.mean())
         rows = torch.arange(profile.shape[0] * profile.shape[1]).view(profile.shape[:2])
-        self.first = rows[:, None] * self.count  # (b, 1, e)
+        self.first = rows[:, None] * self.count  # (b, 1, e), row of ``values`` at delay 0
         self.values = profile.flatten(0, 2)  # (b e t, 2)
         self.places = (receiver.places - receiver.position).float()
         self.elements = (receiver.elements - receiver.position).float()

@@ -206,13 +206,14 @@ def attenuate_paths(
     fields = fields.double()
     powers = fields.square()
     fields[powers < options.faint * powers.sum(1, keepdim=True)] = 0
+    # Legs of the paths that count, of all links in a row (s,).
     link, leg = (fields > 0)[:, folded.path].nonzero().T
     paths = link * len(sequences) + folded.path[leg]
     start = folded.start[link, leg].double()
     along = folded.end[link, leg].double() - start
     depths = obstacles(start.float(), (start + along).float()).real.double()
-    depths = fields.new_zeros(fields.numel()).index_add(0, paths, depths)  # of each path
-    steps = torch.linspace(0, 1, options.samples).to(along)[:, None]
+    depths = fields.new_zeros(fields.numel()).index_add(0, paths, depths)  # (b n,), of each path
+    steps = torch.linspace(0, 1, options.samples).to(along)[:, None]  # (k, 1)
     samples = [
         measure_densities(obstacles, first + steps * way).sum(1)
         for first, way in zip(start, along, strict=True)
