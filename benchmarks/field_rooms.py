@@ -1,4 +1,4 @@
-"""Scores in furnished rooms of one complex number a place, and what their known walls explain.
+"""Scores in furnished rooms of one complex number a place, and bounds by their known walls.
 
     python benchmarks/field_rooms.py --rooms 10 11 --seeds 0 1 2 --folder runs/field_rooms
 
@@ -68,21 +68,16 @@ def planes_of(room: MeshRoom) -> torch.Tensor:
     return torch.tensor(planes, dtype=torch.float64)
 
 
-def write_field(room: MeshRoom, count: int, frequency: float, seed: int, file: Path) -> None:
-    """Traces channels of random places, and writes them for ``data=csi_npz``."""
+def write_field(room: MeshRoom, seed: int, file: Path, frequency: float = 2.4e9) -> None:
+    """Traces channels of 450 places at a carrier [Hz], and writes them for ``data=csi_npz``."""
     position = torch.tensor(room.antenna[0], dtype=torch.float64)
     receiver = Receiver("rx", Pose.from_xyzw(position, (0, 0, 0, 1)), Array(torch.zeros(1, 3)))
-    places = place(room, count, seed)
+    places = place(room, 450, seed)
     paths = find_paths(room, position, places, frequency)
     channels = respond(paths, receiver, frequency, torch.zeros(1))  # (b, 1, 1)
     file.parent.mkdir(parents=True, exist_ok=True)
-    np.savez(
-        file,
-        h=channels.numpy(),
-        tx=places.numpy(),
-        rx=position[None].numpy(),
-        frequencies=[frequency],
-    )
+    arrays = {"h": channels, "tx": places, "rx": position[None], "frequencies": [frequency]}
+    np.savez(file, **arrays)
 
 
 def run_scores(file: Path, seed: int, words: list[str]) -> dict[str, str]:
@@ -94,20 +89,17 @@ def run_scores(file: Path, seed: int, words: list[str]) -> dict[str, str]:
     (file.parent / f"{folder.name}.log").write_text(done.stdout + done.stderr)
     done.check_returncode()
     metrics = json.loads((folder / "metrics.json").read_text())
-    cells = {}
-    for name, values in metrics["models"].items():
-        cells[name] = f"{values['snr_db_median']:.1f} / {values['nmse_db']:.1f}"
-    return cells
+    return {
+        name: f"{values['snr_db_median']:.1f} / {values['nmse_db']:.1f}"
+        for name, values in metrics["models"].items()
+    }
 
 
 def main() -> None:
-    shape = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=shape)
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("words", nargs="*", metavar="KEY=VALUE", help="options of the run")
     parser.add_argument("--rooms", type=int, nargs="+", default=[10, 11])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0])
-    parser.add_argument("--places", type=int, default=500)
-    parser.add_argument("--frequency", type=float, default=2.4e9, help="carrier [Hz]")
     parser.add_argument("--folder", type=Path, default=Path("runs/field_rooms"))
     options = parser.parse_args()
     titles = ("images: a strength each", "images: shared gains", "images: varying gains")
@@ -116,7 +108,7 @@ def main() -> None:
     for number in options.rooms:
         room = draw_room(number)
         file = options.folder / f"room{number}.npz"
-        write_field(room, options.places, options.frequency, number, file)
+        write_field(room, number, file)
         for seed in options.seeds:
             with torch.no_grad():
                 bounds = scores(load_field(file, seed), planes_of(room), 2)[1:]
