@@ -209,10 +209,11 @@ def descend(
     others: list[Tensor],
     steps: int,
     rate: float,
+    turns: float = 0.4,
 ) -> list[Tensor]:
     """Adam on planes, which turn about their ``mean_bounces``, and on other arguments of a loss.
 
-    ``rate`` is the first step of a plane [m]; steps fall to 3 % of it.
+    ``rate`` is the first step of a plane [m], ``turns`` times it the turn [rad]; steps fall to 3 %.
     """
     if not len(planes):
         return [planes, *others]
@@ -224,8 +225,8 @@ def descend(
 
     def moved() -> Float[Tensor, "w 4"]:
         # Lengths change by about twice a shift [m], and by some metres times a turn [rad].
-        turns = 0.4 * (shifts[:, 1:, None] * axes).sum(1)  # (w, 3)
-        normals = functional.normalize(planes[:, :3] + turns, dim=1)
+        turned = planes[:, :3] + turns * (shifts[:, 1:, None] * axes).sum(1)  # (w, 3)
+        normals = functional.normalize(turned, dim=1)
         offsets = (normals * pivots).sum(1) + heights + shifts[:, 0]
         return torch.cat((normals, offsets[:, None]), 1)
 
