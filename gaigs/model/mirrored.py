@@ -195,6 +195,8 @@ class MirroredSplatting(GaussianSplatting):
         room = search.run()
         planes = search.frame.to_world(room.planes)
         self._plan(planes, room.slabs, search.data.order)
+        if placement.obstacles is not None and search.score.fit.count < search.fewest:
+            placement.obstacles.requires_grad_(False)  # a few numbers tell no shadows, either
         if not len(planes):
             return
         # The search has waves exp(-j k L) / L; the pooling's are ``strength`` lambda / (4 pi) times

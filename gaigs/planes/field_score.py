@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from gaigs.planes.channel_links import SLABS, ChannelData, ReceiverChannels
 from gaigs.planes.field_room import FieldFit, FieldRoom, group_places
+from gaigs.planes.frame import mean_bounces
 from gaigs.planes.search import Candidate, GridRatings, Score, descend
 from gaigs.splatting.placement.mirrored.reflections import reflect
 
@@ -28,6 +29,7 @@ class FieldScore(Score[FieldRoom]):
         price: Least fall by a true plane of the sum of log squared errors over all channel values.
             The best of n false planes reaches about log n.
         chunk: Waves that are computed at a time.
+        upright: Least cosine of a plane that is tried upright, or along an axis: 3.6 degrees.
 
     Attributes:
         groups: Groups of places in ratings of a grid.
@@ -36,8 +38,15 @@ class FieldScore(Score[FieldRoom]):
     Source: Mallat and Zhang, Matching pursuits with time-frequency dictionaries, 1993.
     """
 
-    def __init__(self, data: ChannelData, price: float = 12.0, chunk: int = 4_000_000):
+    def __init__(
+        self,
+        data: ChannelData,
+        price: float = 12.0,
+        chunk: int = 4_000_000,
+        upright: float = 0.998,
+    ):
         self.data = data
+        self.upright = upright
         self.fit = FieldFit(data)
         self.price = price / self.fit.count
         self.chunk = chunk
@@ -168,7 +177,30 @@ class FieldScore(Score[FieldRoom]):
     def refine(self, room: FieldRoom) -> FieldRoom:
         return self.descend(room, 40)
 
-    def descend(self, room: FieldRoom, steps: int) -> FieldRoom:
+    def square(self, room: FieldRoom) -> FieldRoom:
+        """The room with planes upright and along axes, if noise explains what tilts gain.
+
+        A free number may lower the sum over n values by log(n) / 2 by chance.
+
+        Source: Schwarz, Estimating the dimension of a model, 1978.
+        """
+        normals = room.planes[:, :3]
+        level = functional.normalize(normals * normals.new_tensor([1.0, 1.0, 0.0]), dim=1)
+        along = torch.eye(3).to(normals)[normals.abs().argmax(1)] * normals.sign()  # (w, 3)
+        is_square = (normals * along).sum(1) > self.upright
+        is_level = (normals * level).sum(1) > self.upright
+        squared = torch.where(is_level[:, None], level, normals)
+        squared = torch.where(is_square[:, None], along, squared)
+        # Planes turn about the points where they reflect.
+        pivots = mean_bounces(self.data.receivers, room.planes)
+        offsets = room.planes[:, 3] + ((squared - normals) * pivots).sum(1)
+        start = room._replace(planes=torch.cat((squared, offsets[:, None]), 1))
+        trial = self.descend(self.fit.fit_gains(start, 5), 40, turns=0.0)
+        saved = torch.where(is_square, 2, is_level.long()).sum().item()
+        chance = saved * math.log(self.fit.count) / (2 * self.fit.count)
+        return trial if self.error(trial) < self.error(room) + chance else room
+
+    def descend(self, room: FieldRoom, steps: int, turns: float = 0.4) -> FieldRoom:
         """The room after a descent of the planes, with gains projected out.
 
         Source: Golub and Pereyra, 1973.
@@ -188,7 +220,7 @@ class FieldScore(Score[FieldRoom]):
             return self.fit.mean_log(kriged.whiten(self.fit.residual(current, waves)))
 
         rate = 0.1 * self.data.wavelength
-        planes = descend(loss, self.data.receivers, room.planes, [], steps, rate)[0]
+        planes = descend(loss, self.data.receivers, room.planes, [], steps, rate, turns)[0]
         moved = self.fit.fit_gains(current._replace(planes=planes), 4)
         return min(room, moved, key=self.error)
 

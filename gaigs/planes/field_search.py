@@ -101,7 +101,8 @@ class FieldSearch:
         room = self.score.refine(search.prune(room, len(self.start)))
         if not len(room.planes):
             log.info("no plane explains more of %d numbers than chance would", fit.count)
-        return room
+            return room
+        return self.score.square(room)
 
     def _extend(self, room: FieldRoom, grids: list[PlaneGrid]) -> FieldRoom | None:
         """The room with one more plane: the best of the first grid with one that lowers the error.

@@ -216,11 +216,12 @@ def descend(
     others: list[Tensor],
     steps: int,
     rate: float,
+    turns: float = 0.4,
 ) -> list[Tensor]:
     """Planes and ``others``, the further arguments of a loss, after a descent by Adam.
 
     Planes turn about their ``mean_bounces`` at the receivers. ``rate`` is the first step of a plane
-    [m]; steps fall to 3 % of it.
+    [m], and ``turns`` times it the first turn [rad]; steps fall to 3 % of it.
     """
     if not len(planes):
         return [planes, *others]
@@ -232,8 +233,8 @@ def descend(
 
     def moved() -> Float[Tensor, "w 4"]:
         # Lengths change by about twice a shift [m], and by some metres times a turn [rad].
-        turns = 0.4 * (shifts[:, 1:, None] * axes).sum(1)  # (w, 3)
-        normals = functional.normalize(planes[:, :3] + turns, dim=1)
+        turned = planes[:, :3] + turns * (shifts[:, 1:, None] * axes).sum(1)  # (w, 3)
+        normals = functional.normalize(turned, dim=1)
         offsets = (normals * pivots).sum(1) + heights + shifts[:, 0]
         return torch.cat((normals, offsets[:, None]), 1)
 
