@@ -102,27 +102,19 @@ class Ensemble(Wrapper):
         A few members differ by chance: so the typical square counts as much as four of them.
         Different models state deviations of their own: the weighted root mean square of these.
         """
-        if self.is_blend:
-            return self._stated(batch)
-        count = len(self._members) - 1
-        return ((count * self._squares(batch) + 4 * self.typical) / (count + 4)).sqrt()
-
-    def _stated(self, batch: Batch) -> Tensor | None:
-        """Root mean square of the deviations that members state; None if no member does."""
-        found = []
+        if not self.is_blend:
+            count = len(self._members) - 1
+            return ((count * self._squares(batch) + 4 * self.typical) / (count + 4)).sqrt()
+        total: Any = 0.0
+        weights = 0.0
         for weight, member in zip(self.weights, self._members, strict=True):
-            deviations = member.deviations(batch.to(member.device))
-            if deviations is not None:
-                found.append((weight, deviations.to(batch.query.transmitters.device)))
-        if not found:
-            return None
-        axes = max(deviations.ndim for _, deviations in found)
-        total = 0.0
-        for weight, deviations in found:
-            squares = deviations.square()  # (b,) or (b, *shape)
-            total = total + weight * squares.reshape(*squares.shape, *[1] * (axes - squares.ndim))
-        mean: Any = total / sum(weight for weight, _ in found)
-        return mean.sqrt()
+            stated = member.deviations(batch.to(member.device))
+            if stated is not None:
+                # (b,) and (b, *shape) add up with the links behind.
+                squares = stated.square().to(batch.query.transmitters.device).movedim(0, -1)
+                total = total + weight * squares
+                weights += weight
+        return (total / weights).sqrt().movedim(-1, 0) if weights else None
 
     def process_at(self, receiver: int) -> Process | None:
         """The process of the first member that has one."""
@@ -164,12 +156,6 @@ class Ensemble(Wrapper):
                 asked = asked[torch.isin(asked, part.asked)]
             if len(asked):
                 yield Unseen(self._of([part.model for part in parts]), asked, links.split.train)
-
-    @property
-    def fold_count(self) -> int:
-        return max(
-            member.fold_count for member in self._members if member.is_trained is self.is_trained
-        )
 
     def take_hyperparameters(self, other: Model) -> None:
         assert isinstance(other, Ensemble)

@@ -49,9 +49,7 @@ class Tried(NamedTuple):
     seconds: float  # duration of fits, training and scores
     asked: Tensor | None = None  # links that it has not learnt from (k,)
     values: Tensor | None = None  # their predictions (k, *shape)
-    unseen: Model | None = (
-        None  # not fitted to validation links; None before a look-up's validation
-    )
+    unseen: Model | None = None  # model without validation links, as it scores at these
     # Result of the training; None for a look-up, which is fitted once it is chosen.
     fitted: Fitted | None = None
     # Members of a blend and their shares; empty for a single model.
@@ -215,9 +213,8 @@ def look_up(label: str, config: dict, links: Links, folder: Path) -> Tried:
         values.append(predicted(unseen.model, links, unseen.asked))
     if not asked:
         raise ValueError(f"its fit took {time.monotonic() - began:.0f} s; raise model.max_time")
-    one = Tried(label, config, folder, {}, 0.0)
-    one = _scored(one, links, torch.cat(asked), torch.cat(values))
-    return one._replace(seconds=time.monotonic() - began)
+    one = Tried(label, config, folder, {}, time.monotonic() - began)
+    return _scored(one, links, torch.cat(asked), torch.cat(values))
 
 
 def train_candidate(label: str, config: dict, links: Links, folder: Path) -> Tried:
@@ -225,30 +222,28 @@ def train_candidate(label: str, config: dict, links: Links, folder: Path) -> Tri
     began = time.monotonic()
     fitted = _fit(config, links, folder)
     unseen = fitted.unseen[config["model"]["name"]]
-    one = Tried(label, config, folder, {}, 0.0, unseen=unseen, fitted=fitted)
     asked = links.split.validation
-    one = _scored(one, links, asked, predicted(unseen, links, asked))
-    return one._replace(seconds=time.monotonic() - began)
+    values = predicted(unseen, links, asked)
+    spent = time.monotonic() - began
+    one = Tried(label, config, folder, {}, spent, unseen=unseen, fitted=fitted)
+    return _scored(one, links, asked, values)
 
 
 def _validated(look_up: Tried, links: Links) -> Tried:
-    """A look-up, or a blend, with its scores at the validation places, as trained candidates have
-    them."""
+    """A look-up or a blend of them with its scores where trained candidates have theirs."""
+    asked = links.split.validation
     if look_up.members:
-        members = [_validated(member, links) for member in look_up.members]
-        blend = _blended(members, look_up.weights)
-        values = _mean([one.values for one in members], torch.tensor(look_up.weights))
-        return _scored(blend, links, links.split.validation, values)
+        members = tuple(_validated(member, links) for member in look_up.members)
+        values = _mean([one.values for one in members], look_up.weights)
+        return _scored(look_up._replace(members=members), links, asked, values)
     model = registry("model").build(look_up.config["model"], scene=links.scene)
     model.fit(replace(links, split=links.split.validating()))
-    asked = links.split.validation
     values = predicted(model, links, asked)
     return _scored(look_up._replace(unseen=model), links, asked, values)
 
 
 def _scored(one: Tried, links: Links, asked: Int[Tensor, " k"], values: Tensor) -> Tried:
-    """A candidate with predictions, and the mean monitored score at each place: links of one place,
-    with errors alike, are one."""
+    """A candidate with predictions and its mean score at each place: errors there are alike."""
     task = links.task
     scores = task.scores(_labels(links, asked), values)[task.monitor].double()
     keys, places = links.query[asked].place_keys.unique(return_inverse=True)
@@ -267,54 +262,45 @@ def _labels(links: Links, index: Int[Tensor, " k"]) -> Tensor:
 def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
     """One candidate, or a blend of those that no other surely leads.
 
-    Shares are fitted at all places; their score is that of shares fitted without each place's fold.
-    A blend is taken unless a candidate surely leads it: where models are level, the error of their
-    mean is at most the mean of their errors. Complex channels of unknown phase have no mean.
+    A blend is scored by shares that are fitted without each place's fold, and taken unless a
+    candidate surely leads it: the error of a mean is at most the mean of the errors. Complex
+    channels of unknown phase have no mean.
     """
     choice = pick(tried, links.task)
-    if len(choice.level) < 2 or links.task.phase != "known":
-        return choice
     level = choice.level
-    asked: Any = level[0].asked
-    for one in level[1:]:  # the time limit may have left out folds of some
-        asked = asked[torch.isin(asked, one.asked)]
-    values = []
-    for one in level:
-        order = {link: row for row, link in enumerate(one.asked.tolist())}
-        values.append(one.values[[order[link] for link in asked.tolist()]])
-    places = links.query[asked].place_keys
-    shares = stack(_labels(links, asked), values, places, folds_of(links, asked, 5))
-    if shares.weights.max() > 0.95:
+    if len(level) < 2 or links.task.phase != "known":
         return choice
-    crossed = _mean(values, shares.crossed)
-    blend = _blended(level, shares.weights.tolist())
-    judged = pick([_scored(blend, links, asked, crossed), *level], links.task)
+    asked: Any = level[0].asked
+    for one in level:  # the time limit may have left out folds of some
+        asked = asked[torch.isin(asked, one.asked)]
+    values: Any = [one.values[torch.isin(one.asked, asked)] for one in level]  # type: ignore
+    places = links.query[asked].place_keys
+    shares, crossed = stack(_labels(links, asked), values, places, folds_of(links, asked))
+    if shares.max() > 0.85:  # a second model is worth more than a tenth
+        return choice
+    blend = _blended(level, shares.tolist())
+    judged = pick([_scored(blend, links, asked, _mean(values, crossed)), *level], links.task)
     return judged._replace(chosen=blend) if judged.chosen.members else choice
 
 
-def _blended(members: Sequence[Tried], weights: Sequence[float]) -> Tried:
+def _blended(tried: Sequence[Tried], weights: Sequence[float]) -> Tried:
     """A blend of candidates; of a blend its members count."""
-    flat: dict[str, Tried] = {}
+    members: dict[str, Tried] = {}
     shares: dict[str, float] = {}
-    for weight, member in zip(weights, members, strict=True):
-        for share, one in zip(member.weights or (1.0,), member.members or (member,), strict=True):
+    for weight, part in zip(weights, tried, strict=True):
+        for share, one in zip(part.weights or (1.0,), part.members or (part,), strict=True):
             if weight * share > 0:
-                flat[one.label] = one
-                shares[one.label] = shares.get(one.label, 0.0) + weight * share
+                members[one.label] = one
+                shares[one.label] = weight * share
     label = " + ".join(f"{share:.2g} {name}" for name, share in shares.items())
-    # The first trained member stands for all, such as by its room.
-    names = sorted(flat, key=lambda name: flat[name].fitted is None)
-    first = members[0]
-    blend = Tried(label, first.config, first.folder, {}, sum(one.seconds for one in members))
-    return blend._replace(
-        members=tuple(flat[name] for name in names), weights=tuple(shares[name] for name in names)
-    )
+    blend = tried[0]._replace(label=label, seconds=sum(one.seconds for one in tried))
+    return blend._replace(members=tuple(members.values()), weights=tuple(shares.values()))
 
 
-def _mean(values: Sequence[Any], shares: Tensor) -> Tensor:
-    """Weighted mean of predictions (k, *shape), of shares of all links (c,) or of each (k, c)."""
+def _mean(values: Sequence[Any], shares: Sequence[float] | Tensor) -> Tensor:
+    """Weighted mean of predictions (k, *shape) by their shares, (c,) or of each link (c, k)."""
     total: Any = 0.0
-    for one, share in zip(values, shares.mT if shares.ndim > 1 else shares, strict=True):
+    for one, share in zip(values, torch.as_tensor(shares), strict=True):
         total = total + share.to(one.real).reshape(-1, *[1] * (one.ndim - 1)) * one
     return total
 
@@ -351,7 +337,7 @@ def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
         return ChosenModel(tried[best], f"{tried[best].label} is the best, {scores}", level)
     lead = f"{leads[best, chosen].mean():.2g}, standard error {scatter[best, chosen]:.2g}"
     reason = (
-        f"{tried[chosen].label} is the simplest that none surely leads; {tried[best].label} is "
+        f"{tried[chosen].label} is the first that none surely leads; {tried[best].label} is "
         f"ahead by {lead}, {scores}"
     )
     return ChosenModel(tried[chosen], reason, level)
@@ -381,38 +367,26 @@ def _fit(config: dict, links: Links, folder: Path) -> Fitted:
 
 
 def _finish(chosen: Tried, links: Links, folder: Path, seconds: float) -> Fitted:
-    """The result of the chosen candidate's run, whose checkpoint and log the folder gets.
-
-    A look-up is fitted to all known links, also as the member of a blend.
+    """The result of the chosen candidate's run, whose checkpoint and log the folder gets; or the
+    blend of several results. A look-up is fitted to all known links.
     """
+    parts = chosen.members or (chosen,)
+    results = [one.fitted or _fit(one.config, links, one.folder) for one in parts]
     if chosen.members:
-        return _finish_blend(chosen, links, folder, seconds)
-    fitted = chosen.fitted or _fit(chosen.config, links, chosen.folder)
+        names = [one.config["model"]["name"] for one in parts]
+        members = [one.models[name] for one, name in zip(results, names, strict=True)]
+        blend = Ensemble(links.scene, members, [*chosen.weights]).eval()
+        unseen: Any = Ensemble(links.scene, [one.unseen for one in parts], blend.weights).eval()
+        blend.known_places = links.query[links.split.known].place_keys.unique()
+        blend.calibration = calibrated(unseen if blend.is_trained else blend, links)
+        checkpoint.save(blend, folder / "best.ckpt")
+        return Fitted({NAME: blend}, {NAME: unseen}, count_gaussians(blend), seconds)
     if (chosen.folder / "best.ckpt").is_file():
         shutil.copy(chosen.folder / "best.ckpt", folder / "best.ckpt")
     if (chosen.folder / "log").is_dir():
         shutil.copytree(chosen.folder / "log", folder / "log", dirs_exist_ok=True)
     name = chosen.config["model"]["name"]
     # The trend of a kriged model is named after the row, too.
-    models = {NAME + key.removeprefix(name): model for key, model in fitted.models.items()}
-    unseen = {NAME: chosen.unseen}
-    return fitted._replace(models=models, unseen=unseen, seconds=seconds)
-
-
-def _finish_blend(chosen: Tried, links: Links, folder: Path, seconds: float) -> Fitted:
-    """A blend of the members' results, with its checkpoint in the folder."""
-    members = []
-    for one in chosen.members:
-        if one.fitted is None:
-            model = registry("model").build(one.config["model"], scene=links.scene)
-            model.fit(links)
-        else:
-            model = one.fitted.models[one.config["model"]["name"]]
-        members.append(model)
-    weights = list(chosen.weights)
-    blend = Ensemble(links.scene, members, weights).eval()
-    unseen = Ensemble(links.scene, [one.unseen for one in chosen.members], weights).eval()
-    blend.known_places = links.query[links.split.known].place_keys.unique()
-    blend.calibration = calibrated(unseen, links)
-    checkpoint.save(blend, folder / "best.ckpt")
-    return Fitted({NAME: blend}, {NAME: unseen}, count_gaussians(blend), seconds)
+    models = {NAME + key.removeprefix(name): model for key, model in results[0].models.items()}
+    assert chosen.unseen is not None
+    return results[0]._replace(models=models, unseen={NAME: chosen.unseen}, seconds=seconds)
