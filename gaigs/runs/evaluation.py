@@ -30,6 +30,7 @@ from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.data.compatibility import check_fit
 from gaigs.io.files import atomic_write
+from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model import Model
 from gaigs.model.answers import batch_size, calibrated, predicted, spreads
 from gaigs.model.kriging import Kriging
@@ -70,11 +71,25 @@ def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> 
     return {name: model for name, model in models.items() if model is not None}
 
 
-def fitted(look_up: Model, links: Links) -> Model:
-    """A copy of a model without a training, fitted to the known links."""
-    model = copy.deepcopy(look_up)
-    model.fit(links)
-    return model
+def fitted(
+    look_up: Model,
+    links: Links,
+    fits: dict[str, Model] | None = None,
+    key: str = "",
+    many: int = ScalarOptions.large,
+) -> Model:
+    """A copy of a model without a training, fitted to the known links.
+
+    It comes into ``fits`` by its key. An earlier fit there, to most of these links, leaves its
+    choices to a fit to more than ``many``.
+    """
+    fits = {} if fits is None else fits
+    if key in fits and len(links.split.known) > many:
+        fits[key] = fits[key].refitted(links)
+    else:
+        fits[key] = copy.deepcopy(look_up)
+        fits[key].fit(links)
+    return fits[key]
 
 
 @dataclass(frozen=True)
@@ -233,12 +248,13 @@ def score(
     links: Links,
     folder: Path | None = None,
     has_intervals: bool = True,
+    fits: dict[str, Model] | None = None,
 ) -> Scores:
     """Scores of every test link by models and look-ups; predictions of the first in a folder.
 
     Look-ups and models with a calibration have scores of intervals too. If subcarriers are held
     out, ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as an
-    uplink is taken for a downlink.
+    uplink is taken for a downlink. Fitted look-ups come into ``fits``, for their next fit.
     """
     test = LinkScores(links)
     look_ups = able_look_ups(look_ups, links)
@@ -253,7 +269,7 @@ def score(
             left_out.append(key)
             continue
         with stages.timed(key):
-            model = models[key] if key in models else fitted(look_ups[key], links)
+            model = models[key] if key in models else fitted(look_ups[key], links, fits, key)
         if is_baseline and stages.is_up():
             left_out.append(key)
             continue
@@ -358,12 +374,17 @@ class LinkScores:
         self.content[f"shares_{key}"] = shares_within(calibration, few, self.query)
 
 
-def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links) -> Scores:
+def validate(
+    models: Mapping[str, Model],
+    look_ups: Mapping[str, Model],
+    links: Links,
+    fits: dict[str, Model] | None = None,
+) -> Scores:
     """Scores of the validation links by models that have not seen them; empty without any."""
     if not len(links.split.validation):
         return {}
     held_out = replace(links, split=links.split.validating(), held_out=None)
-    return score(models, look_ups, held_out, has_intervals=False)
+    return score(models, look_ups, held_out, has_intervals=False, fits=fits)
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
