@@ -464,7 +464,8 @@ class ScalarPosterior(Posterior):
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
         index = links.split.known
         values = residuals(torch.arange(len(index))).double()
-        self.process.cpu().solve(*self._coordinates(links.query[index]), values)
+        is_lazy = self.is_lazy and len(values) > self.process.options.large
+        self.process.cpu().solve(*self._coordinates(links.query[index]), values, is_lazy)
 
     def mean(self, batch: Batch, like: Tensor) -> Tensor:
         return self.process(*self._coordinates(batch.query)).to(like)

@@ -15,7 +15,7 @@ from torch import Tensor
 from gaigs.calibration.held_out import Unseen, validation_halves
 from gaigs.core import stages
 from gaigs.core.antenna import Receiver
-from gaigs.core.query import Batch, Query, evenly, thin_labels
+from gaigs.core.query import Batch, Query, drawn, evenly, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.data import Links
@@ -146,8 +146,10 @@ class Kriging(Wrapper):
         links = limit_known(links, self._most(links, most))
         if is_final and math.isfinite(stages.left()) and len(links.split.known) < count:
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
-        values = predicted(self.trend, links, links.split.known)
         self.fallback.fit(links)
+        if links.task.is_scalar:
+            return self._krige_labels(links, None, is_final)
+        values = predicted(self.trend, links, links.split.known)
         if by_paths is None and self.trend.has_margins:
             is_few = len(single_readings(links, links.split.validation)) < FEWEST
             return self._krige_better(links, values, is_final, is_few)
@@ -194,22 +196,34 @@ class Kriging(Wrapper):
         each = max(time.monotonic() - began, 1e-9) / len(sample)
         return int(min(most, max(100, stages.left() / 9 / each / self.scene.radios)))
 
-    def _krige_labels(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
-        """``krige`` of labels; ``values`` are the trend's predictions of known links."""
+    def _krige_labels(self, links: Links, values: Tensor | None, is_final: bool) -> "Kriging":
+        """``krige`` of labels; ``values`` are the trend's predictions of known links, None if they
+        are to be predicted where they count.
+        """
         self._make_posterior(False)
-        held = links.split.validation
+        task: Any = self.scene.task
+        index, held = links.split.known, links.split.validation
+        held = drawn(held) if values is None else held
         is_unlearnt = False
         if len(held):
             # Levels know their place by more than the distance to a receiver.
-            law = self.scene.task.trends[-1] if self.scene.task.is_scalar else self.fallback_options
+            law = task.trends[-1] if task.is_scalar else self.fallback_options
             alone = registry("model").build(law, scene=self.scene)
             alone.fit(replace(links, split=links.split.validating()))
-            trend = validation_scores(links, values[len(links.split.train) :])
-            fallback = validation_scores(links, predicted(alone, links, held))
+            checked = replace(links, split=links.split.choosing(held))
+            if values is None:
+                trend = validation_scores(checked, predicted(self.trend, links, held))
+            else:
+                trend = validation_scores(links, values[len(links.split.train) :])
+            fallback = validation_scores(checked, predicted(alone, links, held))
             is_unlearnt = is_surely_better(fallback, trend)
         # A law of distance that is surely better than the learnt room: levels show no room.
-        has_room = not (is_unlearnt and self.scene.task.is_scalar)
-        model = self._validation_model(links, values, self.weights if has_room else (0.0,))
+        weights = (0.0,) if is_unlearnt and task.is_scalar else self.weights
+        if values is None:
+            values = torch.full((len(index),), math.nan)  # without weight it is not read
+            if any(weights):
+                values = predicted(self.trend, links, index)
+        model = self._validation_model(links, values, weights)
         if is_unlearnt and self.posterior.chooses_weight:
             # The likelihood may still give the trend weight: without it if the score is higher so.
             without = self._validation_model(links, values, (0.0,))
@@ -248,6 +262,7 @@ class Kriging(Wrapper):
         model = Kriging(self.scene, self.trend, self.fallback_options)
         model._make_posterior(False)
         model._copy_choices(self)
+        model.posterior.is_lazy = True
         model.chosen_by = self.posterior.seen
         model.weight.fill_(1.0)
         model.fallback.fit(training)

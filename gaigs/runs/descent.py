@@ -15,6 +15,7 @@ from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from torch import distributed
 
 from gaigs.core import stages
+from gaigs.core.query import drawn
 from gaigs.data import Links
 from gaigs.model import Model, checkpoint
 from gaigs.model.answers import batch_size
@@ -58,10 +59,11 @@ def descend(
     steps = ENDLESS if trainer.max_steps == -1 else trainer.max_steps
     batches = Batches(links, links.split.train, module.batch_size, seed, steps)
     validation = None
-    if len(links.split.validation):
+    if len(links.split.validation) and links.task.is_scalar:
         # Links of one number need little memory, and few large batches less time.
-        size = batch_size(links) if links.task.is_scalar else module.batch_size
-        validation = InOrder(links, links.split.validation, size)
+        validation = InOrder(links, drawn(links.split.validation), batch_size(links))
+    elif len(links.split.validation):
+        validation = InOrder(links, links.split.validation, module.batch_size)
     resumed = last if last.is_file() else None
     if resumed is not None:
         content = resumable(last, best)

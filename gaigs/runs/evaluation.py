@@ -24,6 +24,7 @@ from gaigs.calibration.conformal import thinned
 from gaigs.calibration.scores import scores_of_links, shares_within, summarise_intervals
 from gaigs.configuration import composed, files_of
 from gaigs.core import stages
+from gaigs.core.query import drawn
 from gaigs.core.results import plot
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
@@ -380,10 +381,16 @@ def validate(
     links: Links,
     fits: dict[str, Model] | None = None,
 ) -> Scores:
-    """Scores of the validation links by models that have not seen them; empty without any."""
+    """Scores of the validation links by models that have not seen them; empty without any.
+
+    Of labels of one number 10,000 count.
+    """
     if not len(links.split.validation):
         return {}
-    held_out = replace(links, split=links.split.validating(), held_out=None)
+    split = links.split.validating()
+    if links.task.is_scalar:
+        split = replace(split, test=drawn(split.test))
+    held_out = replace(links, split=split, held_out=None)
     return score(models, look_ups, held_out, has_intervals=False, fits=fits)
 
 
