@@ -34,9 +34,17 @@ log = logging.getLogger(__name__)
 
 
 def descend(
-    model: Model, loss: Loss, links: Links, config: dict, folder: Path, searched: float
+    model: Model,
+    loss: Loss,
+    links: Links,
+    config: dict,
+    folder: Path,
+    searched: float,
+    rival: float | None = None,
 ) -> tuple[Model, float]:
     """Trains a model by gradient descent, which ``Model.fit`` has prepared in ``searched`` [s].
+
+    It ends when the validation would stay below the score of a ``rival``.
 
     Returns:
         The model at the step with the best validation score, or at the last step without validation
@@ -51,7 +59,7 @@ def descend(
     options, budget = make_budget(config["trainer"], searched)
     keep_last = KeepLast(last, config["save_every"])
     # Lightning calls the keepers of checkpoints after all others.
-    callbacks = [budget, KeepBest(best, module.patience), keep_last]
+    callbacks = [budget, KeepBest(best, module.patience, rival), keep_last]
     callbacks += _callbacks(module, links, config)
     context = {"callbacks": callbacks, "logger": _loggers(folder, config["tensorboard"])}
     trainer = make_trainer(options, default_root_dir=folder, **context)

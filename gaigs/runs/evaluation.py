@@ -73,24 +73,16 @@ def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> 
 
 
 def fitted(
-    look_up: Model,
-    links: Links,
-    fits: dict[str, Model] | None = None,
-    key: str = "",
-    many: int = ScalarOptions.large,
+    look_up: Model, links: Links, before: Model | None = None, many: int = ScalarOptions.large
 ) -> Model:
-    """A copy of a model without a training, fitted to the known links.
-
-    It comes into ``fits`` by its key. An earlier fit there, to most of these links, leaves its
-    choices to a fit to more than ``many``.
+    """A copy of a model without a training, fitted to the known links; to more than ``many`` with
+    the choices of a fit ``before`` to most of these.
     """
-    fits = {} if fits is None else fits
-    if key in fits and len(links.split.known) > many:
-        fits[key] = fits[key].refitted(links)
-    else:
-        fits[key] = copy.deepcopy(look_up)
-        fits[key].fit(links)
-    return fits[key]
+    if before is not None and len(links.split.known) > many:
+        return before.refitted(links)
+    model = copy.deepcopy(look_up)
+    model.fit(links)
+    return model
 
 
 @dataclass(frozen=True)
@@ -219,7 +211,8 @@ def evaluate(
             composed([f"task={task.name}"], {})["baselines"] if files_of("task", task.name) else ()
         )
     baselines = [baselines] if isinstance(baselines, str) else baselines
-    scores = score(models, build_baselines(baselines, model_name, links.scene), links)
+    look_ups = build_baselines(baselines, model_name, links.scene)
+    scores = score(models, look_ups, links, fits={})
     places = links.query[links.split.test].place_keys
     return Evaluation(task, links.split.name, scores, device_name(model.device), places)
 
@@ -270,7 +263,8 @@ def score(
             left_out.append(key)
             continue
         with stages.timed(key):
-            model = models[key] if key in models else fitted(look_ups[key], links, fits, key)
+            model = models[key] if key in models else fitted(look_ups[key], links, fits.get(key))
+            fits[key] = model
         if is_baseline and stages.is_up():
             left_out.append(key)
             continue
@@ -379,17 +373,13 @@ def validate(
     models: Mapping[str, Model],
     look_ups: Mapping[str, Model],
     links: Links,
-    fits: dict[str, Model] | None = None,
+    fits: dict[str, Model],
 ) -> Scores:
-    """Scores of the validation links by models that have not seen them; empty without any.
-
-    Of labels of one number 10,000 count.
-    """
+    """Scores of validation links by models that have not seen them; empty without any."""
     if not len(links.split.validation):
         return {}
     split = links.split.validating()
-    if links.task.is_scalar:
-        split = replace(split, test=drawn(split.test))
+    split = replace(split, test=drawn(split.test))
     held_out = replace(links, split=split, held_out=None)
     return score(models, look_ups, held_out, has_intervals=False, fits=fits)
 

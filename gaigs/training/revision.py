@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import math
 from collections.abc import Iterator
 
 import torch
@@ -45,52 +44,24 @@ class Revision(Callback):
     done when the time of the training is up leaves the model as it was. All processes choose the
     same links by the seed, so that they decide alike.
 
-    A model that ``settles`` takes all revisions as soon as two validations differ by little, and
-    its training ends at the validation after.
-
     Args:
         links: Links with a split.
         seed: Seed of the choice of links.
         max_links: Most training links, and validation links, of a revision: a search evaluates them
             hundreds of times.
-        least_gain: Gain of a validation over the best one before, as a share of it, below which it
-            is flat. Of errors of 3 dB it is 0.03 dB, less than their scatter between seeds.
     """
 
-    def __init__(self, links: Links, seed: int, max_links: int = 48, least_gain: float = 0.01):
+    def __init__(self, links: Links, seed: int, max_links: int = 48):
         self.links = links
         self.seed = seed
         self.max_links = max_links
-        self.least_gain = least_gain
         self.made: list[int] = []
-        self.best = -math.inf  # validation score; an error counts as its negative
-        self.flat = 0  # validations since the first flat one
 
     def state_dict(self) -> dict:
-        return {"made": self.made, "best": self.best, "flat": self.flat}
+        return {"made": self.made}
 
     def load_state_dict(self, state: dict) -> None:
         self.made = state["made"]
-        self.best = state.get("best", -math.inf)  # not in checkpoints of before
-        self.flat = state.get("flat", 0)
-
-    def on_train_start(self, trainer, module) -> None:
-        self._stop_in_time(trainer)  # a run that was killed once it had stopped
-
-    def on_validation_end(self, trainer, module) -> None:
-        if not module.model.settles:
-            return
-        score = trainer.callback_metrics[f"validation/{module.task.monitor}"].item()
-        score = score if module.task.higher_is_better else -score
-        is_flat = score - self.best < self.least_gain * abs(score)
-        self.best = max(self.best, score)
-        self.flat += is_flat or self.flat > 0
-        if self.flat == 1:
-            log.info("step %d: the validation is flat", trainer.global_step)
-        self._stop_in_time(trainer)
-
-    def _stop_in_time(self, trainer) -> None:
-        trainer.should_stop = trainer.should_stop or self.flat > 1
 
     def on_train_batch_start(self, trainer, module, *_) -> None:
         if trainer.global_step == 0:  # after the validation of models that predict untrained
@@ -103,7 +74,7 @@ class Revision(Callback):
     def _revise(self, trainer, module) -> None:
         """Makes the revisions whose share of the training is over."""
         for number, share in enumerate(module.model.revisions):
-            if number in self.made or not (self.flat or _is_due(trainer, share)):
+            if number in self.made or not _is_due(trainer, share):
                 continue
             if is_time_up(trainer):
                 return

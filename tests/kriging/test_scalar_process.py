@@ -272,14 +272,13 @@ def test_many_links_keep_the_choices_of_the_fit_for_the_validation(monkeypatch):
     links = drawn((1.5, 0.8), noise=2.0)
     train = links.split.train
     some = replace(links, split=replace(links.split, train=train[torch.arange(len(train)) % 7 > 0]))
-    fits, errors = {}, []
+    model, errors = None, []
     for part in (some, links):
         look_up = GaussianProcess(links.scene)
-        model = evaluation.fitted(look_up, part, fits, "process", many=100)
+        model = evaluation.fitted(look_up, part, model, many=100)
         values = model(Batch(links.query[links.split.test])).value
         errors.append((values - links.labels[links.split.test]).abs().mean())
         assert look_up.links is None
-        assert fits["process"] is model
         monkeypatch.setattr(ScalarProcess, "fit", None)
     assert len(model.scalar.places) == len(train)
     assert errors[1] < errors[0]

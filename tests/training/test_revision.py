@@ -1,7 +1,6 @@
 """Revisions come when the model asks for them, and a resumed training makes each once."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 
 import pytest
@@ -116,41 +115,3 @@ def test_a_revision_gets_no_more_links_than_it_needs(links, tmp_path):
     for _, train, validation, _, _ in module.model.looks:
         assert len(train) == 48
         assert validation is None
-
-
-class Settled(Revised):
-    """A plane that learns nothing, in two late revisions."""
-
-    revisions = (0.5, 0.75)
-    settles = True
-    learning_rates: Mapping[str, float] = {"slope": 0.0, "network": 0.0}
-
-    def revise(self, number, *parts):
-        self.looks.append(number)
-        return "it is drawn anew"
-
-
-def test_a_flat_validation_ends_the_training_of_a_model_that_settles(links, tmp_path, caplog):
-    """Its revisions come first; the validation at step 5 has none before it, 10 is flat."""
-    caplog.set_level("INFO")
-    module = make_module(links, Settled(links.scene))
-    keeper = KeepLast(tmp_path / "last.ckpt", every=math.inf)
-    assert fit(module, links, tmp_path, 40, Revision(links, 0), keeper).global_step == 15
-    assert module.model.looks == [0, 1]
-    lines = ["step 10: the validation is flat", *2 * ["step 11: it is drawn anew"]]
-    assert log_of(caplog) == lines
-    again = make_module(links, Settled(links.scene))
-    keeper = KeepLast(tmp_path / "again.ckpt", every=math.inf)
-    options = {"resume": tmp_path / "last.ckpt"}
-    trainer = fit(again, links, tmp_path, 40, Revision(links, 0), keeper, **options)
-    assert trainer.global_step == 15, "its last checkpoint is not trained further"
-    restless = Settled(links.scene)
-    restless.settles = False
-    fit(make_module(links, restless), links, tmp_path, 20, Revision(links, 0))
-    assert [line[:7] for line in log_of(caplog)[3:]] == ["step 10", "step 15"]
-
-
-def test_a_training_that_gains_goes_on(links, tmp_path):
-    model = Settled(links.scene)
-    model.learning_rates = Plane.learning_rates
-    assert fit(make_module(links, model), links, tmp_path, 20, Revision(links, 0)).global_step > 15
