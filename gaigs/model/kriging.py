@@ -213,7 +213,7 @@ class Kriging(Wrapper):
         split, is_scalar = links.split, self.scene.task.is_scalar
         held = drawn(split.validation) if is_scalar else split.validation
         is_unlearnt = False
-        if len(held):
+        if len(held) and any(self.weights):
             known = predicted(self.trend, links, held) if values is None else values[-len(held) :]
             trend = validation_scores(links, known, held)
             fallback = self.law_scores(links, held)
