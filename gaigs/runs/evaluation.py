@@ -211,8 +211,7 @@ def evaluate(
             composed([f"task={task.name}"], {})["baselines"] if files_of("task", task.name) else ()
         )
     baselines = [baselines] if isinstance(baselines, str) else baselines
-    look_ups = build_baselines(baselines, model_name, links.scene)
-    scores = score(models, look_ups, links, fits={})
+    scores = score(models, build_baselines(baselines, model_name, links.scene), links)
     places = links.query[links.split.test].place_keys
     return Evaluation(task, links.split.name, scores, device_name(model.device), places)
 
@@ -256,6 +255,7 @@ def score(
     states_intervals = has_intervals and frequencies is None
     first = next(iter([*models, *look_ups]), None)
     left_out = []
+    known = {} if fits is None else fits
     for key in [*models, *look_ups]:
         is_baseline = key in look_ups and key != first
         # A baseline without time has no fit, or one in haste.
@@ -263,8 +263,8 @@ def score(
             left_out.append(key)
             continue
         with stages.timed(key):
-            model = models[key] if key in models else fitted(look_ups[key], links, fits.get(key))
-            fits[key] = model
+            model = models[key] if key in models else fitted(look_ups[key], links, known.get(key))
+            known[key] = model
         if is_baseline and stages.is_up():
             left_out.append(key)
             continue
@@ -373,7 +373,7 @@ def validate(
     models: Mapping[str, Model],
     look_ups: Mapping[str, Model],
     links: Links,
-    fits: dict[str, Model],
+    fits: dict[str, Model] | None = None,
 ) -> Scores:
     """Scores of validation links by models that have not seen them; empty without any."""
     if not len(links.split.validation):
