@@ -255,7 +255,7 @@ def score(
     states_intervals = has_intervals and frequencies is None
     first = next(iter([*models, *look_ups]), None)
     left_out = []
-    known = {} if fits is None else fits
+    earlier = {} if fits is None else fits
     for key in [*models, *look_ups]:
         is_baseline = key in look_ups and key != first
         # A baseline without time has no fit, or one in haste.
@@ -263,8 +263,8 @@ def score(
             left_out.append(key)
             continue
         with stages.timed(key):
-            model = models[key] if key in models else fitted(look_ups[key], links, known.get(key))
-            known[key] = model
+            model = models[key] if key in models else fitted(look_ups[key], links, earlier.get(key))
+            earlier[key] = model
         if is_baseline and stages.is_up():
             left_out.append(key)
             continue
