@@ -46,6 +46,17 @@ def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
     return index[torch.linspace(0, len(index) - 1, most).round().long()]
 
 
+def drawn(index: Int[Tensor, " k"], most: int = 10_000) -> Int[Tensor, " j"]:
+    """At most ``most`` of the links, drawn at random: an even step may meet few of the receivers.
+
+    Of 10,000 errors of 3 dB the mean is known to 0.02 dB.
+    """
+    if len(index) <= most:
+        return index
+    order = torch.randperm(len(index), generator=torch.Generator().manual_seed(0))
+    return index[order[:most].sort().values]
+
+
 def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped[Tensor, "k m"]:
     """At most ``most`` numbers of each label, evenly spread over its rows and columns."""
     numbers = labels[..., None].flatten(1)  # (k, rows x columns)

@@ -69,6 +69,8 @@ class Model(Movable):
         chunk: Largest number of pairs of a link and a direction evaluated at a time; None: whole
             labels. Training sees as many as ``training.thinning`` leaves.
         revisions: Fractions of the training after which ``revise`` is called.
+        settles: True if no revision to come lowers errors at once: a training whose errors would
+            stay above those of a law of distance may end.
         predicts_untrained: True if values before the training are worth a score.
         any_frequency, any_receiver: See ``Movable``.
         configuration: Options that a registered model was made with; ``save`` stores them.
@@ -101,6 +103,7 @@ class Model(Movable):
     penalty_weights: Mapping[str, float] = {}
     chunk: int | None = None
     revisions: tuple[float, ...] = ()
+    settles: bool = False
     predicts_untrained: bool = False
     primitives: Gaussians | None = None
     calibration: Calibration | None = None
@@ -454,7 +457,7 @@ class Model(Movable):
         raise ValueError("the model has no paths of channels; ask has_margins first")
 
     def refit(self, links: Links) -> None:
-        """Fits to some of the links of an earlier fit, whose choices may stay: it may be faster."""
+        """Fits to links most of which an earlier fit had: its choices may stay, to be faster."""
         self.fit(links)
 
     def take_hyperparameters(self, other: "Model") -> None:
@@ -474,13 +477,13 @@ class Model(Movable):
         """
         if not self.is_trained:
             for fold in held_out_folds(links):
-                yield Unseen(self._refitted(fold.rest), fold.asked, fold.rest.split.train)
+                yield Unseen(self.refitted(fold.rest), fold.asked, fold.rest.split.train)
         elif len(links.split.validation):
             asked = single_readings(links, links.split.validation)
             yield Unseen(self, asked, links.split.train)
 
-    def _refitted(self, links: Links) -> "Model":
-        """A copy that is fitted to some of the links of an earlier fit."""
+    def refitted(self, links: Links) -> "Model":
+        """A copy that ``refit`` fits to links."""
         scene = replace(self.scene, receivers=links.receivers)  # whose places may be estimated
         # Known links are large, and stay as they are.
         memo: dict[int, Any] = {id(self.links): self.links, id(self.scene): scene}

@@ -15,7 +15,7 @@ from torch import Tensor
 from gaigs.calibration.held_out import Unseen, validation_halves
 from gaigs.core import stages
 from gaigs.core.antenna import Receiver
-from gaigs.core.query import Batch, Query, evenly, thin_labels
+from gaigs.core.query import Batch, Query, drawn, evenly, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.data import Links
@@ -73,6 +73,7 @@ class Kriging(Wrapper):
     weight: Tensor
     weights = (1.0, 0.75, 0.5, 0.25, 0.0)
     """Candidates of ``trend_weight`` and ``weight``; of equally good ones the first is taken."""
+    laws: tuple[Model, Tensor] | None = None  # of ``law_scores``, and its training links
     chosen_by: Tensor | None = None
     """Links that chose the hyperparameters of a model of the training links alone; None: all."""
 
@@ -151,14 +152,26 @@ class Kriging(Wrapper):
         links = limit_known(links, self._most(links, most))
         if is_final and math.isfinite(stages.left()) and len(links.split.known) < count:
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
-        values = predicted(self.trend, links, links.split.known)
         self.fallback.fit(links)
+        if links.task.is_scalar:
+            return self._krige_labels(links, None, is_final)
+        values = predicted(self.trend, links, links.split.known)
         if by_paths is None and self.trend.has_margins:
             is_few = len(single_readings(links, links.split.validation)) < FEWEST
             return self._krige_better(links, values, is_final, is_few)
         if by_paths:
             return self._krige_paths(links, values, is_final)
         return self._krige_labels(links, values, is_final)
+
+    def law_scores(self, links: Links, held: Int[Tensor, " h"]) -> Float[Tensor, " h"]:
+        """Scores of validation links by the law that may take the trend's place, which is kept."""
+        train, task = links.split.train, self.scene.task
+        if self.laws is None or not torch.equal(self.laws[1], train):
+            # Levels know their place by more than the distance to a receiver.
+            options = task.trends[-1] if task.is_scalar else self.fallback_options
+            self.laws = registry("model").build(options, scene=self.scene), train
+            self.laws[0].fit(replace(links, split=links.split.validating()))
+        return validation_scores(links, predicted(self.laws[0], links, held), held)
 
     def _krige_better(
         self, links: Links, values: Tensor, is_final: bool, is_few: bool
@@ -198,22 +211,24 @@ class Kriging(Wrapper):
         link_time = max(time.monotonic() - began, 1e-9) / len(sample)  # [s]
         return int(min(most, max(100, stages.left() / 9 / link_time / self.scene.radios)))
 
-    def _krige_labels(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
-        """``krige`` of labels; ``values`` are the trend's predictions of known links."""
+    def _krige_labels(self, links: Links, values: Tensor | None, is_final: bool) -> "Kriging":
+        """``krige`` of labels; ``values`` are the trend's predictions of known links, if known."""
         self._make_posterior(False)
-        held = links.split.validation
+        split, is_scalar = links.split, self.scene.task.is_scalar
+        held = drawn(split.validation) if is_scalar else split.validation
         is_unlearnt = False
-        if len(held):
-            # Levels know their place by more than the distance to a receiver.
-            law = self.scene.task.trends[-1] if self.scene.task.is_scalar else self.fallback_options
-            alone = registry("model").build(law, scene=self.scene)
-            alone.fit(replace(links, split=links.split.validating()))
-            trend = validation_scores(links, values[len(links.split.train) :])
-            fallback = validation_scores(links, predicted(alone, links, held))
+        if len(held) and any(self.weights):
+            known = predicted(self.trend, links, held) if values is None else values[-len(held) :]
+            trend = validation_scores(links, known, held)
+            fallback = self.law_scores(links, held)
             is_unlearnt = is_surely_better(fallback, trend)
         # A law of distance that is surely better than the learnt room: levels show no room.
-        has_room = not (is_unlearnt and self.scene.task.is_scalar)
-        model = self._validation_model(links, values, self.weights if has_room else (0.0,))
+        weights = (0.0,) if is_unlearnt and is_scalar else self.weights
+        if values is None and any(weights):
+            values = predicted(self.trend, links, split.known)
+        elif values is None:  # without weight it is not read
+            values = torch.full((len(split.known),), math.nan)
+        model = self._validation_model(links, values, weights)
         if is_unlearnt and self.posterior.chooses_weight:
             # The likelihood may still give the trend weight; it gets none if that scores higher.
             without = self._validation_model(links, values, (0.0,))
@@ -223,35 +238,32 @@ class Kriging(Wrapper):
             self._copy_choices(model)
         if is_final:
             self._solve(links, values)
-            if is_unlearnt:
-                name = self.fallback_options["name"]
+            if is_unlearnt and self.laws is not None:
                 log.warning(
                     "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
                     "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
                     links.task.monitor,
                     trend.mean().abs(),
-                    name_of(alone),
+                    name_of(self.laws[0]),
                     fallback.mean().abs(),
-                    name,
+                    self.fallback_options["name"],
                     100 * (1 - self.weight * (1 - self.trend_weight)),
                 )
             self._log()
         return model
 
     def _validation_model(
-        self, links: Links, values: Tensor, weights: Sequence[float] | None = None
+        self, links: Links, values: Tensor, weights: Sequence[float]
     ) -> "Kriging":
-        """Fits weights and hyperparameters; returns a model that knows the training links alone.
-
-        The trend weight is chosen among some; None: among ``weights``.
-        """
+        """Fits trend weight and hyperparameters; returns a model of the training links alone."""
         split = links.split
-        candidates = self._candidates(links, values, weights or self.weights)
+        candidates = self._candidates(links, values, weights)
         self.trend_weight.fill_(self.posterior.fit(links, candidates))
         training = replace(links, split=split.validating())
         model = Kriging(self.scene, self.trend, self.fallback_options)
         model._make_posterior(False)
         model._copy_choices(self)
+        model.posterior.is_lazy = True
         model.chosen_by = self.posterior.seen
         model.weight.fill_(1.0)
         model.fallback.fit(training)
@@ -270,9 +282,10 @@ class Kriging(Wrapper):
         return model
 
     def _copy_choices(self, other: "Kriging") -> None:
-        """Takes weights and hyperparameters of another model."""
+        """Takes weights, hyperparameters and the law of another model."""
         self.trend_weight.copy_(other.trend_weight)
         self.weight.copy_(other.weight)
+        self.laws = other.laws
         self.posterior.load_state_dict(other.posterior.state_dict())
 
     def _candidates(
@@ -447,6 +460,7 @@ class Kriging(Wrapper):
                 return
             kriged = Kriging(links.scene, self.trend, self.fallback_options).to(self.device)
             kriged.posterior.start_from(self.posterior)
+            kriged.laws = self.laws
             if links.task.is_scalar and len(chooses) >= 300:
                 # A half of so many would choose the same weight as all of them.
                 kriged.weights = (self.trend_weight.item(),)

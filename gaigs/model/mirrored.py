@@ -104,6 +104,9 @@ class MirroredSplatting(GaussianSplatting):
             # A search by phases needs 20 links of each receiver; places of one radio have fewer.
             if searches and not self.is_wide and not self.scene.one_radio:
                 self._prepare_levels(links)
+        # Without phases powers add to the end, and no later revision locates a plane.
+        has_phases = is_known and not self.is_wide and not self.scene.one_radio
+        self.settles = isinstance(self.pooling, PathRssi) and not has_phases
         task = self.scene.task
         if task.is_channel and isinstance(self.pooling, ChannelPooling) and self.trend is None:
             self._fit_channels(links, task, self.pooling)

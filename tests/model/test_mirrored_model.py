@@ -415,7 +415,7 @@ def test_levels_of_a_wide_site_are_not_searched_for_phases(widest, monkeypatch):
     links = replace(links, query=replace(links.query, frequencies=carriers))
     model = build(links, pooling={"name": "path_rssi", "floor_db": -60.0})
     model.fit(links)
-    assert (model.levels is None) == model.is_wide == (widest == 1.0)
+    assert (model.levels is None) == model.is_wide == model.settles == (widest == 1.0)
     if model.is_wide:
         line = model.revise(2, links.batch(torch.arange(4)), None, lambda batch: 1.0)
         assert line == "the box is too wide for phases, so powers add to the end"
