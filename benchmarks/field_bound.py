@@ -41,6 +41,15 @@ def write_built_in(frequency: float, file: Path) -> None:
     )
 
 
+def load_field(file: Path, seed: int = 0) -> Links:
+    """Links of a field with the default split."""
+    return load(
+        {"name": "csi_npz", "file": str(file)},
+        {"name": "random", "test": 0.2, "validation": 0.1, "seed": seed},
+        "csi",
+    )
+
+
 def walls_of(box: list[float]) -> torch.Tensor:
     """Planes of the six faces of a box (6, 4)."""
     axes = torch.eye(3, dtype=torch.float64).repeat(2, 1)
@@ -62,9 +71,9 @@ def best_room(data: ChannelData, fit: FieldFit, walls: torch.Tensor) -> FieldRoo
     rooms = []
     for slab in (SLABS[1], torch.tensor([0.0, math.log(1e6), 0.0]).double()):
         for sign in (1, -1):
-            gains = torch.full((1, 6), 0.7 * sign, dtype=torch.complex128)
-            uses = torch.ones(1, 6, dtype=torch.bool)
-            room = FieldRoom(planes, slab.repeat(6, 1), gains, start.receivers, uses)
+            gains = torch.full((1, len(walls)), 0.7 * sign, dtype=torch.complex128)
+            uses = torch.ones(1, len(walls), dtype=torch.bool)
+            room = FieldRoom(planes, slab.repeat(len(walls), 1), gains, start.receivers, uses)
             rooms.append(fit.fit_gains(room, 30))
     return min(rooms, key=lambda room: fit.mean_log(fit.residual(room)).item())
 
@@ -138,11 +147,7 @@ def main() -> None:
     if arguments.file == "built-in":
         file, box = Path("runs/field.npz"), [0.0, 0.0, 0.0, *ROOM.size]
         write_built_in(arguments.frequency, file)
-    links = load(
-        {"name": "csi_npz", "file": str(file)},
-        {"name": "random", "test": 0.2, "validation": 0.1, "seed": 0},
-        "csi",
-    )
+    links = load_field(file)
     rows = [("order", "strength a path", "shared gains", "varying over places")]
     rows += [scores(links, walls_of(box), order) for order in (1, 2, 3)]
     print(markdown(rows))

@@ -93,8 +93,11 @@ def measure(name, places, seed, data, steps, folder):
 
 
 def short_name(model):
-    """Name of a model; of a kriged one that of its trend."""
+    """Name of a model; of a kriged one that of its trend, of a blend its members' with shares."""
     name = model.configuration["name"]
+    if name == "ensemble":
+        pairs = zip(model.weights, model.members, strict=True)
+        return " + ".join(f"{weight:.2g} {short_name(member)}" for weight, member in pairs)
     return model.trend.configuration["name"] if name == "kriging" else name
 
 

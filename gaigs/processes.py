@@ -123,7 +123,7 @@ def lacks_memory(error: BaseException | None) -> bool:
 
 
 def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
-    """The message of an error that a user can mend; None for a fault of the program.
+    """The message of an error that a user can correct; None for a fault of the program.
 
     Args:
         error: The error of a run.
@@ -243,7 +243,7 @@ class _Repeater:
         raise Stopped("stopped", number)
 
     def repeat(self, lost) -> None:
-        """The hook for ignored errors."""
+        """Sends a stopping signal again if its error was ignored; the hook for ignored errors."""
         if not isinstance(lost.exc_value, KeyboardInterrupt):
             self.hook(lost)
             return
@@ -262,6 +262,7 @@ class _Repeater:
                 raise Stopped("stopped", timer.args[1])
 
     def cancel(self) -> None:
+        """Stops repeated signals that have not come yet."""
         for timer in self.timers:
             timer.cancel()
 

@@ -110,7 +110,7 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return (levels, self._arranged(estimate[1])) if return_std else levels
 
     def _arranged(self, values: Any) -> np.ndarray:
-        """Values of all receivers of the training, in the shape of its levels."""
+        """Values of the model's receivers in the shape of the training's levels, else NaN."""
         levels = np.full((len(values), *(self.shape_ or (1,))), np.nan)
         levels[:, self.columns_] = values.double().numpy()
         return levels if self.shape_ else levels[:, 0]
@@ -136,9 +136,9 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
 
 def _names_of(receivers: Any) -> list[str]:
-    """Names of receivers that are given with names; empty for positions and for None."""
+    """Names of receivers if they are given with names; empty for positions and for None."""
     if isinstance(receivers, Mapping):
         return [*receivers]
-    several = [receivers] if isinstance(receivers, Receiver) else receivers
-    is_named = isinstance(several, Sequence) and all(isinstance(one, Receiver) for one in several)
-    return [one.name for one in several] if is_named else []
+    entries = [receivers] if isinstance(receivers, Receiver) else receivers
+    is_named = isinstance(entries, Sequence) and all(isinstance(it, Receiver) for it in entries)
+    return [entry.name for entry in entries] if is_named else []

@@ -23,7 +23,7 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-    "lines of gaigs/": 47_050,
+    "lines of gaigs/": 47_898,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
     "module constants": 100,
@@ -35,7 +35,7 @@ LIMITS = {
 Lines of 100 characters in place of 120, and dense steps opened up, made 31,400 lines 41,000. Data
 frames, plots, the choice of a model and channels of few numbers made them 44,600; receivers
 without measurements, placement, front ends, large surveys and buildings 47,500. Shorter docstrings
-of internal parts left 46,100.
+of internal parts left 46,100. Reasons and shapes beside the steps of the searches added 480.
 """
 
 

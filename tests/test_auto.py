@@ -2,7 +2,9 @@
 
 import json
 import logging
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,6 +13,7 @@ from gaigs.kriging.scalar import ScalarProcess
 from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.runs import choice
 from gaigs.runs.choice import Tried, pick
+from gaigs.runs.stacking import stack
 from gaigs.training.descent import Descent
 
 pytestmark = pytest.mark.usefixtures("unchecked")
@@ -66,6 +69,121 @@ def test_only_places_that_all_have_count():
     result = pick([one, other], task)
     assert result.chosen.label == "one"
     assert "mean mae_db at 2 places: one 1, other 2" in result.reason
+
+
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
+def test_scores_that_are_not_finite_lose(number):
+    task = gaigs.registries["task"].build({"name": "rssi"})
+    broken, whole = tried(broken=[-1.0, number, -1.0], whole=[-2.0, -2.0, -3.0])
+    for pair in ([broken, whole], [whole, broken]):
+        result = pick(pair, task)
+        assert result.chosen.label == "whole"
+        assert [one.label for one in result.level] == ["whole"]
+
+
+def test_shares_are_those_of_least_squares():
+    generator = np.random.default_rng(0)
+    common = generator.normal(size=4000)
+    labels = 10 * generator.normal(size=4000)
+    one, other = (common + size * generator.normal(size=4000) for size in (1.0, 2.0))
+    values = [torch.from_numpy(labels + error) for error in (one, other)]
+    places = torch.arange(4000)
+    shares, crossed = stack(torch.from_numpy(labels), values, places, places % 4)
+    tried = np.arange(11) / 10
+    best = tried[np.argmin([np.mean((w * one + (1 - w) * other) ** 2) for w in tried])]
+    assert 0.6 < best < 1.0
+    np.testing.assert_allclose(shares, [best, 1 - best])
+    np.testing.assert_allclose(crossed[0], best, atol=0.11)
+    # A worse copy of another model has no share.
+    shares, _ = stack(torch.from_numpy(labels), [values[0], values[0] + 3], places, places % 4)
+    np.testing.assert_allclose(shares, [1, 0], atol=1e-12)
+
+
+def test_shares_without_a_fold_do_not_know_its_labels():
+    labels = torch.zeros(4)
+    values = [torch.tensor([0.0, 9, 9, 9]), torch.tensor([9.0, 0, 0, 0])]
+    places = torch.arange(4)
+    _, crossed = stack(labels, values, places, places)
+    changed = [values[0].index_fill(0, places[:1], 50.0), values[1]]
+    _, other = stack(labels, changed, places, places)
+    torch.testing.assert_close(other[:, 0], crossed[:, 0])
+    assert (other[:, 1:] != crossed[:, 1:]).all()
+
+
+def level(monkeypatch, shares=(0.7, 0.3)):
+    """Makes all candidates level, and their shares known."""
+    monkeypatch.setattr(choice, "pick", lambda tried, _: choice.ChosenModel(tried[0], "", tried))
+    fixed = torch.tensor(shares, dtype=torch.float64)
+    monkeypatch.setattr(
+        choice, "stack", lambda labels, *_: (fixed, fixed[:, None].expand(-1, len(labels)))
+    )
+
+
+def test_level_look_ups_are_averaged(links, tmp_path, monkeypatch):
+    level(monkeypatch)
+    model = gaigs.train(links, folder=tmp_path, candidates=["knn", "gaussian_process"])
+    asked = links.query[links.split.test]
+    parts = [gaigs.train(name, links) for name in ("knn", "gaussian_process")]
+    expected = 0.7 * parts[0].predict(asked).numpy() + 0.3 * parts[1].predict(asked).numpy()
+    np.testing.assert_allclose(model.predict(asked), expected, rtol=1e-5)
+    loaded = gaigs.load(tmp_path)
+    for own, other in zip(
+        model.predict(asked, interval=0.8), loaded.predict(asked, interval=0.8), strict=True
+    ):
+        torch.testing.assert_close(own, other)
+    low, high = model.predict(asked, interval=0.8)[2:4]
+    labels = links.labels[links.split.test]
+    assert 0.6 < ((low <= labels) & (labels <= high)).float().mean() < 0.97
+    # The process states deviations, the neighbours do not.
+    batch = links.batch(links.split.test)
+    torch.testing.assert_close(model.deviations(batch), parts[1].deviations(batch))
+    assert model.process_at(0) is not None
+    assert not model.any_receiver
+    with pytest.raises(ValueError, match="'knn' predicts for its own receivers alone"):
+        model.predict(asked.transmitters, receiver=[1.0, 2.0, 1.5])
+
+
+def test_a_blend_with_a_trained_model_costs_no_training_again(links, tmp_path, monkeypatch):
+    level(monkeypatch)
+    names = ["path_loss", "mirrored"]
+    words = "model=auto", "data=synthetic_rssi", "baselines=[mean]", *SMALL
+    trainer = [f"trainer.{key}={value}".replace("False", "false") for key, value in BRIEF.items()]
+    config = gaigs.compose(*words, f"model.candidates=[{','.join(names)}]", *trainer)
+    metrics = gaigs.run(config, tmp_path)
+    assert [*metrics["models"]] == ["auto", "mean"]
+    assert metrics["auto"]["chosen"] == "0.7 path_loss + 0.3 mirrored"
+    assert metrics["auto"]["weights"] == pytest.approx({"path_loss": 0.7, "mirrored": 0.3})
+    assert metrics["models"]["auto"]["calibration_links"] > 0
+    model = gaigs.load(tmp_path)
+    asked = links.query[links.split.test]
+    members = [gaigs.load(tmp_path / f"candidates/{number}/best.ckpt") for number in "01"]
+    expected = 0.7 * members[0].predict(asked) + 0.3 * members[1].predict(asked)
+    torch.testing.assert_close(model.predict(asked), expected)
+    # Its room is that of the trained member, and it moves to other receivers as its members do.
+    assert type(model.underlying) is type(members[1])
+    place = [[1.0, 2.0, 1.5]]
+    door = gaigs.Receiver("door", gaigs.Pose.at([3.0, 0.2, 2.0]))
+    moved = [one.predict(place, receiver=door) for one in (model, *members)]
+    torch.testing.assert_close(moved[0], 0.7 * moved[1] + 0.3 * moved[2])
+    # Links that no member has seen: the look-up is fitted without the validation links.
+    for unseen in model.unseen(links):
+        assert torch.isin(unseen.asked, links.split.validation).all()
+        law = gaigs.registries["model"].build("path_loss", scene=links.scene)
+        law.fit(replace(links, split=links.split.validating()))
+        own = unseen.model.members[0]
+        torch.testing.assert_close(own.predict(asked), law.predict(asked))
+
+
+def test_channels_of_unknown_phase_are_not_averaged(monkeypatch):
+    level(monkeypatch)
+    for phase, name in {"known": "ensemble", "per_link": "friis"}.items():
+        links = gaigs.links("synthetic_csi", transmitters=20, order=0)
+        task = gaigs.registries["task"].build(
+            {"name": "csi"}, **links.scene.task.options() | {"phase": phase}
+        )
+        links = replace(links, task=task)
+        model = gaigs.train(links, candidates=["friis", "knn"])
+        assert model.configuration["name"] == name
 
 
 def test_links_alone_are_enough(links, tmp_path, capsys, caplog):

@@ -82,7 +82,7 @@ class Algebra:
 
     @property
     def homogeneous(self) -> int:
-        """Index of the blade of all vectors that are not null: e123, a point's homogeneous one."""
+        """Index of the blade of all vectors that are not null, e123: a point's weight."""
         return _vectors(self.dimension).index(tuple(range(self.r, self.dimension)))
 
     def product(
@@ -167,6 +167,7 @@ class Algebra:
         return _table(self, name, like.dtype, like.device)
 
     def _multiply(self, name: str, x: Tensor, y: Tensor) -> Tensor:
+        """The bilinear product of a table; ``product_and_join`` gives 2 k components."""
         # One matrix multiplication, components first in memory, is a third faster than gathering
         # non-zero terms.
         x, y = torch.broadcast_tensors(x, y)
@@ -278,6 +279,7 @@ def _number_maps(algebra: Algebra, null_blades: list[int]) -> Tensor:
 
 @functools.cache
 def _table(algebra: Algebra, name: str, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """``Algebra.table`` in a dtype on a device."""
     # A tensor first made in inference mode (Lightning's validation) could not be saved for a later
     # backward pass.
     with torch.inference_mode(False):

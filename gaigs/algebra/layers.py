@@ -104,6 +104,7 @@ class GeometricBilinear(nn.Module):
         if not self.algebra.r:
             return self.output(self.algebra.product(left, right), scalars)
         products, joins = self.algebra.product_and_join(left, right)
+        # A mirror changes the signs of a join and of the reference's e123, so their product keeps.
         orientation = reference[..., self.algebra.homogeneous, None, None, None]
         return self.output(torch.cat((products, orientation * joins), -2), scalars)
 
@@ -113,8 +114,8 @@ class GeometricAttention(nn.Module):
 
     The logit of a query and a key is their inner product plus the product of their scalars. The
     inner product ignores components with e0, and with them the positions of projective points. So
-    in that algebra the logit also has minus the squared distance of two points, -w(g) w(h) |g y - h
-    x|² for trivectors with e123 of g and h and other components x and y, with w(h) = h / (h² +
+    in that algebra minus the squared distance of two points is added: for trivectors (x, g) and
+    (y, h), with g and h the components of e123, it is -w(g) w(h) |g y - h x|² with w(h) = h / (h² +
     floor).
 
     Args:
@@ -218,7 +219,7 @@ class GeometricAttention(nn.Module):
         return rows
 
     def _read(self, mixed: Float[Tensor, "*tokens heads f"]) -> tuple[Multivectors, Scalars]:
-        """Multivectors and scalars of the values that attention has mixed."""
+        """Splits mixed values into multivectors and scalars of all heads; applies ``output``."""
         width = self.project.to_scalars.out_features // (3 * self.heads)  # scalars of a head
         multivectors, scalars = mixed.split((mixed.shape[-1] - width, width), -1)
         multivectors = multivectors.unflatten(-1, (-1, self.algebra.size)).flatten(-3, -2)

@@ -71,9 +71,11 @@ class Mix(torch.autograd.Function):
         x = torch.bmm(g, matrices[0].mT)  # (k, n, c)
         for wedge, matrix in zip(null_wedges[1:], matrices[1:], strict=True):
             x.flatten(1).addmm_(wedge.mT, torch.bmm(g, matrix.mT).flatten(1))
+        # Each matrix is a row of ``weight`` by ``maps``, so its gradient adds to that row's.
         matrix_gradients = torch.cat([torch.bmm(wedge.mT, g) for wedge in wedges])
         weight_gradient = torch.zeros_like(weight)
         weight_gradient.index_add_(0, maps.flatten(), matrix_gradients)
+        # Gradients of the components 1 and of the scalars by way of the scalars' map.
         ones, scalars = (flat @ to_weight).split((shape[-2], scalars_shape[-1]), -1)
         x[0] += ones
         return (
@@ -90,5 +92,8 @@ class Mix(torch.autograd.Function):
 
 
 def _components_first(multivectors: Tensor) -> Tensor:
-    """(k, tokens, channels), contiguous: other layouts are multiplied matrix by matrix."""
+    """Multivectors (*tokens, channels, k) as (k, tokens, channels), contiguous.
+
+    Torch multiplies other layouts matrix by matrix.
+    """
     return multivectors.movedim(-1, 0).flatten(1, -2).contiguous()

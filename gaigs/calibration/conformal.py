@@ -18,16 +18,17 @@ from gaigs.kriging.links import nearest_places
 
 @dataclass(frozen=True)
 class Calibration:
-    """Quantiles of the absolute errors at links not seen over a model's own deviation, in groups.
+    """Quantiles of a model's errors at links that it has not seen, in groups of links.
 
-    Links are in one group per receiver where each has at least 100 of them; of a model that
-    states no deviation also by the distance to the nearest known place of their receiver, if errors
-    rise with it. Pixels of a spectrum are in eight groups by their predicted amplitude too, or
-    in fewer with pixels of more links each. A group of n links has an interval of level p by the
-    quantile p (n + 1) / n of its errors: it then holds a new link's label with probability p, if
-    links are exchangeable. Of labels of several numbers, n is the number of single ones whose share
-    within an interval of level 0.9 would scatter as much, so they are held with a probability
-    of about p.
+    An error is absolute, over the model's own deviation. A group of n links has an interval of
+    level p by the quantile p (n + 1) / n of its errors: it then holds a new link's label with
+    probability p, if links are exchangeable. For labels of several numbers n is
+    ``effective_count``, so the probability is about p.
+
+    Each receiver is a group where all have at least 100 links. If a model states no deviation,
+    links are also grouped by the distance to the nearest known place of their receiver, if errors
+    rise with it. Pixels of a spectrum are also grouped by their predicted amplitude, see
+    ``bin_numbers``.
 
     Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; by groups of
     links: Dunn, Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical
@@ -66,7 +67,7 @@ class Calibration:
         clusters: Int[Tensor, " n"] | None = None,
         steps: int = 200,
     ) -> "Calibration":
-        """From links that were predicted by models that do not know them.
+        """Computes the calibration from links that models predicted without knowing them.
 
         Args:
             task: Task of the labels.
@@ -77,7 +78,8 @@ class Calibration:
                 None if the model states deviations, which need no groups of distances.
             known: Links that the calibrated model knows.
             clusters: Numbers of links that err together; None: each for itself.
-            steps: Levels of the stored quantiles of errors; one in between has the next higher.
+            steps: Number of levels whose quantiles are stored; a level between two takes the
+                higher one's.
         """
         labels, values, deviations = thinned(task, labels, values, deviations)
         scale = _shaped(deviations, values)  # (n, m)
@@ -115,7 +117,10 @@ class Calibration:
         )
 
     def at_receivers(self, widths: Float[Tensor, " w"]) -> "Calibration | None":
-        """The calibration of receivers without links, of which some may have other ``widths``."""
+        """The calibration for receivers without links, with the relative ``widths`` of intervals.
+
+        None if too few receivers have calibrated it.
+        """
         new = self.elsewhere
         return None if new is None else replace(new, widths=widths, elsewhere=new)
 
@@ -125,13 +130,24 @@ class Calibration:
         return self.widths is not None and bool(((self.widths > 0) & (self.widths < 1)).any())
 
     def estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
-        """The interval of some predictions; raises a ``ValueError`` where it needs more links."""
+        """The interval of predictions at one level.
+
+        Args:
+            value: Predictions (b, *shape).
+            deviations: Deviations that the model states (b,) or (b, *shape).
+            query: Links of the predictions.
+            level: Probability with which an interval holds the label.
+
+        Raises:
+            ValueError: A group has too few links for the level, or receivers without links are not
+                calibrated.
+        """
         return self.estimates(value, deviations, query, [level])[0]
 
     def estimates(
         self, value: Tensor, deviations: Tensor, query: Query, levels: Sequence[float]
     ) -> list[Estimate]:
-        """``estimate`` of several levels, with one search for the known places nearest."""
+        """``estimate`` at several levels, which share the search for the nearest known places."""
         widths = query.receivers.new_zeros(len(query)).to(value.real)
         if self.widths is not None:
             widths = self.widths.to(widths)[query.receivers]  # (b,)
@@ -150,16 +166,17 @@ class Calibration:
         new = self.elsewhere._estimates(value, usual, query, levels)
         if is_new.all():
             return new
-        # Groups are of receivers with links alone: the others get a value that does not count.
+        # Only receivers with links have groups. The others borrow one; its result is not used.
         receivers = torch.where(is_new, query.receivers[~is_new][0], query.receivers)
-        own = self._estimates(value, deviations, replace(query, receivers=receivers), levels)
+        old = self._estimates(value, deviations, replace(query, receivers=receivers), levels)
 
-        def joined(one: Tensor | None, other: Tensor | None) -> Tensor | None:
-            if one is None or other is None:
+        def choose(at_new: Tensor | None, at_old: Tensor | None) -> Tensor | None:
+            if at_new is None or at_old is None:
                 return None
-            return torch.where(is_new if one.ndim == 1 else is_new.reshape(shape), one, other)
+            mask = is_new if at_new.ndim == 1 else is_new.reshape(shape)
+            return torch.where(mask, at_new, at_old)
 
-        return [Estimate(*map(joined, *pair)) for pair in zip(new, own, strict=True)]
+        return [Estimate(*map(choose, *pair)) for pair in zip(new, old, strict=True)]
 
     def _estimates(
         self, value: Tensor, deviations: Tensor, query: Query, levels: Sequence[float]
@@ -171,21 +188,22 @@ class Calibration:
     def _estimate(
         self, value: Tensor, deviations: Tensor, groups: Int[Tensor, " b"], level: float
     ) -> Estimate:
-        """The interval of predictions of links in some groups."""
+        """The interval of predictions, by the number of each link's group."""
         self._check_counts(groups, level)
+        # Numbers of the cells of group and amplitude bin, as in the flattened quantiles.
         cells = groups.reshape(-1, *[1] * (value.ndim - 1))
         amplitudes = self.amplitudes.to(value.real)
         if len(amplitudes):
             cells = cells * (len(amplitudes) + 1) + torch.bucketize(value.contiguous(), amplitudes)
         scale = _shaped(deviations, value)
-        rank = math.ceil(level * self.steps - 1e-9)
+        rank = math.ceil(level * self.steps - 1e-9)  # of the next stored level
         half = scale * self.quantiles[..., rank].flatten().to(scale).take(cells)
         std = scale * self.sizes.flatten().to(scale).take(cells)
         if not value.is_complex():
             lower = (value - half).clamp_min(self.lowest.item())
             # Some models predict less than the least label.
             return Estimate(value, std, torch.minimum(lower, value), value + half)
-        absent = std.isnan()
+        absent = std.isnan()  # elements that an array lacks
         power = value.masked_fill(absent, 0).abs().square().flatten(1).sum(1)  # (b,)
         error = std.masked_fill(absent, 0).abs().square().flatten(1).sum(1)  # (b,)
         return Estimate(value, std, None, None, half, 10 * (power / error).log10())
@@ -202,7 +220,7 @@ class Calibration:
         return groups
 
     def _check_counts(self, groups: Int[Tensor, " b"], level: float) -> None:
-        """Raises the error of ``estimate``."""
+        """Raises a ``ValueError`` if a link's group is too small for intervals of a level."""
         counts = self.counts.to(groups)[groups]
         need = fewest(level)
         if len(counts) and (few := int(counts.min())) < need:
@@ -220,7 +238,10 @@ class Calibration:
 
     @property
     def mean_error(self) -> float:
-        """Mean absolute error over the model's own deviation; of one number a little too large."""
+        """Mean absolute error over the model's own deviation, by the stored quantiles.
+
+        It is a little too large: quantiles are those of intervals for new links.
+        """
         return torch.trapezoid(self.quantiles, dx=1 / self.steps).mean().item()
 
     def gives(self, level: float) -> bool:
@@ -300,17 +321,17 @@ def group_links(
 
 
 class Bins(NamedTuple):
-    """Numbers of labels in bins by the predicted amplitude."""
+    """Values of labels, sorted into bins by their predicted amplitudes."""
 
     amplitudes: Float[Tensor, " a"]  # edges of the bins (bins - 1,)
-    numbers: Int[Tensor, "n m"]  # bin of each number of each link
+    numbers: Int[Tensor, "n m"]  # bin of each value of each link
 
 
 def bin_numbers(values: Inexact[Tensor, "n m"], most: int = 8) -> Bins:
     """Bins of predictions: where the amplitude is high, errors are larger.
 
-    Labels of one number and channels have one bin. So do others if single links fill a bin, whose
-    errors would then be theirs alone.
+    Labels of one number and channels have one bin. Spectra have eight, halved until at least
+    ``fewest(0.9)`` links have pixels in each: errors of a bin should not be those of a few links.
     """
     numbers = (values.abs() if values.is_complex() else values).double()
     sample = numbers.flatten()[evenly(torch.arange(numbers.numel()), 10**6)]
@@ -332,10 +353,15 @@ def link_quantiles(
     clusters: Int[Tensor, " n"] | None = None,
     level: float = 0.9,
 ) -> Float[Tensor, " q"]:
-    """Quantiles of errors for intervals of new links, from sorted numbers ``inside`` of a group.
+    """Quantiles of a group's errors that are the bounds of a new link's errors.
 
-    Links of one of the ``clusters`` err together, and a new link is one of a new cluster.
-    Shares of links scatter at ``level``, which stands for all levels.
+    Args:
+        ordered: Errors of the group's numbers, ascending.
+        errors: Errors of all numbers.
+        inside: True for the numbers of the group.
+        levels: Levels of the intervals.
+        clusters: Numbers of links that err together; a new link is one of a new cluster.
+        level: Level at which the scatter of the links' shares is measured, for all levels.
     """
     held = (errors <= quantile(ordered, levels.new_tensor(level))) & inside
     both = torch.stack((held.sum(1), inside.sum(1)))  # (2, n)
@@ -348,16 +374,16 @@ def link_quantiles(
 
 
 def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float[Tensor, "*q"]:
-    """The least of n sorted numbers that are not below a share of them."""
+    """The smallest of n sorted numbers at or below which a share ``levels`` of them lies."""
     ranks = (levels * len(numbers) - 1e-9).ceil().long()
     return numbers[(ranks - 1).clamp(0, len(numbers) - 1)]
 
 
 def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float:
-    """Number of single numbers whose share within an interval would scatter as much as the share of
-    links with ``counts`` numbers, of which ``held`` are within.
+    """Number of independent numbers that would calibrate an interval as well as some links do.
 
-    Numbers of a link err together, though less than one number with itself.
+    Numbers of a link err together, so links with ``counts`` numbers, of which ``held`` are within
+    the interval, count less than all these numbers, and at least as much as the links themselves.
     """
     total = counts.sum().double()
     weights = counts / total
@@ -365,17 +391,18 @@ def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float
     share = parts.sum().item()
     links = 1 / weights.square().sum().item()
     scatter = (parts - share * weights).square().sum().item()
-    # A share of n independent numbers has the variance p (1 - p) / n.
+    # A share p of n independent numbers has the variance p (1 - p) / n, which is solved for n.
     return max(links, share * (1 - share) * (1 - 1 / links) / max(scatter, 1e-12))
 
 
 def fewest(level: float) -> int:
-    """Fewest links that give an interval of a level; 0.9 / (1 - 0.9) is above 9 by rounding."""
+    """Fewest links n that give an interval of a level p: p (n + 1) / n is at most 1."""
+    # 0.9 / (1 - 0.9) is above 9 by rounding.
     return math.ceil(level / (1 - level) - 1e-9)
 
 
 def usual_deviations(value: Tensor) -> Float[Tensor, " b"]:
-    """Deviations that stand for unknown ones: 1, of channels the root mean square of each value."""
+    """Deviations of a model that states none: 1; for channels each value's root mean square."""
     if value.is_complex():
         return value.abs().square().flatten(1).mean(1).sqrt()
     return torch.ones(len(value), device=value.device)
@@ -395,14 +422,14 @@ def nearest(
 
 
 def _shaped(deviations: Tensor, values: Tensor) -> Tensor:
-    """Deviations of links, or of all their numbers, in the shape of the values; above 0."""
+    """Deviations (b,) or (b, *shape) in the shape of the values, each above 0."""
     axes = [1] * (values.ndim - deviations.ndim)
     shaped = deviations.reshape(*deviations.shape, *axes).to(values.real)
     return shaped.clamp_min(torch.finfo(shaped.dtype).tiny).expand(values.shape)
 
 
 class Thinned(NamedTuple):
-    """Links whose labels have few numbers."""
+    """Labels, predictions and deviations of links by ``thin_labels``: m numbers of each."""
 
     labels: Inexact[Tensor, "n m"]
     values: Inexact[Tensor, "n m"]
@@ -415,7 +442,10 @@ def thinned(
     values: Inexact[Tensor, " n *shape"],
     deviations: Float[Tensor, " n ..."],
 ) -> Thinned:
-    """Aligned labels, predictions and deviations (unless one each link) by ``thin_labels``."""
+    """Thins labels, which are aligned to the predictions first, predictions and deviations.
+
+    Deviations (n,), one for each link, stay as they are.
+    """
     if deviations.ndim > 1:
         deviations = thin_labels(deviations)
     # An alignment takes several times the memory of the labels.

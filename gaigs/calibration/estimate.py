@@ -15,10 +15,10 @@ class Asked(NamedTuple):
     """Names and coordinates of the axes of a prediction."""
 
     positions: Float[Tensor, "*places 3"]  # positions of the transmitters (..., 3) [m]
-    # Names (k,) of the receivers of an axis of their own; or, without that axis, of the receiver of
-    # each position (...).
+    # Names of the receivers: (k,) if these have an axis of their own, else one for each position
+    # (...).
     receivers: ndarray
-    has_axis: bool
+    has_axis: bool  # True if receivers have an axis of their own
     axes: Mapping[str, Axis]  # axes of a label
     # Name and unit of a value.
     quantity: str
@@ -49,8 +49,9 @@ class Estimate(EstimateParts):
 
     Attributes:
         value: The prediction of ``predict`` without an interval.
-        std: Standard deviation of the label about it, in the label's unit; a channel has the
-            complex error's. All but the value is NaN at elements that an array lacks.
+        std: Standard deviation of the label about the value, in the label's unit; for a channel
+            that of the complex error. This and all that follow are NaN at elements that an array
+            lacks.
         lower, upper: Ends of the interval, which holds the label with the asked probability; None
             for channels.
         radius: Radius of a disc about the value which holds the channel with this probability, in
@@ -73,9 +74,7 @@ class Estimate(EstimateParts):
         self.asked = asked
         return self
 
-    def plot(self, ax: Any = None, **options: Any) -> Any:
-        """Draws it as ``gaigs.plot`` does, which lists the options."""
-        return plot(self, ax, **options)
+    plot = plot
 
     def to_xarray(self) -> Any:
         """An ``xarray.Dataset`` with ``value``, ``std``, ... by places, receivers and axes of a
@@ -94,8 +93,8 @@ class Estimate(EstimateParts):
         for number, name in enumerate("xyz"):
             values = asked.positions[..., number].cpu().numpy()
             coordinates[name] = (places, values, {"units": "m"})
-        own = ("receiver",) if asked.has_axis else places
-        coordinates["receiver"] = (own, asked.receivers)
+        axes = ("receiver",) if asked.has_axis else places
+        coordinates["receiver"] = (axes, asked.receivers)
         sizes = dict(zip(dimensions, self.value.shape, strict=True))
         for name, axis in asked.axes.items():  # an array may have fewer elements than another
             coordinates[name] = ((name,), axis.values[: sizes[name]], {"units": axis.unit})

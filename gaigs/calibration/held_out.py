@@ -20,18 +20,18 @@ LOOK_UP_FOLDS = 5
 
 
 class Unseen(NamedTuple):
-    """A model, links that it has not seen, and the links that it knows."""
+    """A model, and links that it has not seen."""
 
     model: Any
-    asked: Int[Tensor, " k"]
-    known: Int[Tensor, " j"]
+    asked: Int[Tensor, " k"]  # indices of links that it has not seen
+    known: Int[Tensor, " j"]  # indices of links that it knows
 
 
 class Fold(NamedTuple):
-    """Links without a fold of the known ones, and links of the fold that are asked for."""
+    """A fold of the known links, held out."""
 
-    rest: Links
-    asked: Int[Tensor, " k"]
+    rest: Links  # links whose split has no link of the fold
+    asked: Int[Tensor, " k"]  # indices of links of the fold, to be predicted
 
 
 class Answers(NamedTuple):
@@ -43,7 +43,10 @@ class Answers(NamedTuple):
 
 
 def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -> Iterator[Fold]:
-    """Folds of the known links, of which at most so many are asked for; ends when time is up."""
+    """Holds out one fold of the known links after the other, until the time is up.
+
+    About ``most`` links of all ``count`` folds together are to be predicted.
+    """
     index, receivers = links.split.known, links.scene.radio_of(links.query.receivers)
     folds = folds_of(links, index) % count
     asked = evenly(single_readings(links, index), most)
@@ -57,6 +60,7 @@ def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -
         if not len(part):
             continue
         rest = replace(links, split=links.split.only(index[is_known]))
+        # Estimated places of receivers are estimated anew, without the fold.
         if links.uncertainties is not None and links.uncertainties.any():
             is_estimated = links.uncertainties > 0
             unknown = torch.where(is_estimated, math.inf, 0.0)
@@ -65,7 +69,10 @@ def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -
 
 
 def validation_halves(links: Links) -> list[tuple[Int[Tensor, " k"], Int[Tensor, " j"]]]:
-    """Each half of the validation links with the other; one group alone with itself."""
+    """Pairs of the halves of the validation links, in both orders.
+
+    Links of one group, which cannot be halved, are paired with themselves.
+    """
     validation = links.split.validation
     halves = folds_of(links, validation) % 2
     first, second = validation[halves == 0], validation[halves == 1]
@@ -95,14 +102,14 @@ def calibrate(
     """
     query = links.scene.by_radio(links.query)
     asked, answers, near = [], [], []
-    for one in stages.track(unseen, "intervals", count):
-        if count > 1 and stages.is_up():  # it was fitted in haste
+    for part in stages.track(unseen, "intervals", count):
+        if count > 1 and stages.is_up():  # the model was fitted in haste
             break
-        asked.append(one.asked)
-        answers.append(answer(one.model, one.asked))
+        asked.append(part.asked)
+        answers.append(answer(part.model, part.asked))
         if not answers[-1].are_stated:
-            known = query[one.known]
-            near.append(nearest(query[one.asked], known.transmitters, known.receivers))
+            known = query[part.known]
+            near.append(nearest(query[part.asked], known.transmitters, known.receivers))
     if stages.is_up() and len(asked) < count:
         stages.leave_out(f"{len(asked)} of {count} folds calibrate {name}")
     if not asked:

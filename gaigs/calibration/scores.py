@@ -21,11 +21,15 @@ def holds(estimate: Estimate, labels: Inexact[Tensor, " k *shape"]) -> Bool[Tens
 def interval_scores(
     labels: Inexact[Tensor, " k *shape"], half: Estimate, most: Estimate
 ) -> dict[str, Float[Tensor, " k"]]:
-    """Scores of each link's intervals of 50 % and 90 %: shares of its aligned numbers inside,
-    width, CRPS and -log p.
+    """Scores of each link's intervals, by name.
 
-    The last two are scores of a normal distribution with the estimate's ``std``, of channels for
-    real and imaginary part. CRPS has the label's unit.
+    They are the shares of its numbers within intervals of 50 % and 90 %, the width of the latter,
+    and CRPS [the label's unit] and -log p of a normal distribution with the estimate's ``std``; for
+    channels of real and imaginary part.
+
+    Args:
+        labels: Labels, aligned to the predictions.
+        half, most: Estimates with intervals of 50 % and of 90 %.
 
     Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation, 2007.
     """
@@ -34,7 +38,7 @@ def interval_scores(
     if errors.is_complex():
         errors = torch.view_as_real(errors)  # (k, *shape, 2)
         std = (std / math.sqrt(2))[..., None].expand(*std.shape, 2)
-    # A deviation of 0, where the model is exact, has the least that float32 tells from it.
+    # A deviation of 0, where the model is exact, becomes the smallest one above 0.
     std = std.double().clamp_min(torch.finfo(torch.float32).tiny)
     z = errors.double() / std
     density = torch.exp(-z.square() / 2) / math.sqrt(2 * math.pi)
@@ -63,8 +67,10 @@ def interval_scores(
 def scores_of_links(
     calibration: Calibration, links: Thinned, query: Query, size: int = 64
 ) -> dict[str, Float[Tensor, " k"]]:
-    """``interval_scores`` of predictions, with ``calibration_links`` and the number of each link's
-    place; ``size`` links at a time, as estimates take ten times the memory of labels.
+    """``interval_scores`` of predictions, with the columns that ``summarise_intervals`` needs.
+
+    ``calibration_links`` is the number of links that calibrate, ``places`` the number of each
+    link's place. ``size`` links are scored at a time: estimates take ten times the labels' memory.
     """
     parts = []
     for rows in torch.arange(len(query)).split(size):
@@ -82,7 +88,10 @@ def scores_of_links(
 def shares_within(
     calibration: Calibration, links: Thinned, query: Query, most: int = 300
 ) -> np.ndarray:
-    """Shares of labels within intervals of levels 0.05 to 0.95 (19,); NaN of too few links."""
+    """Shares of labels within intervals of levels 0.05, 0.1, ..., 0.95 (19,).
+
+    A share is NaN where too few links calibrate its level.
+    """
     rows = evenly(torch.arange(len(query)), most)
     arguments = links.values[rows], links.deviations[rows], query[rows]
     levels = np.arange(1, 20) / 20
@@ -96,10 +105,9 @@ def shares_within(
 
 
 def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
-    """Means over links, and the standard errors of both coverages, ``coverage_50_error`` and
-    ``coverage_90_error``.
+    """Means of ``scores_of_links`` over links, and standard errors of the coverages.
 
-    ``places`` has the number of each link's place, from 0.
+    The errors are ``coverage_50_error`` and ``coverage_90_error``.
     """
     numbers = {}
     for name, score in scores.items():
@@ -119,14 +127,14 @@ def coverage_error(
 ) -> float:
     """Standard error of the mean share of links within intervals; NaN with one place.
 
-    It counts the test's links and the ``calibration_links``, both placed alike. Errors of one place
-    depend on each other, errors of different places count as independent. If all links have one
-    share, places scatter as the level says.
+    Errors of one place depend on each other, errors of different places count as independent. The
+    calibration's links scatter as the test's, and add to the error. If all links have the same
+    share, the level gives the scatter: level (1 - level).
 
     Source: Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015.
     """
     count = len(score)
-    sums = places.bincount(score - score.mean())  # (places,)
+    sums = places.bincount(score - score.mean())  # (places,), of deviations from the mean
     if len(sums) <= 1:
         return math.nan
     links = 1 / count + 1 / calibration_links

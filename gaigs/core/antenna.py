@@ -14,7 +14,7 @@ from gaigs.core.geometry import Pose
 
 
 def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"]]:
-    """The distinct vectors between places, to nine decimals, and each pair's index."""
+    """The distinct vectors between places, to nine decimals, and each pair's index among them."""
     apart = (places[:, None] - places).flatten(0, 1).round(decimals=9)  # (e x e, 3)
     return torch.unique(apart, dim=0, return_inverse=True)
 
@@ -77,14 +77,14 @@ class Array:
 
     @functools.cached_property
     def is_point(self) -> bool:
-        """True for one isotropic element in the middle, which hears alike in any orientation."""
+        """True for one isotropic element in the middle: the orientation does not matter."""
         return len(self) == 1 and self.pattern == "isotropic" and not self.elements.any()
 
     @functools.cached_property
     def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"], Float[Tensor, " l"]]:
-        """The distinct vectors between elements [m], each pair's index, the pairs of each; float64.
+        """Distinct vectors between elements [m], each pair's index, and pairs of each; float64.
 
-        The covariance of a field depends on them only: 49 for a 4 x 4 array.
+        A field's covariance depends on these vectors alone; a 4 x 4 array has 49.
         """
         # Cached tensors of inference mode could not be saved for a later backward pass.
         with torch.inference_mode(False):
@@ -111,8 +111,8 @@ class Receiver:
     """An antenna array or gateway: its name in files and tables, its pose in the room, its antenna.
 
     Attributes:
-        band: Lowest frequency that it hears, and the lowest above it that it does not [Hz]. Other
-            subcarriers of its channels are 0. By default it hears all.
+        band: Lowest frequency that it receives, and the end of its band, not included [Hz]. Its
+            channels are 0 at other subcarriers. By default it receives all.
 
     Example:
         >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])
@@ -154,7 +154,10 @@ def lacking(
     count: int,
     frequencies: Float[Tensor, " s"],
 ) -> Bool[Tensor, "b e s"]:
-    """True for elements, of ``count``, that a receiver lacks, and subcarriers outside its band."""
+    """True for numbers of channels that do not exist at each link's receiver.
+
+    These are elements, of ``count`` ones, that its array lacks, and subcarriers outside its band.
+    """
     sizes = torch.tensor([len(receiver.array) for receiver in receivers])
     hears = torch.stack([receiver.hears(frequencies.cpu()) for receiver in receivers])  # (r, s)
     exists = torch.arange(count) < sizes[:, None]  # (r, e)

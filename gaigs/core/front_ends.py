@@ -14,12 +14,10 @@ from gaigs.core.query import evenly
 
 
 class Shape(NamedTuple):
-    """Freedom of a response: ``count`` numbers over the band, for each element its own.
+    """Freedom of a response over elements and subcarriers."""
 
-    A separable one has the same numbers at all elements, but for a complex gain of each.
-    """
-
-    count: int
+    count: int  # free numbers over the band
+    # True if elements share these numbers, up to a complex gain of each; False if each has its own.
     is_separable: bool
 
     def __str__(self) -> str:
@@ -39,12 +37,12 @@ class FrontEnd(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """A front end, its shape, and scores of free space without and with it at places left out."""
+    """A front end with its shape, and mean scores of free space at places left out of the fit."""
 
     front_end: FrontEnd
     shape: Shape
-    before: float
-    after: float
+    before: float  # score without the front end
+    after: float  # score with it
 
 
 @dataclass(frozen=True)
@@ -69,8 +67,8 @@ class FrontEndFit:
 
     A link is h = g R w exp(j (phi + 2 pi f tau)) + error, with the response R, the direct wave w
     and a positive gain g; phi and tau are 0 unless the task says that they are unknown. Reflections
-    are errors, whose mean over places vanishes. Turns of phi, tau, g and of R, the mean of h / w
-    weighted by the links' errors, maximise the likelihood.
+    are errors, whose mean over places vanishes. The likelihood is maximised in turns: phi, tau and
+    g of each link, then R, the mean of h / w weighted by the inverse errors of the links.
 
     Args:
         labels: Channels of the links.
@@ -92,8 +90,8 @@ class FrontEndFit:
         self.task = task
         self.options = options
 
-    def some(self, index: Int[Tensor, " k"]) -> "FrontEndFit":
-        """The fit of some of the links."""
+    def at(self, index: Int[Tensor, " k"]) -> "FrontEndFit":
+        """The fit to the links of ``index`` alone."""
         return FrontEndFit(self.labels[index], self.waves[index], self.task, self.options)
 
     def start(self, shape: Shape) -> FrontEnd:
@@ -102,13 +100,13 @@ class FrontEndFit:
         relative = self.labels * self.waves.conj() / torch.where(strengths > 0, strengths, 1)
         starts = [relative.mean(0)]
         if self.task.phase != "known":
-            few = evenly(torch.arange(len(relative)), 4)
-            starts = [torch.ones_like(starts[0]), *relative[few]]
-        found = [self.run(shape, start) for start in starts]
-        return max(found, key=lambda one: one.explained)
+            single = evenly(torch.arange(len(relative)), 4)
+            starts = [torch.ones_like(starts[0]), *relative[single]]
+        front_ends = [self.run(shape, start) for start in starts]
+        return max(front_ends, key=lambda front_end: front_end.explained)
 
     def run(self, shape: Shape, response: Complex[Tensor, "e s"]) -> FrontEnd:
-        """Turns of alignment and weighted mean from a response on."""
+        """The front end after turns of alignment and weighted mean, which begin at a response."""
         response = self._normal(self._smooth(response, shape))
         for _ in range(self.options.rounds):
             model = response * self.waves  # (n, e, s)
@@ -116,82 +114,91 @@ class FrontEndFit:
             sizes = model.abs().square().sum((1, 2))  # (n,)
             products = (model.conj() * aligned).sum((1, 2)).real  # (n,)
             gains = (products / sizes.clamp_min(1e-30)).clamp_min(0)
-            left = aligned - gains[:, None, None] * model  # (n, e, s)
-            errors = left.abs().square().sum((1, 2))  # (n,)
+            residuals = aligned - gains[:, None, None] * model  # (n, e, s)
+            errors = residuals.abs().square().sum((1, 2))  # (n,)
             weights = (gains / errors.clamp_min(self.options.floor))[:, None, None]
+            # R of least squares: sum weight h conj(w) / sum weight g |w|², with g in the weights.
             power = (weights * gains[:, None, None] * self.waves.abs().square()).sum(0)  # (e, s)
             scale = torch.where(power > 0, power, 1)
             ratio = (weights * aligned * self.waves.conj()).sum(0) / scale  # (e, s)
             ratio = torch.where(power > 0, ratio, 1)
             response = self._normal(self._smooth(ratio, shape))
         # The sandwich estimator: each link's part in the mean, smoothed as the mean.
-        parts = weights * left * self.waves.conj() / scale  # (n, e, s)
+        parts = weights * residuals * self.waves.conj() / scale  # (n, e, s)
         basis = self._basis(ratio, shape.count)
         scatter = (parts @ basis.conj() @ basis.mT).abs().square().sum(0).sqrt()  # (e, s)
         return FrontEnd(response, scatter, (1 - errors).mean().item())
 
     def likeness(self) -> float:
         """Share of a few links' power that a free response and the direct wave explain."""
-        few = self.some(evenly(torch.arange(len(self.labels)), 64))
-        return few.start(Shape(max(self.options.counts), True)).explained
+        thinned = self.at(evenly(torch.arange(len(self.labels)), 64))
+        return thinned.start(Shape(max(self.options.counts), True)).explained
 
     def choose(self, places: Int[Tensor, " n"]) -> Chosen | None:
-        """The response of the best shape; None if none gains enough."""
+        """The front end of the shape that scores best at places left out of its fit.
+
+        ``places`` are the numbers of the links' places. None if no shape improves free space by
+        ``least_gain``.
+        """
         options = self.options
-        several = self.labels.shape[1] > 1
-        last = self.labels.shape[2]
-        counts = sorted({min(count, last) for count in options.counts})
+        has_array = self.labels.shape[1] > 1
+        subcarriers = self.labels.shape[2]
+        counts = sorted({min(count, subcarriers) for count in options.counts})
         shapes = [Shape(count, True) for count in counts]
-        if several:
+        if has_array:
             shapes += [Shape(count, False) for count in counts]
-        few = evenly(torch.arange(len(self.labels)), self._most(options.most[0]))
-        chooser = self.some(few)
-        places = places[few]
+        choosing = evenly(torch.arange(len(self.labels)), self._most(options.most[0]))
+        chooser = self.at(choosing)
+        places = places[choosing]
         start = chooser.start(Shape(counts[-1], True)).response
         plain = chooser.left_out(places, None, start)
         best = None
         # The largest shapes first: where none of them gains, the others need no look.
-        for number, shape in enumerate(sorted(shapes, key=lambda one: -one.count)):
+        for number, shape in enumerate(sorted(shapes, key=lambda shape: -shape.count)):
             score = chooser.left_out(places, shape, start)
             gain = score - plain
             error = gain.std() / math.sqrt(len(gain))
             if gain.mean() > max(options.least_gain, options.deviations * error):
                 if best is None or score.mean() > best[0]:
                     best = score.mean().item(), shape
-            elif number == 1 + several and best is None:
+            elif number == 1 + has_array and best is None:
                 return None
         if best is None:
             return None
         after, shape = best
-        every = self.some(evenly(torch.arange(len(self.labels)), self._most(options.most[1])))
-        return Chosen(every.run(shape, start), shape, plain.mean().item(), after)
+        fitting = evenly(torch.arange(len(self.labels)), self._most(options.most[1]))
+        front_end = self.at(fitting).run(shape, start)
+        return Chosen(front_end, shape, plain.mean().item(), after)
 
     def left_out(
         self, places: Int[Tensor, " n"], shape: Shape | None, start: Complex[Tensor, "e s"]
     ) -> Float[Tensor, " p"]:
-        """Mean score of free space at each place, of responses of the other places' links."""
+        """Mean score of free space at each place, with a response of this shape.
+
+        The response is fitted to links of places in other folds; shape None: no response.
+        """
         groups, number = places.unique(return_inverse=True)
         order = torch.randperm(len(groups), generator=torch.Generator().manual_seed(0))
         fold = order[number] % self.options.folds  # (n,)
         scores = self.labels.new_zeros(len(places)).real
         for part in range(self.options.folds):
             asked = (fold == part).nonzero()[:, 0]
-            rest = self.some((fold != part).nonzero()[:, 0])
+            rest = self.at((fold != part).nonzero()[:, 0])
             response = torch.ones_like(start)
             if shape is not None:
                 response = rest.run(shape, start).response
             gain = fit_gain(rest.labels, response * rest.waves)
             values = gain * response * self.waves[asked]
             # The task's elements are those of the largest array; smaller ones have zeros.
-            both = [
-                torch.nn.functional.pad(part, (0, 0, 0, self.task.elements - part.shape[1]))
-                for part in (self.labels[asked], values)
-            ]
-            scores[asked] = self.task.scores(*both)[self.task.monitor]
+            padding = (0, 0, 0, self.task.elements - values.shape[1])
+            labels = torch.nn.functional.pad(self.labels[asked], padding)
+            values = torch.nn.functional.pad(values, padding)
+            scores[asked] = self.task.scores(labels, values)[self.task.monitor]
         totals = scores.new_zeros(len(groups)).index_add(0, number, scores)
         return totals / number.bincount()
 
     def _most(self, numbers: int) -> int:
+        """Number of links that have so many numbers together; 64 at least."""
         return max(64, numbers // self.labels[0].numel())
 
     def _smooth(self, response: Complex[Tensor, "e s"], shape: Shape) -> Complex[Tensor, "e s"]:
@@ -213,7 +220,7 @@ class FrontEndFit:
         return basis
 
     def _normal(self, response: Complex[Tensor, "e s"]) -> Complex[Tensor, "e s"]:
-        """The response of mean power 1, and without a delay that no link tells."""
+        """The response scaled to a mean power of 1, without its delay if links' are unknown."""
         if self.task.phase == "per_link_and_delay":
             ones = torch.ones_like(response)
             response = response * alignment(response, ones, self.task.frequencies)
@@ -221,7 +228,10 @@ class FrontEndFit:
 
 
 def _polynomials(frequencies: Float[Tensor, " s"], count: int) -> Float[Tensor, "s k"]:
-    """Orthonormal polynomials over the band of degrees below ``count``; Chebyshev's span them."""
+    """Orthonormal polynomials over the band, of degrees below ``count``.
+
+    They come from Chebyshev's polynomials, cos(k arccos x).
+    """
     middle = (frequencies.min() + frequencies.max()) / 2
     half = (frequencies.max() - middle).clamp_min(1)
     angles = ((frequencies - middle) / half).clamp(-1, 1).acos()

@@ -165,7 +165,7 @@ def unit_quaternions(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 
 
 
 def _of_moderate_length(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Quaternions with a largest component of 1, so that squares neither overflow nor vanish."""
+    """Quaternions over their largest component, so that squares neither overflow nor vanish."""
     largest = quats.detach().abs().amax(-1, keepdim=True)
     return quats / torch.where(largest == 0, 1, largest)
 
@@ -219,6 +219,8 @@ def magnitudes(waves: Complex[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 
 
 class _Sinc(torch.autograd.Function):
+    """``sinc`` with its gradient."""
+
     @staticmethod
     def forward(ctx, values):
         # Added to 0 so that 0 / 0 is 1; to all other numbers it adds nothing.
@@ -405,9 +407,10 @@ def even_places(
     count: int,
     floors: Sequence[float] | Tensor = (),
 ) -> Float[Tensor, "g 3"]:
-    """About ``count`` evenly spaced places in a box [m]; an edge below their distance has one.
+    """About ``count`` evenly spaced places in a box [m].
 
-    With the heights of ``floors`` [m] the places are on these.
+    An edge shorter than their distance has one row of places, in its middle. With heights of
+    ``floors`` [m] places stand at these alone.
     """
     if len(floors):
         each = max(1, count // len(floors))

@@ -15,14 +15,11 @@ MANY = 30
 
 
 class StrangeParts(NamedTuple):
-    """Parts of a receiver whose fixed phases or strengths geometry does not explain.
-
-    ``delay`` [s] explains the subcarriers; None if none does.
-    """
+    """Parts of a receiver whose fixed phases or strengths geometry does not explain."""
 
     elements: bool
     subcarriers: bool
-    delay: float | None
+    delay: float | None  # delay that explains the subcarriers [s]; None if none does
 
 
 def phase_sign(
@@ -33,10 +30,16 @@ def phase_sign(
 ) -> int:
     """Sign with which the phases of channels follow the direct distance, -1 or 1; 0 for neither.
 
-    Divided by free space, a direct path alone is the same number at all links of a receiver. For
-    each sign, the mean over links keeps a share of the power, by chance about 1 / links. The larger
-    share wins if it exceeds ``least_share`` plus four times the share by chance: never with fewer
-    than ``TELLING`` links a receiver. ``waves`` are the links' ``direct_waves`` with the sign -1.
+    Channels divided by free space of the right sign have a common part at all links of a receiver,
+    the direct path. So the mean over links keeps a share of the power; by chance it keeps about 1 /
+    links. The sign with the larger share wins if this exceeds ``least_share`` plus four times the
+    share by chance: never with fewer than ``TELLING`` links a receiver.
+
+    Args:
+        channels: Channels of the links.
+        waves: ``direct_waves`` of the links with the sign -1.
+        receivers: Receiver of each link.
+        least_share: Least share of the power.
     """
     received = max(1, int((channels.abs().amax((1, 2)) > 0).sum()))  # links with a signal
     shares = {}
@@ -57,10 +60,10 @@ def common_responses(
     receivers: Int[Tensor, " k"],
     sign: int,
 ) -> dict[int, Complex[Tensor, "e s"]]:
-    """Mean of each receiver's channels over free space, by the receiver's number.
+    """Mean over links of channels divided by free space, for each receiver by its number.
 
-    All elements and subcarriers have the same number if their places and frequencies are true.
-    Arguments are as for ``phase_sign``.
+    All elements and subcarriers of a receiver have the same mean if their places and frequencies
+    are true. Arguments are as for ``phase_sign``.
     """
     still = _without_phases_of(waves, _relative(channels, waves), sign)
     responses = {}
@@ -80,10 +83,16 @@ def strange_parts(
 ) -> dict[int, StrangeParts]:
     """Receivers at which geometry does not explain fixed phases or strengths of the direct wave.
 
-    A receiver counts with ``MANY`` links or more that have a direct wave. Its elements count if
-    they resolve the directions of the waves: from one direction, reflections look the same.
-    ``common_share`` is the least share of a response that elements or subcarriers share; calibrated
-    arrays have 0.99. ``least_share`` is as in ``phase_sign``, and so are the other arguments.
+    Receivers with fewer than ``MANY`` links, or without a direct wave, are left out. Elements are
+    strange only if they resolve the directions of the waves: with one direction, reflections would
+    look the same.
+
+    Args:
+        channels, waves, receivers, least_share: As for ``phase_sign``.
+        frequencies: Subcarriers [Hz].
+        sign: Sign of the channels' phases.
+        common_share: Share of a response's power that elements or subcarriers have in common, below
+            which they are strange; calibrated arrays have 0.99.
     """
     strange = {}
     for receiver, response in common_responses(channels, waves, receivers, sign).items():
@@ -92,11 +101,11 @@ def strange_parts(
         share = response.abs().square().mean().item()
         if links < MANY or share < least_share + 4 / links:
             continue
-        own = (waves[at_receiver] != 0).any(0)  # (e, s)
-        has_element = own.any(1)
-        is_heard = own.any(0)
-        response = response[has_element][:, is_heard]
-        turns = waves[at_receiver][:, has_element][..., is_heard].sgn()  # (links, e, s)
+        exists = (waves[at_receiver] != 0).any(0)  # (e, s)
+        has_element = exists.any(1)
+        in_band = exists.any(0)
+        response = response[has_element][:, in_band]
+        turns = waves[at_receiver][:, has_element][..., in_band].sgn()  # (links, e, s)
         # The power of the mean response without the part that chance leaves in it.
         by_chance = (1 - share) / links / share
         power = response.abs().square().mean() * (1 - by_chance)
@@ -111,8 +120,8 @@ def strange_parts(
         subcarriers = bool(over_subcarriers < common_share * power)
         delay = None
         if subcarriers:
-            heard = frequencies[is_heard]
-            rates = 2 * math.pi * (heard - heard.mean())
+            subset = frequencies[in_band]
+            rates = 2 * math.pi * (subset - subset.mean())
             late = _best_delays(response.sum(0), rates)
             aligned = response * torch.polar(torch.ones_like(rates), late * rates)
             if aligned.mean().abs().square() > common_share * power:
@@ -127,11 +136,11 @@ def array_sign(
     waves: Complex[Tensor, "k e s"],
     frequencies: Float[Tensor, " s"] | None = None,
 ) -> int:
-    """Sign with which phases follow the distance from element to element, or over subcarriers.
+    """Sign, -1 or 1, with which phases follow the distance over elements and subcarriers.
 
-    It shows even where each link has a random phase; with ``frequencies`` [Hz], a random delay too.
-    The sign, -1 or 1, keeps more power in the mean over elements and subcarriers; it is -1 where
-    neither does. Other arguments are as for ``phase_sign``.
+    Each link may have a random phase and, with ``frequencies`` [Hz], a random delay. Channels
+    divided by free space of the right sign keep more power in the mean over elements and
+    subcarriers; the sign is -1 if both keep the same. Other arguments are as for ``phase_sign``.
     """
     relative = _relative(channels, waves)
     powers = []
@@ -177,6 +186,7 @@ def _best_delays(cross: Complex[Tensor, "*k s"], rates: Float[Tensor, " s"]) -> 
     delays = grid[(cross @ steering).abs().argmax(-1)]
     for _ in range(4):  # Newton's method on half the square of the magnitude
         turned = cross * torch.polar(torch.ones_like(cross.real), delays[..., None] * rates)
+        # Derivatives of the sum, then of |sum|² / 2.
         value = turned.sum(-1)
         slope = (1j * rates * turned).sum(-1)
         bend = ((1j * rates) ** 2 * turned).sum(-1)
@@ -193,19 +203,27 @@ def unknown_phase(
     frequencies: Float[Tensor, " s"],
     declared: str = "known",
 ) -> str | None:
-    """The ``data.phase`` of channels that resemble the direct wave without a common phase.
+    """The ``data.phase`` of channels whose links have unknown phases, if they show it.
 
-    A link's likeness is the share of its power that the direct wave explains after the best phase,
-    at chance one over the numbers of a channel. If its mean is at least a half, 3 dB, and the
-    phases of a receiver's links are as random as by chance, this is ``per_link``; after the best
-    phase and delay ``per_link_and_delay``. None if the phases agree, if the direct wave explains
-    too little to say, or with fewer than 30 links a receiver. With the ``declared`` phase a quarter
-    is enough: it stays. ``waves`` are ``direct_waves`` of the same links.
+    A link's likeness is the share of its power that the direct wave explains after the best phase;
+    by chance it is one over the numbers of a channel. The result is ``per_link`` if the mean
+    likeness is at least a half, 3 dB, and the phases of a receiver's links are as random as by
+    chance. It is ``per_link_and_delay`` if that holds after the best phase and delay.
+
+    Args:
+        channels, waves, receivers: As for ``phase_sign``.
+        frequencies: Subcarriers [Hz].
+        declared: The phase that the user declares; a likeness of a quarter confirms it.
+
+    Returns:
+        The phase. None if phases agree, if the declared one is confirmed, if the direct wave
+        explains too little, or with fewer than ``MANY`` links a receiver.
     """
     chance = len(receivers.unique()) / max(len(receivers), 1)
     if chance > 1 / MANY:
         return None
-    numbers, elements = channels[0].numel(), channels.shape[1]
+    numbers = channels[0].numel()
+    elements = channels.shape[1]
     normalised = _normalised(channels.to(torch.complex128))
     # A single reflection resembles the direct wave but for a delay, unless an array sees its
     # direction.
@@ -236,7 +254,10 @@ def unknown_phase(
 def _without_phases_of(
     waves: Complex[Tensor, "k e s"], channels: Complex[Tensor, "k e s"], sign: int
 ) -> Complex[Tensor, "k e s"]:
-    """Channels turned back by the phases of waves, whose sign is -1; ``sign`` is the channels'."""
+    """Channels less the phases of waves.
+
+    The waves have the sign -1, the channels' phases have ``sign``.
+    """
     phases = waves.angle()
     return channels * torch.polar(torch.ones_like(phases), sign * phases)
 

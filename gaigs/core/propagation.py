@@ -136,11 +136,11 @@ def slab(
 def fit_gain(
     channels: Complex[Tensor, " k *shape"], waves: Complex[Tensor, " k *shape"]
 ) -> Complex[Tensor, ""]:
-    """The complex gain of measured channels h over waves w predicted at a gain of 1; complex128.
+    """The complex gain, complex128, of measured channels h over waves w of gain 1.
 
-    Its magnitude is the median over the links of |h| / |w|, its phase the phase of the sum of w* h
-    / (|w| |h|). So each link counts once, weak or strong. Links with h = 0 or w = 0 do not count;
-    without any other the gain is 0.
+    Its magnitude is the median over the links of |h| / |w|. Its phase is the phase of the sum of w*
+    h / (|w| |h|), in which weak links count as much as strong ones. Links with h = 0 or w = 0 do
+    not count; the gain is 0 if there are no others.
     """
     h = channels.to(torch.complex128).flatten(1)  # (k, numbers)
     w = waves.to(torch.complex128).flatten(1)
@@ -154,10 +154,10 @@ def fit_gain(
 
 
 def common_gain(gains: Inexact[Tensor, " r *shape"]) -> Inexact[Tensor, " *shape"]:
-    """Gain of a receiver in general: the mean over receivers.
+    """Gain expected of an unknown receiver: the mean over receivers.
 
-    Of complex gains it is the root mean square with the phase of the mean: phases of cables differ,
-    and would cancel.
+    For complex gains it is the root mean square with the phase of the mean: phases of cables
+    differ, so a mean would cancel.
     """
     if not gains.is_complex():
         return gains.mean(0)

@@ -30,9 +30,10 @@ class RadioMap:
     """Predictions of one real number a link, e.g. RSSI, for transmitters on a horizontal plane.
 
     Attributes:
-        values: One map a receiver (receivers, rows, columns) [unit]; rows along y, columns along x.
-        x: One a column, world frame [m].
-        y: One a row, world frame [m].
+        values: A map for each receiver (receivers, rows, columns) [unit]; rows along y, columns
+            along x.
+        x: Coordinate of each column, world frame [m].
+        y: Coordinate of each row, world frame [m].
         height: Height of the transmitters, world frame [m].
         receivers: Names of the receivers.
         quantity: Name of the predicted quantity.
@@ -125,6 +126,7 @@ class RadioMap:
 
 
 def _key(unit: str) -> str:
+    """Name of the values in a file, such as ``values_dbm``."""
     return f"values_{unit.lower()}" if unit.isascii() and unit.isalpha() else "values"
 
 
@@ -147,10 +149,10 @@ def radio_map(
             one pitch share them. None: 0.1, more in a room with a side above 12.8 m; doubled until
             the map of a slow model takes a minute.
         height: Height of the transmitters [m]; None: half-way between the lowest and the highest of
-            training, and of several floors that with most training places.
+            training, or the floor with most training places.
         margin: Widening of the box on each side [m].
         receivers: Names or indices, or one of them; None: all receivers.
-        frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
+        frequency: Carrier [Hz]; None: the training links' carrier, or the middle one of several.
         progress: False for no bars.
 
     Warns:
@@ -247,7 +249,7 @@ def _rectangle(scene: Scene, height: float, margin: float) -> tuple[ndarray, nda
 
 
 def _doubts(scene: Scene, height: float, margin: float) -> list[str]:
-    """Warnings about options that put transmitters far outside the training box."""
+    """Sentences on options that put transmitters far outside the training box."""
     beyond = max(scene.lower[2].item() - height, height - scene.upper[2].item())
     messages = []
     for name, distance, most in (
@@ -314,7 +316,7 @@ def _affordable_pitch(
     """A pitch [m] with which the map takes about ``seconds``, or has at most ``fewest`` points.
 
     The longer side has about ``points`` points, unless the model is slow or maps of all receivers
-    would have more than so many ``predictions``.
+    would need more than ``predictions``.
     """
     pitch = max(0.1, float((upper - lower).max()) / points)
     line = np.linspace(lower, upper, points)

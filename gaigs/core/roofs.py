@@ -60,13 +60,14 @@ def obstruct(
     wavelength: float,
     most: int = 2**21,  # samples at a time; a temporary of 8 MB
 ) -> Float[Tensor, "b 4"]:
-    """What roofs do to the direct paths from ``starts`` to ``ends`` [m], a sample a cell.
+    """Obstruction of the direct paths from ``starts`` to ``ends`` [m] by roofs.
 
-    Samples within 1.5 cells of an end do not count: an antenna at a wall may be in its cell.
+    Paths are sampled about once a cell. Samples within 1.5 cells of an end do not count: an antenna
+    at a wall may be in the building's cell.
 
     Returns:
-        1 if a roof is above the path, else 0; length of the path inside buildings [m]; number of
-        walls that it crosses; knife-edge loss over the roofs [dB].
+        Four numbers of each path: 1 if a roof is above it, else 0; its length inside buildings [m];
+        the number of walls that it crosses; knife-edge loss over the roofs [dB].
     """
     plan = (ends - starts)[:, :2].norm(dim=1, keepdim=True).clamp_min(1e-3)  # (b, 1)
     count = max(2, math.ceil(plan.max().item() / roofs.cell)) if len(plan) else 2
@@ -99,7 +100,17 @@ def _bullington(
     plan: Float[Tensor, "b 1"],
     wavelength: float,
 ) -> Float[Tensor, " b"]:
-    """v of the edge for all roofs, where the steepest lines meet; of a free path the largest v.
+    """v of ``knife_edge`` for all roofs along each path together.
+
+    If roofs block the path, they count as one edge where the steepest lines from both ends meet;
+    else the roof with the largest v counts.
+
+    Args:
+        roof: Heights at the samples of the path [m], -inf without a roof.
+        start, end: Heights of the ends [m].
+        before: Horizontal distance of each sample from the start [m].
+        plan: Horizontal distance of the ends [m].
+        wavelength: [m].
 
     Source: ITU-R P.526-15, section 4.5.1, over a flat earth.
     """
@@ -109,7 +120,7 @@ def _bullington(
     meeting = (end - start + down * plan) / (up + down)  # (b, 1)
     meeting = torch.where(is_free, before, meeting)  # (b, k)
     edge = torch.where(is_free, roof, start + up * meeting)
-    rest = plan - meeting
+    rest = plan - meeting  # distance from the edge to the end
     above = edge - (start * rest + end * meeting) / plan
     v = above * (2 * plan / (wavelength * meeting * rest)).sqrt()
     return v.amax(1).clamp_min(-1.0)

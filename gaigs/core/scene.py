@@ -22,25 +22,25 @@ log = logging.getLogger(__name__)
 
 
 class FlatAxis(NamedTuple):
-    """A world axis, 0 to 2, on which transmitters share one coordinate [m], and receivers one.
+    """A world axis on which all transmitters share a coordinate, and all receivers share one.
 
-    A plane across it and its mirror image half-way between the two reflect paths of the same
-    length. ``is_common`` is true if both stand at the same coordinate.
+    A plane across it at h reflects paths of the same lengths as a plane at transmitters + receivers
+    - h, so labels do not show which of the two there is.
     """
 
-    axis: int
-    transmitters: float
-    receivers: float
-    is_common: bool
+    axis: int  # 0 to 2
+    transmitters: float  # their coordinate [m]
+    receivers: float  # their coordinate [m]
+    is_common: bool  # True if both coordinates are the same
 
     def __str__(self) -> str:
         name = ("x", "y", "height")[self.axis]
         if self.is_common:
             return f"{name} not seen: all places at {self.transmitters:.2f} m"
-        both = self.transmitters + self.receivers
+        total = self.transmitters + self.receivers
         return (
             f"{name} seen from either side: places at {self.transmitters:.2f} m, receivers at "
-            f"{self.receivers:.2f} m; a plane across it at h may stand at {both:.2f} m - h"
+            f"{self.receivers:.2f} m; a plane across it at h may stand at {total:.2f} m - h"
         )
 
 
@@ -62,8 +62,8 @@ class Scene:
         responses: Factors of channels by each receiver's front end; None where none is learnt.
         room: Corners of the box of training transmitters and training receivers (2, 3) [m], if the
             receivers are others; None: they are the training's.
-        one_radio: True if the receivers are places of one radio that moves, or of radios alike,
-            which have one gain; a model then learns from all their links together.
+        one_radio: True if the receivers are places of one radio that moves, or of equal radios.
+            They share one gain, and a model learns from all their links together.
 
     Example:
         >>> scene = gaigs.links("synthetic_rssi", transmitters=50).scene
@@ -103,11 +103,11 @@ class Scene:
         return 1 if self.one_radio else len(self.receivers)
 
     def radio_of(self, receivers: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
-        """Numbers of the receivers' radios, which have gains and the like."""
+        """Number of each receiver's radio: what a model learns of a receiver is of its radio."""
         return torch.zeros_like(receivers) if self.one_radio else receivers
 
     def by_radio(self, query: Query) -> Query:
-        """Links with the numbers of radios in place of receivers."""
+        """The links with the number of the radio in place of the receiver."""
         return replace(query, receivers=self.radio_of(query.receivers))
 
     @property
@@ -120,7 +120,7 @@ class Scene:
 
     @functools.cached_property
     def extent(self) -> float:
-        """Diagonal of this box [m]."""
+        """Diagonal of ``box`` [m]."""
         lower, upper = self.box
         return (upper - lower).norm().item()
 
@@ -161,8 +161,8 @@ class Scene:
     def middles(self) -> Float[Tensor, " r"]:
         """Mean frequency of the subcarriers in each receiver's band [Hz]."""
         frequencies = self.task.frequencies
-        heard = [frequencies[receiver.hears(frequencies)] for receiver in self.receivers]
-        return torch.stack([(part if len(part) else frequencies).mean() for part in heard])
+        bands = [frequencies[receiver.hears(frequencies)] for receiver in self.receivers]
+        return torch.stack([(band if len(band) else frequencies).mean() for band in bands])
 
     @property
     def has_band(self) -> bool:
@@ -187,8 +187,8 @@ class Scene:
             order = np.argsort(known)
             asked = frequencies.double().numpy()
             rows = responses.flatten(0, 1).numpy()[:, order]
-            parts = [np.interp(asked, known[order], row) for row in rows]
-            responses = torch.tensor(np.array(parts)).to(responses)
+            interpolated = [np.interp(asked, known[order], row) for row in rows]
+            responses = torch.tensor(np.array(interpolated)).to(responses)
             responses = responses.unflatten(0, self.responses.shape[:2])  # (receivers, e, s)
         return replace(self, task=self.task.at_frequencies(frequencies), responses=responses)
 

@@ -20,9 +20,14 @@ log = logging.getLogger(__name__)
 
 
 class Timekeeper:
-    """The clock of a run with a ``limit`` [s]; its stages have bars if ``shown``.
+    """The clock of a run.
 
-    ``seconds`` has the time of each ``timed`` part, without the parts inside it.
+    Args:
+        limit: Time limit of the run [s].
+        shown: True if its stages have bars.
+
+    Attributes:
+        seconds: Time of each ``timed`` part without the parts inside it [s].
     """
 
     def __init__(self, limit: float = math.inf, shown: bool = True):
@@ -55,7 +60,7 @@ class Stage:
         self.owns_bars = False
 
     def advance(self) -> None:
-        """Ends a step."""
+        """Counts a step as done."""
         self.done += 1
         if self.row is not None and self.keeper.bars is not None:
             self.keeper.bars.update(
@@ -151,7 +156,7 @@ def portion(share: float) -> contextlib.AbstractContextManager[Stage]:
 
 @contextlib.contextmanager
 def timed(name: str) -> Iterator[None]:
-    """A part of the current run whose time counts under a name; a part inside it counts alone."""
+    """A part of the current run whose time counts under a name, without parts inside it."""
     seconds = current().seconds
     inside = sum(seconds.values())
     began = time.monotonic()
@@ -165,7 +170,7 @@ def timed(name: str) -> Iterator[None]:
 def track(
     items: Iterable, name: str = "", total: int | None = None, is_fixed: bool = False
 ) -> Iterator[Any]:
-    """Goes through items, each a step of a stage; ``total`` is needed if they have no length."""
+    """Yields items, each a step of a stage; ``total`` is needed if they have no length."""
     if total is None:
         total = len(items) if isinstance(items, Sized) else 1
     with stage(name, total, is_fixed=is_fixed) as opened:
@@ -175,7 +180,7 @@ def track(
 
 
 def advance() -> None:
-    """Ends a step of the innermost stage, if there is one."""
+    """Counts a step of the innermost stage as done, if there is one."""
     for innermost in current().stages[-1:]:
         innermost.advance()
 

@@ -3,17 +3,20 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.core.task import Task
 from gaigs.data import Links
 
 
-def validation_scores(links: Links, values: Tensor) -> Float[Tensor, " k"]:
-    """Monitored scores of predictions of the validation links, higher ones better."""
+def validation_scores(
+    links: Links, values: Tensor, index: Int[Tensor, " k"] | None = None
+) -> Float[Tensor, " k"]:
+    """Monitored scores of predictions of the validation links, or others, higher ones better."""
     task = links.task
-    scores = task.scores(links.labels[links.split.validation], values)[task.monitor].double()
+    labels = links.labels[links.split.validation if index is None else index]
+    scores = task.scores(labels, values)[task.monitor].double()
     return scores if task.higher_is_better else -scores
 
 

@@ -63,7 +63,8 @@ def matern(apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
     and 4.17.
     """
     steps = apart * (-math.sqrt(2 * smoothness) / length)
-    return steps.exp() if smoothness == 0.5 else (1 - steps) * steps.exp()
+    decay = steps.exp()
+    return decay if smoothness == 0.5 else decay.addcmul(steps, decay, value=-1)
 
 
 def matern_slope(correlation: Tensor, apart: Tensor, length: Tensor, smoothness: float) -> Tensor:

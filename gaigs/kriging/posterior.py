@@ -25,12 +25,14 @@ class Posterior(nn.Module):
         start: Choices of a fit to nearly the same links, from which the next one starts; None: no
             fit before.
         seen: Links by which the fit has chosen; None: all.
+        is_lazy: True if few places will be asked for: many known links are then not all solved.
     """
 
     chooses_weight = False
     by_paths = False
     start: Any = None
     seen: Tensor | None = None
+    is_lazy = False
 
     def cleaned(self, links: Links) -> Links:
         """The links without those that would move the whole fit; by default all."""

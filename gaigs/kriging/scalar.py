@@ -101,6 +101,7 @@ class ScalarProcess(nn.Module):
         means = places.new_zeros(len(places))
         scale = self._choice.scale
         all_places = scaled(self.places, scale)
+        last: tuple[Tensor, Tensor, Tensor] | None = None
         for receiver in receivers.unique().tolist():
             asked, known = receivers == receiver, self.receivers == receiver
             of_receiver = partial(self._covariances, receiver=receiver)
@@ -111,8 +112,13 @@ class ScalarProcess(nn.Module):
                     places[asked], tiles, self.places, of_receiver, solve
                 )
             else:
-                towards = of_receiver(places[asked], self.places[known])
-                means[asked] = towards @ self.weights[known]
+                ends = scaled(places[asked], scale), all_places[known]
+                # Receivers that hear the same places share distances.
+                if last is None or not all(map(torch.equal, ends, last)):
+                    last = (*ends, distances(*ends))
+                length, signal, _ = self.logarithms[receiver].exp()
+                towards = matern(last[2], length, self._choice.smoothness)
+                means[asked] = towards @ (signal**2 * self.weights[known])
         return means
 
     def _solved(self, readings: Merged, receiver: int) -> Float[Tensor, " j"]:
@@ -464,7 +470,8 @@ class ScalarPosterior(Posterior):
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
         index = links.split.known
         values = residuals(torch.arange(len(index))).double()
-        self.process.cpu().solve(*self._coordinates(links.query[index]), values)
+        is_lazy = self.is_lazy and len(values) > self.process.options.large
+        self.process.cpu().solve(*self._coordinates(links.query[index]), values, is_lazy)
 
     def mean(self, batch: Batch, like: Tensor) -> Tensor:
         return self.process(*self._coordinates(batch.query)).to(like)

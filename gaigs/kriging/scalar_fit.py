@@ -31,7 +31,7 @@ class ScalarOptions:
     Attributes:
         neighbours: Readings around a held-out one while a process is fitted.
         around: Readings around a place whose variance is asked of many, and around each of more
-            than ``large`` whose noise has Student's t: those behind them lower a variance by a
+            than ``large`` whose noise has Student's t: those behind them lower a deviation by a
             hundredth.
         local: Readings around a place whose mean is asked of a process that is not solved.
         few: Known readings to each place asked at once, above which such a process stays so.
@@ -60,7 +60,7 @@ class ScalarOptions:
     """
 
     neighbours: int = 32
-    around: int = 16
+    around: int = 12
     local: int = 64
     few: int = 16
     large: int = 6000

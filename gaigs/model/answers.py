@@ -20,8 +20,10 @@ from gaigs.registry import name_of
 
 
 def batch_size(links: Links, model: Model | None = None) -> int:
-    """Links predicted at a time; of labels of one number more, which take little memory, and most
-    by a look-up, whose time grows with the receivers in each batch.
+    """Number of links to predict at a time.
+
+    It is larger for labels of one number, which take little memory, and largest for a look-up, as
+    each batch costs time for every receiver in it.
     """
     if not links.task.is_scalar:
         return 64
@@ -34,14 +36,17 @@ def predicted(
     index: Int[Tensor, " k"],
     frequencies: Float[Tensor, " s"] | None = None,
 ) -> Tensor:
-    """Predictions of a model for some links, on the CPU, also at other subcarriers [Hz]."""
+    """Predictions of a model for the links of ``index``, on the CPU.
+
+    ``frequencies`` are other subcarriers than the labels' [Hz].
+    """
     size = batch_size(links, model)
     values = model.predict_batches(links.query[index], batch_size=size, frequencies=frequencies)
     return torch.cat([part.cpu() for part in values])
 
 
 def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor) -> Tensor:
-    """Deviations of some links, ``Model.spread``, on the CPU; ``values`` are their predictions."""
+    """``Model.spread`` for the links of ``index``, on the CPU; ``values`` are their predictions."""
     directions, device = links.task.directions, model.device
     size = batch_size(links, model)
     parts = []
@@ -52,17 +57,20 @@ def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor
 
 
 def calibrated(model: Model, links: Links) -> Calibration | None:
-    """The calibration of a model by its ``unseen`` links; None without, or for other carriers."""
+    """The calibration of a model by its ``unseen`` links.
+
+    None without such links, or if the links hold out carriers.
+    """
     if links.held_out is not None:
         return None
 
-    def answer(one: Model, index: Int[Tensor, " k"]) -> Answers:
-        values = predicted(one, links, index)
-        # A fold's hyperparameters may state larger or smaller deviations everywhere.
-        one.take_hyperparameters(model)
-        deviations = spreads(one, links, index, values)
-        batch = Batch(links.query[index[:1]], links.task.directions).to(one.device)
-        return Answers(values, deviations, one.deviations(batch) is not None)
+    def answer(fold: Model, index: Int[Tensor, " k"]) -> Answers:
+        values = predicted(fold, links, index)
+        # Hyperparameters of a fold may state larger or smaller deviations everywhere.
+        fold.take_hyperparameters(model)
+        deviations = spreads(fold, links, index, values)
+        batch = Batch(links.query[index[:1]], links.task.directions).to(fold.device)
+        return Answers(values, deviations, fold.deviations(batch) is not None)
 
     with timed("intervals"):
         unseen = model.unseen(links)
@@ -79,8 +87,8 @@ def at_new_receivers(
 ) -> Calibration | None:
     """The calibration of a model at receivers without links; None with fewer than three.
 
-    Each receiver with links in turn has the mean of the others in place of what it has of its own.
-    Receivers err as a whole: the errors of one are a cluster.
+    Each receiver with links in turn is predicted as a new one, from the other receivers. Receivers
+    err as a whole: the errors of one are a cluster.
 
     Args:
         model: A model with ``any_receiver``.
@@ -93,7 +101,7 @@ def at_new_receivers(
     """
     split: Any = links.split
     of_links = links.query.receivers
-    heard = of_links[split.train if model.is_trained else split.known].unique()
+    has_links = of_links[split.train if model.is_trained else split.known].unique()
     asked = split.known
     # The room has learnt from the training links: validation links show its errors.
     if model.is_trained and not split.by_receivers:
@@ -102,7 +110,7 @@ def at_new_receivers(
     chosen = evenly(of_links[asked].unique(), receivers)
     rows, values = [], []
     for receiver in chosen.tolist():
-        others = heard[heard != receiver]
+        others = has_links[has_links != receiver]
         if len(others) < 2:
             return None
         index = evenly(asked[of_links[asked] == receiver], most // len(chosen))
@@ -134,11 +142,15 @@ def at_new_receivers(
 
 
 def random_effects(errors: Sequence[Tensor]) -> Float[Tensor, "2"]:
-    """Variances of errors between receivers and within one, of the errors of each receiver."""
+    """Variances of errors between receivers and within one receiver (2,).
+
+    Args:
+        errors: Errors of each receiver's links.
+    """
     squares = torch.stack([(part - part.mean()).square().sum() for part in errors])
     counts = torch.tensor([*map(len, errors)]).to(squares)
     within = squares.sum() / (counts - 1).sum().clamp_min(1)
-    # The mean error of a receiver scatters by the links that it is the mean of, too.
+    # Means of receivers scatter by within / count even where receivers do not differ.
     means = torch.stack([part.mean() for part in errors])
     between = means.square().mean() - (within / counts).mean()
     return torch.stack((between.clamp_min(0), within))

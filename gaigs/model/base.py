@@ -44,7 +44,7 @@ class Prediction(NamedTuple):
     """A model's answer to a batch.
 
     Attributes:
-        value: (b, *shape) of the task, or of the batch's directions.
+        value: Predicted labels (b, *shape), shaped as the task's or the batch's directions.
         penalties: Scalars added to the loss, by name; means over the batch's places.
     """
 
@@ -69,6 +69,8 @@ class Model(Movable):
         chunk: Largest number of pairs of a link and a direction evaluated at a time; None: whole
             labels. Training sees as many as ``training.thinning`` leaves.
         revisions: Fractions of the training after which ``revise`` is called.
+        settles: True if no revision to come lowers errors at once: a training whose errors would
+            stay above those of a law of distance may end.
         predicts_untrained: True if values before the training are worth a score.
         any_frequency, any_receiver: See ``Movable``.
         configuration: Options that a registered model was made with; ``save`` stores them.
@@ -101,6 +103,7 @@ class Model(Movable):
     penalty_weights: Mapping[str, float] = {}
     chunk: int | None = None
     revisions: tuple[float, ...] = ()
+    settles: bool = False
     predicts_untrained: bool = False
     primitives: Gaussians | None = None
     calibration: Calibration | None = None
@@ -163,8 +166,8 @@ class Model(Movable):
         values = []
         for query in batch.query.parts(max(1, self.chunk // count)):
             parts = (rays[start : start + self.chunk] for start in range(0, count, self.chunk))
-            asked = [replace(batch, query=query, directions=part, labels=None) for part in parts]
-            value = torch.cat([self(part).value for part in asked], 1)
+            chunks = [replace(batch, query=query, directions=part, labels=None) for part in parts]
+            value = torch.cat([self(part).value for part in chunks], 1)
             values.append(value.unflatten(1, batch.directions.shape))
         return torch.cat(values)
 
@@ -191,9 +194,9 @@ class Model(Movable):
         Args:
             transmitters: Positions (..., 3), world frame [m], anything that becomes a float tensor;
                 or a whole query.
-            receiver: Name or index of the receiver, or of that of each position; None: all
-                receivers. Of a model with ``any_receiver`` also a ``Receiver``, ``Pose`` or
-                position [m] that no measurement needs, see ``at_receivers``.
+            receiver: Name or index of one receiver, or one for each position; None: all receivers.
+                A model with ``any_receiver`` also takes a ``Receiver``, ``Pose`` or position [m]
+                without measurements, see ``at_receivers``.
             frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the
                 training links' only carrier.
             batch_size: Links computed at a time, of all receivers at least those of one position;
@@ -206,10 +209,10 @@ class Model(Movable):
                 None: values alone.
 
         Returns:
-            Values (..., receivers, *shape), of the axes of the positions, of all receivers in the
-            order of ``model.scene.receivers``, of a single one too, and of the task's shape. With
-            ``receiver`` (..., *shape); of a query (b, *shape). They are scaled as the training
-            labels (``model.scene.task.normalisation``), on the model's device. With an interval an
+            Values (..., receivers, *shape): axes of the positions, receivers in the order of
+            ``model.scene.receivers``, and the task's shape. With ``receiver`` they are
+            (..., *shape), for a query (b, *shape). They are scaled as the training labels
+            (``model.scene.task.normalisation``), on the model's device. With an interval an
             ``Estimate``: the value, its standard deviation, and the interval's ends. Where arrays
             have different numbers of elements, channels of all receivers are a dictionary by name;
             channels of a named receiver have the elements of its array.
@@ -260,13 +263,13 @@ class Model(Movable):
         return request.estimates(fields, scene)
 
     def to_xarray(self, transmitters: object, interval: float | None = None, **named: Any) -> Any:
-        """``predict`` with arguments by name as an ``xarray.Dataset``; without an interval it has
-        ``value`` alone. Where arrays have different numbers of elements, a dictionary by receiver.
+        """``predict`` with arguments by name as an ``xarray.Dataset``, without an interval of
+        ``value`` alone; a dictionary by receiver where numbers of elements differ.
         """
         model, receiver = self._located(named.pop("receiver", None), transmitters)
-        asked = (named.get(name) for name in ("frequency", "directions", "frequencies"))
+        options = (named.get(name) for name in ("frequency", "directions", "frequencies"))
         answer = model.predict(transmitters, receiver, interval=interval, **named)  # type: ignore
-        return model._request(transmitters, receiver, *asked).to_xarray(answer, model.scene)
+        return model._request(transmitters, receiver, *options).to_xarray(answer, model.scene)
 
     def predict_batches(
         self,
@@ -293,7 +296,7 @@ class Model(Movable):
         )
 
     def _located(self, receiver: object, transmitters: object) -> tuple[Any, object]:
-        """The model that knows a receiver, whose names and numbers stay, and its number there."""
+        """This model and the argument of ``predict``; for a new receiver a copy there, and 0."""
         new = as_new_receiver(receiver, self.scene, transmitters)
         if new is None:
             return self, receiver
@@ -327,7 +330,7 @@ class Model(Movable):
     def _estimates(
         self, request: Request, batch_size: int | None, interval: float
     ) -> Iterator[Estimate]:
-        """Estimates of the links, a batch at a time."""
+        """Estimates of the links at the wanted subcarriers, a batch at a time."""
         columns = request.subcarriers.columns
 
         def chosen(part: Tensor | None) -> Tensor | None:
@@ -367,6 +370,7 @@ class Model(Movable):
 
     @usual_modes()
     def _estimate(self, batch: Batch, interval: float) -> Estimate:
+        """Values of a batch with their intervals, by the calibration."""
         value = self._answer(batch)
         assert self.calibration is not None
         query = self.scene.by_radio(batch.query)
@@ -374,22 +378,19 @@ class Model(Movable):
 
     @torch.no_grad()
     def spread(self, batch: Batch, value: Tensor) -> Tensor:
-        """Standard deviation of the labels as the model knows it, (b,) or of each number; a
-        calibration scales it.
+        """Standard deviations (b,) or (b, *shape) of the labels, which a calibration scales.
 
-        Without ``deviations`` it is 1, of channels the root mean square of each link's value. It is
-        NaN at elements that a receiver's array lacks and outside its band, where there is no error.
+        They are ``deviations``, or ``usual_deviations`` where the model knows none. They are NaN at
+        elements that a receiver's array lacks and outside its band, where there is no error.
         """
         deviations = self.deviations(batch)
         if deviations is None:
             deviations = usual_deviations(value)
         if not lacks_numbers(self.scene):
             return deviations
-        task: Any = self.scene.task
+        task = self.scene.task
         receivers = batch.query.receivers
-        absent = lacking(
-            self.scene.receivers, receivers, task.elements, task.frequencies
-        )  # (b, e, s)
+        absent = lacking(self.scene.receivers, receivers, task.elements, task.frequencies)
         if deviations.ndim == 1:  # over all numbers, of which those that are absent are 0
             present = 1 - absent.to(deviations).mean((1, 2))  # (b,)
             deviations = (deviations / present.sqrt())[:, None, None]
@@ -406,8 +407,8 @@ class Model(Movable):
         return None
 
     def learnt_room(self, links: Links | None = None) -> Any:
-        """The room learnt from the links, a ``gaigs.planes.learnt_room.LearntRoom`` for figures;
-        without links from the state alone. None for a model that learns no room."""
+        """The learnt room for figures, a ``gaigs.planes.learnt_room.LearntRoom``; without links by
+        the state alone. None for a model that learns no room."""
         return None
 
     def learnt_paths(self, query: Query) -> list:
@@ -438,8 +439,8 @@ class Model(Movable):
     # --- what a model knows of its errors ---
 
     def deviations(self, batch: Batch) -> Tensor | None:
-        """Standard deviations of the labels (b,), root mean squares over all their numbers, or of
-        each number (b, *shape); but for a common factor. None if the model does not know them."""
+        """Standard deviations of the labels up to a common factor, (b, *shape), or their root mean
+        squares (b,) over a label's numbers. None if they are unknown."""
         return None
 
     def process_at(self, receiver: int) -> Process | None:
@@ -456,34 +457,33 @@ class Model(Movable):
         raise ValueError("the model has no paths of channels; ask has_margins first")
 
     def refit(self, links: Links) -> None:
-        """Fits to some of the links of an earlier fit, whose choices may stay: it may be faster."""
+        """Fits to links most of which an earlier fit had: its choices may stay, to be faster."""
         self.fit(links)
 
     def take_hyperparameters(self, other: "Model") -> None:
-        """Takes what its ``deviations`` depend on from a model of its kind; by default nothing."""
+        """Copies what ``deviations`` depend on from a model of this kind; by default nothing."""
 
     @property
     def fold_count(self) -> int:
-        """Most models that ``unseen`` gives."""
+        """Largest number of models that ``unseen`` yields."""
         return 1 if self.is_trained else LOOK_UP_FOLDS
 
     def unseen(self, links: Links) -> Iterator[Unseen]:
-        """Models like this one with links that they have not seen, each when it is asked for.
+        """Yields models like this one, each with links that it has not seen.
 
-        A look-up is fitted anew without each fold of the known links; so are estimated places of
-        receivers. A trained model has the validation links; the step of its training stays the one
-        chosen on all of them. Of repeated readings one calibrates, see ``single_readings``. The
-        time limit of a run leaves later folds out.
+        A look-up is fitted anew without each fold of the known links, as are estimated places of
+        receivers. A trained model comes with the validation links, which have chosen its step of
+        the training. Repeated readings count once. Folds end with the time limit of a run.
         """
         if not self.is_trained:
             for fold in held_out_folds(links):
-                yield Unseen(self._refitted(fold.rest), fold.asked, fold.rest.split.train)
+                yield Unseen(self.refitted(fold.rest), fold.asked, fold.rest.split.train)
         elif len(links.split.validation):
             asked = single_readings(links, links.split.validation)
             yield Unseen(self, asked, links.split.train)
 
-    def _refitted(self, links: Links) -> "Model":
-        """A copy that is fitted to some of the links of an earlier fit."""
+    def refitted(self, links: Links) -> "Model":
+        """A copy that ``refit`` fits to links."""
         scene = replace(self.scene, receivers=links.receivers)  # whose places may be estimated
         # Known links are large, and stay as they are.
         memo: dict[int, Any] = {id(self.links): self.links, id(self.scene): scene}

@@ -31,9 +31,8 @@ archive that ``torch.save`` writes, so the file stays an archive."""
 def seal(path: Path) -> None:
     """Appends the seal to a file of ``torch.save``, by which ``read`` detects any changed bit."""
     content = path.read_bytes()
-    sealed = (
-        content[:-2] + (len(SEAL) + 64).to_bytes(2, "little") + SEAL
-    )  # the length of the archive's comment
+    # The last two bytes of a zip archive are the length of its comment; the digest has 64 digits.
+    sealed = content[:-2] + (len(SEAL) + 64).to_bytes(2, "little") + SEAL
     path.write_bytes(sealed + hashlib.sha256(sealed).hexdigest().encode())
 
 
@@ -67,9 +66,8 @@ def read(path: str | Path) -> dict:
         # A view can be far larger than the numbers behind it; the views of a model are not.
         if sum(tensor.nbytes for _, tensor in _tensors(content, "")) > 4 * len(data) + 2**26:
             raise ValueError("larger than the file")
-    except (
-        Exception
-    ) as error:  # any error of zip readers and unpicklers; torch's own message advises to run code
+    except Exception as error:
+        # Any error of zip readers and unpicklers; torch's own message advises to run code.
         if lacks_memory(error):
             raise
         raise ValueError(
@@ -121,10 +119,11 @@ def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Modul
         _check_finite("scene", scene)
         with only_recorded(None if trust else {**recorded, **content[KEY].get("plugins", {})}):
             model = registry("model").build(content[KEY]["model"], scene=Scene.from_state(scene))
+        # Buffers that a new model does not set, such as gains before a fit, may be NaN in the file.
         fresh = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         unset = {name for name, value in fresh.items() if not value.isfinite().all()}
         model.load_state_dict(weights)
-        # The names are the model's: a checkpoint of before may have others.
+        # By the model's names: an older checkpoint may have others.
         state = model.state_dict()
         _check_finite("weights", {name: state[name] for name in state if name not in unset})
         model.calibrate(content[KEY].get("calibration"))
@@ -146,7 +145,10 @@ def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Modul
 
 
 def trained_weights(content: dict) -> dict:
-    """The weights of the training module in a checkpoint, before and after ``update``."""
+    """Weights of the trained model in a checkpoint, by their names in the training module.
+
+    ``update`` may have stored them within a model that wraps the trained one.
+    """
     weights = content["state_dict"]
     if "trained" not in content[KEY]:
         return weights
@@ -159,7 +161,7 @@ def trained_weights(content: dict) -> dict:
 
 
 def described(model: nn.Module) -> dict:
-    """A model's configuration, calibration and keys of the places that it knows, as it has them."""
+    """Entries of a checkpoint on a model: configuration, calibration, keys of known places."""
     calibration = None if model.calibration is None else model.calibration.state()
     return {
         "model": configuration_of(model),
@@ -188,7 +190,11 @@ def update(path: Path, model: nn.Module, trained: str | None = None) -> None:
 
 
 def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
-    """All tensors in nested mappings and lists, with their places; endless ones are refused."""
+    """Yields all tensors in nested mappings and lists, each with its path of keys.
+
+    Raises:
+        ValueError: Nesting is too deep or endless.
+    """
     parts = [(name, value, 0)]
     for count in itertools.count():
         if not parts:
@@ -204,6 +210,7 @@ def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
 
 
 def _check_finite(name: str, value: object) -> None:
+    """Raises a ``ValueError`` unless all numbers in nested values are finite."""
     for place, tensor in _tensors(value, name):
         if not tensor.isfinite().all():
             raise ValueError(f"{place} is not finite")

@@ -1,27 +1,38 @@
-"""Ensembles: models that differ by their seed alone, and so show how certain they are."""
+"""Means of several models: of seeds, which show how certain they are, and of different models."""
 
-from collections.abc import Callable
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from gaigs.calibration.held_out import Unseen
+from gaigs.core.antenna import Receiver
 from gaigs.core.query import Batch, evenly
 from gaigs.core.scene import Scene
 from gaigs.data import Links
+from gaigs.kriging.kernel import Process
 from gaigs.model import Model, Prediction, Wrapper
 from gaigs.registry import register, registry
 
 
 @register("model", "ensemble")
 class Ensemble(Wrapper):
-    """The mean of trained models; a run trains them by ``ensemble=5``.
+    """The mean of models; a run makes it by ``ensemble=5`` or by ``model=auto``.
 
     Args:
-        members: Trained models, or their configurations if a state is to be loaded.
+        members: Trained and fitted models, or their configurations if a state is to be loaded.
+        weights: Shares of different models, which sum to 1; None: equal ones of trained models that
+            differ by their seed alone.
 
     Attributes:
         typical: Mean square difference of the members, over all links.
+
+    Raises:
+        ValueError: The weights are no shares of the members.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=50)
@@ -36,55 +47,137 @@ class Ensemble(Wrapper):
 
     typical: Tensor
 
-    def __init__(self, scene: Scene, members: list):
+    def __init__(self, scene: Scene, members: list, weights: list | None = None):
         super().__init__(scene)
         built = [
             one if isinstance(one, Model) else registry("model").build(one, scene=scene)
             for one in members
         ]
         self.members = nn.ModuleList(built)
-        self.chunk, self.any_frequency = built[0].chunk, built[0].any_frequency
+        self.is_blend = weights is not None
+        self.weights = [1 / len(built)] * len(built) if weights is None else weights
+        is_share = len(self.weights) == len(built) and min(self.weights) >= 0
+        if not is_share or abs(sum(self.weights) - 1) > 1e-6:
+            raise ValueError(f"weights must be {len(built)} shares that sum to 1, got {weights}")
+        self.chunk = min((one.chunk for one in built if one.chunk is not None), default=None)
         self.register_buffer("typical", torch.tensor(0.0))
 
     @property
     def any_receiver(self) -> bool:  # type: ignore[override]
-        return self.underlying.any_receiver
+        return all(member.any_receiver for member in self._members)
+
+    @property
+    def any_frequency(self) -> bool:  # type: ignore[override]
+        return all(member.any_frequency for member in self._members)
 
     @property
     def underlying(self) -> Model:
-        """The first member, whose room and Gaussians stand for all."""
-        return self.members[0]  # type: ignore[return-value]
+        """The first trained member, whose room and Gaussians stand for all."""
+        return next((member for member in self._members if member.is_trained), self._members[0])
+
+    @property
+    def _members(self) -> list[Model]:
+        return [*self.members]  # type: ignore[list-item]
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
-        """Renders by all members, one after the other."""
-        parts = [member.rendering(batch) for member in self.members]  # type: ignore[operator]
-        return None if None in parts else lambda: [part() for part in parts]
+        """Renders by all members that do, one after the other."""
+        asked = (member.rendering(batch) for member in self._members)
+        parts = [part for part in asked if part is not None]
+        return (lambda: [part() for part in parts]) if parts else None
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
         """Takes the mean square difference of the members at training links."""
         index = evenly(links.split.train, 256)
-        device = self.typical.device
-        parts = [self._squares(links.batch(part).to(device)) for part in index.split(32)]
+        parts = [self._squares(links.batch(part).to(self.device)) for part in index.split(32)]
         self.typical = torch.cat(parts).mean()
 
     def forward(self, batch: Batch) -> Prediction:
-        return Prediction(self._each(batch).mean(0), {})
+        values = self._each(batch)  # (members, b, *shape)
+        return Prediction(torch.tensordot(values.new_tensor(self.weights), values, 1), {})
 
-    def deviations(self, batch: Batch) -> Tensor:
+    def deviations(self, batch: Batch) -> Tensor | None:
         """Root mean square difference of the members, over the numbers of a label.
 
         A few members differ by chance: so the typical square counts as much as four of them.
+        Different models state deviations of their own: the weighted root mean square of these.
         """
-        count = len(self.members) - 1
-        return ((count * self._squares(batch) + 4 * self.typical) / (count + 4)).sqrt()
+        if not self.is_blend:
+            count = len(self._members) - 1
+            return ((count * self._squares(batch) + 4 * self.typical) / (count + 4)).sqrt()
+        total: Any = 0.0
+        weights = 0.0
+        for weight, member in zip(self.weights, self._members, strict=True):
+            stated = member.deviations(batch.to(member.device))
+            if stated is not None:
+                # (b,) and (b, *shape) add up with the links behind.
+                squares = stated.square().to(batch.query.transmitters.device).movedim(0, -1)
+                total = total + weight * squares
+                weights += weight
+        return (total / weights).sqrt().movedim(-1, 0) if weights else None
+
+    def process_at(self, receiver: int) -> Process | None:
+        """The process of the first member that has one."""
+        processes = (member.process_at(receiver) for member in self._members)
+        return next((process for process in processes if process is not None), None)
+
+    def facts(self) -> dict[str, Any]:
+        return self.underlying.facts()
+
+    def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
+        return self._of([member.at_frequencies(frequencies) for member in self._members])
+
+    def at_receivers(
+        self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
+    ) -> Model:
+        moved = self._of([member.at_receivers(receivers, known) for member in self._members])
+        moved.take_calibration(self)
+        return moved
+
+    def unseen(self, links: Links) -> Iterator[Unseen]:
+        """Models like this one with links that no member has seen.
+
+        With a trained member these are validation links; look-ups are fitted without them.
+        """
+        if not self.is_blend or not self.is_trained:
+            yield from super().unseen(links)
+            return
+        training = replace(links, split=links.split.validating())
+        of_members = []
+        for member in self._members:
+            if member.is_trained:
+                of_members.append([*member.unseen(links)])
+            else:
+                refitted = member._refitted(training)
+                of_members.append([Unseen(refitted, links.split.validation, links.split.train)])
+        for parts in itertools.product(*of_members):
+            asked = parts[0].asked
+            for part in parts[1:]:
+                asked = asked[torch.isin(asked, part.asked)]
+            if len(asked):
+                yield Unseen(self._of([part.model for part in parts]), asked, links.split.train)
+
+    def take_hyperparameters(self, other: Model) -> None:
+        assert isinstance(other, Ensemble)
+        for mine, theirs in zip(self._members, other._members, strict=True):
+            mine.take_hyperparameters(theirs)
+
+    def _refitted(self, links: Links) -> Model:
+        return self._of([member._refitted(links) for member in self._members])
+
+    def _of(self, members: list) -> "Ensemble":
+        """The same mean of other members."""
+        other = Ensemble(members[0].scene, members, self.weights if self.is_blend else None)
+        other.typical = self.typical
+        return other.train(self.training)
 
     def _squares(self, batch: Batch) -> Tensor:
         """Variances of the members' labels, means over a label's numbers (b,)."""
         batch = replace(batch, directions=self.scene.task.directions)  # whichever are asked
-        batch = batch.to(self.typical.device)
-        return self._each(batch)[..., None].flatten(2).var(0).mean(1)
+        return self._each(batch.to(self.device))[..., None].flatten(2).var(0).mean(1)
 
     def _each(self, batch: Batch) -> Tensor:
-        """Values of all members (members, b, *shape)."""
-        return torch.stack([member(batch).value for member in self.members])
+        """Values of all members (members, b, *shape); look-ups answer on the processor."""
+        device = batch.query.transmitters.device
+        values = [member(batch.to(member.device)).value.to(device) for member in self._members]
+        return torch.stack(values)

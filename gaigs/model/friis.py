@@ -1,7 +1,5 @@
 """Free space: the direct wave alone."""
 
-from typing import Any
-
 import torch
 from jaxtyping import Complex, Float
 from torch import Tensor
@@ -20,11 +18,10 @@ from gaigs.registry import register
 class Friis(Model):
     """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element, one complex g a receiver.
 
-    a is the elements' pattern towards the transmitter. The gain, ``fit_gain`` of the known links,
-    contains transmit power, cables and the clock's phase. The sign of the phase is estimated from
-    the known links, as both time conventions are in use. If phases are declared known but show no
-    sign, the gain is 0. With fewer than ``TELLING`` links a receiver the sign is -1. NaN before
-    ``fit``.
+    a is the elements' pattern towards the transmitter. The gain g, ``fit_gain`` of the known links,
+    contains transmit power, cables and the clock's phase; it is NaN before ``fit``. The sign of the
+    phase is estimated from the known links, as both time conventions are in use. With fewer than
+    ``TELLING`` links a receiver it is -1. If enough links show no sign, gains are 0.
 
     Raises:
         ValueError: The labels are not channels, or their number of elements is not the array's.
@@ -46,8 +43,7 @@ class Friis(Model):
     @property
     def frequencies(self) -> Float[Tensor, " s"]:
         """The subcarriers [Hz]; ``Model.at_frequencies`` exchanges the scene."""
-        task: Any = self.scene.task
-        return task.frequencies
+        return self.scene.task.frequencies
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:

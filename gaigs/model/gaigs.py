@@ -28,7 +28,7 @@ from gaigs.splatting.rasterizer import Rasterizer
 
 
 class Excited(NamedTuple):
-    """The Gaussians as places excite them."""
+    """The Gaussians as each of some places excites them."""
 
     placed: Placed  # Gaussians before the deformation
     residuals: Residuals  # changes by the deformation
@@ -57,7 +57,7 @@ class GaussianSplatting(Model):
             pooling takes paths.
         gaussians: Options of ``gaigs.splatting.gaussians.Gaussians`` [m]; None if the placement
             alone brings Gaussians.
-        trend: Model whose value the pooled map is added to, likewise; None for none.
+        trend: Model to whose value the pooled map is added, given like a component; None: 0.
 
     Raises:
         ValueError: The pooling does not give the task's labels; the projection does not see all of
@@ -124,6 +124,7 @@ class GaussianSplatting(Model):
         self.deformation = registry("deformation").build(deformation, **context)
 
     def _built_trend(self, trend: str | Mapping | Model) -> Model:
+        """The trend, which must have no parameters and keep no links; adds the buffer ``level``."""
         built = build_trend(trend, self.scene)
         keeps_links = isinstance(built, LookUp) or not built.state_dict()
         if keeps_links or [*built.parameters()]:
@@ -191,6 +192,7 @@ class GaussianSplatting(Model):
             )
 
     def _built_gaussians(self, options: Mapping | None, zone: Any) -> Gaussians | None:
+        """Free Gaussians within elevations ``zone`` [rad]; None if the placement brings all."""
         name = name_of(self.placement)
         if options is None:
             if not self.placement.has_own:
@@ -229,7 +231,10 @@ class GaussianSplatting(Model):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits placement, pooling and trend; takes the map's level off, to start from the trend."""
+        """Fits placement, pooling and trend.
+
+        ``level`` becomes the mean of the untrained map, so that the training starts at the trend.
+        """
         self.placement.fit(links)
         self.pooling.fit(links)
         if self.trend is None:
@@ -241,8 +246,7 @@ class GaussianSplatting(Model):
         if self.scene.task.dtype.is_complex:
             return  # waves have no level: their phases differ from link to link
         count = len(links.split.train)
-        # Evenly spread, though not at whole steps, which might meet the same receiver time and
-        # again.
+        # Evenly spread, but not in equal steps, which might meet one receiver alone.
         rows = torch.linspace(0, count - 1, min(64, count)).long()
         query = links.query[links.split.train[rows]]
         batch = Batch(query, links.task.directions).to(self.level.device)
@@ -268,34 +272,33 @@ class GaussianSplatting(Model):
         return self.respond(self.excite(places), which, batch)
 
     def respond(self, excited: Excited, which: Int[Tensor, " b"], batch: Batch) -> Prediction:
-        """Values of a batch whose rows excite the Gaussians as rows ``which`` of ``excited``."""
+        """Values of a batch, whose rows have the excited Gaussians of places ``which``."""
         query = batch.query
         links, values = [], []
         together = self.takes_paths and self.pooling.is_same_for_all
         group = torch.zeros_like(query.receivers) if together else query.receivers
-        for receiver in group.unique().tolist() or [0]:  # no links have a label's shape too
+        for receiver in group.unique().tolist() or [0]:  # an empty batch needs the label's shape
             index = (group == receiver).nonzero()[:, 0]
-            asked, rows = query[index], which[index]
+            part = query[index]
+            rows = which[index]
             if self.takes_paths:
-                received = self.paths(excited, rows, receiver, asked)
+                received = self.paths(excited, rows, receiver, part)
             else:
                 calls = self._splats(excited, rows, receiver, batch.directions)
                 received = torch.cat([self.rasterizer(*arguments)[0] for arguments in calls])
-            value = self.pooling(received, asked, batch.directions)
+            value = self.pooling(received, part, batch.directions)
             if not self.takes_paths and self.pooling.grid is None and batch.directions is not None:
                 # A list of rays was rendered as one row.
-                value = value.reshape(len(asked), *batch.directions.shape)
+                value = value.reshape(len(part), *batch.directions.shape)
             links.append(index)
             values.append(value)
-        value = self.on_trend(torch.cat(values)[torch.cat(links).argsort()], batch)
+        value = torch.cat(values)[torch.cat(links).argsort()]
+        if self.trend is not None:
+            value = self.trend(batch).value + value - self.level
         penalties = {}
         if excited.residuals.delta_opacities is not None:
             penalties["opacity"] = excited.residuals.delta_opacities.square().mean()
         return Prediction(value, penalties | self.placement.penalties())
-
-    def on_trend(self, value: Tensor, batch: Batch) -> Tensor:
-        """The pooled value on top of the trend."""
-        return value if self.trend is None else self.trend(batch).value + value - self.level
 
     @property
     def any_frequency(self) -> bool:  # type: ignore[override]
@@ -305,13 +308,14 @@ class GaussianSplatting(Model):
 
     @property
     def any_receiver(self) -> bool:  # type: ignore[override]
-        """True if parts that depend on receivers name what belongs to each."""
+        """True if all parts that depend on receivers have ``take_receivers``."""
         parts = self.placement, self.tokenizer, self.deformation
         seeing = [part for part in parts if getattr(part, "sees_receivers", False)]
         knows_all = all(hasattr(part, "take_receivers") for part in seeing)
         return knows_all and (self.trend is None or self.trend.any_receiver)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
+        """A group for each parameter of the Gaussians, the placement's, and all networks."""
         groups = {}
         if self.gaussians is not None:
             groups = {name: [parameter] for name, parameter in self.gaussians.named_parameters()}
@@ -372,7 +376,7 @@ class GaussianSplatting(Model):
     def paths(
         self, excited: Excited, which: Int[Tensor, " b"], receiver: int, query: Query
     ) -> ReceivedPaths:
-        """The paths of some queries, each with its place ``which``, to one receiver."""
+        """The paths of links to one receiver; ``which`` is the row of ``excited`` for each link."""
         placed = excited.placed
         means, axes = placed.means, excited.semi_axes
         means = means if len(means) == 1 else means[which]  # (1 or b, n, 3)
@@ -392,7 +396,10 @@ class GaussianSplatting(Model):
         )
 
     def carriers(self, query: Query) -> Float[Tensor, " b"]:
-        """The links' frequencies [Hz]; None for single antennas, whose power is the same at any."""
+        """The links' carriers [Hz]; 1 if they are unknown and all antennas are single elements.
+
+        The power at a single element does not depend on the frequency.
+        """
         is_known = (
             query.frequencies is not None
             or len(self.scene.frequencies)
@@ -409,8 +416,9 @@ class GaussianSplatting(Model):
         receiver: int,
         directions: Directions | None,
     ) -> list[tuple]:
-        """The rasterizer's arguments: Gaussians on the receiver's plane, for all queries at once
-        unless they move.
+        """Arguments of each call of the rasterizer, for links to one receiver.
+
+        One call draws all links if the Gaussians stand still, else one link.
         """
         placed, axes = excited.placed, excited.semi_axes
         if self.pooling.grid is not None or directions is None:
@@ -430,7 +438,7 @@ class GaussianSplatting(Model):
         return calls
 
     def _strengths(self, excited: Excited, which: Int[Tensor, " b"]) -> Strengths:
-        """Strengths of the Gaussians for some queries."""
+        """Strengths of the Gaussians for each row ``which`` of the places."""
         placed, residuals = excited.placed, excited.residuals
         signal, opacities = placed.signal, placed.opacities
         if signal.ndim == 4:  # another for each query
@@ -466,7 +474,10 @@ class GaussianSplatting(Model):
 def _towards(
     bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]
 ) -> Float[Tensor, "*b n c 1"]:
-    """Signal of Gaussians towards transmitters at offsets [m], over the constant harmonic."""
+    """Signal of Gaussians towards transmitters, over the value of the constant harmonic.
+
+    ``offsets`` lead from the Gaussians to the transmitters [m].
+    """
     if bands.shape[-1] == 1:
         return bands
     # On a centre there is no direction. Nearer than 0.05 m the harmonics fade: gradients stay

@@ -31,7 +31,7 @@ from gaigs.registry import name_of, register
 
 
 class Solved(NamedTuple):
-    """What predictions of one receiver are made from; neither in local kriging."""
+    """What predictions of one receiver are made from; both are None in local kriging."""
 
     solution: Tensor | None  # residuals over the covariances of their links (k, m)
     factor: Tensor | None  # Cholesky factor of the covariances (k, k)
@@ -50,11 +50,11 @@ class GaussianProcess(LookUp):
     ``gaigs.kriging.fit``. All receivers share the three. The signal's variance is each receiver's
     most likely one.
 
-    Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` instead: kernel, noise and
-    trend are those with which folds of the known links are most likely, and each receiver has
+    Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` instead: folds of the
+    known links choose kernel, noise and trend by the likelihood, and each receiver has
     hyperparameters of its own. Many readings are solved in parts, see ``gaigs.kriging.tiles``.
 
-    Of other labels a receiver with more than ``LIMIT`` known links is predicted from the 300
+    For other labels, a receiver with more than ``LIMIT`` known links is predicted from the 300
     nearest to each query (local kriging): with this kernel near links screen those behind them.
     Residuals of channels are limited, see ``gaigs.kriging.fit.damping``.
 
@@ -77,7 +77,7 @@ class GaussianProcess(LookUp):
     def __init__(self, scene: Scene, trend: dict | None = None):
         super().__init__(scene)
         given = [{"name": name} for name in scene.task.trends] if trend is None else [trend]
-        self.trends = tuple(build_trend(one, scene) for one in given)
+        self.trends = tuple(build_trend(entry, scene) for entry in given)
         if any(built.is_trained for built in self.trends):
             raise ValueError(
                 f"model.trend cannot be trained, got {given[0]['name']}; "
@@ -91,7 +91,7 @@ class GaussianProcess(LookUp):
         self.signals: list[float] = []  # deviation of each receiver's process
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        for key in [*state_dict]:  # the process was in a list in checkpoints of before
+        for key in [*state_dict]:  # older checkpoints have the process in a list
             if key.startswith(f"{prefix}scalar.0."):
                 state_dict[key.replace("scalar.0.", "scalar.", 1)] = state_dict.pop(key)
         super()._load_from_state_dict(state_dict, prefix, *args)
@@ -128,6 +128,7 @@ class GaussianProcess(LookUp):
 
     @torch.no_grad()
     def _fit(self, links: Links, chooses: bool) -> None:
+        """``fit``, or ``refit`` if ``chooses`` is False."""
         if self.scalar is not None:
             links = without_gross_errors(links)
         self.links, self.known = links, known_links(links, self.any_receiver)
@@ -143,7 +144,10 @@ class GaussianProcess(LookUp):
 
     @torch.no_grad()
     def _solve_known(self, chooses: bool) -> None:
-        """Factorises the covariances of the known links, and takes their residuals over them."""
+        """Solves for predictions from the known links, receiver by receiver.
+
+        With ``chooses`` the hyperparameters are fitted first.
+        """
         links, self.factors = self.links, None
         if self.scene.task.dtype.is_complex:
             index = torch.cat(self.known)
@@ -171,6 +175,7 @@ class GaussianProcess(LookUp):
             self.signals.append(white.abs().square().mean().sqrt().item())
 
     def _fit_scalar(self, process: ScalarProcess, links: Links, chooses: bool) -> None:
+        """Fits the process of labels of one number; with ``chooses`` its kernel and trend too."""
         index = torch.cat(known_links(links, any_receiver=True))
         query = links.query[index]
         known = coordinates(self.scene, query, 1.0), self.scene.radio_of(query.receivers)
@@ -213,11 +218,13 @@ class GaussianProcess(LookUp):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """The last trend alone, of levels a law of distance: residuals at one receiver do not
-        correlate with those at others. A process over both ends stays.
+        """The last trend alone, for levels a law of distance.
+
+        Residuals at one receiver do not correlate with those at others. The process stays where the
+        receivers are places of one radio.
         """
         if self.scene.one_radio or not self.any_receiver:
-            moved = super().at_receivers(receivers)  # has the error
+            moved = super().at_receivers(receivers)  # raises without ``any_receiver``
             moved.trends = tuple(trend.at_receivers(receivers) for trend in self.trends)
             return moved
         trend = self.trends[-1].at_receivers(receivers, known)
@@ -225,7 +232,10 @@ class GaussianProcess(LookUp):
         return trend
 
     def facts(self) -> dict[str, object]:
-        """``length_m``, ``nugget``, ``frequency_scale_m`` of a band; of scalars other choices."""
+        """``length_m``, ``nugget`` and, with several carriers, ``frequency_scale_m``.
+
+        For labels of one number the facts of ``ScalarProcess`` and the trend.
+        """
         if self.scalar is not None:
             return {**self.scalar.facts(), "trend": name_of(self.trend)} | self.trend.facts()
         return {**self.process.facts()}
@@ -272,6 +282,7 @@ class GaussianProcess(LookUp):
         return self.process.at(places, self.signals[receiver] ** 2)
 
     def _places(self, query: Query) -> Tensor:
+        """Coordinates of the links in place and frequency [m]."""
         return coordinates(self.scene, query, self.process.scale)
 
     def _factor(self, index: Int[Tensor, " k"]) -> Tensor | None:
@@ -283,7 +294,7 @@ class GaussianProcess(LookUp):
         )
 
     def _solve(self, index: Int[Tensor, " k"], factor: Tensor | None) -> Solved:
-        """What predictions of a receiver are made from, the smaller of both."""
+        """Solution or factor of a receiver, whichever has fewer numbers."""
         if factor is None or math.prod(self.scene.task.shape) >= len(index):
             return Solved(None, factor)
         residuals = torch.cat([*self._residuals(index)]).reshape(len(index), -1)
@@ -291,7 +302,10 @@ class GaussianProcess(LookUp):
         return Solved(torch.cholesky_solve(residuals.to(wide), factor.to(wide)), None)
 
     def _residuals(self, index: Int[Tensor, " k"]) -> Iterator[Tensor]:
-        """Labels of links, aligned to their trend, less this trend; ``PART`` links at a time."""
+        """Yields labels, aligned to their trend, less this trend, for ``PART`` links at a time.
+
+        Channels are damped by ``factors``.
+        """
         for part in index.split(PART):
             trend = self.trend(Batch(self.links.query[part], self.scene.task.directions)).value
             residuals = self.scene.task.align(self.links.labels[part], trend) - trend
@@ -300,10 +314,16 @@ class GaussianProcess(LookUp):
             yield residuals
 
     def _kriged(self, query: Query, receiver: int) -> Tensor:
-        """Residuals (b, *shape) that the process predicts."""
-        index, task = self.known[receiver], self.scene.task
+        """Residuals (b, *shape) that the process predicts for links to one receiver.
+
+        They are k K^-1 r, with the kernel k, and covariances K and residuals r of the known links.
+        K^-1 r is stored unless it has more numbers than K.
+        """
+        index = self.known[receiver]
+        task = self.scene.task
         solution, factor = self.solved[receiver]
-        asked, known = self._places(query), self._places(self.links.query[index])
+        asked = self._places(query)
+        known = self._places(self.links.query[index])
         length, nugget, _ = self.process
         if solution is not None:
             values = kernel(asked, known, length).to(solution) @ solution
@@ -313,6 +333,7 @@ class GaussianProcess(LookUp):
         else:
             near = distances(asked, known).topk(self.neighbours, largest=False).indices
             local, _ = kriging_weights(asked, known[near], length, nugget)  # (b, neighbours)
+            # A column for each known link that is near any query.
             used, column = near.unique(return_inverse=True)
             weights = local.new_zeros(len(query), len(used)).scatter(1, column, local)
             index = index[used]

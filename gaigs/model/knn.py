@@ -31,10 +31,10 @@ COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50)
 class HeldOutLinks(NamedTuple):
     """Held-out links of one receiver."""
 
-    rows: Int[Tensor, " h"]  # their rows among the known links
-    # Distances of the known links [m], infinite for those that are held out, too.
+    rows: Int[Tensor, " h"]  # their rows among the receiver's known links
+    # Distances to the known links [m]; infinite to links that are held out with them.
     apart: Float[Tensor, "h k"]
-    index: Int[Tensor, " k"]  # the known links
+    index: Int[Tensor, " k"]  # the receiver's known links
 
 
 @register("model", "knn")
@@ -45,16 +45,21 @@ class KNearestNeighbours(LookUp):
     unknown phase are aligned to the nearest. The look-up keeps all links, one byte a pixel for
     images.
 
-    Where the training links have several carriers, the distance is that in place and frequency, d²
-    = |dx|² + (s d ln f)². ``fit`` takes the scale s [m] with the least squared error of known links
-    that are predicted from those at other places.
+    Where the training links have several carriers, distances are in place and frequency, d² =
+    |dx|² + (s d ln f)². ``fit`` chooses the scale s [m] that predicts known links from those at
+    other places with the least squared error.
 
     Args:
-        k: Number of neighbours; with fewer known links, all of them. None: 3, or of noisy labels
-            that of ``COUNTS`` with the least error of known links that are predicted from those of
-            other folds, see ``gaigs.kriging.links.folds_of``.
-        power: Exponent of the distance; 0 weights all neighbours equally. None: 2, or 1 of noisy
+        k: Number of neighbours; with fewer known links, all of them. None: 3; for noisy labels the
+            one of ``COUNTS`` that predicts known links best from those of other folds, see
+            ``gaigs.kriging.links.folds_of``.
+        power: Exponent of the distance; 0 weights all neighbours equally. None: 2, or 1 for noisy
             labels.
+
+    Attributes:
+        chosen: Number of neighbours in use.
+        scale: s [m]; NaN with one carrier.
+        home: Scene of the known links; ``scene`` differs in a copy at other receivers.
 
     Source: reference look-up of the data sets' own README; Shepard, 1968.
     """
@@ -81,7 +86,7 @@ class KNearestNeighbours(LookUp):
         return self.scene.one_radio
 
     def fit(self, links: Links) -> None:
-        """Keeps the links; chooses the scale of frequencies, and ``neighbours`` if it is None."""
+        """Keeps the links; chooses the scale of frequencies, and the number of neighbours."""
         self.links, self.known = links, known_links(links)
         self.scale = math.nan
         self.chosen = self.k or 3
@@ -125,6 +130,7 @@ class KNearestNeighbours(LookUp):
     def _distances(
         self, query: Query, index: Int[Tensor, " k"], scale: float
     ) -> Float[Tensor, "b k"]:
+        """Distances from the places of links to those of known links [m]."""
         asked = coordinates(self.scene, query, scale)
         known = coordinates(self.home, self.links.query[index], scale)
         return distances(asked, known)
@@ -132,22 +138,27 @@ class KNearestNeighbours(LookUp):
     def _levels(
         self, query: Query, index: Int[Tensor, " k"], count: int, size: int = 2**20
     ) -> Float[Tensor, " b"]:
-        """Labels of one number from the ``count`` nearest known links, and all that are as near as
-        the last that counts; at most ``size`` distances of these at a time.
+        """Predictions of labels of one number, for a receiver with known links ``index``.
+
+        The ``count`` nearest of these are searched; four times as many, at most ``size`` distances
+        at a time, for links at which the last one ties with the last neighbour in use.
         """
         asked = coordinates(self.scene, query, self.scale)
         known = coordinates(self.home, self.links.query[index], self.scale)
         near = nearest_places(asked, known, count)
         labels = self._mean(near, index)
         if count < len(index):
-            # Links at one place.
+            # More links may be as near, such as several at one place.
             is_tied = near.apart[:, -1] <= near.apart[:, self.chosen - 1]
             for rows in is_tied.nonzero()[:, 0].split(max(1, size // (4 * count))):
                 labels[rows] = self._levels(query[rows], index, 4 * count, size)
         return labels
 
     def _weights(self, apart: Float[Tensor, "b j"]) -> Float[Tensor, "b j"]:
-        """Weights of known links by their distances; of links at an infinite distance 0."""
+        """Weights of known links by their distances, with a sum of 1.
+
+        They are 0 beyond the last neighbour, and at an infinite distance.
+        """
         farthest = apart.topk(min(self.chosen, apart.shape[1]), largest=False).values[:, -1:]
         near = (apart <= farthest) & apart.isfinite()
         # A transmitter within a micrometre of a measured one gets that label.
@@ -156,12 +167,12 @@ class KNearestNeighbours(LookUp):
         return weights / weights.sum(1, keepdim=True)
 
     def _mean(self, near: Near, index: Int[Tensor, " k"]) -> Float[Tensor, " b"]:
-        """Labels of one number from the labels of the nearest known links."""
+        """Weighted means of the labels of the nearest known links, for labels of one number."""
         labels = self.links.labels[index]
         return (self._weights(near.apart).to(labels) * labels[near.rows]).sum(1)
 
     def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, " k"]) -> Tensor:
-        """Labels from the labels of known links and their distances."""
+        """Weighted means of the labels of known links, by their distances, for other labels."""
         weights = self._weights(apart)
         used = weights.any(0)
         labels, align = self.links.labels[index[used]], self.scene.task.align
@@ -173,7 +184,11 @@ class KNearestNeighbours(LookUp):
         return torch.stack(rows)
 
     def _held_out(self, folds: Sequence[Int[Tensor, " _"]] | None = None) -> Iterator[HeldOutLinks]:
-        """Some known links of each receiver, held out with their fold, or for None their place."""
+        """Holds out at most about 256 known links of all receivers together, in groups of 32.
+
+        All known links at the place of a held-out link are held out with it; with ``folds``, which
+        give the fold of each receiver's known links, all links of its fold.
+        """
         for receiver, index in enumerate(self.known):
             for rows in evenly(torch.arange(len(index)), max(1, 256 // len(self.known))).split(32):
                 asked, known = self.links.query[index[rows]], self.links.query[index]
@@ -186,7 +201,7 @@ class KNearestNeighbours(LookUp):
                     yield HeldOutLinks(rows[has_others], apart[has_others], index)
 
     def _predicted(self, held: HeldOutLinks) -> tuple[Tensor, Tensor]:
-        """Labels of held-out links, and what the others predict."""
+        """Labels of held-out links, aligned to the predictions, and their predictions."""
         if self.scene.task.shape:
             values = self._look_up(held.apart, held.index)
         else:
@@ -197,6 +212,7 @@ class KNearestNeighbours(LookUp):
         return self.scene.task.align(labels, values), values
 
     def _squared_error(self, scale: float) -> float:
+        """Mean squared error of held-out links with a scale of frequencies [m]."""
         self.scale = scale
         errors = []
         for held in self._held_out():
@@ -205,7 +221,7 @@ class KNearestNeighbours(LookUp):
         return torch.cat(errors).mean().item() if errors else 0.0
 
     def _rank(self, count: int, held: Sequence[HeldOutLinks]) -> float:
-        """Mean score of known links by some neighbours, an error or a negative similarity."""
+        """Mean error, or negative similarity, of held-out links with ``count`` neighbours."""
         self.chosen = count
         task = self.scene.task
         pairs = map(self._predicted, held)

@@ -15,7 +15,7 @@ from torch import Tensor
 from gaigs.calibration.held_out import Unseen, validation_halves
 from gaigs.core import stages
 from gaigs.core.antenna import Receiver
-from gaigs.core.query import Batch, Query, evenly, thin_labels
+from gaigs.core.query import Batch, Query, drawn, evenly, thin_labels
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.data import Links
@@ -38,30 +38,29 @@ log = logging.getLogger(__name__)
 class Kriging(Wrapper):
     """weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend.
 
-    The trend is a trained model. The fallback is a model that is fitted at once. z is the mean of a
+    The trend is a trained model. The fallback is a simple model, fitted at once. z is the mean of a
     Gaussian process over places, as in ``gaigs.model.gaussian_process``, and 0 far from all known
-    links. With a trend weight of 0 and a weight of 1 this is that process, but for the
-    hyperparameters of labels of one real number.
+    links. With a trend weight of 0 and a weight of 1 this is ``gaussian_process`` with the
+    fallback as its trend; only hyperparameters of labels of one real number differ.
 
     Trend weight, length and nugget maximise the likelihood of the validation links given the
     training links around them. The weight is the one with which the validation links, predicted
     from the training links, score best: the likelihood alone would trust kriging too far where
     cubes of space are held out.
 
-    z is one of three posteriors: ``ScalarPosterior`` of labels of one real number, with
-    hyperparameters of each receiver; ``FieldPosterior`` of other labels; and ``PathPosterior`` of a
-    trend whose paths have ``margins``: strengths are kriged path by path. The first and the last
-    have a weight of 1, or 0. Where the validation links say that kriged labels are better than
-    kriged paths by more than chance, as of places closer than half a wavelength, labels are kriged.
+    z comes from one of three posteriors. ``ScalarPosterior`` is for labels of one real number, with
+    hyperparameters of each receiver. ``FieldPosterior`` is for other labels. ``PathPosterior`` is
+    for a trend whose paths have ``margins``: strengths are kriged path by path. The first and the
+    last have a weight of 1, or 0. Where validation links are surely better by kriged labels than by
+    kriged paths, such as at places closer than half a wavelength, labels are kriged.
 
     A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal
-    components. Of a receiver with more than ``LIMIT`` known links an even part is used, except of
-    labels of one number.
+    components. If a receiver has more than ``LIMIT`` known links, an even part of them is used;
+    labels of one number use all.
 
     Args:
         trend: The trained model, or its configuration if a state is to be loaded.
-        fallback: Configuration of the model that takes the rest of the trend weight; None: each
-            receiver's mean label.
+        fallback: Configuration of the fallback; None: ``mean``.
 
     Raises:
         ValueError: The trend has no training, or the fallback is trained or needs its data.
@@ -74,6 +73,7 @@ class Kriging(Wrapper):
     weight: Tensor
     weights = (1.0, 0.75, 0.5, 0.25, 0.0)
     """Candidates of ``trend_weight`` and ``weight``; of equally good ones the first is taken."""
+    laws: tuple[Model, Tensor] | None = None  # of ``law_scores``, and its training links
     chosen_by: Tensor | None = None
     """Links that chose the hyperparameters of a model of the training links alone; None: all."""
 
@@ -97,6 +97,7 @@ class Kriging(Wrapper):
         self._make_posterior(self.trend.has_margins)
 
     def _make_posterior(self, by_paths: bool) -> None:
+        """Sets a new posterior: of the trend's paths, or of the task's labels."""
         posterior: Posterior
         if self.scene.task.is_scalar:
             posterior = ScalarPosterior(self.scene)
@@ -108,7 +109,7 @@ class Kriging(Wrapper):
         self.posterior: Any = posterior.to(self.weight.device)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        # Parts of the posterior were parts of the model in checkpoints of before.
+        # In older checkpoints parts of the posterior are parts of the model.
         for key in [*state_dict]:
             name = key.removeprefix(prefix)
             if name.startswith(("process.", "fields.", "hyperparameters")):
@@ -130,14 +131,19 @@ class Kriging(Wrapper):
         by_paths: bool | None = None,
         most: int | None = None,
     ) -> "Kriging":
-        """Fits, and gives the validation model: the same choices on the training links alone.
+        """Fits this model, and returns its validation model.
+
+        The validation model has the same hyperparameters and weights, and knows the training links
+        alone.
 
         Args:
             links: Links with a split.
-            is_final: False if only the validation model is fitted, without a word.
-            by_paths: True if strengths of paths are kriged, False if labels are; None: ``FEWEST``
-                validation links or more choose.
-            most: Most known links of a receiver; None: ``LIMIT``, of labels of one number all.
+            is_final: False if only the validation model is wanted: this model keeps no residuals,
+                and nothing is logged.
+            by_paths: True if strengths of paths are kriged, False if labels are. None: the
+                validation links choose, if there are ``FEWEST`` or more; else paths.
+            most: Largest number of known links of a receiver; None: ``LIMIT``, or all for labels of
+                one number.
         """
         links = self.posterior.cleaned(links)
         count = len(links.split.known)
@@ -146,8 +152,10 @@ class Kriging(Wrapper):
         links = limit_known(links, self._most(links, most))
         if is_final and math.isfinite(stages.left()) and len(links.split.known) < count:
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
-        values = predicted(self.trend, links, links.split.known)
         self.fallback.fit(links)
+        if links.task.is_scalar:
+            return self._krige_labels(links, None, is_final)
+        values = predicted(self.trend, links, links.split.known)
         if by_paths is None and self.trend.has_margins:
             is_few = len(single_readings(links, links.split.validation)) < FEWEST
             return self._krige_better(links, values, is_final, is_few)
@@ -155,10 +163,20 @@ class Kriging(Wrapper):
             return self._krige_paths(links, values, is_final)
         return self._krige_labels(links, values, is_final)
 
+    def law_scores(self, links: Links, held: Int[Tensor, " h"]) -> Float[Tensor, " h"]:
+        """Scores of validation links by the law that may take the trend's place, which is kept."""
+        train, task = links.split.train, self.scene.task
+        if self.laws is None or not torch.equal(self.laws[1], train):
+            # Levels know their place by more than the distance to a receiver.
+            options = task.trends[-1] if task.is_scalar else self.fallback_options
+            self.laws = registry("model").build(options, scene=self.scene), train
+            self.laws[0].fit(replace(links, split=links.split.validating()))
+        return validation_scores(links, predicted(self.laws[0], links, held), held)
+
     def _krige_better(
         self, links: Links, values: Tensor, is_final: bool, is_few: bool
     ) -> "Kriging":
-        """``krige`` of paths, or of labels if the validation links are surely better by these."""
+        """``krige`` by paths; by labels if those are surely better at enough validation links."""
         if is_few:
             return self._krige_paths(links, values, is_final)
         of_labels = self._krige_labels(links, values, False)
@@ -179,11 +197,10 @@ class Kriging(Wrapper):
         return self._krige_labels(links, values, is_final)
 
     def _most(self, links: Links, most: int = LIMIT) -> int:
-        """Largest number of known links of a receiver: at most ``most``.
+        """The number of known links of a receiver that time allows, at most ``most``.
 
-        It is lower if three predictions of all these links would exceed a third of the remaining
-        time. The trained model predicts the links once, and once more for each half of the
-        validation links.
+        The trained model predicts the links once, and once more for each half of the validation
+        links. These three predictions may take a third of the time that is left.
         """
         if math.isinf(stages.left()):
             return most
@@ -191,27 +208,29 @@ class Kriging(Wrapper):
         predicted(self.trend, links, sample[:1])  # the first prediction compiles and loads
         began = time.monotonic()
         predicted(self.trend, links, sample)
-        each = max(time.monotonic() - began, 1e-9) / len(sample)
-        return int(min(most, max(100, stages.left() / 9 / each / self.scene.radios)))
+        link_time = max(time.monotonic() - began, 1e-9) / len(sample)  # [s]
+        return int(min(most, max(100, stages.left() / 9 / link_time / self.scene.radios)))
 
-    def _krige_labels(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
-        """``krige`` of labels; ``values`` are the trend's predictions of known links."""
+    def _krige_labels(self, links: Links, values: Tensor | None, is_final: bool) -> "Kriging":
+        """``krige`` of labels; ``values`` are the trend's predictions of known links, if known."""
         self._make_posterior(False)
-        held = links.split.validation
+        split, is_scalar = links.split, self.scene.task.is_scalar
+        held = drawn(split.validation) if is_scalar else split.validation
         is_unlearnt = False
-        if len(held):
-            # Levels know their place by more than the distance to a receiver.
-            law = self.scene.task.trends[-1] if self.scene.task.is_scalar else self.fallback_options
-            alone = registry("model").build(law, scene=self.scene)
-            alone.fit(replace(links, split=links.split.validating()))
-            trend = validation_scores(links, values[len(links.split.train) :])
-            fallback = validation_scores(links, predicted(alone, links, held))
+        if len(held) and any(self.weights):
+            known = predicted(self.trend, links, held) if values is None else values[-len(held) :]
+            trend = validation_scores(links, known, held)
+            fallback = self.law_scores(links, held)
             is_unlearnt = is_surely_better(fallback, trend)
         # A law of distance that is surely better than the learnt room: levels show no room.
-        has_room = not (is_unlearnt and self.scene.task.is_scalar)
-        model = self._validation_model(links, values, self.weights if has_room else (0.0,))
+        weights = (0.0,) if is_unlearnt and is_scalar else self.weights
+        if values is None and any(weights):
+            values = predicted(self.trend, links, split.known)
+        elif values is None:  # without weight it is not read
+            values = torch.full((len(split.known),), math.nan)
+        model = self._validation_model(links, values, weights)
         if is_unlearnt and self.posterior.chooses_weight:
-            # The likelihood may still give the trend weight: without it if the score is higher so.
+            # The likelihood may still give the trend weight; it gets none if that scores higher.
             without = self._validation_model(links, values, (0.0,))
             score = validation_scores(links, predicted(model, links, held)).mean()
             if validation_scores(links, predicted(without, links, held)).mean() > score:
@@ -219,35 +238,32 @@ class Kriging(Wrapper):
             self._copy_choices(model)
         if is_final:
             self._solve(links, values)
-            if is_unlearnt:
-                name = self.fallback_options["name"]
+            if is_unlearnt and self.laws is not None:
                 log.warning(
                     "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
                     "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
                     links.task.monitor,
                     trend.mean().abs(),
-                    name_of(alone),
+                    name_of(self.laws[0]),
                     fallback.mean().abs(),
-                    name,
+                    self.fallback_options["name"],
                     100 * (1 - self.weight * (1 - self.trend_weight)),
                 )
             self._log()
         return model
 
     def _validation_model(
-        self, links: Links, values: Tensor, weights: Sequence[float] | None = None
+        self, links: Links, values: Tensor, weights: Sequence[float]
     ) -> "Kriging":
-        """Fits weights and hyperparameters; returns a model that knows the training links alone.
-
-        The trend weight is chosen among some; None: among ``weights``.
-        """
+        """Fits trend weight and hyperparameters; returns a model of the training links alone."""
         split = links.split
-        candidates = self._candidates(links, values, weights or self.weights)
+        candidates = self._candidates(links, values, weights)
         self.trend_weight.fill_(self.posterior.fit(links, candidates))
         training = replace(links, split=split.validating())
         model = Kriging(self.scene, self.trend, self.fallback_options)
         model._make_posterior(False)
         model._copy_choices(self)
+        model.posterior.is_lazy = True
         model.chosen_by = self.posterior.seen
         model.weight.fill_(1.0)
         model.fallback.fit(training)
@@ -266,17 +282,18 @@ class Kriging(Wrapper):
         return model
 
     def _copy_choices(self, other: "Kriging") -> None:
-        """Takes weights and hyperparameters of another model."""
+        """Takes weights, hyperparameters and the law of another model."""
         self.trend_weight.copy_(other.trend_weight)
         self.weight.copy_(other.weight)
+        self.laws = other.laws
         self.posterior.load_state_dict(other.posterior.state_dict())
 
     def _candidates(
         self, links: Links, values: Tensor, weights: Sequence[float]
     ) -> dict[float, Tensor]:
-        """Residuals of the known links (k, m), ``thin_labels`` of them, by trend weight."""
+        """Residuals (k, m) of the known links for each trend weight, thinned by ``thin_labels``."""
         index, task = links.split.known, links.task
-        # Labels that are never turned count number by number, and few numbers are enough.
+        # Without an alignment each number stands alone, so labels may be thinned first.
         is_turned = type(task).align is not Task.align
         parts: dict[float, list[Tensor]] = {weight: [] for weight in weights}
         for rows in torch.arange(len(index)).split(PART):
@@ -297,10 +314,10 @@ class Kriging(Wrapper):
             shape, dtype = self.scene.task.shape, self.scene.task.dtype
             differences = torch.empty(len(rows), *shape, dtype=dtype)
             for part in torch.arange(len(rows)).split(PART):
-                few = rows[part]
-                fallback = predicted(self.fallback, links, index[few])
-                mean = blend(task, values[few], fallback, weight)
-                labels = links.labels[index[few]]
+                chunk = rows[part]
+                fallback = predicted(self.fallback, links, index[chunk])
+                mean = blend(task, values[chunk], fallback, weight)
+                labels = links.labels[index[chunk]]
                 differences[part] = (task.align(labels, mean) - mean).to(differences)
             return differences
 
@@ -308,7 +325,7 @@ class Kriging(Wrapper):
         self.posterior.to(self.weight.device)
 
     def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
-        """``krige`` for a trend of paths.
+        """``krige`` by paths of the trend.
 
         The weight of kriging is 1 if it raises the mean score of the validation links by more than
         1.5 standard errors, and these are ``FEWEST`` or more; else 0.
@@ -328,6 +345,7 @@ class Kriging(Wrapper):
         query = links.query[index]
         device = self.weight.device
         aligned = links.task.align(links.labels[index], values)
+        # Of each receiver's known links, from which the posterior's strengths are solved.
         equations = self.posterior.equations(query, aligned, aligned - values, device)
         self.posterior.fit_process()
         model = Kriging(self.scene, self.trend, self.fallback_options)
@@ -372,6 +390,7 @@ class Kriging(Wrapper):
         return self.posterior.deviations(batch)
 
     def _log(self) -> None:
+        """Logs weights, hyperparameters and sizes."""
         facts = self.facts()["kriging"].items()
         log.info("kriging: %s", ", ".join(f"{name} {value:.3g}" for name, value in facts))
 
@@ -396,7 +415,7 @@ class Kriging(Wrapper):
         return self._alone.any_frequency
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
-        """The trend alone, or the fallback: residuals at other frequencies do not correlate."""
+        """``_alone`` at other frequencies, at which residuals do not correlate."""
         return self._alone.at_frequencies(frequencies)
 
     @property
@@ -406,7 +425,10 @@ class Kriging(Wrapper):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """The trend alone, or the fallback: no residuals are known at others than one radio."""
+        """``_alone`` at other receivers, of which no residuals are known.
+
+        The process stays where the receivers are places of one radio.
+        """
         if self.scene.one_radio and not self.by_paths:
             return super().at_receivers(receivers)
         alone = self._alone.at_receivers(receivers, known)
@@ -418,12 +440,12 @@ class Kriging(Wrapper):
         return 2
 
     def unseen(self, links: Links, enough: int = 1000, most: int = 4000) -> Iterator[Unseen]:
-        """Kriging of the training links with each half of the validation links, by whose other half
-        its weights and hyperparameters are chosen; one group alone chooses, too.
+        """Yields models that krige the training links, with validation links that they do not know.
 
-        A model of the training links alone asks the validation links that have chosen nothing in
-        place of these, if there are ``enough``; of labels of one number at most ``most``, as more
-        tell no more of quantiles.
+        Each of two models comes with one half of these links; the other half has chosen its weights
+        and hyperparameters. Links of one group, which cannot be halved, do both. If ``enough`` of
+        them have chosen nothing (``chosen_by``), this model itself comes with these. For labels of
+        one number ``most`` links suffice: more say no more of quantiles.
         """
         if not len(links.split.validation):
             return
@@ -438,6 +460,7 @@ class Kriging(Wrapper):
                 return
             kriged = Kriging(links.scene, self.trend, self.fallback_options).to(self.device)
             kriged.posterior.start_from(self.posterior)
+            kriged.laws = self.laws
             if links.task.is_scalar and len(chooses) >= 300:
                 # A half of so many would choose the same weight as all of them.
                 kriged.weights = (self.trend_weight.item(),)
@@ -454,6 +477,7 @@ class Kriging(Wrapper):
 
     @property
     def _alone(self) -> Model:
+        """The trend without kriging, or the fallback if the trend has no weight."""
         return self.trend if self.trend_weight > 0 else self.fallback
 
     @property

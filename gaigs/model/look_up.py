@@ -16,7 +16,7 @@ from gaigs.registry import name_of
 class LookUp(Model):
     """Base of a model whose state are its known links and the attributes named in ``learnt``.
 
-    It answers on the processor.
+    It stays on the CPU.
 
     Attributes:
         links: Links, or a batch of the known ones; None before the fit.
@@ -29,10 +29,11 @@ class LookUp(Model):
     learnt: tuple[str, ...] = ()
 
     def _apply(self, *_: Any) -> "LookUp":
+        """Ignores moves to another device or dtype."""
         return self
 
     def get_extra_state(self) -> dict:
-        """Known links and ``learnt``; labels in bytes if all are 255ths, as of 8-bit images."""
+        """Known links and ``learnt``; labels of 8-bit images, multiples of 1 / 255, as bytes."""
         if self.links is None:
             raise ValueError(f"model {name_of(self)!r} has no links to save; fit it first")
         index = torch.cat([*self.known])

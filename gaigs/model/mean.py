@@ -28,7 +28,7 @@ class Mean(Model):
         self.register_buffer("means", torch.full(shape, torch.nan, dtype=scene.task.dtype))
 
     def fit(self, links: Links) -> None:
-        """Computes the means; a receiver without links has their mean."""
+        """Computes the means; a receiver without links gets ``common_gain`` of the others'."""
         known = known_links(links, any_receiver=True)
         for receiver, index in enumerate(known):
             if not len(index):

@@ -46,11 +46,11 @@ log = logging.getLogger(__name__)
 class MirroredSplatting(GaussianSplatting):
     """The splatting pipeline with Gaussians at mirror images, learnt from coarse to fine.
 
-    ``ChannelSearch`` locates planes of channels before the training, and ``LagSearch`` planes of
-    spectra. Powers of signal strength come first, which teach obstacles; then ``LevelSearch``
-    locates planes by phases. Where frequencies are unknown, powers add to the end. Labels that no
-    search can read start from the faces of the box; each plane is then turned square to the others
-    and moved along its normal to the least error.
+    For channels and spectra, ``ChannelSearch``, ``FieldSearch`` or ``LagSearch`` locates the planes
+    before the training. For signal strengths the training begins with powers, which show the
+    obstacles; then ``LevelSearch`` locates planes by phases. Where frequencies are unknown, powers
+    add to the end. For labels that no search reads, planes start at the faces of the box; in the
+    training each is turned square to the others and moved along its normal to the least error.
 
     Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that
     suits it.
@@ -61,10 +61,10 @@ class MirroredSplatting(GaussianSplatting):
     name, own_placement = "mirrored", "mirrored"
     revisions = (0.0, 0.06, 0.25, 0.5, 0.75)
 
-    # Box whose levels are searched for phases [wavelengths]. A phase takes places and walls to a
-    # tenth of a wavelength; surveys know both to about a ten-thousandth of the site.
+    # Largest box whose levels are searched for phases [wavelengths]. A phase needs places and walls
+    # to a tenth of a wavelength; surveys know both to about a ten-thousandth of the site.
     widest = 1000.0
-    is_wide = False  # set by fit
+    is_wide = False  # True if the box is larger; set by fit
 
     places: Query | None = None  # set by fit
     levels: LevelSearch | None = None
@@ -93,11 +93,7 @@ class MirroredSplatting(GaussianSplatting):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits the pipeline, and keeps some links for the report of the paths' powers.
-
-        Spectra start from planes that ``LagSearch`` finds in them, channels without a trend from
-        planes of ``ChannelSearch``.
-        """
+        """Fits the pipeline; searches planes in spectra and channels, prepares this for levels."""
         super().fit(links)
         self.places = thin_links(links.query[links.split.train])
         is_known = links.query.frequencies is not None or len(self.scene.frequencies) == 1
@@ -107,18 +103,23 @@ class MirroredSplatting(GaussianSplatting):
         if is_known and isinstance(self.pooling, PathRssi):
             wavelength = speed_of_light / carriers(self.scene, links.query).max().item()
             self.is_wide = self.placement.diagonal > self.widest * wavelength
-            # A search by phases takes 20 links at a place of the receiver.
+            # A search by phases needs 20 links of each receiver; places of one radio have fewer.
             if searches and not self.is_wide and not self.scene.one_radio:
                 self._prepare_levels(links)
+        # Without phases powers add to the end, and no later revision locates a plane.
+        has_phases = is_known and not self.is_wide and not self.scene.one_radio
+        self.settles = isinstance(self.pooling, PathRssi) and not has_phases
         task = self.scene.task
         if task.is_channel and isinstance(self.pooling, ChannelPooling) and self.trend is None:
             self._fit_channels(links, task, self.pooling)
 
     def _search_spectra(self, links: Links, pooling: PathSpectrum) -> None:
-        """Moves the planes to where ``LagSearch`` finds them and keeps only the paths at these.
+        """Moves the planes to where ``LagSearch`` finds them, and keeps only paths at these planes.
 
-        Changes nothing if no receiver's array explains its spectra.
+        Nothing changes if no receiver's array explains its spectra.
         """
+        # A spectrum gives back the covariances (lags) of the array's elements, whose phases the
+        # search reads.
         placement = self.placement
         frequencies = carriers(self.scene, links.query)
         search = LagSearch(links, frequencies, pooling.beamformer.lags, placement.order)
@@ -131,6 +132,7 @@ class MirroredSplatting(GaussianSplatting):
             placement.place(number, plane)
         placement.kept.copy_(placement.sequences_of(torch.arange(len(planes))))
         placement.most.copy_(placement.kept.sum())
+        # Planes stand to fractions of a wavelength, so paths interfere from the first step on.
         placement.enable_phases(search.wavelength)
         if placement.log_bandwidth is not None and self.scene.bandwidth is None:
             placement.log_bandwidth.fill_(math.log(search.bandwidth))
@@ -138,7 +140,7 @@ class MirroredSplatting(GaussianSplatting):
         log.info("%d planes found in spectra", len(planes))
 
     def _prepare_levels(self, links: Links) -> None:
-        """Keeps the levels for ``revise``, which searches them once powers are learnt."""
+        """Makes the search of levels that ``revise`` runs once powers have shown the obstacles."""
         trend = 0 * links.labels
         if self.trend is not None:
             trend = self.trend(Batch(links.query).to(self.device)).value.cpu()
@@ -152,10 +154,10 @@ class MirroredSplatting(GaussianSplatting):
         )
 
     def _fit_channels(self, links: Links, task: Task, pooling: ChannelPooling) -> None:
-        """Starts from free space, and puts planes for the first revision.
+        """Starts the training from free space, and plans planes for its first revision.
 
-        Planes are those that ``ChannelSearch`` finds; of channels of few numbers, ``FieldSearch``.
-        Without a phase in common these have the faces of the box.
+        ``ChannelSearch`` finds the planes; for channels of few numbers ``FieldSearch``, which needs
+        a common phase. Without one, the faces of the box stay.
         """
         placement = self.placement
         received = links.labels
@@ -177,7 +179,8 @@ class MirroredSplatting(GaussianSplatting):
                 self._search_field(links, sign, start, pooling)
             return
         labels = links.labels.clone()
-        labels[train] = task.align(labels[train], waves)  # without delays that paths do not have
+        # Unknown delays of links are none of their paths'.
+        labels[train] = task.align(labels[train], waves)
         planes, slabs = ChannelSearch(
             replace(links, labels=labels),
             int(pooling.array_sign),
@@ -195,27 +198,34 @@ class MirroredSplatting(GaussianSplatting):
     def _search_field(
         self, links: Links, sign: int, start: Float[Tensor, "w 4"], pooling: ChannelPooling
     ) -> None:
-        """Starts from the planes and strengths that ``FieldSearch`` finds."""
+        """Plans the planes that ``FieldSearch`` finds, and starts from its strengths."""
         placement = self.placement
         search = FieldSearch(links, sign, placement.order, len(placement.origin), start)
         room = search.run()
         planes = search.frame.to_world(room.planes)
         self._plan(planes, room.slabs, search.data.order)
+        if placement.obstacles is not None and search.score.fit.count < search.fewest:
+            placement.obstacles.requires_grad_(False)  # a few numbers tell no shadows, either
         if not len(planes):
             return
+        # The search has waves exp(-j k L) / L; the pooling's are ``strength`` lambda / (4 pi) times
+        # as large.
         wavelengths = torch.tensor([receiver.wavelength for receiver in search.data.receivers])
         unit = pooling.strength.item() * wavelengths / (4 * math.pi)  # (r,)
         numbers = torch.tensor(search.data.numbers)
         gains = room.gains.new_ones(len(placement.bands), len(planes))
         gains[placement.band_numbers[numbers]] = room.gains[search.score.fit.band_numbers]
-        of_receivers = room.receivers / unit
+        receiver_gains = room.receivers / unit
         if self.scene.one_radio:
-            of_receivers = of_receivers.mean().expand_as(of_receivers)
-        placement.start_strengths(gains, self.scene.radio_of(numbers), of_receivers)
+            receiver_gains = receiver_gains.mean().expand_as(receiver_gains)
+        placement.start_strengths(gains, self.scene.radio_of(numbers), receiver_gains)
         placement.step.mul_(0.1)
 
     def _plan(self, planes: Tensor, slabs: Tensor, order: int | float = math.inf) -> None:
-        """Puts planes with their slabs for the first revision; paths have up to ``order``."""
+        """Places planes and their slabs; the first revision begins to use paths at them.
+
+        These paths have at most ``order`` reflections.
+        """
         placement = self.placement
         for number, (plane, slab) in enumerate(zip(planes, slabs, strict=True)):
             placement.place(number, plane, slab)
@@ -231,29 +241,29 @@ class MirroredSplatting(GaussianSplatting):
         waves: Complex[Tensor, "b e s"],
         pooling: ChannelPooling,
     ) -> Complex[Tensor, " r"]:
-        """Gain of each receiver over its training links, as of ``friis``.
+        """Gain of each receiver's training links over the pooling's waves, by ``fit_gain``.
 
-        0.1 where phases say nothing: a stronger start would be worse than nothing.
+        It is 0.1 where the phases follow no sign: a stronger start would be worse than silence.
         """
         gains = []
         radios = self.scene.radio_of(query.receivers)
         for radio in range(self.scene.radios):
             rows = radios == radio
             gains.append(fit_gain(labels[rows], waves[rows]))
-        each = torch.stack(gains) / pooling.strength.cpu()
-        return torch.where((each != 0) & (int(pooling.sign) != 0), each, 0.1)
+        relative = torch.stack(gains) / pooling.strength.cpu()
+        return torch.where((relative != 0) & (int(pooling.sign) != 0), relative, 0.1)
 
     @property
     def predicts_untrained(self) -> bool:  # type: ignore[override]
         return super().predicts_untrained or bool(self.placement.is_bare)
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Loss) -> str:
-        """Lets phases count and moves planes to them; drops what does not help.
+        """Lets paths interfere, and moves planes to where phases agree; drops needless paths.
 
         Planes that a search has found do not move.
         """
         placement = self.placement
-        # The labels are sums of waves: powers say nothing alone, and phases count from the start.
+        # Channels are sums of waves: powers alone say nothing, and phases count from the start.
         adds_waves = not isinstance(self.pooling, LagPooling)
         if placement.is_bare:
             placement.enable_reflections()
@@ -314,9 +324,9 @@ class MirroredSplatting(GaussianSplatting):
         return f"; {len(boxes)} boxes found"
 
     def _start(self) -> Float[Tensor, "w 4"]:
-        """Planes from which a search starts.
+        """Planes from which a search starts, in the world's frame.
 
-        The user's walls or planes that are learnt, or the faces of the box without their tilt.
+        They are the user's walls, or learnt planes, or the faces of the box without their tilt.
         """
         placement = self.placement
         used = placement.used
@@ -334,9 +344,9 @@ class MirroredSplatting(GaussianSplatting):
 
     @torch.no_grad()
     def margins(self, query: Query) -> Complex[Tensor, "b n e s"]:
-        """Channels by which each path of links to one receiver may deviate, for kriging.
+        """Channels of each path with the strength ``PathFields.margins``, for kriging.
 
-        Paths deviate by ``PathFields.margins``.
+        All links are to one receiver.
         """
         return self._separate(query, self.placement.margins(query))
 
@@ -352,7 +362,7 @@ class MirroredSplatting(GaussianSplatting):
             """Each path of each link as a link of its own (b n, 1, ...)."""
             return values.expand(count, *values.shape[1:]).flatten(0, 1)[:, None]
 
-        each = replace(
+        single_paths = replace(
             paths,
             means=separate(paths.means),
             semi_axes=separate(paths.semi_axes),
@@ -361,10 +371,11 @@ class MirroredSplatting(GaussianSplatting):
             coherences=paths.coherences[:1],
             carriers=paths.carriers.repeat_interleave(n),
         )
-        return self.pooling(each, query[which.repeat_interleave(n)]).unflatten(0, (count, n))
+        links = query[which.repeat_interleave(n)]
+        return self.pooling(single_paths, links).unflatten(0, (count, n))
 
     def facts(self) -> dict[str, object]:
-        """Numbers of planes and paths, and the part of each plane, beside the rasterizer."""
+        """Facts of the pipeline, numbers of planes and paths, and tables by ``summarize``."""
         placement = self.placement
         facts = super().facts() | {
             "num_gaussians": int(placement.kept.sum())
@@ -379,15 +390,14 @@ class MirroredSplatting(GaussianSplatting):
     def export(self, folder: Path) -> None:
         """Writes ``planes.obj`` and ``obstacles.ply`` beside the free Gaussians.
 
-        Planes end where the paths of the training links meet them; of a loaded model, the paths of
-        links all over the training transmitters' box.
+        Planes reach as far as paths of the links ``traced`` meet them.
         """
         super().export(folder)
         write_room(self.placement, self.traced, folder)
 
     @property
     def traced(self) -> Query:
-        """Links whose paths show where planes end."""
+        """Links whose paths show where planes end: training links; of a loaded model others."""
         return spread_links(self.scene) if self.places is None else self.places
 
     def learnt_room(self, links: Links | None = None) -> LearntRoom:

@@ -22,9 +22,9 @@ class Movable(nn.Module):
     Attributes:
         any_frequency: True if channels are a function of frequency, read from
             ``scene.task.frequencies``.
-        any_receiver: True if the model predicts for receivers without links. A module of it names
-            buffers by receiver in ``of_receivers``; a receiver in general has the mean over the
-            receivers. Its ``take_receivers``, if it has one, does more. ``of_level`` names what
+        any_receiver: True if the model predicts for receivers without links. Each of its modules
+            may name buffers with a row for each receiver in ``of_receivers``, whose mean a new
+            receiver gets; do more in ``take_receivers``; and name in ``of_level`` the buffer that
             ``adapt`` moves.
     """
 
@@ -47,13 +47,13 @@ class Movable(nn.Module):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Any:
-        """A copy of a model with ``any_receiver`` for other receivers, which no measurement needs.
+        """A copy of a model with ``any_receiver`` for other receivers, without measurements there.
 
-        What a receiver has of its own, such as its gain, is the mean over known receivers.
+        What the model learns of each receiver, such as a gain, is the mean over known receivers.
 
         Args:
             receivers: Receivers of the copy, in place of the model's own.
-            known: Numbers of the receivers whose mean stands; None: all.
+            known: Numbers of the receivers over which means are taken; None: all.
 
         Raises:
             ValueError: The model predicts for its own receivers alone, or there are no receivers.
@@ -83,7 +83,7 @@ class Movable(nn.Module):
                 f"at_receivers takes one receiver or more, each with a name of its own, got {names}"
             )
         room = torch.stack(self.scene.box)
-        # No measurement tells the front end of a new receiver.
+        # The front end of a new receiver is unknown.
         scene = replace(self.scene, receivers=tuple(receivers), room=room, responses=None)
         other = self._copied()
         for part in other.modules():
@@ -99,9 +99,7 @@ class Movable(nn.Module):
         return other
 
     def _copied(self) -> Any:
-        """A copy with the same known links, which are large, and the same scenes and calibration,
-        which never change.
-        """
+        """A copy that shares the known links, which are large, the scenes and the calibration."""
         memo = {id(self.links): self.links, id(self.calibration): self.calibration}
         for part in self.modules():
             if hasattr(part, "scene"):
@@ -110,18 +108,18 @@ class Movable(nn.Module):
 
     @torch.no_grad()
     def adapt(self, links: Links) -> Any:
-        """A copy at the receivers of a few links, whose levels these correct; the room stays.
+        """A copy at new receivers, whose levels a few links correct; the room stays.
 
-        With n places of mean error e, the level of a receiver moves by e s / (s + w / n): s is the
-        variance of errors between receivers, w the one within them. Repeated readings of a place
-        count as one. Intervals shrink accordingly.
+        With n places of mean error e, the level of a receiver moves by e s / (s + w / n). Here s is
+        the variance of errors between receivers, and w the variance within them. Repeated readings
+        of a place count as one. Intervals shrink accordingly.
 
         Args:
             links: Readings at one or several receivers without training links; a split is not used.
 
         Raises:
-            ValueError: The labels are no levels, too few receivers have told how they differ, or
-                the model is an adapted one.
+            ValueError: The labels are no levels, too few receivers have calibrated how levels
+                differ, or the model is an adapted one.
 
         Source: Robinson, That BLUP is a good thing: the estimation of random effects, 1991.
 
@@ -152,14 +150,14 @@ class Movable(nn.Module):
                 "adapt takes a model of levels, calibrated with links of three receivers or more, "
                 "such as path_loss or mirrored"
             )
-        between, within = new.scatter.clamp_min(1e-9)  # of constant levels both are 0
+        between, within = new.scatter.clamp_min(1e-9)  # both are 0 if levels are constant
         receivers = links.query.receivers
         errors = (links.labels - moved.predict(links.query).cpu()).double()
         votes = links.query.votes  # (n,)
         none = votes.new_zeros(len(links.receivers))
         counts = none.index_add(0, receivers, votes)  # (r,), of places
         sums = none.index_add(0, receivers, votes * errors)
-        variances = 1 / (1 / between + counts / within)  # of what is left
+        variances = 1 / (1 / between + counts / within)  # of the levels after the readings
         for part in parts:
             level = getattr(part, part.of_level)
             level += (variances * sums / within).to(level)
@@ -168,8 +166,10 @@ class Movable(nn.Module):
         return moved
 
     def take_calibration(self, other: "Movable") -> None:
-        """Takes another model's calibration of receivers without links; of one radio, which has
-        links, its own."""
+        """Takes another model's calibration for receivers without links.
+
+        Receivers that are places of one radio have links, and take the calibration as it is.
+        """
         self.calibration = other.calibration
         if other.calibration is not None and not self.scene.one_radio:
             widths = torch.ones(len(self.scene.receivers))

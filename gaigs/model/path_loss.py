@@ -17,13 +17,14 @@ from gaigs.registry import register
 class PathLoss(Model):
     """T - 10 gamma log10(distance / 1 m) for each receiver; NaN before ``fit``.
 
-    It is meant for RSSI [dBm], and accepts any task of one real number a link. T is fitted by least
-    squares. So is gamma, but drawn towards the mean of all receivers as far as chance explains
-    their scatter: a few readings alone give wild slopes. Negative exponents are kept: there
-    distance explains nothing. If all links of a receiver are equally long, gamma is that mean;
-    without any other receiver 2, as in free space. Distances below 0.1 m count as 0.1 m: within
-    about a wavelength the field does not follow the law. From a receiver whose place is estimated
-    the logarithm is the mean over the region in which it may stand, so no peak is at its middle.
+    It is meant for RSSI [dBm], and accepts any task of one real number a link. T and gamma are
+    fitted by least squares. Exponents gamma are then drawn towards the mean of all receivers, as
+    far as chance explains their scatter (``shrunk``): a few readings alone give wild slopes. A
+    receiver whose links are equally long gets this mean, or 2, as in free space, if no receiver has
+    an exponent. Negative exponents are kept: there distance explains nothing. Distances below 0.1 m
+    count as 0.1 m: within about a wavelength the field does not follow the law. If a receiver's
+    place is estimated, the logarithm is averaged over the region in which it may stand, so there is
+    no peak in its middle.
 
     Raises:
         ValueError: A label is more than one real number.
@@ -50,8 +51,9 @@ class PathLoss(Model):
         self.register_buffer("regions", torch.zeros(len(scene.receivers)))
 
     def fit(self, links: Links) -> None:
-        """Fits level and exponent of each receiver; see ``without_gross_errors`` for levels that do
-        not count. A receiver without links has the mean of both.
+        """Fits level and exponent of each receiver, ``without_gross_errors``.
+
+        A receiver without links gets the means of levels and exponents.
         """
         lines = []
         if links.uncertainties is not None:
@@ -77,9 +79,9 @@ class PathLoss(Model):
         exponents = shrunk(exponents, weights, noise)
         levels = levels + 10 * exponents * centres
         is_known = torch.tensor([*map(len, known)]) > 0
-        for own, fitted in ((self.levels, levels), (self.exponents, exponents)):
-            own[is_known] = fitted.to(own)
-            own[~is_known] = fitted.mean().to(own)
+        for buffer, fitted in ((self.levels, levels), (self.exponents, exponents)):
+            buffer[is_known] = fitted.to(buffer)
+            buffer[~is_known] = fitted.mean().to(buffer)
 
     def forward(self, batch: Batch) -> Prediction:
         decades = self._decades(batch.query.transmitters, batch.query.receivers)
@@ -87,7 +89,7 @@ class PathLoss(Model):
         return Prediction(self.levels[radios] - 10 * self.exponents[radios] * decades, {})
 
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
-        """New receivers stand at known places."""
+        """Takes new receivers, which stand at known places."""
         self.regions = self.regions.new_zeros(len(scene.receivers))
 
     def _decades(
@@ -102,7 +104,7 @@ class PathLoss(Model):
         return (lengths.square() + 0.56 * regions.square()).log10() / 2
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        # Checkpoints of before have places alone.
+        # Older checkpoints have no regions.
         state_dict.setdefault(f"{prefix}regions", torch.zeros_like(self.regions))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
@@ -115,8 +117,8 @@ def shrunk(
     Args:
         exponents: Exponents fitted by least squares.
         weights: Inverse variances of their errors, for noise of variance 1; 0 without an exponent.
-        noise: Variance of the labels about the law; NaN if too few of them say it, and the mean
-            counts alone.
+        noise: Variance of the labels about the law; NaN if too few labels show it. All exponents
+            then become their weighted mean.
     """
     total = weights.sum()
     if not total:

@@ -42,7 +42,7 @@ class Request(NamedTuple):
     query: Query  # links, the receivers of a position one after the other
     axes: tuple[int, ...]  # axes of the links in the answer, see ``Query.from_positions``
     receiver: object  # receivers as they were asked for; None: all
-    each: int  # number of links of a position
+    each: int  # number of links at a position
     directions: Directions | None  # directions to predict; None: the label's own
     subcarriers: Subcarriers  # subcarriers to predict
     # Sentences on positions, carriers and subcarriers far from the training links.
@@ -58,7 +58,7 @@ class Request(NamedTuple):
         directions: Directions | None,
         subcarriers: Subcarriers,
     ) -> "Request":
-        """Checks the arguments of ``Model.predict``, which has the errors."""
+        """Checks the arguments of ``Model.predict``, whose docstring lists the errors."""
         directions = as_directions(directions, scene.task.directions, scene.task.name)
         names = [one.name for one in scene.receivers]
         query, axes = Query.from_positions(
@@ -72,13 +72,13 @@ class Request(NamedTuple):
         return cls(query, axes, receiver, each, directions, subcarriers, warnings)
 
     def asked(self, scene: Scene, name: str | None = None) -> Asked:
-        """Names and coordinates of the answer's axes; of its part at receiver ``name``."""
+        """Names and coordinates of the answer's axes, or of its part at receiver ``name``."""
         task = self._task(scene)
         known = [receiver.name for receiver in scene.receivers]
-        one = self.receiver if name is None else name
-        if task.is_channel and one is not None and not np.ndim(one):
-            heard = scene.receivers[int(as_receivers(one, known))].hears(task.frequencies)
-            task = task if heard.all() else task.at_frequencies(task.frequencies[heard])
+        receiver = self.receiver if name is None else name
+        if task.is_channel and receiver is not None and not np.ndim(receiver):
+            in_band = scene.receivers[int(as_receivers(receiver, known))].hears(task.frequencies)
+            task = task if in_band.all() else task.at_frequencies(task.frequencies[in_band])
         if isinstance(self.directions, Grid):
             task = copy.copy(task)
             task.directions = self.directions
@@ -106,7 +106,7 @@ class Request(NamedTuple):
         return task
 
     def estimates(self, fields: Sequence, scene: Scene) -> Any:
-        """Estimates of arranged fields; by receiver where these are dictionaries."""
+        """The ``Estimate`` of its fields, or a dictionary if these are dictionaries by receiver."""
         if not isinstance(fields[0], dict):
             return Estimate(*fields).about(self.asked(scene))
         estimates = {}
@@ -156,11 +156,11 @@ class Request(NamedTuple):
 
 
 def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver | None:
-    """The receiver of ``Model.predict`` if it is one, or a pose or a position; None for names and
-    indices.
+    """The new receiver that an argument of ``Model.predict`` gives; None for names and indices.
 
-    Three whole numbers beside three transmitters are indices. A pose has the array of the scene's
-    receivers, and so has a position where this array has no orientation.
+    The argument may be a ``Receiver``, a pose, or a position; the last two get the array of the
+    scene's receivers, which for a position must have no orientation. Three whole numbers beside
+    three transmitters are indices.
     """
     if isinstance(receiver, Receiver) or receiver is None:
         return receiver
@@ -199,7 +199,7 @@ def is_same(one: Receiver, other: Receiver) -> bool:
 
 
 def _kind_of(values: Any) -> tuple[str, tuple[int, ...]]:
-    """Kind of numpy and shape of numbers; ``O`` of anything else."""
+    """numpy's kind of dtype, and the shape, of numbers; kind ``O`` for anything else."""
     try:
         array = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
     except ValueError:  # ragged lists
@@ -219,7 +219,10 @@ def lacks_numbers(scene: Scene) -> bool:
 
 
 def as_known_subcarriers(frequencies: object, scene: Scene, any_frequency: bool) -> Subcarriers:
-    """Subcarriers of ``Model.predict``, for a model that computes them anywhere or does not."""
+    """The wanted subcarriers, checked, with a warning if they are far from the labels' own.
+
+    Without ``any_frequency`` the model gives the labels' nearest ones.
+    """
     if frequencies is None:
         return Subcarriers()
     if not scene.task.is_channel:
@@ -282,7 +285,7 @@ def check_interval(
 
 
 def usual_batch_size(shape: tuple[int, ...], numbers: int = 2**17, most: int = 1024) -> int:
-    """Links that have so many numbers of labels together; 16 links at least."""
+    """Number of links whose labels have so many numbers together; from 16 to ``most``."""
     return min(most, max(16, numbers // math.prod(shape)))
 
 

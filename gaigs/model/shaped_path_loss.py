@@ -14,9 +14,9 @@ from gaigs.registry import register
 
 @register("model", "shaped_path_loss")
 class ShapedPathLoss(PathLoss):
-    """``path_loss`` with a break point, lobes and heights, each where held-out links gain by it.
+    """``path_loss`` with the terms of ``PathTerms``: a break point, lobes and heights.
 
-    Source: as of ``PathTerms``, which has the terms.
+    Held-out links choose the terms. Sources are in ``PathTerms``.
     """
 
     def __init__(self, scene: Scene):
@@ -27,7 +27,7 @@ class ShapedPathLoss(PathLoss):
         self._fit_terms(links, chooses=True)
 
     def refit(self, links: Links) -> None:
-        """As ``fit``, for some of the known links: the choice of terms stays."""
+        """Fits level, exponent and the chosen terms to some of the known links."""
         self._fit_terms(links, chooses=False)
 
     def _fit_terms(self, links: Links, chooses: bool) -> None:
@@ -46,7 +46,7 @@ class ShapedPathLoss(PathLoss):
         return {**self.terms.facts()}
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        # A process of before had ``path_loss``: no terms.
+        # Processes of older checkpoints have ``path_loss``: no terms.
         for name, buffer in self.terms.state_dict().items():
             state_dict.setdefault(f"{prefix}terms.{name}", torch.zeros_like(buffer))
         super()._load_from_state_dict(state_dict, prefix, *args)

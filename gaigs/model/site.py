@@ -29,10 +29,9 @@ class Site(Model):
     """``path_loss`` of each receiver, less a common loss by buildings; NaN before ``fit``.
 
     Loss = c1 [a roof is above the direct path] + c2 10 log10(1 + length inside / 1 m) + c3 (walls
-    crossed) + c4 (knife-edge loss over the roofs). The coefficients are 0 or more, by least squares
-    of the known links together with the level and exponent of each receiver, and drawn towards 0 as
-    by one link. ``fit`` reads the file, and a checkpoint keeps the roofs on a grid of 1 m or, of a
-    large site, coarser.
+    crossed) + c4 (knife-edge loss over the roofs). The coefficients are fitted by least squares
+    together with the level and exponent of each receiver, see ``shared_coefficients``. ``fit``
+    reads the file, and a checkpoint keeps the roofs on a grid of 1 m, or coarser for a large site.
 
     Args:
         buildings: GeoJSON file, see ``gaigs.data.geojson.read_buildings``: longitude and latitude,
@@ -83,15 +82,16 @@ class Site(Model):
         lengths = (query.transmitters - positions).norm(dim=1).double()
         self.losses.copy_(shared_coefficients(columns, lengths, query.receivers))
         log.info("losses by buildings, their length, walls and edges: %s", self.losses.tolist())
-        rest = links.labels.clone()
-        rest[index] += (features @ self.losses.double()).to(rest)
-        self.law.fit(replace(kept, labels=rest))
+        corrected = links.labels.clone()
+        corrected[index] += (features @ self.losses.double()).to(corrected)
+        self.law.fit(replace(kept, labels=corrected))
 
     def forward(self, batch: Batch) -> Prediction:
         loss = self._features(batch.query) @ self.losses
         return Prediction(self.law(batch).value - loss, {})
 
     def _features(self, query: Query) -> Float[Tensor, "b 4"]:
+        """The four factors of c1 to c4 for each link; NaN before ``fit``."""
         x, y, cell = self.grid.tolist()
         if not cell:  # before the fit
             return query.transmitters.new_full((len(query), 4), torch.nan)
@@ -125,25 +125,35 @@ class Site(Model):
 def shared_coefficients(
     columns: Float[Tensor, "k c"], lengths: Float[Tensor, " k"], receivers: Tensor
 ) -> Float[Tensor, " f"]:
-    """Non-negative coefficients of features, fitted with a level and exponent of each receiver.
+    """Non-negative coefficients c of features x in y = level + exponent log10(d) + c . x.
 
-    The first column is the level of each link [dBm], the others are its features. A feature that
-    level and exponent explain has the coefficient 0.
+    Level and exponent differ from receiver to receiver, c is shared. Coefficients are drawn towards
+    0 as by one link each. A feature that level and exponent explain has the coefficient 0.
+
+    Args:
+        columns: Level y of each link [dBm], then its features x.
+        lengths: Distances d [m].
+        receivers: Receiver of each link.
 
     Source: Frisch and Waugh, Partial time regressions as compared with individual trends, 1933.
     """
     columns = columns.clone()
     decades = lengths.clamp_min(0.1).log10()
-    # What level and exponent explain is taken off first (Frisch and Waugh, 1933).
+    # Least squares of c alone give the same c if level and exponent are regressed out of y and x
+    # first (Frisch and Waugh, 1933).
     for receiver in receivers.unique():
         rows = receivers == receiver
-        own = torch.stack((torch.ones_like(decades[rows]), decades[rows]), 1)  # (j, 2)
-        law = torch.linalg.lstsq(own, columns[rows], driver="gelsd").solution  # (2, c)
-        columns[rows] -= own @ law
-    spreads = columns[:, 1:].square().mean(0).sqrt()  # (f,)
+        law = torch.stack((torch.ones_like(decades[rows]), decades[rows]), 1)  # (j, 2)
+        fitted = torch.linalg.lstsq(law, columns[rows], driver="gelsd").solution  # (2, c)
+        columns[rows] -= law @ fitted
+    residual = columns[:, 0]
+    features = columns[:, 1:]  # (k, f)
+    spreads = features.square().mean(0).sqrt()  # (f,)
+    # A feature that the law explains has only rounding left: an infinite spread makes its c 0.
     spreads = spreads.where(spreads > 1e-6, math.inf)
-    # One more link for each coefficient, which says 0, in units of its spread.
-    matrix = torch.cat((columns[:, 1:] / spreads, torch.eye(len(spreads)).double()))
-    values = torch.cat((columns[:, 0], torch.zeros(len(spreads)).double()))
-    found, _ = nnls(matrix.cpu().numpy(), values.cpu().numpy())
-    return torch.from_numpy(found) / spreads.cpu()
+    # Ridge regression: one more row for each coefficient in units of its spread, with the value 0.
+    ridge = torch.eye(len(spreads)).double()
+    matrix = torch.cat((features / spreads, ridge))
+    values = torch.cat((residual, torch.zeros(len(spreads)).double()))
+    scaled, _ = nnls(matrix.cpu().numpy(), values.cpu().numpy())
+    return torch.from_numpy(scaled) / spreads.cpu()

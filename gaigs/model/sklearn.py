@@ -69,6 +69,7 @@ class SklearnRegressor(LookUp):
         self._fit()
 
     def _fit(self) -> None:
+        """Fits a clone of the estimator to the known links of each receiver."""
         from sklearn.base import clone
 
         self.fitted = []
@@ -90,12 +91,12 @@ class SklearnRegressor(LookUp):
                 ) from error
 
     def _inputs(self, asked: Tensor | Query) -> Float[ndarray, "k d"]:
-        """Inputs of the regressors, of a query or of known links."""
+        """Inputs of the regressors, for a query or for known links by their indices."""
         query = asked if isinstance(asked, Query) else self.links.query[asked]
         return coordinates(self.scene, query, 1.0).numpy()
 
     def _predictions(self, query: Query, **options: bool) -> Iterator[tuple[Tensor, Any]]:
-        """Queries of each receiver, as a mask, and what its regressor predicts for them."""
+        """Yields, for each receiver, a mask of its links and its regressor's predictions there."""
         for receiver in query.receivers.unique().tolist() if self.fitted else ():
             is_asked = query.receivers == receiver
             inputs = self._inputs(query[is_asked])
@@ -122,7 +123,9 @@ class SklearnRegressor(LookUp):
 
 
 def build_estimator(given: Any) -> Any:
-    """Estimators of names and mappings, also inside of lists and options; other values stay.
+    """Builds estimators from names and mappings, also within lists and options.
+
+    Other values are returned as they are.
 
     Raises:
         ImportError: scikit-learn is not installed.
@@ -134,13 +137,13 @@ def build_estimator(given: Any) -> Any:
         given = {"_target_": given}
     if not isinstance(given, Mapping) or "_target_" not in given:
         return given
-    made = find_class(str(given["_target_"]))
+    kind = find_class(str(given["_target_"]))
     options = {key: build_estimator(value) for key, value in given.items() if key != "_target_"}
-    known = inspect.signature(made).parameters
+    known = inspect.signature(kind).parameters
     for key in options:
         if key not in known:
-            raise ValueError(f"{made.__name__} has no option {suggest(key, known)}; see its help")
-    return made(**options)
+            raise ValueError(f"{kind.__name__} has no option {suggest(key, known)}; see its help")
+    return kind(**options)
 
 
 def find_class(target: str) -> type:
@@ -151,19 +154,19 @@ def find_class(target: str) -> type:
     except ImportError:
         raise ImportError("scikit-learn is missing: pip install 'gaigs[sklearn]'") from None
     path, _, name = target.rpartition(".")
-    found = None
-    near = ""
+    kind = None
+    hint = ""
     if path.partition(".")[0] == "sklearn":
         try:
             module = importlib.import_module(path)
         except ImportError:
-            near = f"; there is no module {path}"
+            hint = f"; there is no module {path}"
         else:
-            found = getattr(module, name, None)
-            near = f"; {path} has no {suggest(name, vars(module))}"
-    if not (isinstance(found, type) and issubclass(found, BaseEstimator | Kernel)):
+            kind = getattr(module, name, None)
+            hint = f"; {path} has no {suggest(name, vars(module))}"
+    if not (isinstance(kind, type) and issubclass(kind, BaseEstimator | Kernel)):
         raise ValueError(
             "an estimator must be a class of scikit-learn, such as sklearn.svm.SVR, got "
-            f"{target!r}{near if found is None else ''}"
+            f"{target!r}{hint if kind is None else ''}"
         )
-    return found
+    return kind

@@ -31,7 +31,10 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         self.data = data
 
     def find_upright(self, room: SlabRoom) -> SlabRoom:
-        """The upright plane along the axes of a room that explains most alone, if there is any."""
+        """A room of the one upright plane that explains most alone; an empty room without any.
+
+        It stands along the axes of ``room``.
+        """
         axes = room_axes(room.planes)
         nothing = SlabRoom(room.planes[:0], room.slabs[:0])
         walls, amid = self.propose_along(nothing, axes[axes[:, 2].abs() < 0.01], 0.0)
@@ -47,7 +50,11 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
     def grow_along(
         self, room: SlabRoom, most: int, others: Float[Tensor, "v 4"] | None = None
     ) -> SlabRoom:
-        """The room with further planes along its axes, or else near others."""
+        """The room with further planes, ``most`` in all.
+
+        Each is a wall along the room's axes; or else a plane along them amid the places; or else
+        one of ``others``.
+        """
         count = len(room.planes)
 
         def extend(room: SlabRoom) -> SlabRoom | None:
@@ -55,9 +62,11 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
             walls, amid = self.propose_along(
                 room, room_axes(room.planes), self.data.options.added_share
             )
-            near = [] if others is None else list(others)
-            new = [plane for plane in near if not self.frame.is_like(room.planes, plane).any()]
-            for candidates in (walls, amid, new):
+            unused = []
+            for plane in others if others is not None else []:
+                if not self.frame.is_like(room.planes, plane).any():
+                    unused.append(plane)
+            for candidates in (walls, amid, unused):
                 if not candidates:
                     continue
                 larger = self.add_best(room, candidates)
@@ -73,10 +82,11 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
     def propose_along(
         self, room: SlabRoom, normals: Float[Tensor, "k 3"], least: float
     ) -> tuple[list[Float[Tensor, "4"]], list[Float[Tensor, "4"]]]:
-        """Planes with these normals that explain more than a share of the rest, the best first.
+        """Planes with these normals that explain more than a share ``least`` of the residual.
 
-        At most four walls, which have all places on one side, and four planes amid the places:
-        these explain more of the rest.
+        Returns:
+            At most four walls, which have all places on one side, and at most four planes amid the
+            places, each list best first. Planes amid the places would outdo walls in one list.
         """
         walls: list[Candidate] = []
         amid: list[Candidate] = []
@@ -91,7 +101,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         return _strongest(walls, least), _strongest(amid, least)
 
     def add_best(self, room: SlabRoom, candidates: list[Float[Tensor, "4"]]) -> SlabRoom:
-        """The room with the best candidate, which may not move to a known plane; or the room."""
+        """The room with the best candidate after its move; unchanged if all move to known ones."""
         trials = []
         number = len(room.planes)
         for plane in candidates:
@@ -103,7 +113,10 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         return self.score.polish(best[0], 12, 5e-4, number) if best else room
 
     def settle(self, room: SlabRoom, polishes: bool = False) -> SlabRoom:
-        """Each plane once more at its best offset and tilt, as the others are known now."""
+        """The room with each plane moved once more, as the others are known now.
+
+        ``polishes`` adds a descent to each move.
+        """
         move = self.score.move_and_polish if polishes else self.score.move
         room = self.sweep(room, range(len(room.planes)), move=move)
         if stages.is_up():
@@ -111,7 +124,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         return self.score.choose_best([room, self.score.polish(room, 30, 3e-4)])[0]
 
     def _propose_by_phases(self, planes: Float[Tensor, "w 4"], number: int, tilt: float) -> list:
-        """Planes near one of some planes, with every third slab."""
+        """Planes near plane ``number``, with every third slab of ``SLABS``."""
         return propose_by_phases(self.data, planes, number, self.data.reach, tilt, SLABS[::3])
 
 
@@ -122,10 +135,15 @@ def _strongest(candidates: list[Candidate], least: float) -> list[Float[Tensor, 
 
 
 def room_axes(planes: Float[Tensor, "w 4"]) -> Float[Tensor, "k 3"]:
-    """Normals of planes, and level, upright ones and those at right angles to upright ones."""
+    """Normals along which a room may have further planes.
+
+    They are the planes' own; the vertical; the horizontal parts of steep planes' normals; and the
+    horizontal normals at right angles to these.
+    """
     normals = planes[:, :3]
     up = planes.new_tensor([0.0, 0.0, 1.0])
-    upright = functional.normalize(normals[normals[:, 2].abs() < 0.5] * (1 - up), dim=1)
+    is_steep = normals[:, 2].abs() < 0.5
+    upright = functional.normalize(normals[is_steep] * (1 - up), dim=1)
     across = torch.linalg.cross(up.expand_as(upright), upright)
     return torch.stack(distinct(torch.cat((normals, up[None], upright, across)), 2e-4))
 

@@ -39,17 +39,17 @@ class ChannelOptions:
     # reflections.
     fewest_free: int = 37
     certain_share: float = 0.006  # share of the power from which a plane is taken
-    # The same if the rest falls by ``certain_fall``. Validation drops planes later; a few too many
-    # cost time alone.
+    # The same share if the residual falls by ``certain_fall``. Validation drops planes later; a few
+    # too many cost time alone.
     faint_share: float = 0.003
-    # Fall of the mean log of the rest by a true plane behind others: false ones reach 0.3.
+    # Fall of the mean log of the residual by a true plane behind others: false ones reach 0.3.
     certain_fall: float = 0.5
     # Least fall of the mean log of what neighbours do not predict by a true plane. Walls have 0.05
     # and more, false planes up to 0.02, furniture 0.01 to 0.06.
     price: float = 0.02
     neighbours: int = 8  # places whose strengths predict a place
     predicted: int = 250  # most places that are predicted
-    # Least share of the rest that a candidate along the room's axes explains.
+    # Least share of the residual that a candidate along the room's axes explains.
     added_share: float = 0.05
     # Largest distance of a plane from all transmitters and receivers [diagonals].
     margin: float = 0.3
@@ -62,8 +62,8 @@ class ChannelOptions:
     # times numbers.
     most_waves: int = 100_000_000
     drawing_error: float = 0.2  # largest error of a wall in a floor plan [m]
-    # Share of the rest that the best of thousands of planes explains by chance, times the number of
-    # places.
+    # Share of the residual that the best of thousands of planes explains by chance, times the
+    # number of places.
     chance: float = 6.0
 
 
@@ -89,7 +89,7 @@ class SlabRoom(NamedTuple):
 
 
 def half_spaces(planes: Float[Tensor, "w 4"]) -> SlabRoom:
-    """A room with walls without a far side."""
+    """A room whose planes are faces of half-spaces: thick slabs, the second of ``SLABS``."""
     return SlabRoom(planes, SLABS[1].repeat(len(planes), 1))
 
 
@@ -101,7 +101,7 @@ class SlabMaterials(NamedTuple):
 
 
 def materials_of(slabs: Float[Tensor, "*w 3"]) -> SlabMaterials:
-    """Materials of rows as in ``SLABS``."""
+    """Permittivities and thicknesses of slabs, which are given as in ``SLABS``."""
     real, imaginary, thicknesses = slabs.exp().unbind(-1)
     return SlabMaterials(torch.complex(1 + real, -imaginary), thicknesses)
 
@@ -120,46 +120,54 @@ class ReceiverChannels:
     def of(
         cls, links: Links, number: int, sign: int, elements: int = 16, subcarriers: int = 32
     ) -> "ReceiverChannels":
+        """Channels of receiver ``number`` that carry power, with phases as of exp(-j 2 pi f t).
+
+        Args:
+            links: Their training links count.
+            number: Number of the receiver.
+            sign: Sign of the labels' phases.
+            elements, subcarriers: Largest numbers, evenly spread over the array and the band.
+        """
         receiver = links.receivers[number]
         query = links.query
         task: Csi = links.task
         train = links.split.train
         rows = train[query.receivers[train] == number]
-        which = evenly(torch.arange(len(receiver.array)), elements)
-        heard = receiver.hears(task.frequencies).nonzero()[:, 0]
-        when = evenly(heard, subcarriers)
-        channels = links.labels[rows][:, which][:, :, when].to(torch.complex128)  # (b, e, s)
+        chosen = evenly(torch.arange(len(receiver.array)), elements)
+        in_band = receiver.hears(task.frequencies).nonzero()[:, 0]
+        carriers = evenly(in_band, subcarriers)
+        channels = links.labels[rows][:, chosen][:, :, carriers].to(torch.complex128)  # (b, e, s)
         is_received = channels.abs().amax((1, 2)) > 0
         pose = receiver.pose.to(torch.zeros((), dtype=torch.float64))
         return cls(
             query.transmitters[rows][is_received].double(),
             (channels.conj() if sign > 0 else channels)[is_received],
             pose.position,
-            pose.world(receiver.array.elements[which].double()),
-            task.frequencies[when],
+            pose.world(receiver.array.elements[chosen].double()),
+            task.frequencies[carriers],
         )
 
     @property
     def wavelength(self) -> float:
-        """At the middle frequency [m]."""
+        """Wavelength at the mean frequency [m]."""
         return speed_of_light / float(self.frequencies.mean())
 
     def about(self, middle: Float[Tensor, "3"]) -> "ReceiverChannels":
-        """The same seen from a point."""
+        """The same channels, with positions from a point ``middle`` [m]."""
         points = {name: getattr(self, name) - middle for name in ("places", "position", "elements")}
         return replace(self, **points)
 
-    def at(self, index: object, when: object = slice(None)) -> "ReceiverChannels":
-        """The channels of some places at some subcarriers."""
+    def at(self, places: object, subcarriers: object = slice(None)) -> "ReceiverChannels":
+        """The channels at places and subcarriers, both chosen by an index, a mask or a slice."""
         return replace(
             self,
-            places=self.places[index],
-            channels=self.channels[index][:, :, when],
-            frequencies=self.frequencies[when],
+            places=self.places[places],
+            channels=self.channels[places][:, :, subcarriers],
+            frequencies=self.frequencies[subcarriers],
         )
 
     def single(self) -> "ReceiverChannels":
-        """In single precision, for descents."""
+        """The same channels in single precision, for descents."""
         parts = {
             name: part.float()
             for name, part in vars(self).items()
@@ -168,7 +176,8 @@ class ReceiverChannels:
         return replace(self, **parts, channels=self.channels.to(torch.complex64))
 
     def of_unique_places(self) -> "ReceiverChannels":
-        """One link of each received place: links of one place would explain each other."""
+        """The first link of each place that is received: two links of a place would predict each
+        other."""
         received = self.at(self.channels.abs().amax((1, 2)) > 0)
         _, which = received.places.unique(dim=0, return_inverse=True)
         first: dict[int, int] = {}
@@ -183,7 +192,7 @@ class ReceiverChannels:
 
     @property
     def few_subcarriers(self) -> slice:
-        """A fifth of the subcarriers, or as many as leave 64 numbers of a channel."""
+        """Every fifth subcarrier, or a smaller step that leaves a channel about 64 numbers."""
         return slice(None, None, min(5, max(1, self.flat.shape[1] // 64)))
 
     def images(
@@ -209,8 +218,8 @@ class ReceiverChannels:
     ) -> Complex[Tensor, "b n k"]:
         """Waves of all paths after their reflections; 0 for a path that does not meet its planes.
 
-        Slabs reflect as ``at`` some frequencies [Hz], by default at each subcarrier's. Half-spaces
-        reflect all alike.
+        Slabs reflect as at the frequencies ``at`` [Hz], by default each subcarrier's. One frequency
+        saves work with half-spaces, which reflect alike at all.
         """
         at = self.frequencies if at is None else at
         planes = room.planes.to(self.places)
@@ -238,7 +247,7 @@ class ChannelSample(NamedTuple):
     phases: list[Complex[Tensor, " c"]]
 
     def every(self, step: int) -> "ChannelSample":
-        """Every ``step``-th place."""
+        """The sample at every ``step``-th place."""
         receivers = [receiver.at(slice(None, None, step)) for receiver in self.receivers]
         phases = [phase if len(phase) == 1 else phase[::step] for phase in self.phases]
         return ChannelSample(receivers, phases)
@@ -294,15 +303,19 @@ class ChannelData:
         parts = []
         for receiver in self.receivers:
             places = self._draw_rows(len(receiver.places), each)
-            when = self._draw_rows(len(receiver.frequencies), subcarriers)
-            parts.append(receiver.at(places, when))
+            carriers = self._draw_rows(len(receiver.frequencies), subcarriers)
+            parts.append(receiver.at(places, carriers))
         return parts
 
     def _draw_rows(self, size: int, most: int | None) -> Int[Tensor, " k"]:
+        """At most ``most`` random numbers below ``size`` without repetition, ascending."""
         return torch.randperm(size, generator=self.frame.generator)[:most].sort().values
 
     def sample(self, planes: Float[Tensor, "w 4"]) -> ChannelSample:
-        """About a hundred places at some subcarriers, and their phases beside planes."""
+        """Channels at about a hundred places and ``few_subcarriers``, in single precision.
+
+        Their reference phases are ``reference_phases`` with ``planes``.
+        """
         receivers = []
         phases = []
         references = self.reference_phases(planes, self.receivers)
@@ -323,7 +336,10 @@ class ChannelData:
     def reference_phases(
         self, planes: Float[Tensor, "w 4"], receivers: list[ReceiverChannels]
     ) -> list[Complex[Tensor, " c"]]:
-        """Phase of each receiver's direct paths: one in common, or one for each place."""
+        """Phase of each receiver's direct paths, as a number of magnitude 1.
+
+        It is one for all places (1,) if channels have a common phase, else one for each place (b,).
+        """
         phases = []
         for receiver in receivers:
             if not self.has_common_phase:

@@ -61,7 +61,7 @@ class ChannelScore(Score[SlabRoom]):
         room: SlabRoom,
         sequences: Int[Tensor, "n order"],
     ) -> Float[Tensor, " t"]:
-        """Log of the share of each target's power that its neighbours' strengths leave."""
+        """Log of the share of each target's power that its neighbours' strengths do not explain."""
         receiver = links.receiver.at(slice(None), links.receiver.few_subcarriers).single()
         channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
         power = receiver.flat.abs().square().sum(1)[:, None, None]
@@ -83,16 +83,17 @@ class ChannelScore(Score[SlabRoom]):
 
     @cached_property
     def neighbours(self) -> list[NeighbourLinks]:
-        """Predicted places of each receiver."""
+        """Each receiver's predicted places, evenly thinned, and the places that predict them."""
         neighbours = []
         most = max(8, self.options.predicted // len(self.data.receivers))
         for links in self.data.receivers:
             receiver = links.of_unique_places()
             targets = evenly(torch.arange(len(receiver.places)), most)
             gaps = torch.cdist(receiver.places[targets], receiver.places)
-            gaps[gaps < self.data.wavelength] = math.inf
+            gaps[gaps < self.data.wavelength] = math.inf  # see ``NeighbourLinks.counts``
             count = min(self.options.neighbours, gaps.shape[1])
-            gaps, near = gaps.topk(count, largest=False)
+            gaps, near = gaps.topk(count, largest=False)  # (t, k)
+            # Only the rows in use are kept; their numbers then count among these.
             rows = torch.cat((targets, near.flatten())).unique()
             neighbours.append(
                 NeighbourLinks(
@@ -115,11 +116,15 @@ class ChannelScore(Score[SlabRoom]):
         return self._best_moves(room, number)[0]
 
     def move_and_polish(self, room: SlabRoom, number: int) -> SlabRoom:
-        """``move`` after a descent with each of the best: an ill slab may hide the best offset."""
+        """The best room of ``move`` or of a descent with each of its best trials.
+
+        The descent also fits the slab: a wrong one may hide the best offset.
+        """
         best = self._best_moves(room, number)
         return self.choose_best(best + [self.polish(trial, 12, 5e-4, number) for trial in best])[0]
 
     def _best_moves(self, room: SlabRoom, number: int) -> list[SlabRoom]:
+        """At most three rooms, best first: the room, or its plane moved to where phases agree."""
         trials = [room]
         for plane, material in propose_by_phases(
             self.data, room.planes, number, self.data.reach, 0.006, SLABS
@@ -130,59 +135,63 @@ class ChannelScore(Score[SlabRoom]):
     # --- residuals ---
 
     def choose_best(self, rooms: list[SlabRoom]) -> list[SlabRoom]:
-        """At most three rooms that leave least, the best first. Few places choose these three."""
+        """At most three rooms of the smallest ``measure``, best first.
+
+        A third of the places chooses the three.
+        """
         if not rooms:
             return []
         sample = self.data.sample(rooms[0].planes)
         if len(rooms) > 3:
-            few = sample.every(3)
-            rooms = sorted(rooms, key=lambda room: self.measure(few, room).item())[:3]
+            thinned = sample.every(3)
+            rooms = sorted(rooms, key=lambda room: self.measure(thinned, room).item())[:3]
         return sorted(rooms, key=lambda room: self.measure(sample, room).item())
 
     def measure(
         self, sample: ChannelSample, room: SlabRoom, resolved: Bool[Tensor, " w"] | bool = True
     ) -> Float[Tensor, ""]:
-        """Mean log of the share of power that real strengths leave.
+        """Mean log of the share of power that real strengths do not explain.
 
-        Paths at planes that are not ``resolved`` have complex strengths.
+        Paths at planes that are not ``resolved`` have complex strengths: their planes are not known
+        to a fraction of the wavelength.
         """
         shares = []
-        rests = self.residuals(sample, room, resolved)
-        for receiver, rest in zip(sample.receivers, rests, strict=True):
-            shares.append(log_share(rest, receiver.flat))
+        residuals = self.residuals(sample, room, resolved)
+        for receiver, residual in zip(sample.receivers, residuals, strict=True):
+            shares.append(log_share(residual, receiver.flat))
         return torch.cat(shares).mean()
 
     def residuals(
         self, sample: ChannelSample, room: SlabRoom, resolved: Bool[Tensor, " w"] | bool = True
     ) -> list[Complex[Tensor, "b k"]]:
-        """What the strengths of ``measure`` leave of each receiver's channels."""
+        """Residuals of each receiver's channels after the strengths of ``measure``."""
         sequences = self.data.sequences(room.planes)
         resolved = torch.as_tensor(resolved).expand(len(room.planes))
         is_free = torch.isin(sequences, (~resolved).nonzero()).any(1)
         # A complex strength is two signed real ones, of the wave and of one a quarter turn ahead.
         signed = torch.cat((is_free, is_free[is_free]))
-        rests = []
+        residuals = []
         for receiver, phase in zip(sample.receivers, sample.phases, strict=True):
             channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
             waves = receiver.reflected(room, sequences)
             waves = torch.cat((waves, 1j * waves[:, is_free]), 1)
-            rest = real_residual(waves, channels, signed, self.options.ridge)
+            residual = real_residual(waves, channels, signed, self.options.ridge)
             if not self.data.has_common_phase:
                 # Once more with the phase of each place that explains most.
-                channels = align_phases(channels, channels - rest)
-                rest = real_residual(waves, channels, signed, self.options.ridge)
-            rests.append(rest)
-        return rests
+                channels = align_phases(channels, channels - residual)
+                residual = real_residual(waves, channels, signed, self.options.ridge)
+            residuals.append(residual)
+        return residuals
 
     def polish(self, room: SlabRoom, steps: int, rate: float, only: int | None = None) -> SlabRoom:
-        """The room after a descent on ``measure`` with all planes, or with one.
+        """The room after a descent on ``measure`` with all planes, or with plane ``only``.
 
-        ``rate`` as in ``search.descend`` [m].
+        ``steps`` and ``rate`` [m] as in ``search.descend``.
         """
         moves = torch.ones(len(room.planes), dtype=torch.bool)
         if only is not None:
             moves = torch.arange(len(room.planes)) == only
-        moves = moves[:, None]
+        moves = moves[:, None]  # (w, 1), True for planes that move
         receivers = self.data.receivers
         references = self.data.reference_phases(room.planes, receivers)
         generator = self.data.frame.generator
@@ -196,10 +205,10 @@ class ChannelScore(Score[SlabRoom]):
             for receiver, phase in zip(receivers, references, strict=True):
                 # Other links in each step: a stochastic gradient.
                 count = max(4, 40 // len(receivers))
-                index = torch.randperm(len(receiver.places), generator=generator)[:count]
-                when = torch.randperm(len(receiver.frequencies), generator=generator)[:6]
-                parts.append(receiver.at(index, when).single())
-                phases.append(phase if len(phase) == 1 else phase[index])
+                places = torch.randperm(len(receiver.places), generator=generator)[:count]
+                carriers = torch.randperm(len(receiver.frequencies), generator=generator)[:6]
+                parts.append(receiver.at(places, carriers).single())
+                phases.append(phase if len(phase) == 1 else phase[places])
             return self.measure(ChannelSample(parts, phases), trial)
 
         planes, slabs = descend(loss, receivers, room.planes, [room.slabs], steps, rate)
@@ -214,12 +223,12 @@ class ChannelScore(Score[SlabRoom]):
         return GridRatings(ratings, lambda planes: self.added_shares(room, planes))
 
     def added_shares(self, room: SlabRoom, planes: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
-        """Mean share, 0 to 1, of what known paths leave that one more image explains beside them.
+        """Mean share, 0 to 1, of the residual that an image in each plane explains.
 
-        The image in a wall behind the array resembles the direct path, so the residual hides it:
-        only the part of its wave that known paths do not explain counts, in power too. Strengths of
-        known paths are free, or real where free ones would explain channels of few numbers. 0 for a
-        plane between the ends.
+        The residual is what known paths leave. Only the part of the image's wave that known paths
+        do not explain counts, in numerator and denominator: the image in a wall behind the array
+        resembles the direct path and would be underrated. The share is 0 for a plane between
+        transmitter and receiver.
         """
         total = planes.new_zeros(len(planes))
         count = 0
@@ -229,17 +238,23 @@ class ChannelScore(Score[SlabRoom]):
             unknowns = known.shape[1] if self.has_free_strengths else known.shape[1] / 2
             if unknowns >= known.shape[2]:  # known paths explain any channel
                 continue
-            gram = self._taken(known.conj() @ known.mT)
+            gram = self._fitted_part(known.conj() @ known.mT)
+            # Rows of the pseudo-inverse: their product with a wave gives its strengths.
             inverse = torch.linalg.solve(ridged(gram, self.options.ridge), known.conj())
             channels = (receiver.flat * phase[:, None].conj().to(receiver.flat))[..., None]
-            rest = channels - known.mT @ self._taken(inverse @ channels)  # (b, k, 1)
-            count += len(rest)
+            residual = channels - known.mT @ self._fitted_part(inverse @ channels)  # (b, k, 1)
+            count += len(residual)
             for rows in torch.arange(len(planes)).split(64):
-                total[rows] += self._added_of_receiver(receiver, known, inverse, rest, planes[rows])
+                total[rows] += self._added_of_receiver(
+                    receiver, known, inverse, residual, planes[rows]
+                )
         return total / max(count, 1)
 
-    def _taken(self, values: Tensor) -> Tensor:
-        """The part of strengths or Gram matrices that is fitted: all, or the real one."""
+    def _fitted_part(self, values: Tensor) -> Tensor:
+        """Strengths or Gram matrices; only their real part unless strengths are free.
+
+        Free strengths would explain channels of few numbers by any plane.
+        """
         return values if self.has_free_strengths else values.real.to(values)
 
     def _added_of_receiver(
@@ -247,14 +262,20 @@ class ChannelScore(Score[SlabRoom]):
         receiver: ReceiverChannels,
         known: Complex[Tensor, "b n k"],
         inverse: Complex[Tensor, "b n k"],
-        rest: Complex[Tensor, "b k 1"],
+        residual: Complex[Tensor, "b k 1"],
         planes: Float[Tensor, "c 4"],
     ) -> Float[Tensor, " c"]:
-        """Sum over places of the share of a residual that an image in each plane explains.
+        """Sum of ``added_shares`` over the places of one receiver.
 
-        ``inverse`` gives the strengths of known waves that explain another wave best.
+        Args:
+            receiver: Places and elements.
+            known: Waves of the known paths.
+            inverse: Pseudo-inverse of ``known``: its product with a wave gives the strengths of
+                known waves that explain it best.
+            residual: Residual of the known paths.
+            planes: Candidates.
         """
-        power = rest.abs().square().sum((1, 2)).clamp_min(torch.finfo(torch.float32).tiny)
+        power = residual.abs().square().sum((1, 2)).clamp_min(torch.finfo(torch.float32).tiny)
         normals, offsets = planes[:, :3].float(), planes[:, 3].float()
         heights = receiver.places @ normals.mT - offsets  # (b, c)
         points = receiver.places[:, None] - 2 * heights[..., None] * normals  # (b, c, 3)
@@ -263,15 +284,15 @@ class ChannelScore(Score[SlabRoom]):
         strengths = (inverse @ waves.mT).mT  # (b, c, n)
         # The image's own phase is unknown: its wave and the one a quarter of a turn ahead, each
         # without the part that known waves explain.
-        ahead = waves - self._taken(strengths) @ known
-        aside = 1j * waves - self._taken(1j * strengths) @ known
-        # Share of the rest by least squares of two waves:
+        ahead = waves - self._fitted_part(strengths) @ known
+        aside = 1j * waves - self._fitted_part(1j * strengths) @ known
+        # Share of the residual by least squares of two waves:
         # (bb a² - 2 ab a b + aa b²) / (aa bb - ab²).
         aa = ahead.abs().square().sum(2) + self.options.ridge * size
         bb = aside.abs().square().sum(2) + self.options.ridge * size
         ab = (ahead.conj() * aside).real.sum(2)
-        a = (ahead.conj() @ rest)[..., 0].real
-        b = (aside.conj() @ rest)[..., 0].real
+        a = (ahead.conj() @ residual)[..., 0].real
+        b = (aside.conj() @ residual)[..., 0].real
         numerator = bb * a.square() - 2 * ab * a * b + aa * b.square()
         share = numerator / (aa * bb - ab.square()) / power[:, None]
         is_beside = heights * (normals @ receiver.position - offsets) > 0

@@ -79,7 +79,7 @@ class ChannelSearch:
         """The room of ``run`` in the frame."""
         with stages.portion(0.6):  # planes that are not resolved are worth nothing
             planes = self.find_free(self.start)
-        best = SlabRoom(planes, planes[:, :3])
+        best = SlabRoom(planes, planes[:, :3])  # kept if it is empty
         if len(planes):
             best = self.prune(self.resolve(self.free.descend(planes, 300, 5e-3)))
         if stages.is_up():
@@ -107,10 +107,10 @@ class ChannelSearch:
         return self.prune(self.along_axes.grow_along(best, self.most))
 
     def search_anew(self, room: SlabRoom) -> SlabRoom:
-        """The best of a room and of two others.
+        """The best of a room and two variants of it, after pruning dropped planes.
 
-        One follows from a search for what dropped planes explained, one is the room resolved again:
-        false planes had moved the others.
+        The first adds planes for what the dropped ones explained. The second resolves the best room
+        so far again, because false planes had moved the others.
         """
         planes = self.find_free(self.free.descend(room.planes, 100, 1e-2))
         again = self.prune(self.resolve(self.free.descend(planes, 300, 5e-3)))
@@ -118,7 +118,7 @@ class ChannelSearch:
         return min(room, self.resolve(room.planes), key=self.score.error)
 
     def prune(self, room: SlabRoom) -> SlabRoom:
-        """The room without planes that explain nothing that others do not; the start's stay."""
+        """The room without the planes whose absence lowers the error; known planes stay."""
         return self.along_axes.prune(room, len(self.start))
 
     def find_axis_walls(self) -> SlabRoom:
@@ -126,7 +126,7 @@ class ChannelSearch:
         return CommonGains(self.data, self.start, self.most).find_axis_walls()
 
     def find_free(self, known: Float[Tensor, "v 4"]) -> Float[Tensor, "w 4"]:
-        """Known planes and others by ``FreeScore``, each refined with those before."""
+        """Known planes and those that ``FreeScore`` adds, all refined after each addition."""
         normals = torch.cat((fibonacci_lattice(400, 0.0, math.pi / 2), torch.eye(3)))
         grid = self.frame.grid(normals.to(self.frame.points), 80, self.data.options.margin)
         search = PlaneSearch(self.frame, self.free)
@@ -147,12 +147,16 @@ class ChannelSearch:
             return min([*search.list_extensions(others, grid), last], key=self.free.error)
 
         room = search.grow(self.free.evaluate(known), self.most, extend)
-        # The first of the new planes once more, as others are known now; it becomes the last.
+        # Each new plane is searched once more, as the others are known now. It becomes the last, so
+        # the next one always stands first, behind the known planes.
         turns = [len(known)] * (len(room.planes) - len(known))
         return search.sweep(room, turns, "search of planes", replace).planes
 
     def resolve(self, planes: Float[Tensor, "w 4"]) -> SlabRoom:
-        """Moves planes to where real strengths of slabs leave least; others stay complex."""
+        """The room with each plane moved to a fraction of the wavelength, and its best slab.
+
+        A plane that is not moved yet keeps complex strengths, see ``ChannelScore.measure``.
+        """
         room = half_spaces(planes)
         resolved = torch.zeros(len(planes), dtype=torch.bool)
         sample = self.data.sample(planes)
@@ -189,9 +193,10 @@ class ChannelSearch:
     def square_variants(
         self, planes: Float[Tensor, "w 4"], number: int
     ) -> list[Float[Tensor, "w 4"]]:
-        """The planes, with one of them parallel or at right angles to others.
+        """Copies of the planes in which plane ``number`` is parallel or square to others.
 
-        It stands at the best two offsets nearby: a tilted plane may stand for two parallel ones.
+        Each of its normals gives two copies, at the best two offsets nearby: a tilted plane may
+        stand for two parallel ones.
         """
         is_other = torch.arange(len(planes)) != number
         axes = _square_axes(planes, number, is_other)
@@ -217,7 +222,7 @@ class ChannelSearch:
 def _square_axes(
     planes: Float[Tensor, "w 4"], number: int, is_other: Bool[Tensor, " w"]
 ) -> list[Float[Tensor, "3"]]:
-    """At most three normals near one plane's that are parallel or square to others' (3,)."""
+    """At most three normals (3,) near plane ``number``'s, parallel or square to other planes."""
     normals = planes[is_other, :3]
     pairs = torch.combinations(torch.arange(len(normals)))
     crossed = torch.linalg.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])

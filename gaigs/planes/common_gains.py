@@ -18,12 +18,19 @@ class CommonFit(NamedTuple):
     residuals: list[Complex[Tensor, "b k"]]
 
 
+class BestOffset(NamedTuple):
+    """A plane at its best offset, and the share of power that its image explains there."""
+
+    share: float
+    plane: Float[Tensor, "4"]
+
+
 class CommonGains:
     """Planes square to the axes of coordinates, one after the other: a matching pursuit.
 
-    Each image has one real gain for all places, as by a half-space. One gain explains hardly
-    anything by chance, so offsets show to millimetres also where free strengths at each place
-    explain any few numbers of a channel.
+    Each image has one real gain for all places, as by a half-space. Free strengths at each place
+    would explain channels of few numbers by any plane. A common gain explains hardly anything by
+    chance, so offsets show to millimetres.
 
     Args:
         data: Training channels.
@@ -41,9 +48,9 @@ class CommonGains:
     def find_axis_walls(self) -> SlabRoom:
         """Half-spaces of the known walls and of further planes square to the axes.
 
-        Known walls move along their normals where that explains more than by chance. No planes
-        result if the room is too large for its wavelength: a grid of offsets then leaves room for
-        fewer than 50 places.
+        Known walls move along their normals where that explains more than by chance. The result is
+        empty if the room is so many wavelengths large that ``most_waves`` allows fewer than 50
+        places.
         """
         options = self.data.options
         frame = self.data.frame
@@ -55,61 +62,72 @@ class CommonGains:
         subcarriers = max(4, 32 // elements)
         max_places = min(200, options.most_waves // (int(steps.sum()) * elements * subcarriers))
         unique = [part.of_unique_places() for part in self.data.draw(max_places, subcarriers, 1)]
-        parts = [part for part in unique if len(part.places)]
-        if max_places < 50 or not parts:
+        receivers = [part for part in unique if len(part.places)]
+        if max_places < 50 or not receivers:
             return half_spaces(self.start[:0])
         axes = torch.eye(3).to(frame.points).split(1)
         lines = []
         for axis, count in zip(axes, steps, strict=True):
             lines.append(frame.grid(axis, int(count), options.margin)[0])
-        # Share of the rest that the best of all these planes explains by chance.
-        by_chance = options.chance / sum(len(part.places) for part in parts)
-        planes = self._place_start(parts, by_chance)
-        planes = self._pursue(parts, planes, torch.cat(lines), by_chance)
+        # Share of the residual that the best of all these planes explains by chance.
+        by_chance = options.chance / sum(len(part.places) for part in receivers)
+        planes = self._place_start(receivers, by_chance)
+        planes = self._pursue(receivers, planes, torch.cat(lines), by_chance)
         # Each plane moves once more, as the others are known now. A known wall stays unless the
         # move explains more than by chance.
         for number in range(len(planes)):
             bonus = by_chance if number < len(self.start) else 0.0
-            planes[number] = self.move(parts, _without(planes, number), planes[number], bonus)[1]
-        planes = self.choose_lobes(parts, planes, by_chance)
-        return half_spaces(self._without_chance_planes(parts, planes, by_chance))
+            planes[number] = self.move(
+                receivers, _without(planes, number), planes[number], bonus
+            ).plane
+        planes = self.choose_lobes(receivers, planes, by_chance)
+        return half_spaces(self._without_chance_planes(receivers, planes, by_chance))
 
     def _without_chance_planes(
-        self, parts: list[ReceiverChannels], planes: Float[Tensor, "w 4"], by_chance: float
+        self, receivers: list[ReceiverChannels], planes: Float[Tensor, "w 4"], by_chance: float
     ) -> Float[Tensor, "v 4"]:
-        """Known walls, and the found planes without which the rest rises by more than chance."""
+        """Known walls, and those further planes that lower the residual by more than chance."""
         for number in reversed(range(len(self.start), len(planes))):
             others = _without(planes, number)
-            share = self.fit(parts, half_spaces(planes)).share
-            if self.fit(parts, half_spaces(others)).share < (1 + by_chance) * share:
+            share = self.fit(receivers, half_spaces(planes)).share
+            if self.fit(receivers, half_spaces(others)).share < (1 + by_chance) * share:
                 planes = others
         return planes
 
-    def _place_start(self, parts: list[ReceiverChannels], by_chance: float) -> Float[Tensor, "w 4"]:
-        """Walls of a drawing where phases agree; those that explain most go first."""
+    def _place_start(
+        self, receivers: list[ReceiverChannels], by_chance: float
+    ) -> Float[Tensor, "w 4"]:
+        """Known walls moved to where phases agree, by at most ``drawing_error``.
+
+        In each round the wall that explains most is placed; it then counts as known to the others.
+        """
         planes = self.start.clone()
         waiting = list(range(len(self.start)))
         while waiting:
             placed = planes[[number for number in range(len(planes)) if number not in waiting]]
             trials = {
-                number: self.move(parts, placed, planes[number], by_chance) for number in waiting
+                number: self.move(receivers, placed, planes[number], by_chance)
+                for number in waiting
             }
-            best = max(waiting, key=lambda number: trials[number][0])
-            planes[best] = trials[best][1]
+            best = max(waiting, key=lambda number: trials[number].share)
+            planes[best] = trials[best].plane
             waiting.remove(best)
         return planes
 
     def _pursue(
         self,
-        parts: list[ReceiverChannels],
+        receivers: list[ReceiverChannels],
         planes: Float[Tensor, "w 4"],
         lines: Float[Tensor, "c 4"],
         by_chance: float,
     ) -> Float[Tensor, "v 4"]:
-        """The planes, and planes of lines that explain most of the rest, more than by chance."""
+        """The planes, followed by planes of ``lines`` until none explains more than chance.
+
+        Each is the one that explains most of the residual (a matching pursuit).
+        """
         while len(planes) < self.most:
-            known = self.fit(parts, half_spaces(planes))
-            shares = self.rate(parts, known.residuals, lines)
+            known = self.fit(receivers, half_spaces(planes))
+            shares = self.rate(receivers, known.residuals, lines)
             for plane in planes:
                 shares[self.data.frame.is_like(lines, plane)] = 0
             if shares.max() < by_chance * known.share:
@@ -118,17 +136,17 @@ class CommonGains:
         return planes
 
     def choose_lobes(
-        self, parts: list[ReceiverChannels], planes: Float[Tensor, "w 4"], by_chance: float
+        self, receivers: list[ReceiverChannels], planes: Float[Tensor, "w 4"], by_chance: float
     ) -> Float[Tensor, "w 4"]:
-        """The planes, each at the offset where paths of all orders leave least.
+        """The planes, each moved to the offset of the smallest residual of paths of all orders.
 
         The fit over an offset has a maximum (a lobe) every half wavelength: a reflected path then
         changes by a whole wavelength, and phases agree again. Known walls move at most
-        ``drawing_error`` in all, and only if that lowers the rest by more than chance.
+        ``drawing_error`` in all, and only if that lowers the residual by more than chance.
         """
         options = self.data.options
         order = self.data.order
-        least = self.fit(parts, half_spaces(planes), order).share
+        least = self.fit(receivers, half_spaces(planes), order).share
         for step in (1 / 16, 1 / 32, 1 / 64):
             for number in range(len(planes)):
                 # Within the lobe, and to the neighbouring lobes half a wavelength apart.
@@ -141,7 +159,7 @@ class CommonGains:
                     moves = moves[gaps.abs() <= options.drawing_error]
                 trials = planes.repeat(len(moves), 1, 1)
                 trials[:, number, 3] += moves
-                shares = [self.fit(parts, half_spaces(trial), order).share for trial in trials]
+                shares = [self.fit(receivers, half_spaces(trial), order).share for trial in trials]
                 if shares and min(shares) < least * (1 - by_chance * is_known):
                     least = min(shares)
                     planes = trials[shares.index(least)]
@@ -149,39 +167,40 @@ class CommonGains:
 
     def move(
         self,
-        parts: list[ReceiverChannels],
+        receivers: list[ReceiverChannels],
         others: Float[Tensor, "v 4"],
         plane: Float[Tensor, "4"],
         bonus: float,
-    ) -> tuple[float, Float[Tensor, "4"]]:
-        """Largest share of power that a plane explains nearby, and the plane there.
-
-        It moves along its normal by at most ``drawing_error``.
+    ) -> BestOffset:
+        """The plane moved along its normal, by at most ``drawing_error``, to explain most.
 
         Args:
-            parts: Channels.
+            receivers: Channels.
             others: Planes whose images the fit has already.
             plane: The plane, at its present offset.
             bonus: Advantage of the present offset, as a share of the power that the others leave.
         """
-        known = self.fit(parts, half_spaces(others))
+        known = self.fit(receivers, half_spaces(others))
         error = self.data.options.drawing_error
         grid = torch.arange(-error, error, self.data.wavelength / 16)
         moves = torch.cat((torch.zeros(1), grid)).to(plane)
         line = plane.repeat(len(moves), 1)
         line[:, 3] += moves
-        shares = self.rate(parts, known.residuals, line)
+        shares = self.rate(receivers, known.residuals, line)
         shares[0] += bonus * known.share
-        return shares.max().item(), line[shares.argmax()]
+        return BestOffset(shares.max().item(), line[shares.argmax()])
 
-    def fit(self, parts: list[ReceiverChannels], room: SlabRoom, order: int = 1) -> CommonFit:
-        """Least squares of one real gain of each path for all places."""
+    def fit(self, receivers: list[ReceiverChannels], room: SlabRoom, order: int = 1) -> CommonFit:
+        """Least squares of one real gain of each path, not negative, for all places.
+
+        Each place counts alike: its squares are over its power.
+        """
         sequences = all_sequences(len(room.planes), order)
         waves = []
         channels = []
         powers = []
-        phases = self.data.reference_phases(room.planes[:0], parts)
-        for receiver, phase in zip(parts, phases, strict=True):
+        phases = self.data.reference_phases(room.planes[:0], receivers)
+        for receiver, phase in zip(receivers, phases, strict=True):
             waves.append(receiver.single().reflected(room, sequences))
             channels.append((receiver.flat * phase[:, None].conj()).to(torch.complex64))
             powers.append(receiver.flat.abs().square().sum(1).float()[:, None, None])
@@ -201,34 +220,35 @@ class CommonGains:
                 channels = [align_phases(*pair) for pair in zip(channels, known, strict=True)]
             residuals = [channel - part for channel, part in zip(channels, known, strict=True)]
         shares = [
-            rest.abs().square().sum(1) / power[:, 0, 0]
-            for rest, power in zip(residuals, powers, strict=True)
+            residual.abs().square().sum(1) / power[:, 0, 0]
+            for residual, power in zip(residuals, powers, strict=True)
         ]
         return CommonFit(torch.cat(shares).mean().item(), residuals)
 
     def rate(
         self,
-        parts: list[ReceiverChannels],
+        receivers: list[ReceiverChannels],
         residuals: list[Complex[Tensor, "b k"]],
         line: Float[Tensor, "c 4"],
     ) -> Float[Tensor, " c"]:
-        """Share of power that one more image explains with a common gain, for planes of a line."""
+        """Share of power that the image in each plane of a line explains by a common gain."""
         total, size = line.new_zeros(2, len(line))
-        for receiver, rest in zip(parts, residuals, strict=True):
+        for receiver, residual in zip(receivers, residuals, strict=True):
             single = receiver.single()
             middle = receiver.frequencies.mean().float()[None]
             powers = receiver.flat.abs().square().sum(1, keepdim=True).float()
             for rows in torch.arange(len(line)).split(64):
                 sequences = torch.arange(len(rows))[:, None]  # each plane alone
                 waves = single.reflected(half_spaces(line[rows]), sequences, middle)
-                products = (waves.conj() @ rest[..., None]).real[..., 0]  # (b, rows)
+                products = (waves.conj() @ residual[..., None]).real[..., 0]  # (b, rows)
                 total[rows] += (products / powers).sum(0)
                 squares = torch.view_as_real(waves).square().sum((2, 3))
                 size[rows] += (squares / powers).sum(0)
         # A gain that is not negative: (sum w . r)² / sum |w|².
         shares = total.clamp_min(0).square() / size.clamp_min(torch.finfo(line.dtype).tiny)
-        return shares / sum(len(receiver.places) for receiver in parts)
+        return shares / sum(len(receiver.places) for receiver in receivers)
 
 
 def _without(planes: Float[Tensor, "w 4"], number: int) -> Float[Tensor, "v 4"]:
+    """All planes but one."""
     return torch.cat((planes[:number], planes[number + 1 :]))

@@ -56,10 +56,10 @@ Operator = Callable[[Tensor], Tensor]
 
 
 class Kriged(NamedTuple):
-    """Residuals after kriging by path from the places near: whitened, or of places not known."""
+    """Operators on residuals, which krige each path's field from the places nearby."""
 
-    whiten: Operator
-    unseen: Operator
+    whiten: Operator  # decorrelates residuals: by the inverse Cholesky factor
+    unseen: Operator  # errors of each place as the other places of its block predict it
 
 
 class Variation(NamedTuple):
@@ -68,7 +68,7 @@ class Variation(NamedTuple):
     Attributes:
         share: Standard deviation of a path's field over its mean.
         length: Distance at which the kernel falls to 1 / e [m].
-        noise: Standard deviation of the rest over the mean field.
+        noise: Standard deviation of uncorrelated errors over the mean field.
     """
 
     share: float
@@ -77,32 +77,34 @@ class Variation(NamedTuple):
 
     @classmethod
     def choices(cls) -> list["Variation"]:
-        """Variations that are tried: none, then shadows as wide as furniture or as half a room."""
-        tried = [cls(0.0, 1.0, 1.0)]
+        """Candidates: no variation, then shadows as wide as furniture or as half a room."""
+        candidates = [cls(0.0, 1.0, 1.0)]
         for share in (0.2, 0.5):
             for length in (0.5, 2.0):
-                tried += [cls(share, length, 0.1), cls(share, length, 0.3)]
-        return tried
+                candidates += [cls(share, length, 0.1), cls(share, length, 0.3)]
+        return candidates
 
 
 class GainChanges(NamedTuple):
-    """Products of the gains of each path (n,), and their derivatives by each gain (n, w)."""
+    """Gains of paths, each a product of plane gains."""
 
     products: Complex[Tensor, " n"]
-    derivatives: Complex[Tensor, "n w"]
+    derivatives: Complex[Tensor, "n w"]  # of each product by each plane's gain
 
 
 def multiply_gains(gains: Complex[Tensor, " w"], sequences: Int[Tensor, "n order"]) -> GainChanges:
     """Products of plane gains over the planes of each sequence."""
     n, order = sequences.shape
+    w = len(gains)
     factors = torch.cat((gains, gains.new_ones(1)))[sequences]  # (n, order); 1 for no plane
-    derivatives = gains.new_zeros(n, len(gains) + 1)
+    derivatives = gains.new_zeros(n, w + 1)
     for column in range(order):
+        # The derivative by one factor is the product of the others. A plane that comes twice gets
+        # the sum. Number -1, no plane, falls into the last column, which is left out.
         others = torch.arange(order) != column
-        derivatives.scatter_add_(
-            1, sequences[:, column, None] % (len(gains) + 1), factors[:, others].prod(1)[:, None]
-        )
-    return GainChanges(factors.prod(1), derivatives[:, : len(gains)])
+        planes = sequences[:, column, None] % (w + 1)  # (n, 1)
+        derivatives.scatter_add_(1, planes, factors[:, others].prod(1)[:, None])
+    return GainChanges(factors.prod(1), derivatives[:, :w])
 
 
 class PlaceBlock(NamedTuple):
@@ -124,13 +126,24 @@ class PlaceBlock(NamedTuple):
 class FieldFit:
     """Least squares of fields by the images in a room's planes, over all places at once.
 
-    Every number counts relative to its receiver's mean at its distance, so that near places do not
-    own the fit.
+    Every number counts relative to its receiver's mean at its distance; otherwise near places would
+    dominate.
 
     Args:
         data: Training channels with a phase in common.
         floor: Share of the mean power below which an error hardly counts: 20 dB.
         damping: Share of the mean squared derivative added in each step of Gauss and Newton.
+        largest: Channel values of a ``PlaceBlock``; a Cholesky factor of more costs time.
+
+    Attributes:
+        values: Channel values of all receivers (m,), scaled to a mean power of 1 at each.
+        scale: Factor from channel values to ``values`` (m,).
+        owner: Number of each value's receiver (m,).
+        bands: Different wavelengths [m].
+        band_numbers: Number of each receiver's band.
+        band: Number of each value's band (m,).
+        variations: How strengths of paths vary over places in each band.
+        blocks: Neighbouring places that are kriged together.
     """
 
     def __init__(
@@ -143,8 +156,8 @@ class FieldFit:
         values = []
         scales = []
         for receiver in self.receivers:
-            near = 0.05 * data.frame.diagonal
-            lengths = (receiver.places - receiver.position).norm(dim=1).clamp_min(near)
+            nearest = 0.05 * data.frame.diagonal
+            lengths = (receiver.places - receiver.position).norm(dim=1).clamp_min(nearest)
             scaled = receiver.flat * lengths[:, None]  # (b, k)
             scale = lengths / scaled.abs().square().mean().sqrt()
             scales.append(scale[:, None].expand_as(receiver.flat).flatten())
@@ -160,30 +173,34 @@ class FieldFit:
         self.blocks = list(self._divide(largest))
 
     def _divide(self, largest: int) -> Iterator[PlaceBlock]:
-        """Blocks of channel values of neighbouring places at one receiver, about ``largest`` each.
+        """Splits ``values`` into blocks of neighbouring places, with about ``largest`` values each.
 
-        Values are in the order of ``self.values``: receiver by receiver, b places of k values.
+        Kriging solves a linear system for each block in place of one for all places.
         """
+        # ``values`` has the receivers one after the other, each with b places of k values.
         first = 0
         for receiver, band in zip(self.receivers, self.band_numbers.tolist(), strict=True):
             b, k = receiver.flat.shape
             rows = first + torch.arange(b * k).view(b, k)
             first += b * k
+            # ``group_places`` halves, so the number of groups is a power of two.
             count = 2 ** max(0, math.ceil(math.log2(b * k / largest)))
             groups = group_places(receiver.places, count)
             for group in groups.unique():
-                own = groups == group
-                gaps = torch.cdist(receiver.places[own], receiver.places[own])
-                gaps = gaps.repeat_interleave(k, 0).repeat_interleave(k, 1)
-                yield PlaceBlock(rows[own].flatten(), gaps, k, band)
+                is_member = groups == group
+                places = receiver.places[is_member]
+                gaps = torch.cdist(places, places)
+                # The k values of a place have the same distances.
+                gaps = gaps.repeat_interleave(k, 0).repeat_interleave(k, 1)  # (c, c)
+                yield PlaceBlock(rows[is_member].flatten(), gaps, k, band)
 
     @property
     def count(self) -> int:
-        """Complex numbers of all training links."""
+        """Number of complex channel values of all training links."""
         return len(self.values)
 
     def start(self, planes: Float[Tensor, "w 4"]) -> FieldRoom:
-        """Known planes as half-spaces; without any it is free space alone."""
+        """A room of known planes as half-spaces, with fitted gains; free space without planes."""
         gains = torch.ones(len(self.bands), len(planes), dtype=torch.complex128)
         receivers = torch.ones(len(self.receivers), dtype=torch.complex128)
         slabs = SLABS[1].repeat(len(planes), 1)
@@ -191,7 +208,7 @@ class FieldFit:
         return self.fit_gains(FieldRoom(planes.double(), slabs, gains, receivers, uses), 12)
 
     def waves(self, planes: Float[Tensor, "w 4"], room: FieldRoom) -> Complex[Tensor, "m n"]:
-        """Scaled waves of all paths after reflection by slabs, for each number."""
+        """Waves of all paths after reflection by the room's slabs, scaled as ``values``."""
         sequences = all_sequences(len(planes), self.order)
         slabs = SlabRoom(planes, room.slabs)
         parts = []
@@ -209,7 +226,13 @@ class FieldFit:
     ) -> FieldRoom:
         """The room with the gains of least mean log error: damped steps of Gauss and Newton.
 
-        Weights make least squares the logarithm's (iteratively reweighted least squares).
+        Weights turn least squares into the mean logarithm (iteratively reweighted least squares).
+
+        Args:
+            room: Planes, and gains at the start.
+            steps: Number of steps; one that raises the error is taken back, with more damping.
+            waves: The room's ``waves`` if they are known.
+            kriged: The room's ``krige`` if it is known.
         """
         waves = self.waves(room.planes, room) if waves is None else waves
         best = room
@@ -238,16 +261,19 @@ class FieldFit:
     ) -> FieldRoom:
         """The room after one damped step of all gains (Levenberg and Marquardt)."""
         sequences = all_sequences(len(room.planes), self.order)
-        unit = torch.zeros_like(self.values)  # (m,)
-        by_gain = waves.new_zeros(len(waves), *room.gains.shape)  # (m, bands, w)
+        # Derivatives of the predicted values: by a receiver's gain they are the values at a gain of
+        # 1, by a plane's gain those of the paths at this plane.
+        by_receiver = torch.zeros_like(self.values)  # (m,)
+        by_plane = waves.new_zeros(len(waves), *room.gains.shape)  # (m, bands, w)
         for number, gains in enumerate(room.gains):
-            own = self.band == number
+            in_band = self.band == number
             changes = multiply_gains(gains, sequences)
-            unit[own] = waves[own] @ changes.products
-            by_gain[own, number] = (waves[own] @ changes.derivatives) * room.uses[number]
-        by_gain = room.receivers[self.owner, None] * by_gain.flatten(1)  # (m, bands w)
-        is_own = self.owner[:, None] == torch.arange(len(self.receivers))
-        jacobian = whiten(torch.cat((by_gain, unit[:, None] * is_own), 1))  # (m, w + r)
+            by_receiver[in_band] = waves[in_band] @ changes.products
+            by_plane[in_band, number] = (waves[in_band] @ changes.derivatives) * room.uses[number]
+        by_plane = room.receivers[self.owner, None] * by_plane.flatten(1)  # (m, bands w)
+        is_owner = self.owner[:, None] == torch.arange(len(self.receivers))  # (m, r)
+        jacobian = torch.cat((by_plane, by_receiver[:, None] * is_owner), 1)  # (m, bands w + r)
+        jacobian = whiten(jacobian)
         weights = 1 / (rest.abs().square() + self.floor)
         gram = jacobian.mH @ (weights[:, None] * jacobian)
         size = gram.diagonal().real
@@ -260,14 +286,13 @@ class FieldFit:
     def residual(
         self, room: FieldRoom, waves: Complex[Tensor, "m n"] | None = None
     ) -> Complex[Tensor, " m"]:
-        """Scaled errors of all numbers, without deviations of paths."""
+        """Scaled errors of all channel values, before kriging."""
         waves = self.waves(room.planes, room) if waves is None else waves
         products = self.products(room)
-        # One product of matrices a band: of each number with its own would take their memory.
+        # A product of matrices for each band: ``products[self.band]`` would be as large as waves.
         total = torch.zeros_like(self.values)
-        for number, of_band in enumerate(products):
-            own = self.band == number
-            total = torch.where(own, waves @ of_band, total)
+        for number, strengths in enumerate(products):
+            total = torch.where(self.band == number, waves @ strengths, total)
         return self.values - room.receivers[self.owner] * total
 
     def products(self, room: FieldRoom) -> Complex[Tensor, "bands n"]:
@@ -277,10 +302,10 @@ class FieldFit:
 
     @torch.no_grad()
     def krige(self, room: FieldRoom, waves: Complex[Tensor, "m n"]) -> Kriged:
-        """Kriging by path of residuals beside a room.
+        """Operators that krige a room's residuals path by path.
 
-        The covariance of two numbers is the covariance of their paths' fields, times the kernel
-        of their places.
+        The covariance of two channel values is the product of their paths' fields, summed over
+        paths, times the kernel of their places; on the diagonal noise is added.
 
         Source: Dubrule, Cross validation of kriging in a unique neighborhood, 1983.
         """
@@ -291,35 +316,36 @@ class FieldFit:
         unseen = []
         for block in self.blocks:
             variation = self.variations[block.band]
-            own = fields[block.rows].to(torch.complex64)
+            paths = fields[block.rows].to(torch.complex64)  # (c, n)
             kernel = variation.share**2 * (-block.gaps / variation.length).exp()
-            covariance = kernel.float() * (own @ own.mH)
-            covariance = covariance + variation.noise**2 * torch.eye(len(own))
+            covariance = kernel.float() * (paths @ paths.mH)
+            identity = torch.eye(len(paths))
+            covariance = covariance + variation.noise**2 * identity
             factor = torch.linalg.cholesky(covariance)
-            root = torch.linalg.solve_triangular(
-                factor, torch.eye(len(own)).to(factor), upper=False
-            )
+            root = torch.linalg.solve_triangular(factor, identity.to(factor), upper=False)
+            # Errors of place i from all others are (Q_ii)^-1 (Q r)_i with Q the inverse covariance
+            # (Dubrule, 1983); Q_ii has the k values of a place.
             by_place = (root.mH @ root).unflatten(0, (-1, block.each))  # (b, k, c)
             of_place = by_place.unflatten(2, (-1, block.each)).diagonal(dim1=0, dim2=2)  # (k, k, b)
-            left = torch.linalg.solve(of_place.movedim(2, 0), by_place)
+            from_others = torch.linalg.solve(of_place.movedim(2, 0), by_place)  # (b, k, c)
             whitening.append(variation.noise * root.to(torch.complex128))
-            unseen.append(left.flatten(0, 1).to(torch.complex128))
+            unseen.append(from_others.flatten(0, 1).to(torch.complex128))
         return Kriged(partial(self._apply, whitening), partial(self._apply, unseen))
 
     def _apply(self, operators: list[Tensor], rest: Tensor) -> Tensor:
-        """Values (m, ...) after an operator for each block."""
+        """Residuals (m, ...) after each block's matrix."""
         applied = torch.empty_like(rest)
         for block, operator in zip(self.blocks, operators, strict=True):
             applied[block.rows] = operator @ rest[block.rows]
         return applied
 
     def unseen(self, room: FieldRoom) -> Complex[Tensor, " m"]:
-        """Scaled errors of each place as all others predict it."""
+        """Scaled errors of each place as the other places of its block predict it."""
         waves = self.waves(room.planes, room)
         return self.krige(room, waves).unseen(self.residual(room, waves))
 
     def choose_variation(self, room: FieldRoom) -> None:
-        """Takes the variation with which a room's places predict each other best in each band."""
+        """Sets ``variations``: in each band the one with which places predict each other best."""
         waves = self.waves(room.planes, room)
         rest = self.residual(room, waves)
         errors = []
@@ -332,19 +358,23 @@ class FieldFit:
         self.variations = [Variation.choices()[number] for number in best]
 
     def mean_log(self, rest: Complex[Tensor, " m"]) -> Float[Tensor, ""]:
-        """Mean logarithm of squared errors over the mean power, with the floor."""
+        """Mean of log(|error|² + ``floor``) over scaled errors."""
         return (rest.abs().square() + self.floor).log().mean()
 
 
 def group_places(places: Float[Tensor, "b 3"], count: int) -> Int[Tensor, " b"]:
-    """Numbers of ``count`` groups of neighbouring places, a power of two: halved lengthwise."""
+    """Group of each place, of ``count`` groups of neighbours, a power of two.
+
+    Each group is halved at the median of its longest axis until there are as many.
+    """
     groups = torch.zeros(len(places), dtype=torch.long)
     while groups.max() + 1 < count:
         halves = torch.zeros_like(groups)
         for group in groups.unique():
             rows = (groups == group).nonzero()[:, 0]
-            own = places[rows]
-            along = own[:, (own.amax(0) - own.amin(0)).argmax()]
+            members = places[rows]
+            extents = members.amax(0) - members.amin(0)
+            along = members[:, extents.argmax()]
             halves[rows] = (along > along.median()).long()
         groups = 2 * groups + halves
     return groups

@@ -12,6 +12,7 @@ from torch.nn import functional
 
 from gaigs.planes.channel_links import SLABS, ChannelData, ReceiverChannels
 from gaigs.planes.field_room import FieldFit, FieldRoom, group_places
+from gaigs.planes.frame import mean_bounces
 from gaigs.planes.search import Candidate, GridRatings, Score, descend
 from gaigs.splatting.placement.mirrored.reflections import reflect
 
@@ -19,21 +20,33 @@ from gaigs.splatting.placement.mirrored.reflections import reflect
 class FieldScore(Score[FieldRoom]):
     """Planes by the power that an image explains with one gain for all places.
 
-    Any planes explain one number at each place, but not with the same gains at all places: there
-    a few hundred places are one large array, and a wrong plane's phases differ from place to place.
+    Any planes explain one number at each place by free gains, but not by gains that all places
+    share: a few hundred places are one large array, over which a wrong plane's phases differ.
     Receivers and groups of places, whose relative gains are unknown, add up as powers.
 
     Args:
         data: Training channels with a phase in common.
-        price: Least fall of the sum over all numbers of the logarithm of squared errors by a true
-            plane. The best of n false ones reaches about the logarithm of n.
+        price: Least fall by a true plane of the sum of log squared errors over all channel values.
+            The best of n false planes reaches about log n.
         chunk: Waves that are computed at a time.
+        upright: Least cosine of a plane that is tried upright, or along an axis: 3.6 degrees.
+
+    Attributes:
+        groups: Groups of places in ratings of a grid.
+        rated: True for bands that rate planes.
 
     Source: Mallat and Zhang, Matching pursuits with time-frequency dictionaries, 1993.
     """
 
-    def __init__(self, data: ChannelData, price: float = 12.0, chunk: int = 4_000_000):
+    def __init__(
+        self,
+        data: ChannelData,
+        price: float = 12.0,
+        chunk: int = 4_000_000,
+        upright: float = 0.998,
+    ):
         self.data = data
+        self.upright = upright
         self.fit = FieldFit(data)
         self.price = price / self.fit.count
         self.chunk = chunk
@@ -49,7 +62,10 @@ class FieldScore(Score[FieldRoom]):
     # --- ratings ---
 
     def rate(self, room: FieldRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
-        """Ratings over those of noise in the ``rated`` bands; of the grid with places in groups."""
+        """Ratings in the ``rated`` bands; 1 for each receiver and group would be noise.
+
+        The grid is rated with places in ``groups``, single planes with all places together.
+        """
         ratings = self._explain(room, grid.flatten(0, 1), self.groups)
         return GridRatings(
             ratings.view(grid.shape[:2]), lambda planes: self._explain(room, planes, 1)
@@ -58,6 +74,10 @@ class FieldScore(Score[FieldRoom]):
     def _explain(
         self, room: FieldRoom, planes: Float[Tensor, "c 4"], groups: int
     ) -> Float[Tensor, " c"]:
+        """Power that the image in each plane explains, summed over receivers and groups of places.
+
+        A matched filter: |sum conj(wave) residual|² / sum |wave|², over residuals of mean power 1.
+        """
         rest = self.fit.unseen(room)
         # The derivative of the logarithm: a place in shadow counts little.
         power = rest.abs().square()
@@ -66,11 +86,11 @@ class FieldScore(Score[FieldRoom]):
         for number, receiver in enumerate(self.data.receivers):
             if not self.rated[self.fit.band_numbers[number]]:
                 continue
-            own = self.fit.owner == number
-            power = rest[own].abs().square().mean()
-            shape = receiver.flat.shape
-            normalised = (rest[own] / power.sqrt()).to(torch.complex64).view(shape)
-            scale = self.fit.scale[own].float().view(shape)[:, :1]  # (b, 1)
+            at_receiver = self.fit.owner == number
+            power = rest[at_receiver].abs().square().mean()
+            shape = receiver.flat.shape  # (b, k)
+            normalised = (rest[at_receiver] / power.sqrt()).to(torch.complex64).view(shape)
+            scale = self.fit.scale[at_receiver].float().view(shape)[:, :1]  # (b, 1)
             member = functional.one_hot(group_places(receiver.places, groups)).float()  # (b, g)
             step = max(1, self.chunk // len(receiver.places))
             for rows in torch.arange(len(planes)).split(step):
@@ -78,6 +98,7 @@ class FieldScore(Score[FieldRoom]):
                 sums = torch.zeros((), dtype=torch.complex64)
                 size = torch.zeros(())
                 waves = self._waves(receiver, part)
+                # Number by number of the channels, so that no tensor has waves of all.
                 for (cosine, sine, reach), values in zip(waves, normalised.mT, strict=True):
                     weights = scale * member
                     real = weights * values.real[:, None]
@@ -95,7 +116,10 @@ class FieldScore(Score[FieldRoom]):
     def _waves(
         receiver: ReceiverChannels, planes: Float[Tensor, "c 4"]
     ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Real parts, negative imaginary parts and amplitudes (c, b) of images, by number."""
+        """Yields the images' waves (c, b) for each number of a channel.
+
+        They are real parts, negative imaginary parts and amplitudes.
+        """
         normals, offsets = planes[:, :3], planes[:, 3:]
         places = receiver.places.float()
         heights = normals @ places.mT - offsets  # (c, b)
@@ -113,10 +137,10 @@ class FieldScore(Score[FieldRoom]):
 
     def add(self, room: FieldRoom, candidate: Candidate) -> FieldRoom | None:
         before = self.error(room)
-        # Without a gain the new plane changes no covariance.
+        # A new plane has no gain yet, so the room's kriging holds for it.
         kriged = self.fit.krige(room, self.fit.waves(room.planes, room))
         trials = []
-        # A plane that some bands show may have a part in the others.
+        # Bands that do not show the plane may still receive paths at it.
         uses = [self.rated] if self.rated.all() else [self.rated, torch.ones_like(self.rated)]
         readings = self._readings(room, candidate.plane)
         for plane, slab, used in itertools.product(readings, (SLABS[1], self.mirror), uses):
@@ -131,10 +155,10 @@ class FieldScore(Score[FieldRoom]):
         return best if best is not None and self.error(best) < before else None
 
     def _readings(self, room: FieldRoom, plane: Float[Tensor, "4"]) -> list[Float[Tensor, "4"]]:
-        """A plane, and planes by whose reflection after or before a known one it would be found.
+        """A found plane, and the planes that would give its image together with a known plane.
 
-        An image of second order of a single receiver, of one band or several, is as good as one in
-        a plane of its own.
+        With a single receiver position, an image of second order looks like the image in a plane of
+        its own. So the true plane may reflect before or after a known one.
         """
         readings = [plane]
         position = self.data.receivers[0].position
@@ -153,7 +177,30 @@ class FieldScore(Score[FieldRoom]):
     def refine(self, room: FieldRoom) -> FieldRoom:
         return self.descend(room, 40)
 
-    def descend(self, room: FieldRoom, steps: int) -> FieldRoom:
+    def square(self, room: FieldRoom) -> FieldRoom:
+        """The room with planes upright and along axes, if noise explains what tilts gain.
+
+        A free number may lower the sum over n values by log(n) / 2 by chance.
+
+        Source: Schwarz, Estimating the dimension of a model, 1978.
+        """
+        normals = room.planes[:, :3]
+        level = functional.normalize(normals * normals.new_tensor([1.0, 1.0, 0.0]), dim=1)
+        along = torch.eye(3).to(normals)[normals.abs().argmax(1)] * normals.sign()  # (w, 3)
+        is_square = (normals * along).sum(1) > self.upright
+        is_level = (normals * level).sum(1) > self.upright
+        squared = torch.where(is_level[:, None], level, normals)
+        squared = torch.where(is_square[:, None], along, squared)
+        # Planes turn about the points where they reflect.
+        pivots = mean_bounces(self.data.receivers, room.planes)
+        offsets = room.planes[:, 3] + ((squared - normals) * pivots).sum(1)
+        start = room._replace(planes=torch.cat((squared, offsets[:, None]), 1))
+        trial = self.descend(self.fit.fit_gains(start, 5), 40, turns=0.0)
+        saved = torch.where(is_square, 2, is_level.long()).sum().item()
+        chance = saved * math.log(self.fit.count) / (2 * self.fit.count)
+        return trial if self.error(trial) < self.error(room) + chance else room
+
+    def descend(self, room: FieldRoom, steps: int, turns: float = 0.4) -> FieldRoom:
         """The room after a descent of the planes, with gains projected out.
 
         Source: Golub and Pereyra, 1973.
@@ -173,7 +220,7 @@ class FieldScore(Score[FieldRoom]):
             return self.fit.mean_log(kriged.whiten(self.fit.residual(current, waves)))
 
         rate = 0.1 * self.data.wavelength
-        planes = descend(loss, self.data.receivers, room.planes, [], steps, rate)[0]
+        planes = descend(loss, self.data.receivers, room.planes, [], steps, rate, turns)[0]
         moved = self.fit.fit_gains(current._replace(planes=planes), 4)
         return min(room, moved, key=self.error)
 

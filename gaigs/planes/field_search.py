@@ -101,10 +101,14 @@ class FieldSearch:
         room = self.score.refine(search.prune(room, len(self.start)))
         if not len(room.planes):
             log.info("no plane explains more of %d numbers than chance would", fit.count)
-        return room
+            return room
+        return self.score.square(room)
 
     def _extend(self, room: FieldRoom, grids: list[PlaneGrid]) -> FieldRoom | None:
-        """The room with the best plane of the first grid that has one; None without any."""
+        """The room with one more plane: the best of the first grid with one that lowers the error.
+
+        None if no grid has any.
+        """
         score = self.score
         for grid in [self._make_axes(room), *grids]:
             normals = grid.normals.to(self.frame.points)
@@ -130,7 +134,7 @@ class FieldSearch:
         return None
 
     def _rated(self) -> list[Bool[Tensor, " bands"]]:
-        """Bands that rate planes: all together, and of several each alone.
+        """Masks of the bands that rate planes: all bands, and each alone if there are several.
 
         Shadows and lengths of waves differ: what one band shows clearly may be noise in the others.
         """
@@ -141,13 +145,15 @@ class FieldSearch:
     # --- grids ---
 
     def _make_axes(self, room: FieldRoom) -> PlaneGrid:
-        """Planes along the axes of a room, of its places and of coordinates."""
+        """Planes along the axes of the room's planes, of the places and of coordinates."""
         turn = upright_turn(self.frame.points).to(self.frame.points)
         axes = torch.cat((room_axes(room.planes), torch.eye(3).to(turn), turn.mT))
         normals = torch.stack(distinct(axes, 2e-4))
         return self._make_grid("along the axes", 1, lambda turn: normals)
 
     def _make_upright(self) -> PlaneGrid | None:
+        """Upright planes with evenly spaced normals."""
+
         def make(turn: float) -> Float[Tensor, "n 3"]:
             angles = torch.arange(0, math.pi, turn)
             return torch.stack((angles.cos(), angles.sin(), 0 * angles), 1)
@@ -155,6 +161,8 @@ class FieldSearch:
         return self._choose_grid("upright", make)
 
     def _make_tilted(self) -> PlaneGrid | None:
+        """Planes with normals evenly spread over half of the sphere."""
+
         def make(turn: float) -> Float[Tensor, "n 3"]:
             count = math.ceil(2 * math.pi / turn**2)
             return fibonacci_lattice(min(count, 1_000_000), 0.0, math.pi / 2)
@@ -164,7 +172,14 @@ class FieldSearch:
     def _choose_grid(
         self, title: str, make: Callable[[float], Float[Tensor, "n 3"]]
     ) -> PlaneGrid | None:
-        """The grid with fewest groups whose work is bounded; None without such a grid."""
+        """The grid with the fewest groups of places whose ratings cost at most ``most_waves``.
+
+        More groups allow a coarser grid. None if groups would have fewer than ``smallest`` places.
+
+        Args:
+            title: Name of the grid for the log.
+            make: Function from the angle between neighbouring normals [rad] to the normals.
+        """
         groups = 1
         places = max(len(receiver.places) for receiver in self.data.receivers)
         while places >= groups * self.smallest:

@@ -12,8 +12,8 @@ from gaigs.splatting.placement.mirrored.reflections import reflection_points, se
 class RoomFrame:
     """Transmitters and receivers about the middle of their box.
 
-    There single precision suffices, and a plane that turns stays near. A plane is a row (unit
-    normal, offset along it [m]).
+    Near the origin single precision suffices, and a plane that turns moves little. A plane is a row
+    (unit normal, offset along it [m]).
 
     Args:
         points: Transmitters and receivers in the world's frame (n, 3) [m].
@@ -33,7 +33,7 @@ class RoomFrame:
 
     @cached_property
     def generator(self) -> torch.Generator:
-        """Random numbers of the search, made when drawn: the training's are left alone."""
+        """Random numbers of the search; the training's give the seed when they are first used."""
         return torch.Generator().manual_seed(int(torch.randint(2**31, ())))
 
     def from_world(self, planes: Float[Tensor, "*w 4"]) -> Float[Tensor, "*w 4"]:
@@ -65,16 +65,17 @@ class RoomFrame:
     def is_like(
         self, planes: Float[Tensor, "k 4"], plane: Float[Tensor, "4"]
     ) -> Bool[Tensor, " k"]:
-        """True for planes within 16 degrees and three hundredths of the room of one."""
+        """True for planes within 16 degrees of a plane, and within 3 % of the diagonal."""
         cosines = planes[:, :3] @ plane[:3]
         gaps = (planes[:, 3] * cosines.sign() - plane[3]).abs()
         return (cosines.abs() > 0.96) & (gaps < 0.03 * self.diagonal)
 
 
 def mean_bounces(receivers: list, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "w 3"]:
-    """Mean point at which each plane reflects to receivers with ``places`` and ``position`` [m].
+    """Mean of the points at which each plane reflects from places to receivers [m].
 
-    Turned about it, a plane changes the lengths of paths least.
+    A plane that turns about this point changes the lengths of paths least. ``receivers`` are
+    ``ReceiverChannels`` or ``ReceiverLags``.
     """
     points = []
     for receiver in receivers:

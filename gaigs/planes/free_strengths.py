@@ -14,7 +14,7 @@ from gaigs.planes.strengths import fit_free, log_share
 
 
 class FreeRoom(NamedTuple):
-    """Planes with what free strengths at each place leave of the channels."""
+    """Planes, and how far free strengths at each place explain the channels by them."""
 
     planes: Float[Tensor, "w 4"]  # planes in the frame
     error: float  # mean over links of the log of the share of power that remains
@@ -29,8 +29,8 @@ class FreeScore(Score[FreeRoom]):
     and offsets. Planes are refined by variable projection: strengths are solved for at each step.
 
     Attributes:
-        links: Training links that errors and ratings take.
-        numbers: Numbers of a channel that its band and its array resolve.
+        links: At most 200 random training links, for errors and ratings.
+        numbers: Independent values of a channel that band and array resolve.
 
     Source: Golub and Pereyra, The differentiation of pseudo-inverses and nonlinear least squares
     problems whose variables separate, 1973.
@@ -38,21 +38,23 @@ class FreeScore(Score[FreeRoom]):
 
     def __init__(self, data: ChannelData):
         self.data = data
+        # Values of a delay profile: elements times delays.
         size = max(
             receiver.channels.shape[1] * self._count_delays(receiver) for receiver in data.receivers
         )
         longest = max(receiver.flat.shape[1] for receiver in data.receivers)
-        # Delays are an eighth of the resolution apart, over four diagonals.
+        # Delays are an eighth of the resolution apart, over four diagonals: 1 / 32 of them are
+        # resolved within one diagonal.
         self.numbers = min(size / 32, longest)
         # Profiles of a gigabyte at most, also in a hall with a large band.
         self.links = data.draw(min(200, 60_000_000 // size))
 
     def evaluate(self, planes: Float[Tensor, "w 4"], share: float = 0.0) -> FreeRoom:
-        """A room with its error: the mean log of the share of power that free strengths leave."""
+        """A room with its error; ``share`` is the rating of its last plane."""
         shares = []
         for receiver in self.links:
-            rest = self.data.fit_free(receiver, planes).residual
-            shares.append(log_share(rest, receiver.flat))
+            residual = self.data.fit_free(receiver, planes).residual
+            shares.append(log_share(residual, receiver.flat))
         return FreeRoom(planes, torch.cat(shares).mean().item(), share)
 
     def error(self, room: FreeRoom) -> float:
@@ -63,8 +65,9 @@ class FreeScore(Score[FreeRoom]):
             self.compute_profile(receiver, self.data.fit_free(receiver, room.planes).residual)
             for receiver in self.links
         ]
-        few = [receiver.at(slice(None, None, 3)) for receiver in self.links]
-        rough = self.rate_lines(few, [profile[::3] for profile in profiles], grid)
+        # The grid is rated by every third place, candidates near its maxima by all.
+        thinned = [receiver.at(slice(None, None, 3)) for receiver in self.links]
+        rough = self.rate_lines(thinned, [profile[::3] for profile in profiles], grid)
 
         def rate(planes: Float[Tensor, "c 4"]) -> Float[Tensor, " c"]:
             return self.rate_lines(self.links, profiles, planes[:, None])[:, 0]
@@ -74,8 +77,8 @@ class FreeScore(Score[FreeRoom]):
     def add(self, room: FreeRoom, candidate: Candidate) -> FreeRoom | None:
         """The room with the candidate; None if it explains too little.
 
-        A plane of ``certain_share`` is taken, one of ``faint_share`` if the error then falls by
-        ``certain_fall``. The candidate must explain more than a plane of no meaning does by chance.
+        A plane that explains ``certain_share`` is taken. A plane that explains ``faint_share``, and
+        more than chance does, is taken if the error falls by ``certain_fall``.
         """
         options = self.data.options
         # The room leaves a share exp(error) of the power. If that is noise, one wave explains
@@ -110,31 +113,34 @@ class FreeScore(Score[FreeRoom]):
                 receiver = receiver.single()
                 points = receiver.images(planes.to(receiver.places), sequences)
                 waves = receiver.waves(points)
-                rest = fit_free(waves, receiver.flat, self.data.options.ridge).residual
-                shares.append(log_share(rest, receiver.flat))
+                residual = fit_free(waves, receiver.flat, self.data.options.ridge).residual
+                shares.append(log_share(residual, receiver.flat))
             return torch.cat(shares).mean()
 
         return descend(loss, self.data.receivers, planes, [], steps, rate)[0]
 
     def compute_profile(
-        self, receiver: ReceiverChannels, rest: Complex[Tensor, "b k"]
+        self, receiver: ReceiverChannels, residual: Complex[Tensor, "b k"]
     ) -> Float[Tensor, "b e t 2"]:
         """Delay profiles of a residual at each element, over the root of the channel's power.
 
-        A candidate then costs a look-up of each element in place of a sum over subcarriers.
+        With them a candidate costs one look-up for each element in place of a sum over subcarriers.
+        Delays are relative to the mean carrier; the last dimension is real and imaginary part.
         """
-        rest = rest / (receiver.flat.norm(dim=1, keepdim=True) * math.sqrt(rest.shape[1]))
+        residual = residual / (
+            receiver.flat.norm(dim=1, keepdim=True) * math.sqrt(residual.shape[1])
+        )
         centre = float(receiver.frequencies.mean())
         longest = 4 * self.data.frame.diagonal / speed_of_light  # [s]
         delays = torch.linspace(0, longest, self._count_delays(receiver)).double()
         turns = 2 * math.pi * torch.outer(receiver.frequencies - centre, delays)  # (s, t)
-        rest = rest.unflatten(1, (len(receiver.elements), -1))  # (b, e, s)
-        profile = rest @ torch.polar(torch.ones_like(turns), turns)  # (b, e, t)
+        residual = residual.unflatten(1, (len(receiver.elements), -1))  # (b, e, s)
+        profile = residual @ torch.polar(torch.ones_like(turns), turns)  # (b, e, t)
         # Single precision suffices: a hundredth of a radian at 10 GHz, after a path of 30 m.
         return torch.view_as_real(profile.to(torch.complex64))
 
     def _count_delays(self, receiver: ReceiverChannels) -> int:
-        """Delays over four diagonals of the room, an eighth of the resolution apart."""
+        """Number of delays over four diagonals of the room, an eighth of the resolution apart."""
         band = float(receiver.frequencies.max() - receiver.frequencies.min())
         return 2 + math.ceil(8 * band * 4 * self.data.frame.diagonal / speed_of_light)
 
@@ -170,10 +176,10 @@ class _ProfileTable:
         self, receiver: ReceiverChannels, profile: Float[Tensor, "b e t 2"], longest: float
     ):
         self.count = profile.shape[2]
-        self.rate = (self.count - 1) * speed_of_light / longest  # [1/s]
+        self.rate = (self.count - 1) * speed_of_light / longest  # entries for each second of delay
         self.carrier = float(receiver.frequencies.mean())
         rows = torch.arange(profile.shape[0] * profile.shape[1]).view(profile.shape[:2])
-        self.first = rows[:, None] * self.count  # (b, 1, e)
+        self.first = rows[:, None] * self.count  # (b, 1, e), row of ``values`` at delay 0
         self.values = profile.flatten(0, 2)  # (b e t, 2)
         self.places = (receiver.places - receiver.position).float()
         self.elements = (receiver.elements - receiver.position).float()

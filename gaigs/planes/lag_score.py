@@ -42,14 +42,15 @@ class LagRoom(NamedTuple):
     """Planes of the room, and which paths are open at each link."""
 
     planes: Float[Tensor, "w 4"]  # normals and offsets [m]
-    # For each link the direct path, then all paths at each plane (b, w + 1).
+    # True where paths are open at a link: column 0 the direct path, then all paths at each plane
+    # (b, w + 1).
     open: Bool[Tensor, "b v"]
     # Error of each link. Where the last moved plane is not open, it is the error without this plane
     # plus ``LagOptions.blocked``.
     errors: Float[Tensor, " b"]
 
     def opened(self, column: int, value: Bool[Tensor, " b"] | bool) -> Bool[Tensor, "b v"]:
-        """``open`` with another column."""
+        """``open`` with one column replaced."""
         changed = self.open.clone()
         changed[:, column] = value
         return changed
@@ -59,7 +60,7 @@ class LinkPaths:
     """Paths at planes at all receivers, and their periodogram.
 
     Attributes:
-        bandwidth: Over which powers are averaged [Hz].
+        bandwidth: Band over which powers are averaged [Hz]; 0 for one carrier. Searches set it.
     """
 
     def __init__(
@@ -77,18 +78,18 @@ class LinkPaths:
         self.bandwidth = 0.0
 
     def with_receivers(self, receivers: list[ReceiverLags]) -> "LinkPaths":
-        """The same with other labels of the receivers."""
+        """A copy with other labels of the same receivers."""
         other = copy.copy(self)
         other.receivers = receivers
         return other
 
     def split(self, passing: Tensor) -> list[tuple[ReceiverLags, Tensor]]:
-        """Receivers, and the rows of their links in ``passing`` (b, v)."""
+        """Pairs of each receiver and its links' rows of ``passing`` (b, v)."""
         parts = passing.split([len(receiver.places) for receiver in self.receivers])
         return list(zip(self.receivers, parts, strict=True))
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
-        """All sequences but faint ones of several reflections."""
+        """Sequences of planes without those of several reflections whose power is faint."""
         sequences = all_sequences(len(planes), self.order)
         powers = self.powers(planes, sequences)
         is_short = (sequences >= 0).sum(1) <= 1
@@ -135,7 +136,10 @@ class LagScore(Score[LagRoom]):
         sequences: Int[Tensor, "n order"] | None = None,
         every: int = 1,
     ) -> Float[Tensor, " c"]:
-        """Log of what paths leave of each link, or of every second one: no link must rule."""
+        """Log of the share of each spectrum that paths do not explain, for ``every`` k-th link.
+
+        Logarithms keep single links from dominating a mean. ``open_`` is as in ``LagRoom``.
+        """
         sequences = self.paths.sequences(planes) if sequences is None else sequences
         logs = []
         for receiver, passing in self.paths.split(open_):
@@ -147,11 +151,12 @@ class LagScore(Score[LagRoom]):
     # --- moves ---
 
     def move(self, room: LagRoom, number: int) -> LagRoom:
-        """The room with a plane where the error is least.
+        """The room with a plane at the peak of its periodogram where the error is least.
 
-        The plane is near its own normal, or square to another plane. Its paths are open where that
-        lowers a link's error.
+        Normals near its own are tried, and normals square to another plane. The plane's paths are
+        open where that lowers a link's error.
         """
+        # The wave that the other planes' paths lack, and the errors without this plane.
         is_other = torch.arange(len(room.planes)) != number
         known = room.planes[is_other]
         open_ = room.open[:, torch.cat((is_other.new_ones(1), is_other))]
@@ -168,6 +173,7 @@ class LagScore(Score[LagRoom]):
         everywhere = room.opened(number + 1, True)
         sequences = self.paths.sequences(room.planes)
         errors = torch.stack([self.errors(trial, everywhere, sequences) for trial in trials])
+        # Each link takes the better of an open and a blocked plane.
         least = torch.minimum(errors, blocked)  # (trials, b)
         best = int(least.mean(1).argmin())
         if not self._is_certain(least[0] - least[best]):
@@ -181,6 +187,7 @@ class LagScore(Score[LagRoom]):
         open_: Bool[Tensor, "b v"],
         sequences: Int[Tensor, "n order"],
     ) -> list[FurtherWave]:
+        """The wave that each receiver's links lack beside the paths at planes."""
         waves = []
         for receiver, passing in self.paths.split(open_):
             paths = receiver.paths(planes, sequences, passing)
@@ -192,10 +199,9 @@ class LagScore(Score[LagRoom]):
 
         The direct path is open where that lowers a link's error.
         """
-        is_open, is_blocked = (
-            self.errors(room.planes, room.opened(0, value)) for value in (True, False)
-        )
-        room = room._replace(open=room.opened(0, is_open <= is_blocked + self.options.blocked))
+        with_direct = self.errors(room.planes, room.opened(0, True))
+        without = self.errors(room.planes, room.opened(0, False))
+        room = room._replace(open=room.opened(0, with_direct <= without + self.options.blocked))
         sequences = self.paths.sequences(room.planes)
 
         def loss(planes: Float[Tensor, "w 4"]) -> Float[Tensor, ""]:
@@ -206,7 +212,7 @@ class LagScore(Score[LagRoom]):
         return room._replace(planes=planes) if self._is_certain(gains) else room
 
     def _is_certain(self, gains: Float[Tensor, " b"]) -> bool:
-        """True if the mean gain of two links or more exceeds its error clearly."""
+        """True if the mean gain of two links or more exceeds ``certain`` standard errors."""
         if len(gains) < 2:
             return False
         return bool(gains.mean() > self.options.certain * gains.std() / math.sqrt(len(gains)))
@@ -236,7 +242,10 @@ class LagScore(Score[LagRoom]):
     def _rate_powers(
         self, maps: list[Float[Tensor, "b 1 k k"]], planes: Float[Tensor, "c 4"]
     ) -> Float[Tensor, " c"]:
-        """Fall of the errors by the power of one more reflection, over the norm of that power."""
+        """Fall of the errors by the power of a reflection at each plane, over the power's norm.
+
+        ``maps`` have each link's fall by a wave from each direction, as an image of two sines.
+        """
         total, square = planes.new_zeros(2, len(planes))
         for receiver, falls in zip(self.paths.receivers, maps, strict=True):
             single = receiver.reflect_once(planes)

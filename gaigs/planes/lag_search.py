@@ -22,11 +22,11 @@ from gaigs.splatting.gaussians import fibonacci_lattice
 
 
 class LinkGroup(NamedTuple):
-    """Training links of a receiver and a carrier [Hz]; the pose is about the room's middle."""
+    """Training links of one receiver at one carrier."""
 
     rows: Int[Tensor, " b"]
-    carrier: float
-    pose: Pose
+    carrier: float  # [Hz]
+    pose: Pose  # of the receiver, from the middle of the room
     receiver: Receiver
 
 
@@ -42,25 +42,27 @@ def frame_of(links: Links) -> RoomFrame:
 def group_links(
     links: Links, frequencies: Float[Tensor, " n"], frame: RoomFrame, most: int, pairs: int
 ) -> list[LinkGroup]:
-    """Training links of at most ``pairs`` receivers and carriers; each has at least 20 links.
+    """Training links in groups by receiver and carrier, both evenly thinned.
 
-    ``most`` is the number of links in all.
+    Args:
+        links: Their training links count.
+        frequencies: Carrier of each link [Hz].
+        frame: Frame of the poses.
+        most: About the number of links in all; each group has 20, or as many as there are.
+        pairs: Largest number of groups.
     """
     train = links.split.train
     numbers = links.query.receivers[train]
     carriers = frequencies[train]
-    every = torch.stack((numbers.double(), carriers.double()), 1).unique(dim=0)
-    chosen = every[evenly(torch.arange(len(every)), pairs)].tolist()
+    existing = torch.stack((numbers.double(), carriers.double()), 1).unique(dim=0)
+    chosen = existing[evenly(torch.arange(len(existing)), pairs)].tolist()
+    size = max(20, most // len(chosen))
     groups = []
     for number, carrier in chosen:
         receiver = links.receivers[int(number)]
         rows = train[(numbers == number) & (carriers == carrier)]
         pose = replace(receiver.pose, position=receiver.pose.position - frame.middle)
-        groups.append(
-            LinkGroup(
-                evenly(rows, max(20, most // len(chosen))), carrier, pose.to(frame.points), receiver
-            )
-        )
+        groups.append(LinkGroup(evenly(rows, size), carrier, pose.to(frame.points), receiver))
     return groups
 
 
@@ -70,10 +72,10 @@ class LagSearch:
     Args:
         links: Their training links count; of the task ``spectrum``.
         frequencies: Carrier of each link [Hz].
-        lags_of: Function from labels and their query to lags, each label's up to a scale, and the
-            share of each label that they do not explain.
+        lags_of: Function from labels and their query to each label's lags, up to a factor, and
+            to the share of each label that its lags do not explain.
         order: Largest number of reflections of a path; more than 2 count as 2.
-        most: Links that count, of all receivers and carriers together; of each at least 20.
+        most: As for ``group_links``.
         options: Options of the search.
 
     Attributes:
@@ -126,7 +128,7 @@ class LagSearch:
         self.use(receivers, order)
 
     def use(self, receivers: list[ReceiverLags], order: int) -> None:
-        """Takes the links of other receivers."""
+        """Replaces the receivers whose links are searched."""
         self.paths = LinkPaths(self.frame, receivers, self.wavelength, order, self.options.faint)
         self.score = LagScore(self.paths, self.options)
         self.search = PlaneSearch(self.frame, self.score)
@@ -144,13 +146,13 @@ class LagSearch:
     def run(
         self, planes: Float[Tensor, "w 4"], bandwidth: float | None, most: int
     ) -> Float[Tensor, "v 4"]:
-        """The planes, each moved twice by up to 8 % of the diagonal and 18 degrees, and others.
+        """Planes in the world's frame: the given ones, moved, and then further ones.
+
+        A plane moves twice, each time by up to 8 % of the diagonal and 18 degrees.
 
         Args:
             planes: Planes at the start, in the world's frame.
-            bandwidth: Band over which powers are averaged [Hz]. None: the one with which moving the
-                strongest plane leaves least, or a carrier if moving all planes leaves less with it:
-                one plane among others in the wrong places hardly interferes.
+            bandwidth: Band over which powers are averaged [Hz]. None: see ``_choose_bandwidth``.
             most: Largest number of planes.
         """
         if not len(planes) or not self.receivers:
@@ -163,7 +165,12 @@ class LagSearch:
         return self.frame.to_world(room.planes.double())
 
     def _choose_bandwidth(self, start: LagRoom, choices: list[float]) -> LagRoom:
-        """Sets the bandwidth; the start with all planes moved."""
+        """Sets the best of some bandwidths, and returns the start with all planes moved.
+
+        The best is the one with which moving the strongest plane leaves the smallest error. The
+        first choice, nearly a single carrier, is compared once more with all planes moved: one
+        plane among others in the wrong places hardly interferes.
+        """
         best = choices[0]
         if len(choices) > 1:
             strongest = self.paths.sort_by_strength(start.planes)[0]

@@ -73,7 +73,7 @@ class ReceiverLags:
     )
 
     def at(self, index: object) -> "ReceiverLags":
-        """The covariances of some of the links."""
+        """The covariances of the links that an index, mask or slice chooses."""
         return replace(self, places=self.places[index], lags=self.lags[index])
 
     @property
@@ -87,24 +87,24 @@ class ReceiverLags:
 
     @cached_property
     def elements(self) -> Float[Tensor, "e 2"]:
-        """Elements in the plane of the array [m]."""
+        """Positions of the elements in the plane of the array [m]."""
         return self.array.elements[:, :2].to(self.places)
 
     @cached_property
     def counts(self) -> Float[Tensor, " l"]:
-        """Pairs of elements at each lag."""
+        """Number of pairs of elements at each lag."""
         return self.array.lags[2].to(self.places)
 
     # --- errors ---
 
     @cached_property
     def shapes(self) -> Float[Tensor, "b k"]:
-        """Shapes of the training spectra."""
+        """``shape_of`` the training spectra."""
         return self.shape_of(self.lags)
 
     @cached_property
     def basis(self) -> Float[Tensor, "m k"]:
-        """Contribution of each lag's real and imaginary part, from 0 on, to the power."""
+        """Power in each of ``directions`` by the lags from 0 on: real, then imaginary parts."""
         half = len(self.counts) // 2
         # Opposite lags are conjugate, so one of two counts twice.
         weights = self.counts[half:] * torch.where(torch.arange(half + 1) > 0, 2, 1)
@@ -113,8 +113,11 @@ class ReceiverLags:
         return torch.cat((phases.cos() * weights[:, None], phases.sin() * weights[:, None]))
 
     def shape_of(self, lags: Complex[Tensor, "b l"]) -> Float[Tensor, "b k"]:
-        """Amplitudes with a mean of 0 and a norm of 1: labels have lost their scale."""
-        later = lags[:, lags.shape[1] // 2 :]
+        """Amplitudes of spectra in ``directions``, with a mean of 0 and a norm of 1.
+
+        Labels are known up to a factor and an offset, which this removes.
+        """
+        later = lags[:, lags.shape[1] // 2 :]  # the others are their conjugates
         later = later / later[:, :1].real.clamp_min(1e-12)
         powers = torch.cat((later.real, later.imag), 1) @ self.basis  # (b, k)
         amplitudes = powers.clamp_min(1e-4).sqrt()  # of a mean power of e²

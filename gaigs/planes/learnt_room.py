@@ -56,11 +56,11 @@ class Matter(NamedTuple):
 
 
 class LearntRoom(NamedTuple):
-    """Planes, strongest first; matter, None without obstacles; a transmitter's strongest paths."""
+    """The parts of a learnt room that figures show."""
 
-    planes: list[LearntPlane]
-    matter: Matter | None
-    paths: list[LearntPath]
+    planes: list[LearntPlane]  # strongest first
+    matter: Matter | None  # None without obstacles
+    paths: list[LearntPath]  # a transmitter's strongest paths
 
     def plot(self, ax: Any = None, **options: Any) -> Any:
         """Draws it as ``gaigs.plot`` does, which lists the options."""
@@ -69,9 +69,10 @@ class LearntRoom(NamedTuple):
 
 @torch.no_grad()
 def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
-    """The room by the training links, and the strongest paths of the first test transmitter.
+    """The room as paths of links show it.
 
-    Without links it is the room by ``spread_links``, without paths.
+    Planes are those of the training links, paths those of the first test transmitter. Without links
+    planes are those of ``spread_links``, and there are no paths.
     """
     if links is None:
         query = spread_links(placement.scene)
@@ -81,8 +82,8 @@ def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
     matter = None
     if placement.obstacles is not None:
         blobs = placement.obstacles
-        parts = (blobs.centres + placement.middle, blobs.widths, NEPER * blobs.densities)
-        matter = Matter(*(part.cpu().double().numpy() for part in parts))
+        columns = (blobs.centres + placement.middle, blobs.widths, NEPER * blobs.densities)
+        matter = Matter(*(column.cpu().double().numpy() for column in columns))
     paths: list[LearntPath] = []
     if links is not None:
         test = links.query[links.split.test]
@@ -95,16 +96,16 @@ def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
 
 @torch.no_grad()
 def tabulate_planes(placement: Mirrored, ends: Float[ndarray, "k 3"]) -> PlaneTable:
-    """All planes of a placement; the room is on the side of the middle of the paths' ends."""
+    """All planes of a placement, with normals away from the middle of the paths' ``ends``."""
     real = 1 + placement.log_permittivities.exp()
     permittivities = torch.complex(real, -placement.log_conductivities.exp())
     reflected, _ = fresnel(permittivities, torch.ones_like(real))
     gains = reflected.abs().log() + placement.plane_gains  # [Np]
-    middles = placement.middles + placement.middle.double()
+    middles = placement.middles + placement.middle.double()  # from the world's origin
     parts = placement.normals, placement.planes[:, 3], gains, middles, placement.log_extents.exp()
     normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in parts)
     # The middle of the reflecting area need not lie on the plane: take the plane's point with the
-    # least loss.
+    # least loss. By Lagrange's multiplier it is middle + apart / (n' E² n) E² n, with E = extents.
     steep = extents**2 * normals
     spread = (steep * normals).sum(1)
     apart = offsets - (normals * middles).sum(1)
@@ -116,7 +117,10 @@ def tabulate_planes(placement: Mirrored, ends: Float[ndarray, "k 3"]) -> PlaneTa
 
 
 def other_offset(scene: Scene, planes: PlaneTable, number: int) -> float | None:
-    """Offset at which a plane reflects paths of equal lengths [m], see ``FlatAxis``; or None."""
+    """The other offset at which a plane reflects paths of the same lengths [m], see ``FlatAxis``.
+
+    None unless the plane stands across a flat axis.
+    """
     normal = planes.normals[number]
     for flat in scene.flat_axes:
         if abs(normal[flat.axis]) > 0.99:
@@ -171,7 +175,11 @@ def outline_planes(placement: Mirrored, traced: TracedPaths) -> list[LearntPlane
         if number in walls:
             edge = 2 * table.extents[number]  # there it reflects 17 dB less than in its middle
             sides += _sides(table.middles[number] - edge, table.middles[number] + edge)
-            corners = _wall_corners(table, number, (lower + upper) / 2, diagonal)
+            # A square about the foot of the room's centre, so large that the sides cut it.
+            centre = (lower + upper) / 2
+            middle = centre - (centre @ normal - table.offsets[number]) * normal
+            half = np.full(2, 2 * diagonal)
+            corners = _rectangle(middle, normal, -half, half)
         else:
             corners = _furniture_corners(table, number, traced, tolerance)
         for side in sides:
@@ -181,19 +189,10 @@ def outline_planes(placement: Mirrored, traced: TracedPaths) -> list[LearntPlane
     return drawn
 
 
-def _wall_corners(
-    table: PlaneTable, number: int, centre: Float[ndarray, "3"], diagonal: np.floating
-) -> Float[ndarray, "4 3"]:
-    """A square on a wall, twice as wide as the room's diagonal on either side of its centre."""
-    normal = table.normals[number]
-    middle = centre - (centre @ normal - table.offsets[number]) * normal
-    return _rectangle(middle, normal, np.full(2, -2 * diagonal), np.full(2, 2 * diagonal))
-
-
 def _furniture_corners(
     table: PlaneTable, number: int, traced: TracedPaths, tolerance: np.floating
 ) -> Float[ndarray, "4 3"]:
-    """The rectangle around a plane's bounces, weak ones of its paths left out."""
+    """The rectangle around a plane's bounces; paths below 1 % of its strongest are left out."""
     shares = traced.shares
     link, path, step = np.nonzero((traced.sequences == number) & (shares > 0)[..., None])
     share = shares[link, path]
@@ -218,7 +217,10 @@ def _rectangle(
     low: Float[ndarray, "2"],
     high: Float[ndarray, "2"],
 ) -> Float[ndarray, "4 3"]:
-    """Corners on a plane between bounds from its middle, counterclockwise against the normal."""
+    """Corners of a rectangle on a plane, counterclockwise as seen from the normal's end.
+
+    ``low`` and ``high`` are bounds from ``middle`` along ``_basis`` [m].
+    """
     flat = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
     return middle + flat @ _basis(normal).T
 

@@ -41,11 +41,11 @@ class LevelOptions:
 
 @dataclass(frozen=True)
 class ReceiverLevels(ReceiverLags):
-    """Training levels of one receiver of one carrier; ``lags`` are powers (b, 1)."""
+    """Training levels of one receiver at one carrier; ``lags`` are the received powers (b, 1)."""
 
     @cached_property
     def levels(self) -> Float[Tensor, " b"]:
-        """[dB]."""
+        """Received levels [dB]."""
         return 10 * self.lags[:, 0].real.log10()
 
     def errors(self, lags: Complex[Tensor, "b 1"]) -> Float[Tensor, " b"]:
@@ -83,16 +83,19 @@ class LevelScore(Score[LevelRoom]):
         return -room.gain
 
     def move(self, room: LevelRoom, number: int) -> LevelRoom:
-        """The room with a plane where errors fall most clearly if its phases count."""
+        """The room with a plane moved to where its phases lower the errors most clearly.
+
+        ``gain`` of the result is 0 if the phases lower them nowhere.
+        """
         sequences = self.paths.sequences(room.planes)
-        phased = is_phased(sequences, room.located)
+        phased = is_phased(sequences, room.located)  # (n,)
         waves = []
-        before = []
+        before = []  # powers of each receiver's links while the plane has no phase
         for receiver, passing in self.paths.split(room.passing):
             paths = receiver.paths(room.planes, sequences, passing)
             before.append(self.add_powers(paths, phased))
-            # The wave of one more path beside those that interfere, as far as the plane's paths
-            # pass.
+            # The wave of one more path that interferes with paths at located planes, times the
+            # share of the plane's paths that obstacles let through.
             slopes = receiver.slopes(before[-1])[:, 0]
             known = phased & ~(sequences == number).any(1)
             weights = slopes * paths.fields * known * passing[:, number + 1, None]
@@ -123,7 +126,7 @@ class LevelScore(Score[LevelRoom]):
         before: list[Complex[Tensor, "b 1"]],
         sequences: Int[Tensor, "n order"],
     ) -> float:
-        """Mean fall of the errors against powers ``before``, over its standard error."""
+        """Mean fall of the errors from powers ``before`` to the room's, in standard errors."""
         phased = is_phased(sequences, room.located)
         gains = []
         for (receiver, passing), old in zip(self.paths.split(room.passing), before, strict=True):
@@ -135,7 +138,7 @@ class LevelScore(Score[LevelRoom]):
         return mean.item() / max(deviation.item(), 1e-12) * math.sqrt(len(room.passing))
 
     def add_powers(self, paths: ArrayPaths, phased: Bool[Tensor, " n"]) -> Complex[Tensor, "b 1"]:
-        """Powers of paths, of which some interfere."""
+        """Powers of paths: ``phased`` paths interfere, the others add as powers."""
         waves = paths.fields[:, phased]
         lengths = paths.lengths[:, phased]
         gaps = lengths[:, :, None] - lengths[:, None]  # (b, n, n)
@@ -145,9 +148,9 @@ class LevelScore(Score[LevelRoom]):
         return powers[:, None]
 
     def measure_chance(self, room: LevelRoom, numbers: list[int], enough: float) -> float:
-        """Largest gain of some planes where the errors of each receiver's links are shuffled.
+        """Largest gain of planes ``numbers`` by chance: with errors shuffled among links.
 
-        The first gain above ``enough`` ends the trials; if the time is up, it is infinite.
+        The first gain above ``enough`` ends the trials. The result is infinite if the time is up.
         """
         sequences = self.paths.sequences(room.planes)
         phased = is_phased(sequences, room.located)
@@ -218,6 +221,7 @@ class LevelSearch:
             sums = values.new_zeros(len(places)).index_add(0, which, values[rows])
             levels = sums / which.bincount()
             powers = 10 ** ((levels - levels.median()) / 10)
+            # A single point: its only lag is the power.
             array = group.receiver.array
             point = replace(array, elements=array.elements.new_zeros(1, 3))
             lags = powers[:, None].to(torch.complex64)
@@ -234,21 +238,22 @@ class LevelSearch:
 
     @torch.no_grad()
     def locate(self, placement: Mirrored) -> list[int]:
-        """Puts planes where they are clear, and lets paths at them interfere.
+        """Moves the placement's planes to where they are clear, and lets their paths interfere.
 
         Returns:
             Numbers of these planes in the placement.
         """
         numbers: list[int] = []
-        least = 0.0
+        least = 0.0  # gain above chance; measured with the first clear plane
         while True:
             waiting = [k for k, number in enumerate(self.numbers) if not placement.located[number]]
             if not waiting:
                 return numbers
             room = self.room_of(placement)
             is_unknown = self.known_bandwidth is None and not room.located.any()
-            bandwidths = list_bandwidths(None, self.frame, self.lag_options)
-            if not is_unknown:
+            if is_unknown:
+                bandwidths = list_bandwidths(None, self.frame, self.lag_options)
+            else:
                 learnt = placement.log_bandwidth
                 bandwidths = [0.0 if learnt is None else learnt.exp().item()]
             best = self.locate_one(room, waiting, bandwidths)
@@ -271,32 +276,33 @@ class LevelSearch:
     def locate_one(
         self, room: LevelRoom, numbers: list[int], bandwidths: list[float]
     ) -> LevelRoom | None:
-        """The room with the clearest of some planes; None if the time is up.
+        """The room with the clearest of planes ``numbers`` moved; None if the time is up.
 
-        ``bandwidth`` of the paths is the best one from then on.
+        Each plane is tried with each of ``bandwidths`` [Hz]. The best one stays set in ``paths``.
         """
         trials = []
         pairs = [*itertools.product(bandwidths, numbers)]
-        for self.paths.bandwidth, number in stages.track(pairs, "search of planes"):
+        for bandwidth, number in stages.track(pairs, "search of planes"):
             if stages.is_up():
                 return None
+            self.paths.bandwidth = bandwidth
             trials.append(self.score.move(room, number))
         best = min(trials, key=self.score.error)
         self.paths.bandwidth = best.bandwidth
         return best
 
     def room_of(self, placement: Mirrored) -> LevelRoom:
-        """The room of a placement: located planes, and the others at their start."""
+        """The room of a placement: located planes where they are, the others at their start."""
         located = placement.located[self.numbers].cpu()
         placed = self.frame.from_world(placement.planes[self.numbers].cpu()).float()
         planes = torch.where(located[:, None], placed, self.start)
         return LevelRoom(planes, located, self.passing(placement, planes))
 
     def passing(self, placement: Mirrored, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b v"]:
-        """A model's fields of the direct path and at each plane, over those that planes alone give.
+        """Shares of fields that a model's obstacles let through, see ``LevelRoom.passing``.
 
-        At most 1: near Brewster's angle planes reflect next to nothing, which another plane would
-        multiply.
+        They are the model's fields over the fields by reflection alone, at most 1: near Brewster's
+        angle the quotient has no meaning, as planes reflect next to nothing.
         """
         columns = [0, *(number + 1 for number in self.numbers)]
         parts = []

@@ -23,31 +23,31 @@ class Material(NamedTuple):
 
 
 class SlabOption(NamedTuple):
-    """A material, its complex relative permittivity, and a thickness for each plane [m]."""
+    """A material that is compared, with a thickness for each plane."""
 
     name: str
-    permittivity: complex
-    thicknesses: Float[Tensor, " w"]
+    permittivity: complex  # relative
+    thicknesses: Float[Tensor, " w"]  # [m]
 
 
 @torch.no_grad()
 def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, Material]:
     """Material and thickness of each plane that a query's paths meet, at a carrier [Hz].
 
-    Reflections are compared at the bounces of these paths, weighted by the paths' powers.
-    Permittivities alone would not do: a plane may reflect strongly by its permittivity or by its
-    gain. A learnt reflection has the plane's gain and its share of the path's gain over the gain of
-    the direct path. The thickness is the learnt one or, if a half-space reflects more alike, 1 m:
-    the losses of such a slab hide its back. Where paths have phases of their own, magnitudes are
-    compared.
+    The material is the one whose reflections have the least squared difference from the learnt ones
+    at the bounces of these paths, weighted by the paths' powers. A learnt reflection includes the
+    plane's gain, and an equal share for each bounce of the path's gain over the direct path's.
+    Magnitudes are compared where paths have phases of their own. The thickness is the learnt one
+    or, if a half-space fits better, 1 m.
 
     Source: ITU-R P.2040-3, table 3; outside 1 to 40 GHz its formulas are extrapolated.
     """
     sequences = placement.sequences[placement.kept]
     normals = placement.normals
-    own = placement.of_bands(placement.path_gains, query).mean(0)
-    gains = own[placement.kept] - own[0]
-    gains = (gains / (sequences >= 0).sum(1).clamp_min(1)).exp()  # of each bounce
+    path_gains = placement.of_bands(placement.path_gains, query).mean(0)
+    gains = path_gains[placement.kept] - path_gains[0]  # logarithms over the direct path
+    bounces = (sequences >= 0).sum(1).clamp_min(1)
+    gains = (gains / bounces).exp()  # of each bounce
     compared = torch.abs if placement.path_phases is not None else torch.Tensor.clone
     options = _list_slabs(placement, frequency)
     errors = normals.new_zeros(len(options), len(normals))

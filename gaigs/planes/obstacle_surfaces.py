@@ -115,14 +115,16 @@ class MatterGrid:
     pitch: float
 
     def number_surfaces(self, density: float) -> Int[ndarray, "x y z"]:
-        """Number of the surface of a density around each point, 0 outside."""
+        """Number of the surface around each point of the grid, from 1; 0 in thinner matter."""
         numbers, _ = ndimage.label(self.log_densities > math.log(density))
         return numbers
 
     def mesh(
         self, density: float, number: int
     ) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
-        """Corners from the middle of the room [m], and triangles, of a surface, closed by the box.
+        """Corners [m] from the middle of the room, and triangles, of one surface of a density.
+
+        The box closes a surface that reaches beyond it.
 
         Source: Lewiner et al., Efficient implementation of marching cubes' cases with topological
         guarantees, 2003.
@@ -164,7 +166,7 @@ def sample_matter(
 def find_crossings(
     obstacles: Obstacles, matter: MatterGrid, density: float, legs: Legs
 ) -> Crossings:
-    """Crossings of legs with the surfaces of a density, counted from 0."""
+    """Points where legs cross the surfaces of a density; surfaces count from 0."""
     is_inside = legs.densities > density
     leg, step = (is_inside[:, 1:] != is_inside[:, :-1]).nonzero().T
     before, after = legs.densities[leg, step], legs.densities[leg, step + 1]
@@ -177,7 +179,8 @@ def find_crossings(
     gradients = points * (each @ weights) - each @ (weights * obstacles.centres.double())
     normals = functional.normalize(gradients)
     cosines = (normals * functional.normalize(unit)).sum(1).abs().clamp_min(1e-3)
-    # The sample inside tells the surface; a point of the grid farther out counts, too.
+    # The sample on the inner side names the surface. Its grid point may be just outside: a dilation
+    # gives such a point its neighbour's number.
     inside = legs.start[leg] + (step + (after > before))[:, None] * unit
     numbers = matter.number_surfaces(density)
     numbers = np.where(numbers, numbers, ndimage.grey_dilation(numbers, 3))
@@ -193,7 +196,7 @@ def find_crossings(
 def attenuate_paths(
     placement: Mirrored, obstacles: Obstacles, query: Query, options: SurfaceOptions
 ) -> AttenuatedPaths:
-    """Paths of a query's links, evenly thinned, and what obstacles pass."""
+    """Paths of a query's links, evenly thinned to ``options.paths``, with what obstacles pass."""
     sequences = placement.sequences[placement.kept]
     query = query[:: math.ceil(len(query) * len(sequences) / options.paths)]
     query = query.to(placement.middle.device)
@@ -203,13 +206,14 @@ def attenuate_paths(
     fields = fields.double()
     powers = fields.square()
     fields[powers < options.faint * powers.sum(1, keepdim=True)] = 0
+    # Legs of the paths that count, of all links in a row (s,).
     link, leg = (fields > 0)[:, folded.path].nonzero().T
     paths = link * len(sequences) + folded.path[leg]
     start = folded.start[link, leg].double()
     along = folded.end[link, leg].double() - start
     depths = obstacles(start.float(), (start + along).float()).real.double()
-    depths = fields.new_zeros(fields.numel()).index_add(0, paths, depths)  # of each path
-    steps = torch.linspace(0, 1, options.samples).to(along)[:, None]
+    depths = fields.new_zeros(fields.numel()).index_add(0, paths, depths)  # (b n,), of each path
+    steps = torch.linspace(0, 1, options.samples).to(along)[:, None]  # (k, 1)
     samples = [
         measure_densities(obstacles, first + steps * way).sum(1)
         for first, way in zip(start, along, strict=True)
@@ -219,9 +223,10 @@ def attenuate_paths(
 
 
 def choose_densities(paths: AttenuatedPaths, count: int) -> list[float]:
-    """Densities of matter at which paths lose their fields, from a tenth to nine tenths [Np/m].
+    """Densities of matter [Np/m] at which paths lose their fields; empty if they lose nothing.
 
-    None if paths lose nothing.
+    They are evenly spaced logarithms between the densities below which paths lose a tenth and nine
+    tenths.
     """
     densities = paths.legs.densities
     # Each leg's loss, spread over its matter.
@@ -251,8 +256,8 @@ class SheetFit:
         self.fields = paths.fields
         self.passed = paths.passed
         self.crossings = crossings
-        self.wanted = (self.fields * self.passed).square().sum(1)
-        if not (self.wanted > 0).any():
+        self.powers = (self.fields * self.passed).square().sum(1)  # (b,), behind obstacles
+        if not (self.powers > 0).any():
             raise ValueError(
                 "obstacles absorb every path, so none shows their surfaces; train the model first"
             )
@@ -260,23 +265,32 @@ class SheetFit:
     def error(
         self, chosen: Sequence[int], logs: Sequence[Tensor], gain: Tensor
     ) -> Float[Tensor, ""]:
-        """Mean error of the links [dB], by logarithms of each surface's conductance."""
+        """Mean error of the links [dB], with a gain of all paths [Np].
+
+        ``logs`` has for each chosen density the logarithms of its surfaces' conductances.
+        """
         count = self.fields.numel()
         losses = self.fields.new_zeros(count)
         for number, log in zip(chosen, logs, strict=True):
             losses = losses + self.crossings[number].losses(log.exp(), count)
         passed = (gain - losses).exp().view_as(self.fields)
         off = (self.fields * (passed - self.passed)).square().sum(1)
-        is_reached = self.wanted > 0
+        is_reached = self.powers > 0
         # Below -40 dB nothing is gained.
-        return 10 * (off[is_reached] / self.wanted[is_reached] + 1e-4).log10().mean()
+        return 10 * (off[is_reached] / self.powers[is_reached] + 1e-4).log10().mean()
 
     def fit(
         self, chosen: Sequence[int], sizes: Sequence[int], start: Tensor
     ) -> tuple[float, Tensor]:
-        """Least error [dB]; logarithms of ``sizes`` conductances of each density, and the gain.
+        """Conductances of least error, by L-BFGS.
 
-        A single conductance of a density holds for all its surfaces.
+        Args:
+            chosen: Numbers of densities.
+            sizes: Number of conductances of each: one for all its surfaces, or one for each.
+            start: Logarithms of all conductances, then the gain of all paths [Np].
+
+        Returns:
+            The error [dB], and the values in the order of ``start``.
         """
         values = start.clone().requires_grad_()
         descent = torch.optim.LBFGS([values], max_iter=50, line_search_fn="strong_wolfe")
@@ -315,7 +329,7 @@ def fit_sheets(
     surface gets a conductance of its own.
 
     Args:
-        placement: With obstacles, or without any, which have no sheets.
+        placement: The learnt room; without obstacles there are no sheets.
         query: Links.
         lower, upper: Corners of the room [m].
 

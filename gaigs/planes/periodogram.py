@@ -16,7 +16,7 @@ from gaigs.splatting.placement.mirrored.reflections import reflect, tangents
 
 
 class Likeness(NamedTuple):
-    """Likeness of the reflection at each plane to a further wave."""
+    """Likeness of the reflections at planes to a further wave, at each link."""
 
     values: Complex[Tensor, "c b"]  # products of both waves, of about the same size at all links
     # Change of their phases if the plane moves [rad/m], or turns about its pivot towards two axes
@@ -73,13 +73,20 @@ class PlanePeriodogram:
         normal: Float[Tensor, "3"],
         plane: Float[Tensor, "4"],
     ) -> list[TilePeak]:
-        """At most six maxima with planes near a normal, in place of a known plane."""
+        """At most six maxima whose planes are near a normal and a known plane's offset.
+
+        Args:
+            waves: Further wave of each receiver's links.
+            bandwidth: Band over which powers are averaged [Hz].
+            normal: Normal about which planes turn.
+            plane: The known plane, which these replace.
+        """
         (bounce,) = mean_bounces(self.receivers, plane[None])
         # Tiles lie in a row along the normal; each reaches this far on either side [m].
         half = min(self.wavelength, self.reach)
         moves = torch.linspace(-half, half, 19)
         turns = self._turns(bounce)
-        every = torch.cat((-turns.flip(0)[:-1], turns))
+        both_ways = torch.cat((-turns.flip(0)[:-1], turns))
         axes = torch.stack(tangents(normal))
         count = 2 * math.ceil(self.reach / half / 2) + 1
         starts = normal @ bounce + torch.linspace(-self.reach, self.reach, count)
@@ -99,7 +106,7 @@ class PlanePeriodogram:
             best = sums.flatten().topk(2)
             at = torch.unravel_index(best.indices, sums.shape)
             for height, step, first, second in zip(best.values.tolist(), *at, strict=True):
-                turned = normal + every[first] * axes[0] + every[second] * axes[1]
+                turned = normal + both_ways[first] * axes[0] + both_ways[second] * axes[1]
                 turned = functional.normalize(turned, dim=0)
                 offset = turned @ pivot + moves[step]
                 peaks.append(TilePeak(height, torch.cat((turned, offset[None])), pivot))
@@ -124,6 +131,7 @@ class PlanePeriodogram:
         return distinct
 
     def _is_apart(self, peak: TilePeak, other: TilePeak) -> bool:
+        """True if two planes differ by a quarter of a tile, or of a wavelength at the pivot."""
         gap = peak.plane - other.plane
         move = (gap[3] - gap[:3] @ peak.pivot).abs()
         return bool(gap[:3].norm() > self.tile / 4 or move > self.wavelength / 4)
@@ -183,7 +191,8 @@ def periodogram(
     """
     phases = rates[:, :1] * moves
     moved = values[:, None] * torch.polar(torch.ones_like(phases), phases)  # (b, m)
-    # Turns to both sides have the same products of cosines and sines, but for their signs.
+    # With v exp(j r0 move) = x + j y, Re(v exp(j (a + b))) is (x cos a cos b - x sin a sin b)
+    # - (y sin a cos b + y cos a sin b). Turns to both sides have the same products but for signs.
     sides = rates[:, 1:, None] * turns  # (b, 2, t)
     cos, other_cos = sides.cos().unbind(1)
     sin, other_sin = sides.sin().unbind(1)

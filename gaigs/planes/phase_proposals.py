@@ -15,7 +15,7 @@ from gaigs.splatting.placement.mirrored.reflections import polarised, reflect, t
 
 
 class Phasors(NamedTuple):
-    """Single reflections at a plane, at the places where they are strongest."""
+    """Single reflections at a plane, at some places."""
 
     # Strengths over the channels' root power, with the phase against the direct path.
     values: Complex[Tensor, " b"]
@@ -39,7 +39,7 @@ def propose_by_phases(
     tilt: float,  # largest turn towards either side [rad]
     slabs: Float[Tensor, "m 3"],  # slabs that are tried
 ) -> list[tuple[Float[Tensor, "4"], Float[Tensor, "3"]]]:
-    """Planes near one of some planes, and slabs, with which its reflections have like phases.
+    """Planes near plane ``number``, with slabs, whose reflections have like phases at all places.
 
     Returns:
         Planes (4,) and slabs (3,): at most eight half-spaces and eight slabs, highest maxima of the
@@ -84,7 +84,7 @@ def propose_by_phases(
 
 
 def _grids(data: ChannelData, reach: float, tilt: float) -> list[Float[Tensor, " k"]]:
-    """Offsets [m] and tilts [rad] of the periodogram."""
+    """Grids of the periodogram: offsets [m], and tilts [rad] towards two axes."""
     wavelength = data.wavelength
     offset_step = min(wavelength / 16, reach / 4)
     tilt_step = min(wavelength / 5 / data.frame.diagonal, tilt / 4)
@@ -100,7 +100,7 @@ def _shifted(
     axes: tuple[Float[Tensor, "3"], Float[Tensor, "3"]],
     shift: Float[Tensor, "3"],
 ) -> Float[Tensor, "4"]:
-    """A plane moved along its normal and turned towards two axes."""
+    """A plane moved by ``shift[0]`` [m] and turned by the other two [rad] towards two axes."""
     turned = functional.normalize(plane[:3] + shift[1] * axes[0] + shift[2] * axes[1], dim=0)
     return torch.cat((turned, (plane[3] + shift[0])[None]))
 
@@ -112,7 +112,10 @@ def _phasors(
     planes: Float[Tensor, "w 4"],
     number: int,
 ) -> Phasors:
-    """Single reflections at a plane beside all other paths, at some hundred places in all."""
+    """Single reflections at plane ``number``, with strengths fitted beside all other paths.
+
+    Of all receivers together about 120 places stay: those where the reflection is strongest.
+    """
     sequences = data.sequences(planes)
     is_single = sequences[:, :-1].lt(0).all(1) & (sequences[:, -1] == number)
     path = int(is_single.nonzero())
@@ -122,12 +125,12 @@ def _phasors(
     normal, offset = planes[number, :3], planes[number, 3]
     axes = tangents(normal)
 
-    def length(shift: Float[Tensor, "3"]) -> Float[Tensor, " b"]:
+    def path_lengths(shift: Float[Tensor, "3"]) -> Float[Tensor, " b"]:
         plane = _shifted(planes[number], axes, shift)
         ways = reflect(receiver.places, plane[:3], plane[3]) - receiver.position
         return ways.norm(dim=1)
 
-    slopes = torch.autograd.functional.jacobian(length, torch.zeros(3).double())  # (b, 3)
+    slopes = torch.autograd.functional.jacobian(path_lengths, torch.zeros(3).double())  # (b, 3)
     ways = reflect(receiver.places, normal, offset) - receiver.position
     cosines = (functional.normalize(ways, dim=1) @ normal).abs().clamp(1e-3, 1)
     weights = strengths.abs() * waves[:, path].norm(dim=1) / receiver.flat.norm(dim=1)

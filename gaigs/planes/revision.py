@@ -21,13 +21,16 @@ Loss = Callable[[Batch], float]
 
 
 def thin_batch(batch: Batch, rows: int) -> Batch:
-    """A batch with about ``rows`` of its labels' rows, and columns in proportion."""
+    """The batch with at least ``rows`` rows of its maps, and columns in proportion.
+
+    Labels without a grid of directions stay whole.
+    """
     labels = batch.labels
     directions = batch.directions
     if isinstance(directions, Grid):
-        every = slice(None, None, max(1, round(directions.shape[0] / rows)))
-        labels = labels[:, every, every]
-        directions = directions.thin(every, every)
+        thinning = slice(None, None, max(1, round(directions.shape[0] / rows)))
+        labels = labels[:, thinning, thinning]
+        directions = directions.thin(thinning, thinning)
     return Batch(batch.query, directions, labels)
 
 
@@ -69,16 +72,18 @@ def move_planes(
 def move_plane(
     model, plane: int, reach: float, wavelength: float, batch: Batch, turns: bool
 ) -> float:
-    """Moves a plane along its normal to the least error; returns the move [m].
+    """Moves a plane to the least error of a batch; returns the move along the normal [m].
 
-    With ``turns`` it may take one of ``square_normals``.
+    It moves by at most ``reach`` [m] in steps of a tenth of the wavelength [m]. With ``turns`` it
+    may also take one of ``square_normals``.
     """
     placement: Mirrored = model.placement
     origin = placement.origin[plane]
-    step = wavelength / 10  # a reflected path changes by twice of it
+    step = wavelength / 10  # a reflected path changes by twice as much
     count = round(reach / step)
     moves = step * torch.arange(-count, count + 1).to(origin)
-    moves = moves[moves.abs().argsort(stable=True)]  # of equal errors the least move
+    # ``argmin`` takes the first of equal errors: the least move.
+    moves = moves[moves.abs().argsort(stable=True)]
     normals = [origin[:3].clone()]
     if turns:
         used = placement.used.tolist()
@@ -97,34 +102,34 @@ def move_plane(
 def _measure_moves(
     model, batch: Batch, plane: int, moves: Float[Tensor, " m"]
 ) -> Float[Tensor, " m"]:
-    """Mean error with a plane moved along its normal [m] and strengths held.
+    """Mean error of the links after each move of a plane along its normal [m].
 
-    Absolute errors count, of channels the logarithms of ``log_share``.
+    Strengths of paths stay as they are; only lengths change.
     """
     placement = model.placement
     count = len(batch.query)
     errors = []
     with placement.holding():
         model.excite(batch.query)
-        held = placement.held
+        strengths = placement.held
         numbers = max(1000, batch.labels[0].numel())
         for part in moves.split(max(1, 2_000_000 // (count * numbers))):
             # Each link once for each move.
             rows = torch.arange(count, device=moves.device).repeat(len(part))
-            placement.held = held[rows]
+            placement.held = strengths[rows]
             placement.tried = placement.offsets.repeat(len(rows), 1)
             placement.tried[:, plane] += part.repeat_interleave(count)
             moved = Batch(batch.query[rows], batch.directions)
             numbered = torch.arange(len(rows), device=rows.device)
             value = model.respond(model.excite(moved.query), numbered, moved).value
             label = model.scene.task.align(batch.labels[rows], value)
-            each = _measure_links(value, label)
-            errors.append(each.view(len(part), count).mean(1))
+            link_errors = _measure_links(value, label)
+            errors.append(link_errors.view(len(part), count).mean(1))
     return torch.cat(errors)
 
 
 def _measure_links(value: Tensor, label: Tensor) -> Float[Tensor, " b"]:
-    """Error of each link (b, ...)."""
+    """Error of each link: mean absolute error; of channels ``log_share``."""
     error = (value - label).reshape(len(value), -1)
     if not error.is_complex():
         return error.abs().mean(1)
@@ -135,10 +140,13 @@ def _measure_links(value: Tensor, label: Tensor) -> Float[Tensor, " b"]:
 
 
 def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: float = 1e-6) -> str:
-    """Drops planes, then paths, that hardly lower any batch's loss, weakest first.
+    """Drops planes, then paths, without which no batch's loss rises by 0.1 %, weakest first.
 
-    A path whose power is ``negligible`` over the strongest one's goes in any case: hundreds would
-    take long.
+    Args:
+        placement: Its ``kept`` changes.
+        batches: Links that count; the first sorts planes and paths by power.
+        loss: Loss of the model on a batch.
+        negligible: Share of the strongest path's power below which a path goes in any case.
 
     Returns:
         A sentence for the log.
@@ -147,7 +155,8 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: flo
     paths = int(placement.kept.sum())
     before = [loss(batch) for batch in batches]
 
-    def is_good(kept: Bool[Tensor, " n"]) -> bool:
+    def suffices(kept: Bool[Tensor, " n"]) -> bool:
+        """Keeps these paths; True if no batch's loss rises by 0.1 %."""
         placement.kept.copy_(kept)
         return all(
             loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True)
@@ -155,17 +164,18 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: flo
 
     best = placement.kept.clone()
     shares = torch.stack([_path_shares(placement, batch) for batch in batches]).amax(0)
-    best[best.nonzero()[:, 0][shares < negligible * shares.max()]] = False
+    paths_in_use = best.nonzero()[:, 0]
+    best[paths_in_use[shares < negligible * shares.max()]] = False
     for plane in reversed(sort_by_strength(placement, batches[0])):
         without = best & ~(placement.sequences == plane).any(1)
-        best = without if is_good(without) else best
+        best = without if suffices(without) else best
     placement.kept.copy_(best)
     weakest = best.nonzero()[:, 0][_path_shares(placement, batches[0]).argsort()]
     # The largest number of weak paths that may go, by bisection.
     low, high = 0, len(weakest) - 1
     while low < high:
         middle = (low + high + 1) // 2
-        if is_good(best.index_fill(0, weakest[:middle], False)):
+        if suffices(best.index_fill(0, weakest[:middle], False)):
             low = middle
         else:
             high = middle - 1

@@ -36,6 +36,7 @@ def summarize(placement: Mirrored, query: Query) -> dict[str, list]:
 
 
 def _summarize_planes(placement: Mirrored, traced: TracedPaths) -> list[dict]:
+    """Position, loss and share in the power of each plane, strongest first."""
     table = tabulate_planes(placement, traced.ends)
     planes = []
     for number, share in traced.plane_shares.items():
@@ -55,6 +56,7 @@ def _summarize_planes(placement: Mirrored, traced: TracedPaths) -> list[dict]:
 
 
 def _summarize_paths(traced: TracedPaths) -> list[dict]:
+    """Number and share in the power of the kept paths with 0, 1, ... bounces."""
     counts = (traced.sequences >= 0).sum(1)
     means = traced.shares.mean(0)
     paths = []
@@ -67,7 +69,7 @@ def _summarize_paths(traced: TracedPaths) -> list[dict]:
 
 @torch.no_grad()
 def write_room(placement: Mirrored, query: Query, folder: Path) -> None:
-    """Writes ``planes.obj``, as far as the query's paths reach, and ``obstacles.ply`` for any."""
+    """Writes ``planes.obj``, as far as the query's paths reach, and any obstacles' ``.ply``."""
     write_text(folder / "planes.obj", wavefront_obj(placement, trace_paths(placement, query)))
     blobs = placement.obstacles
     if blobs is None:
@@ -115,7 +117,7 @@ def wavefront_obj(placement: Mirrored, traced: TracedPaths, sheets: Sequence[She
 
 
 def to_meshes(planes: Sequence[LearntPlane], sheets: Sequence[Sheet]) -> list[Mesh]:
-    """Planes, a face each, and sheets of obstacles as meshes without materials."""
+    """Meshes without materials: one face for each plane, and the sheets of obstacles."""
     parts = []
     for plane in planes:
         face = tuple(range(len(plane.corners)))
@@ -126,4 +128,5 @@ def to_meshes(planes: Sequence[LearntPlane], sheets: Sequence[Sheet]) -> list[Me
 
 
 def _rows(array: ndarray) -> tuple:
+    """Rows of an array as tuples of numbers."""
     return tuple(map(tuple, array.tolist()))

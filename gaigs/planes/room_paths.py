@@ -47,10 +47,10 @@ class TracedPaths(NamedTuple):
 
 
 class LearntPath(NamedTuple):
-    """Transmitter, bounces and receiver of a path [m], and its power over the strongest's [dB]."""
+    """A path through the room."""
 
-    points: Float[ndarray, "p 3"]
-    power_db: float
+    points: Float[ndarray, "p 3"]  # transmitter, bounces, receiver [m]
+    power_db: float  # over the strongest listed path
 
 
 def thin_links(query: Query) -> Query:
@@ -60,7 +60,7 @@ def thin_links(query: Query) -> Query:
 
 
 def spread_links(scene: Scene) -> Query:
-    """Links evenly spread over the training transmitters' box, the receivers and the carriers."""
+    """256 links spread over the training transmitters' box, the receivers and the carriers."""
     number = torch.arange(256)
     shares = torch.quasirandom.SobolEngine(3).draw(len(number)).to(scene.lower)
     places = scene.lower + (scene.upper - scene.lower) * shares

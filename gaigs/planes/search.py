@@ -15,7 +15,7 @@ from gaigs.splatting.placement.mirrored.reflections import tangents
 
 @runtime_checkable
 class SearchedRoom(Protocol):
-    """Planes in the frame (w, 4), and what a score fits beside them, such as materials."""
+    """A room of a search: its planes, and what a score fits with them, such as materials."""
 
     @property
     def planes(self) -> Float[Tensor, "w 4"]: ...
@@ -25,10 +25,10 @@ R = TypeVar("R", bound=SearchedRoom)
 
 
 class Candidate(NamedTuple):
-    """A plane (4,) that a room may lack, and its rating."""
+    """A plane that a room may lack."""
 
     plane: Float[Tensor, "4"]
-    rating: float
+    rating: float  # what it explains, as ``Score.rate`` measures it
 
 
 class GridRatings(NamedTuple):
@@ -118,7 +118,10 @@ class PlaneSearch(Generic[R]):
         self.shift = shift
 
     def propose(self, room: R, lines: Float[Tensor, "n k 4"]) -> list[Candidate]:
-        """At most three planes apart from the room's: the highest maxima of a grid, sharpened."""
+        """At most three candidates: the highest maxima of a grid, sharpened by a random search.
+
+        Planes like the room's, or like a better candidate, are left out.
+        """
         rough = self.score.rate(room, lines)
         grid = lines.flatten(0, 1)  # (n k, 4)
         ratings = rough.ratings.flatten().clone()
@@ -161,9 +164,9 @@ class PlaneSearch(Generic[R]):
         return min(self.list_extensions(room, grid), key=self.score.error, default=None)
 
     def grow(self, room: R, most: int, extend: Callable[[R], R | None]) -> R:
-        """The room with planes one after the other, ``most`` in all.
+        """The room after repeated ``extend``, with at most ``most`` planes.
 
-        ``extend`` gives the room with one more plane, or None to end.
+        ``extend`` returns the room with one more plane, or None to end.
         """
         for _ in stages.track(range(most - len(room.planes)), "search of planes"):
             if stages.is_up():
@@ -181,7 +184,11 @@ class PlaneSearch(Generic[R]):
         title: str = "",
         move: Callable[[R, int], R] | None = None,
     ) -> R:
-        """The room with each of some planes moved, as the others are known by then."""
+        """The room with planes ``numbers`` moved one after the other.
+
+        Each is moved by ``move`` in the room that the moves before it have left; None: by
+        ``Score.move``.
+        """
         for number in stages.track(numbers, title):
             if stages.is_up():
                 break
@@ -189,7 +196,7 @@ class PlaneSearch(Generic[R]):
         return room
 
     def prune(self, room: R, fewest: int) -> R:
-        """The room without planes beyond ``fewest`` whose absence lowers the error, worst first."""
+        """The room without the planes whose absence lowers the error; the first ``fewest`` stay."""
         while len(room.planes) > fewest and not stages.is_up():
             smaller = [
                 self.score.remove(room, number) for number in range(fewest, len(room.planes))
@@ -209,10 +216,12 @@ def descend(
     others: list[Tensor],
     steps: int,
     rate: float,
+    turns: float = 0.4,
 ) -> list[Tensor]:
-    """Adam on planes, which turn about their ``mean_bounces``, and on other arguments of a loss.
+    """Planes and ``others``, the further arguments of a loss, after a descent by Adam.
 
-    ``rate`` is the first step of a plane [m]; steps fall to 3 % of it.
+    Planes turn about their ``mean_bounces`` at the receivers. ``rate`` is the first step of a plane
+    [m], and ``turns`` times it the first turn [rad]; steps fall to 3 % of it.
     """
     if not len(planes):
         return [planes, *others]
@@ -224,8 +233,8 @@ def descend(
 
     def moved() -> Float[Tensor, "w 4"]:
         # Lengths change by about twice a shift [m], and by some metres times a turn [rad].
-        turns = 0.4 * (shifts[:, 1:, None] * axes).sum(1)  # (w, 3)
-        normals = functional.normalize(planes[:, :3] + turns, dim=1)
+        turned = planes[:, :3] + turns * (shifts[:, 1:, None] * axes).sum(1)  # (w, 3)
+        normals = functional.normalize(turned, dim=1)
         offsets = (normals * pivots).sum(1) + heights + shifts[:, 0]
         return torch.cat((normals, offsets[:, None]), 1)
 

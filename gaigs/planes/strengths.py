@@ -8,14 +8,14 @@ from torch import Tensor
 
 
 class FreeFit(NamedTuple):
-    """Residual of channels (b, k) after the strengths of their waves (b, n)."""
+    """Strengths of waves in channels, and the residual after them."""
 
     residual: Complex[Tensor, "b k"]
     strengths: Complex[Tensor, "b n"]
 
 
 def ridged(gram: Inexact[Tensor, "b n n"], ridge: float) -> Inexact[Tensor, "b n n"]:
-    """Gram matrices with a ridge over their mean power: unresolved images then share theirs."""
+    """Gram matrices plus ``ridge`` times their mean power: unresolved waves share their power."""
     power = gram.diagonal(dim1=1, dim2=2).real.mean(1)  # (b,)
     power = torch.where(power > 0, power, 1)  # without any wave strengths are 0
     return gram + ridge * power[:, None, None] * torch.eye(gram.shape[-1], dtype=gram.real.dtype)
@@ -37,7 +37,7 @@ def real_residual(
     signed: Bool[Tensor, " n"],
     ridge: float,
 ) -> Complex[Tensor, "b k"]:
-    """Residual after the best real strengths, of which only ``signed`` ones may be negative."""
+    """Residual of channels after the best real strengths; only ``signed`` ones may be negative."""
     gram = ridged((waves.conj() @ waves.mT).real, ridge)
     strengths = real_strengths(gram, (waves.conj() @ channels[..., None]).real, signed)
     return channels - (strengths.mT.to(waves) @ waves)[:, 0]
@@ -48,9 +48,10 @@ def real_strengths(
     right: Float[Tensor, "b n 1"],
     signed: Bool[Tensor, " n"] | bool = False,
 ) -> Float[Tensor, "b n 1"]:
-    """Solutions of linear systems without negative values, but for ``signed`` ones.
+    """Solutions of linear systems in which only ``signed`` values may be negative.
 
-    Values that would be negative are 0, and the others follow: one step of an active-set method.
+    Values that the plain solution makes negative are set to 0, and the others are solved for once
+    more: one step of an active-set method.
     """
     is_active = torch.linalg.solve(gram, right) >= 0
     active = (is_active | torch.as_tensor(signed)[..., None]).to(gram)  # (b, n, 1)
@@ -61,7 +62,7 @@ def real_strengths(
 def log_share(
     rest: Complex[Tensor, "b k"], channels: Complex[Tensor, "b k"], floor: float = 1e-3
 ) -> Float[Tensor, " b"]:
-    """Logarithm of a residual's share of the channels' power, from 30 dB below on constant."""
+    """Logarithm of each residual's share of its channel's power, plus ``floor``."""
     power = channels.abs().square().sum(-1)
     return (rest.abs().square().sum(-1) / torch.where(power > 0, power, 1) + floor).log()
 

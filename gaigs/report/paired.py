@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gaigs.core.query import drawn
 from gaigs.core.task import Task
 from gaigs.report.scores import headline
 
@@ -15,7 +16,7 @@ class Paired(NamedTuple):
     """Models against the best baseline."""
 
     baseline: str
-    places: int  # number of the test links' places
+    places: int  # number of the test links' places that are drawn from
     # Probability of a difference as large by chance, by the names of model and metric.
     p: dict[str, dict[str, float]]
 
@@ -26,6 +27,7 @@ def paired(
     places: Tensor,
     resamples: int = 1000,
     seed: int = 0,
+    most: int = 25_000,
 ) -> Paired | None:
     """A paired bootstrap over places, of each metric; None without baselines or with one place.
 
@@ -39,6 +41,7 @@ def paired(
         places: A number for the place of each link (k,).
         resamples: Number of resamples; no probability is below 2 / (resamples + 1).
         seed: Seed of the resamples.
+        most: About the most links of a resample; with more a part of the places is drawn from.
 
     Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapters 8 and 16.
     """
@@ -53,13 +56,14 @@ def paired(
     order = groups.argsort(stable=True)
     counts = groups.bincount().numpy()  # links of each place
     firsts = counts.cumsum() - counts  # in the order
+    chosen = drawn(torch.arange(len(counts)), max(2, most * len(counts) // len(groups))).numpy()
     random = np.random.default_rng(seed)
     gaps: dict[tuple[str, str], list[float]] = {}
     for _ in range(resamples):
-        drawn = random.integers(0, len(counts), len(counts))
-        lengths = counts[drawn]
+        sample = chosen[random.integers(0, len(chosen), len(chosen))]
+        lengths = counts[sample]
         # All links of the first drawn place, then all of the second, and so on.
-        shifts = firsts[drawn] - (lengths.cumsum() - lengths)
+        shifts = firsts[sample] - (lengths.cumsum() - lengths)
         rows = order[shifts.repeat(lengths) + np.arange(lengths.sum())]
         summaries = {}
         for name, parts in scores.items():
@@ -75,4 +79,4 @@ def paired(
         # Two-sided: the smaller tail of the differences, the observed one counted in.
         tails = np.less_equal(differences, 0).sum(), np.greater_equal(differences, 0).sum()
         p.setdefault(name, {})[key] = min(1.0, 2 * (int(min(tails)) + 1) / (resamples + 1))
-    return Paired(best, len(numbers), p)
+    return Paired(best, len(chosen), p)

@@ -188,13 +188,13 @@ def train_and_test(config: dict, folder: Path) -> dict | None:
         return None
     look_ups = dict(baselines)
     if not fitted.unseen:  # a model without a training is fitted for the validation, too
-        model = registry("model").build(config["model"], scene=links.scene)
-        look_ups = {name: model} | baselines
+        look_ups = {name: registry("model").build(config["model"], scene=links.scene)} | baselines
+    fits: dict[str, Model] = {}
     # Shares of the run's limit; maps and figures have the rest.
     with stage(until=0.86), timed("validation"):
-        validation = evaluation.validate(fitted.unseen, look_ups, links)
+        validation = evaluation.validate(fitted.unseen, look_ups, links, fits)
     with stage(until=0.92):
-        scores = evaluation.score(fitted.models, baselines, links, folder)
+        scores = evaluation.score(fitted.models, baselines, links, folder, fits=fits)
     model = fitted.models[name]
     metrics = _facts(links, config["seed"], model, fitted, folder / "best.ckpt")
     metrics |= {

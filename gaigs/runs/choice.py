@@ -1,6 +1,7 @@
 """The choice of a model by validation links: ``model=auto``."""
 
 import logging
+import math
 import shutil
 import statistics
 import time
@@ -20,12 +21,15 @@ from gaigs.configuration import composed, differences, preset
 from gaigs.core import stages
 from gaigs.core.task import Task
 from gaigs.data import Links
-from gaigs.model import Model
-from gaigs.model.answers import predicted
+from gaigs.kriging.links import folds_of
+from gaigs.model import Model, checkpoint
+from gaigs.model.answers import calibrated, predicted
+from gaigs.model.ensemble import Ensemble
 from gaigs.processes import limited_threads
 from gaigs.registry import call, registry
-from gaigs.runs.fitting import Fitted, fit
+from gaigs.runs.fitting import Fitted, count_gaussians, fit
 from gaigs.runs.folder import claim
+from gaigs.runs.stacking import stack
 from gaigs.training.budget import seconds
 
 log = logging.getLogger(__name__)
@@ -43,10 +47,14 @@ class Tried(NamedTuple):
     # Mean score of the links at each place, higher ones better, by the place's key.
     gains: dict[int, float]
     seconds: float  # duration of fits, training and scores
-    # The model by name, not fitted to validation links; empty before a look-up's validation.
-    unseen: Mapping[str, Model] = {}
+    asked: Tensor | None = None  # links that it has not learnt from (k,)
+    values: Tensor | None = None  # their predictions (k, *shape)
+    unseen: Model | None = None  # model without validation links, as it scores at these
     # Result of the training; None for a look-up, which is fitted once it is chosen.
     fitted: Fitted | None = None
+    # Members of a blend and their shares; empty for a single model.
+    members: "tuple[Tried, ...]" = ()
+    weights: tuple[float, ...] = ()
 
 
 class ChosenModel(NamedTuple):
@@ -54,11 +62,12 @@ class ChosenModel(NamedTuple):
 
     chosen: Tried
     reason: str
+    level: Sequence[Tried] = ()  # candidates that no other surely leads
 
 
 def choose(links: Links, config: dict, folder: Path) -> Fitted:
-    """The simplest candidate that no other surely leads, as a run of its own gives it, under the
-    name ``auto``.
+    """The simplest candidate that no other surely leads, or a blend of those that are level, as a
+    run of its own gives it, under the name ``auto``.
 
     Look-ups are compared at all known places, by folds of which each is predicted from the others;
     the best of them with trained candidates at the validation places. Each candidate is a run in
@@ -88,13 +97,13 @@ def choose(links: Links, config: dict, folder: Path) -> Fitted:
     contenders = []
     reasons = []
     if looked:
-        best = pick(looked, links.task)
+        best = settle(looked, links)
         reasons = [f"of look-ups {best.reason}"] if len(looked) > 1 else []
         contenders = [_validated(best.chosen, links)]
     trained = _try_each(train_candidate, configs, links, folder, end)
     if not looked and not trained:
         raise ValueError("model=auto has no candidate left; the lines above say why")
-    choice = pick([*contenders, *trained], links.task)
+    choice = settle([*contenders, *trained], links)
     reason = "; ".join([choice.reason, *reasons] if trained else reasons or [choice.reason])
     log.info("auto: %s", reason)
     # In Python nothing shows the log, unless the caller has set it up.
@@ -197,47 +206,109 @@ def look_up(label: str, config: dict, links: Links, folder: Path) -> Tried:
     began = time.monotonic()
     model = registry("model").build(config["model"], scene=links.scene)
     model.fit(links)
-    gains: dict[int, float] = {}
+    asked = []
+    values = []
     for unseen in model.unseen(links):
-        gains |= place_gains(unseen.model, links, unseen.asked)
-    if not gains:
+        asked.append(unseen.asked)
+        values.append(predicted(unseen.model, links, unseen.asked))
+    if not asked:
         raise ValueError(f"its fit took {time.monotonic() - began:.0f} s; raise model.max_time")
-    return Tried(label, config, folder, gains, time.monotonic() - began)
+    one = Tried(label, config, folder, {}, time.monotonic() - began)
+    return _scored(one, links, torch.cat(asked), torch.cat(values))
 
 
 def train_candidate(label: str, config: dict, links: Links, folder: Path) -> Tried:
     """A trained candidate with its scores at the validation places."""
     began = time.monotonic()
     fitted = _fit(config, links, folder)
-    name = config["model"]["name"]
-    gains = place_gains(fitted.unseen[name], links, links.split.validation)
-    unseen = {name: fitted.unseen[name]}
-    return Tried(label, config, folder, gains, time.monotonic() - began, unseen, fitted)
+    unseen = fitted.unseen[config["model"]["name"]]
+    asked = links.split.validation
+    values = predicted(unseen, links, asked)
+    spent = time.monotonic() - began
+    one = Tried(label, config, folder, {}, spent, unseen=unseen, fitted=fitted)
+    return _scored(one, links, asked, values)
 
 
 def _validated(look_up: Tried, links: Links) -> Tried:
-    """A look-up with its scores at the validation places, as trained candidates have them."""
+    """A look-up or a blend of them with its scores where trained candidates have theirs."""
+    asked = links.split.validation
+    if look_up.members:
+        members = tuple(_validated(member, links) for member in look_up.members)
+        values = _mean([one.values for one in members], look_up.weights)
+        return _scored(look_up._replace(members=members), links, asked, values)
     model = registry("model").build(look_up.config["model"], scene=links.scene)
     model.fit(replace(links, split=links.split.validating()))
-    gains = place_gains(model, links, links.split.validation)
-    return look_up._replace(gains=gains, unseen={look_up.config["model"]["name"]: model})
+    values = predicted(model, links, asked)
+    return _scored(look_up._replace(unseen=model), links, asked, values)
 
 
-def place_gains(model: Model, links: Links, index: Int[Tensor, " k"]) -> dict[int, float]:
-    """Mean monitored score at each place: links of one place, with errors alike, are one."""
+def _scored(one: Tried, links: Links, asked: Int[Tensor, " k"], values: Tensor) -> Tried:
+    """A candidate with predictions and its mean score at each place: errors there are alike."""
     task = links.task
-    labels = torch.cat([links.labels[part] for part in index.split(64)])
-    scores = task.scores(labels, predicted(model, links, index))[task.monitor].double()
-    keys, places = links.query[index].place_keys.unique(return_inverse=True)
+    scores = task.scores(_labels(links, asked), values)[task.monitor].double()
+    keys, places = links.query[asked].place_keys.unique(return_inverse=True)
     sums = scores.new_zeros(len(keys)).index_add(0, places, scores)
     means = sums / places.bincount()  # (p,)
     if not task.higher_is_better:
         means = -means
-    return dict(zip(keys.tolist(), means.tolist(), strict=True))
+    gains = dict(zip(keys.tolist(), means.tolist(), strict=True))
+    return one._replace(gains=gains, asked=asked, values=values)
+
+
+def _labels(links: Links, index: Int[Tensor, " k"]) -> Tensor:
+    return torch.cat([links.labels[part] for part in index.split(64)])
+
+
+def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
+    """One candidate, or a blend of those that no other surely leads.
+
+    A blend is scored by shares that are fitted without each place's fold, and taken unless a
+    candidate surely leads it: the error of a mean is at most the mean of the errors. Complex
+    channels of unknown phase have no mean.
+    """
+    choice = pick(tried, links.task)
+    level = choice.level
+    if len(level) < 2 or links.task.phase != "known":
+        return choice
+    asked: Any = level[0].asked
+    for one in level:  # the time limit may have left out folds of some
+        asked = asked[torch.isin(asked, one.asked)]
+    values: Any = [one.values[torch.isin(one.asked, asked)] for one in level]  # type: ignore
+    places = links.query[asked].place_keys
+    shares, crossed = stack(_labels(links, asked), values, places, folds_of(links, asked))
+    if shares.max() > 0.85:  # a second model is worth more than a tenth
+        return choice
+    blend = _blended(level, shares.tolist())
+    judged = pick([_scored(blend, links, asked, _mean(values, crossed)), *level], links.task)
+    return judged._replace(chosen=blend) if judged.chosen.members else choice
+
+
+def _blended(tried: Sequence[Tried], weights: Sequence[float]) -> Tried:
+    """A blend of candidates; of a blend its members count."""
+    members: dict[str, Tried] = {}
+    shares: dict[str, float] = {}
+    for weight, part in zip(weights, tried, strict=True):
+        for share, one in zip(part.weights or (1.0,), part.members or (part,), strict=True):
+            if weight * share > 0:
+                members[one.label] = one
+                shares[one.label] = weight * share
+    label = " + ".join(f"{share:.2g} {name}" for name, share in shares.items())
+    blend = tried[0]._replace(label=label, seconds=sum(one.seconds for one in tried))
+    return blend._replace(members=tuple(members.values()), weights=tuple(shares.values()))
+
+
+def _mean(values: Sequence[Any], shares: Sequence[float] | Tensor) -> Tensor:
+    """Weighted mean of predictions (k, *shape) by their shares, (c,) or of each link (c, k)."""
+    total: Any = 0.0
+    for one, share in zip(values, torch.as_tensor(shares), strict=True):
+        total = total + share.to(one.real).reshape(-1, *[1] * (one.ndim - 1)) * one
+    return total
 
 
 def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
     """The first candidate that no other is ahead of by more than a standard error.
+
+    A candidate whose scores are not finite is behind all others.
 
     Differences are paired: what is hard at a place is hard for both. All pairs count, as the best
     mean of few places is often that of the candidate whose scores scatter most.
@@ -252,23 +323,24 @@ def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
     rows = [itemgetter(*keys)(one.gains) for one in tried]
     gains = torch.tensor(rows).reshape(len(tried), len(keys))  # (c, p)
     means = gains.mean(1)
-    best = int(means.argmax())
+    best = int(means.nan_to_num(-math.inf, -math.inf).argmax())
     leads = gains[:, None] - gains  # (c, c, p), of the first over the second
     # One place tells no scatter: the best is taken.
     scatter = leads.std(2) / len(shared) ** 0.5 if len(shared) > 1 else 0 * leads.mean(2)
-    is_beaten = (leads.mean(2) > scatter).any(0)  # (c,)
+    is_beaten = (leads.mean(2) > scatter).any(0) | ~means.isfinite()  # (c,)
     chosen = int(is_beaten.int().argmin())
+    level = [one for one, beaten in zip(tried, is_beaten.tolist(), strict=True) if not beaten]
     signed = means if task.higher_is_better else -means
     texts = [f"{one.label} {mean:.3g}" for one, mean in zip(tried, signed.tolist(), strict=True)]
     scores = f"mean {task.monitor} at {len(shared)} places: {', '.join(texts)}"
     if chosen == best:
-        return ChosenModel(tried[best], f"{tried[best].label} is the best, {scores}")
+        return ChosenModel(tried[best], f"{tried[best].label} is the best, {scores}", level)
     lead = f"{leads[best, chosen].mean():.2g}, standard error {scatter[best, chosen]:.2g}"
     reason = (
-        f"{tried[chosen].label} is the simplest that none surely leads; {tried[best].label} is "
+        f"{tried[chosen].label} is the first that none surely leads; {tried[best].label} is "
         f"ahead by {lead}, {scores}"
     )
-    return ChosenModel(tried[chosen], reason)
+    return ChosenModel(tried[chosen], reason, level)
 
 
 def _facts(tried: Sequence[Tried], chosen: Tried, reason: str, task: Task) -> dict:
@@ -278,7 +350,10 @@ def _facts(tried: Sequence[Tried], chosen: Tried, reason: str, task: Task) -> di
         score = statistics.fmean(one.gains.values()) * (1 if task.higher_is_better else -1)
         facts = {task.monitor: score, "places": len(one.gains), "seconds": one.seconds}
         candidates[one.label] = facts
-    return {NAME: {"chosen": chosen.label, "reason": reason, "candidates": candidates}}
+    labels = [one.label for one in chosen.members or (chosen,)]
+    weights = dict(zip(labels, chosen.weights or (1.0,), strict=True))
+    about = {"chosen": chosen.label, "weights": weights, "reason": reason}
+    return {NAME: about | {"candidates": candidates}}
 
 
 def _fit(config: dict, links: Links, folder: Path) -> Fitted:
@@ -292,17 +367,26 @@ def _fit(config: dict, links: Links, folder: Path) -> Fitted:
 
 
 def _finish(chosen: Tried, links: Links, folder: Path, seconds: float) -> Fitted:
-    """The result of the chosen candidate's run, whose checkpoint and log the folder gets.
-
-    A look-up is fitted to all known links.
+    """The result of the chosen candidate's run, whose checkpoint and log the folder gets; or the
+    blend of several results. A look-up is fitted to all known links.
     """
-    fitted = chosen.fitted or _fit(chosen.config, links, chosen.folder)
+    parts = chosen.members or (chosen,)
+    results = [one.fitted or _fit(one.config, links, one.folder) for one in parts]
+    if chosen.members:
+        names = [one.config["model"]["name"] for one in parts]
+        members = [one.models[name] for one, name in zip(results, names, strict=True)]
+        blend = Ensemble(links.scene, members, [*chosen.weights]).eval()
+        unseen: Any = Ensemble(links.scene, [one.unseen for one in parts], blend.weights).eval()
+        blend.known_places = links.query[links.split.known].place_keys.unique()
+        blend.calibration = calibrated(unseen if blend.is_trained else blend, links)
+        checkpoint.save(blend, folder / "best.ckpt")
+        return Fitted({NAME: blend}, {NAME: unseen}, count_gaussians(blend), seconds)
     if (chosen.folder / "best.ckpt").is_file():
         shutil.copy(chosen.folder / "best.ckpt", folder / "best.ckpt")
     if (chosen.folder / "log").is_dir():
         shutil.copytree(chosen.folder / "log", folder / "log", dirs_exist_ok=True)
     name = chosen.config["model"]["name"]
     # The trend of a kriged model is named after the row, too.
-    models = {NAME + key.removeprefix(name): model for key, model in fitted.models.items()}
-    unseen = {NAME: chosen.unseen[name]}
-    return fitted._replace(models=models, unseen=unseen, seconds=seconds)
+    models = {NAME + key.removeprefix(name): model for key, model in results[0].models.items()}
+    assert chosen.unseen is not None
+    return results[0]._replace(models=models, unseen={NAME: chosen.unseen}, seconds=seconds)

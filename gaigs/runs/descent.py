@@ -15,6 +15,7 @@ from lightning.pytorch.strategies import DDPStrategy, SingleDeviceStrategy
 from torch import distributed
 
 from gaigs.core import stages
+from gaigs.core.query import drawn
 from gaigs.data import Links
 from gaigs.model import Model, checkpoint
 from gaigs.model.answers import batch_size
@@ -33,9 +34,17 @@ log = logging.getLogger(__name__)
 
 
 def descend(
-    model: Model, loss: Loss, links: Links, config: dict, folder: Path, searched: float
+    model: Model,
+    loss: Loss,
+    links: Links,
+    config: dict,
+    folder: Path,
+    searched: float,
+    rival: float | None = None,
 ) -> tuple[Model, float]:
     """Trains a model by gradient descent, which ``Model.fit`` has prepared in ``searched`` [s].
+
+    It ends when the validation would stay below the score of a ``rival``.
 
     Returns:
         The model at the step with the best validation score, or at the last step without validation
@@ -50,7 +59,7 @@ def descend(
     options, budget = make_budget(config["trainer"], searched)
     keep_last = KeepLast(last, config["save_every"])
     # Lightning calls the keepers of checkpoints after all others.
-    callbacks = [budget, KeepBest(best, module.patience), keep_last]
+    callbacks = [budget, KeepBest(best, module.patience, rival), keep_last]
     callbacks += _callbacks(module, links, config)
     context = {"callbacks": callbacks, "logger": _loggers(folder, config["tensorboard"])}
     trainer = make_trainer(options, default_root_dir=folder, **context)
@@ -58,10 +67,11 @@ def descend(
     steps = ENDLESS if trainer.max_steps == -1 else trainer.max_steps
     batches = Batches(links, links.split.train, module.batch_size, seed, steps)
     validation = None
-    if len(links.split.validation):
+    if len(links.split.validation) and links.task.is_scalar:
         # Links of one number need little memory, and few large batches less time.
-        size = batch_size(links) if links.task.is_scalar else module.batch_size
-        validation = InOrder(links, links.split.validation, size)
+        validation = InOrder(links, drawn(links.split.validation), batch_size(links))
+    elif len(links.split.validation):
+        validation = InOrder(links, links.split.validation, module.batch_size)
     resumed = last if last.is_file() else None
     if resumed is not None:
         content = resumable(last, best)

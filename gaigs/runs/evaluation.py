@@ -24,12 +24,14 @@ from gaigs.calibration.conformal import thinned
 from gaigs.calibration.scores import scores_of_links, shares_within, summarise_intervals
 from gaigs.configuration import composed, files_of
 from gaigs.core import stages
+from gaigs.core.query import drawn
 from gaigs.core.results import plot
 from gaigs.core.scene import Scene
 from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.data.compatibility import check_fit
 from gaigs.io.files import atomic_write
+from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model import Model
 from gaigs.model.answers import batch_size, calibrated, predicted, spreads
 from gaigs.model.kriging import Kriging
@@ -70,8 +72,14 @@ def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> 
     return {name: model for name, model in models.items() if model is not None}
 
 
-def fitted(look_up: Model, links: Links) -> Model:
-    """A copy of a model without a training, fitted to the known links."""
+def fitted(
+    look_up: Model, links: Links, before: Model | None = None, many: int = ScalarOptions.large
+) -> Model:
+    """A copy of a model without a training, fitted to the known links; to more than ``many`` with
+    the choices of a fit ``before`` to most of these.
+    """
+    if before is not None and len(links.split.known) > many:
+        return before.refitted(links)
     model = copy.deepcopy(look_up)
     model.fit(links)
     return model
@@ -233,12 +241,13 @@ def score(
     links: Links,
     folder: Path | None = None,
     has_intervals: bool = True,
+    fits: dict[str, Model] | None = None,
 ) -> Scores:
     """Scores of every test link by models and look-ups; predictions of the first in a folder.
 
     Look-ups and models with a calibration have scores of intervals too. If subcarriers are held
     out, ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as an
-    uplink is taken for a downlink.
+    uplink is taken for a downlink. Fitted look-ups come into ``fits``, for their next fit.
     """
     test = LinkScores(links)
     look_ups = able_look_ups(look_ups, links)
@@ -246,6 +255,7 @@ def score(
     states_intervals = has_intervals and frequencies is None
     first = next(iter([*models, *look_ups]), None)
     left_out = []
+    earlier = {} if fits is None else fits
     for key in [*models, *look_ups]:
         is_baseline = key in look_ups and key != first
         # A baseline without time has no fit, or one in haste.
@@ -253,7 +263,8 @@ def score(
             left_out.append(key)
             continue
         with stages.timed(key):
-            model = models[key] if key in models else fitted(look_ups[key], links)
+            model = models[key] if key in models else fitted(look_ups[key], links, earlier.get(key))
+            earlier[key] = model
         if is_baseline and stages.is_up():
             left_out.append(key)
             continue
@@ -358,12 +369,19 @@ class LinkScores:
         self.content[f"shares_{key}"] = shares_within(calibration, few, self.query)
 
 
-def validate(models: Mapping[str, Model], look_ups: Mapping[str, Model], links: Links) -> Scores:
-    """Scores of the validation links by models that have not seen them; empty without any."""
+def validate(
+    models: Mapping[str, Model],
+    look_ups: Mapping[str, Model],
+    links: Links,
+    fits: dict[str, Model] | None = None,
+) -> Scores:
+    """Scores of validation links by models that have not seen them; empty without any."""
     if not len(links.split.validation):
         return {}
-    held_out = replace(links, split=links.split.validating(), held_out=None)
-    return score(models, look_ups, held_out, has_intervals=False)
+    split = links.split.validating()
+    split = replace(split, test=drawn(split.test))
+    held_out = replace(links, split=split, held_out=None)
+    return score(models, look_ups, held_out, has_intervals=False, fits=fits)
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:

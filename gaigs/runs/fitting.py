@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gaigs.core import stages
+from gaigs.core.query import drawn
 from gaigs.data import Links
 from gaigs.kriging.links import check_known
 from gaigs.model import Model, checkpoint
@@ -56,8 +57,15 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         if is_first() and model.state_dict():
             checkpoint.save(model, best)
         return Fitted({name: model}, {}, start)
+    rival = None
+    held = drawn(links.split.validation)
+    if kriged is not None and model.settles and len(held) > 1:
+        with stages.timed("kriging"):
+            scores = kriged.law_scores(links, held)
+        # Two standard errors below its mean: kriging leaves out a room that is surely worse.
+        rival = (scores.mean() - 2 * scores.std() / len(held) ** 0.5).item()
     with stages.stage(until=0.5 / config["ensemble"]), stages.timed("training"):
-        model, seconds = descend(model, loss, links, config, folder, searched)
+        model, seconds = descend(model, loss, links, config, folder, searched, rival)
     if not is_first():
         return None
     trained = None

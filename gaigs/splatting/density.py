@@ -32,7 +32,7 @@ def prune(
         gaussians: They lose rows in place.
         optimizer: Their optimizer.
         gone: True for each Gaussian to remove.
-        follower: Its parameters that follow the Gaussians lose rows, too.
+        follower: Deformation whose parameters with a row for each Gaussian lose these rows too.
 
     Source: Kerbl et al., 2023, section 5.2.
     """
@@ -112,7 +112,13 @@ def _rearrange(
     select_state: SelectRows,
     follower: Deformation | None,
 ) -> None:
-    """Replaces the parameters in the modules and in the optimizer."""
+    """Replaces rows of the parameters in the modules and in the optimizer.
+
+    Args:
+        gaussians, optimizer, follower: As for ``prune``.
+        select: Function from a parameter's rows to its new rows.
+        select_state: The same for the optimizer's state of a row.
+    """
     owned: list[tuple[nn.Module, str]] = [(gaussians, name) for name in gaussians.PARAMETERS]
     if follower is not None:
         owned += [(follower, name) for name in follower.follows]

@@ -106,7 +106,7 @@ class Gaussians(nn.Module):
             directions = fibonacci_lattice(share, low, high)  # (share, 3)
             distances = near + (far - near) * torch.rand(share)  # [m]
             means.append(receiver.pose.world(distances[:, None] * directions))
-            # Angle between neighbours: the root of the zone's solid angle for each of them.
+            # Angle between neighbours: the root of each one's share of the zone's solid angle.
             pitch = math.sqrt(2 * math.pi * (math.sin(high) - math.sin(low)) / share)  # [rad]
             scales.append(distances * pitch * spread)
         self.means = nn.Parameter(torch.cat(means))  # (n, 3)

@@ -1,5 +1,6 @@
 """Checkpoints of a training: the best one, and the last one, from which it goes on."""
 
+import logging
 import math
 import signal
 import threading
@@ -14,31 +15,39 @@ from gaigs.io.files import atomic_write
 from gaigs.model import checkpoint
 from gaigs.processes import STOPPING, hang_up
 from gaigs.training import MeanScores
+from gaigs.training.budget import share_done
+
+log = logging.getLogger(__name__)
 
 
 class KeepBest(Checkpoint):
     """Writes the checkpoint of the best validation score (``Task.monitor``), or of the last step
     without validation.
 
-    After ``patience`` validations without a better score it stops the training.
+    After ``patience`` validations without a better score it stops the training; also once scores
+    that rise on as they did between the last two validations would end below a ``rival`` score.
     """
 
-    def __init__(self, path: Path, patience: int | None):
+    def __init__(self, path: Path, patience: int | None, rival: float | None = None):
         if patience is not None and patience < 1:
             raise ValueError(
                 f"training.patience must be at least 1 validation or null, got {patience}"
             )
         self.path = path
         self.patience = patience
+        self.rival = rival
         self.best = -math.inf  # an error counts as its negative
         self.waited = 0
+        self.share = 0.0  # of the training, at the last validation
+        self.is_behind = False
 
     def state_dict(self) -> dict:
-        return {"best": self.best, "waited": self.waited}
+        names = "best", "waited", "share", "is_behind"
+        return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict) -> None:
-        self.best = state["best"]
-        self.waited = state["waited"]
+        for name, value in state.items():  # fewer in checkpoints of before
+            setattr(self, name, value)
 
     def on_train_start(self, trainer, module) -> None:
         """Scores the start of a model that predicts untrained, too."""
@@ -50,7 +59,14 @@ class KeepBest(Checkpoint):
         if trainer.sanity_checking:
             return
         score = trainer.callback_metrics[f"validation/{module.task.monitor}"].item()
+        before, share = self.best, self.share
         self.waited = 0 if self._keep(trainer, module, score) else self.waited + 1
+        if self.rival is not None:
+            self.share = share_done(trainer)(trainer.global_step)
+            rate = (self.best - before) / max(self.share - share, 1e-9)
+            self.is_behind = self.best + rate * (1 - self.share) < self.rival
+        if self.is_behind:
+            log.info("step %d: a law of distance stays ahead of the room", trainer.global_step)
         self._stop_in_time(trainer)
 
     def on_train_end(self, trainer, module) -> None:
@@ -83,7 +99,7 @@ class KeepBest(Checkpoint):
         return is_better
 
     def _stop_in_time(self, trainer) -> None:
-        if self.patience is not None and self.waited >= self.patience:
+        if self.is_behind or (self.patience is not None and self.waited >= self.patience):
             trainer.should_stop = True
 
 

@@ -54,6 +54,7 @@ def measured(folder, phase, response, transmitters=48, is_divided=True):
     frequencies = torch.linspace(5.0e9, 5.1e9, SUBCARRIERS, dtype=torch.float64)
     offsets = 0.03 * torch.eye(3, dtype=torch.float64)[[0, 0, 1, 2]] * ELEMENT_STEPS[:, None]
     receiver = torch.tensor([1.0, 1.5, 1.2], dtype=torch.float64)
+    offsets = offsets[: len(response)]
     places, channels = room_channels(transmitters, receiver + offsets, frequencies)
     generator = torch.Generator().manual_seed(1)
     phases = 2 * math.pi * torch.rand(transmitters, 1, 1, generator=generator).double()
@@ -104,6 +105,20 @@ def test_the_response_is_found_and_explains_channels(phase, tmp_path):
     assert own > plain + 1
     assert own > score("mean", links)["snr_aligned_db_median"]
     assert score("gaussian_process", links)["snr_aligned_db_median"] > plain + 1
+
+
+def test_one_antenna_with_a_filter_is_above_free_space_and_the_mean(tmp_path):
+    """As a Wi-Fi radio of few places reports them: a random phase and delay of each link."""
+    links = measured(tmp_path, "per_link_and_delay", invented(1), transmitters=39)
+    median = "snr_aligned_db_median"
+    least = max(
+        score("friis", replace(links, front_ends=None))[median] + 1, score("mean", links)[median]
+    )
+    for name in ("friis", "gaussian_process"):
+        assert score(name, links)[median] > least
+    options = {"max_steps": 20, "enable_progress_bar": False}
+    mirrored = gaigs.train("mirrored", links, **options)
+    assert gaigs.evaluate(mirrored, links, baselines=[]).models["mirrored"][median] > least
 
 
 def test_without_a_filter_nothing_is_learnt(tmp_path):

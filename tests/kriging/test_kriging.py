@@ -19,7 +19,7 @@ from gaigs.kriging.likelihood import Choice
 from gaigs.kriging.links import at_directions, coordinates, limit_known
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.kriging.scalar_fit import ScalarOptions
-from gaigs.model import Model, Prediction, kriging
+from gaigs.model import Model, Prediction, answers, kriging
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging
 from gaigs.registry import registry
@@ -469,3 +469,26 @@ def test_residuals_of_zero_are_kriged_to_zero():
 def test_untrained_trends_and_unsuitable_fallbacks_are_refused(trend, fallback, message):
     with pytest.raises(ValueError, match=message):
         Kriging(example_links("rssi").scene, trend, fallback)
+
+
+def test_a_law_ahead_of_the_room_is_fitted_once_and_nothing_is_predicted_for_the_known(monkeypatch):
+    links = make(smooth=3.0, noise=0.1, count=400)
+    model = Kriging(links.scene, Trained(links.scene))
+    held = links.split.validation[::2]
+    scores = model.law_scores(links, held)
+    law, _ = model.laws
+    alone = registry("model").build(links.task.trends[-1], scene=links.scene)
+    alone.fit(replace(links, split=links.split.validating()))
+    errors = (alone.predict(links.query[held]) - links.labels[held]).abs()
+    torch.testing.assert_close(scores, -errors.double())
+    asked = []
+
+    def predicted(one, links, index):
+        asked.append((one, len(index)))
+        return answers.predicted(one, links, index)
+
+    monkeypatch.setattr(kriging, "predicted", predicted)
+    model.krige(links)
+    assert model.laws[0] is law
+    assert model.trend_weight == 0
+    assert [count for one, count in asked if one is model.trend] == [len(links.split.validation)]

@@ -23,6 +23,7 @@ from gaigs.kriging.scalar import ScalarProcess
 from gaigs.kriging.scalar_fit import HeldOutCost, ScalarOptions
 from gaigs.kriging.tiles import Tiles
 from gaigs.model.gaussian_process import GaussianProcess
+from gaigs.runs import evaluation
 from gaigs.testing import example_links
 
 BOX = torch.tensor([6.0, 4.0, 2.0])
@@ -263,6 +264,24 @@ def test_folds_of_many_readings_are_predicted_as_well(monkeypatch):
             assert one.model.scalar.is_solved == (large > 100)
     whole, quick = torch.stack(errors).reshape(2, -1).mean(1)
     assert abs(quick / whole - 1) < 0.02
+
+
+def test_many_links_keep_the_choices_of_the_fit_for_the_validation(monkeypatch):
+    """The validation's fit has chosen kernel, noise and trend: a second choice takes time alone."""
+    monkeypatch.setattr(ScalarProcess, "options", ScalarOptions(neighbours=16, large=100))
+    links = drawn((1.5, 0.8), noise=2.0)
+    train = links.split.train
+    some = replace(links, split=replace(links.split, train=train[torch.arange(len(train)) % 7 > 0]))
+    model, errors = None, []
+    for part in (some, links):
+        look_up = GaussianProcess(links.scene)
+        model = evaluation.fitted(look_up, part, model, many=100)
+        values = model(Batch(links.query[links.split.test])).value
+        errors.append((values - links.labels[links.split.test]).abs().mean())
+        assert look_up.links is None
+        monkeypatch.setattr(ScalarProcess, "fit", None)
+    assert len(model.scalar.places) == len(train)
+    assert errors[1] < errors[0]
 
 
 @pytest.mark.parametrize("together", [150, 60])

@@ -180,6 +180,19 @@ def test_channels_of_order_0_need_no_planes():
     assert model.predict(links.query).isfinite().all()
 
 
+def test_obstacles_stay_where_a_few_numbers_tell_nothing():
+    receiver = Receiver("rx", POSE, Array(torch.zeros(1, 3)))
+    offsets = torch.zeros(1, dtype=torch.float64)
+    labels = simulated(place(20, 0), receiver, offsets, 1).to(torch.complex64)
+    task = Csi(1, torch.tensor([CARRIER], dtype=torch.float64))
+    links = links_of(labels, task, receiver)
+    model = build(links, pooling="path_csi", placement=MIRRORED | {"obstacles": 5})
+    model.fit(links)
+    placement = model.placement
+    assert placement.receiver_gains.requires_grad
+    assert not any(part.requires_grad for part in placement.obstacles.parameters())
+
+
 def test_with_the_rooms_walls_it_predicts_signal_strength():
     """Relative to that at a metre of free space; paths interfere by a decibel or two."""
     receiver = Receiver("gateway1", POSE)
@@ -402,7 +415,7 @@ def test_levels_of_a_wide_site_are_not_searched_for_phases(widest, monkeypatch):
     links = replace(links, query=replace(links.query, frequencies=carriers))
     model = build(links, pooling={"name": "path_rssi", "floor_db": -60.0})
     model.fit(links)
-    assert (model.levels is None) == model.is_wide == (widest == 1.0)
+    assert (model.levels is None) == model.is_wide == model.settles == (widest == 1.0)
     if model.is_wide:
         line = model.revise(2, links.batch(torch.arange(4)), None, lambda batch: 1.0)
         assert line == "the box is too wide for phases, so powers add to the end"

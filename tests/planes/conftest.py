@@ -10,8 +10,8 @@ from gaigs.planes.search import descend
 def half_the_steps(monkeypatch):
     """Half of the steps find planes of these small rooms as well."""
 
-    def fewer(loss, receivers, planes, others, steps, rate):
-        return descend(loss, receivers, planes, others, (steps + 1) // 2, rate)
+    def fewer(loss, receivers, planes, others, steps, rate, *turns):
+        return descend(loss, receivers, planes, others, (steps + 1) // 2, rate, *turns)
 
     for module in (channel_score, field_score, free_strengths):
         monkeypatch.setattr(module, "descend", fewer)

@@ -82,6 +82,21 @@ def test_places_together_show_planes_of_a_turned_room(links):
     assert len(found.planes) == len(WALLS)
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.05], ids=["square", "leaning"])
+def test_planes_are_turned_square_where_walls_are(tilt, monkeypatch):
+    walls = WALLS.copy()
+    walls[2] = [tilt, 0, np.sqrt(1 - tilt**2), -0.2]
+    monkeypatch.setitem(globals(), "WALLS", walls)
+    slant = torch.tensor([0.004, 0.003, 0.005, 0.0])
+    search = FieldSearch(room(), -1, 1, 4, torch.from_numpy(walls) + slant)
+    score = search.score
+    found = score.refine(score.fit.start(search.start))
+    turned = score.square(found)
+    normals = turned.planes[:, :3].abs().numpy()
+    assert (normals[2, 2] == 1) == (tilt == 0)
+    assert (normals[:2, 2] == 0).all() == (tilt == 0)
+
+
 def test_noise_has_no_planes():
     torch.manual_seed(0)
     found = FieldSearch(room(100, is_noise=True), -1, 2, 4, torch.zeros(0, 4)).run()

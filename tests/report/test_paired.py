@@ -35,6 +35,15 @@ def test_a_difference_at_every_place_is_no_chance():
     assert "worse" not in test.p
 
 
+def test_of_many_links_a_part_of_the_places_is_drawn_from():
+    """The best baseline is that of all links."""
+    other = errors(0, shift=1.0)
+    scores = {"own": errors(0), "worse": other, "mean": {"mae_db": other["mae_db"] + 0.01}}
+    test = paired(Rssi(), scores, PLACES, resamples=200, most=40)
+    assert (test.baseline, test.places) == ("worse", 10)
+    assert test.p["own"]["mae_db"] == pytest.approx(2 / 201)
+
+
 def test_places_not_links_are_drawn():
     """A difference of a few places is chance, though many links of these have it."""
     other = errors(0)["mae_db"].clone()

@@ -106,6 +106,29 @@ def test_patience_counts_validations_without_a_better_score(tmp_path, kill):
         KeepBest(tmp_path, patience=0)
 
 
+@pytest.mark.usefixtures("unsealed")
+@pytest.mark.parametrize(
+    ("rival", "stops"),
+    [
+        (-4.0, [False, False, True]),  # 5.0 falls by 0.2 a fifth, to 4.6
+        (-4.7, [False, False, False]),
+        (None, [False, False, False]),
+    ],
+)
+def test_a_training_that_would_stay_behind_a_rival_stops(tmp_path, rival, stops):
+    callback = KeepBest(tmp_path / "best.ckpt", None, rival)
+    trainer = Trainer(max_steps=5, callbacks=[])
+    found = []
+    for error in (7.0, 5.2, 5.0):
+        trainer.validate(callback, error, RSSI)
+        found.append(trainer.should_stop)
+    assert found == stops
+    resumed, again = KeepBest(tmp_path / "best.ckpt", None, rival), Trainer()
+    resumed.load_state_dict(callback.state_dict())
+    resumed.on_train_start(again, None)
+    assert again.should_stop == stops[-1]
+
+
 class Level(Model):
     """One number for all links, which the training raises by 1 dB a step."""
 

@@ -58,8 +58,8 @@ class Task(ABC):
         frequencies: Subcarriers [Hz], the last axis of channels; None for other labels.
         phase: What is unknown of a channel's phase, see ``Csi``.
         lowest: Least possible number of a real label.
-        limits: Bounds of the numbers of labels that are read: others are of another unit, or marks.
-        beyond: What errors add on numbers beyond these bounds.
+        limits: Bounds of labels that are read; numbers beyond them have another unit, or are marks.
+        beyond: Advice in errors on numbers beyond these bounds.
     """
 
     name: str
@@ -98,7 +98,7 @@ class Task(ABC):
 
     @property
     def trends(self) -> tuple[str, ...]:
-        """Look-ups among which a Gaussian process of labels chooses its trend."""
+        """Names of the look-ups among which a Gaussian process chooses its trend."""
         return ("mean", "shaped_path_loss") if self.is_scalar else ("mean",)
 
     @property
@@ -146,10 +146,10 @@ class Task(ABC):
         return means
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor] | None:
-        """Scores that the mean of many labels at a place would reach; by default None, unknown.
+        """Scores that the mean of many labels at a place would reach; None if unknown, by default.
 
-        Two labels at a place with independent noise of variance s² differ by 2 s² in the mean
-        square, a label and the mean of many by s²: half.
+        Two labels of a place, with independent noise of variance s², differ by 2 s² in the mean
+        square; a label differs from the mean of many by half of that.
 
         Args:
             scores: Scores of one label as the prediction of another at the same place.
@@ -189,7 +189,7 @@ class Task(ABC):
         return {"name": self.name, **self.options()}
 
     def align(self, labels: Tensor, values: Tensor) -> Tensor:
-        """Labels turned onto predictions by all that is unknown of each link.
+        """Labels with all that is unknown of each link, such as a phase, fitted to predictions.
 
         By default they stay as they are. Losses, kriging and look-ups compare the result with the
         predictions. Shapes are (k, *shape); either k may be 1.
@@ -221,7 +221,7 @@ class Task(ABC):
     def stored(
         self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]
     ) -> dict[str, np.ndarray]:
-        """Arrays of a model for ``predictions.npz`` by start of name; by default all scores."""
+        """Arrays for ``predictions.npz``, where the model ends each name; by default all scores."""
         return {name: score.numpy() for name, score in scores.items()}
 
 

@@ -110,11 +110,11 @@ class Csi(Task):
     def align(
         self, labels: Complex[Tensor, "#k e s"], values: Complex[Tensor, "#k e s"]
     ) -> Complex[Tensor, "k e s"]:
-        """Labels with the phase that suits the predictions best.
+        """Labels with what ``phase`` says is unknown fitted to the predictions.
 
-        If ``phase`` is known, they stay as they are. With ``per_link_and_delay`` they have the best
-        delay and the power of the predictions too. A gradient flows through this power, so that no
-        loss of the result depends on the scale of the predictions.
+        With ``per_link`` this is a phase; with ``per_link_and_delay`` also a delay and the power. A
+        gradient flows through this power, so that no loss of the result depends on the scale of the
+        predictions.
         """
         if self.phase == "known":
             return labels
@@ -122,9 +122,9 @@ class Csi(Task):
         if self.phase == "per_link":
             return turned
         sizes = turned.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
-        wanted = values.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
-        is_received = (sizes > 0) & (wanted > 0)
-        gains = torch.where(is_received, wanted, 1) / torch.where(is_received, sizes, 1)  # (k,)
+        predicted = values.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
+        is_received = (sizes > 0) & (predicted > 0)
+        gains = torch.where(is_received, predicted, 1) / torch.where(is_received, sizes, 1)  # (k,)
         return turned * gains[:, None, None].to(turned.real)
 
     def fingerprint(self, values: Complex[Tensor, "k e s"]) -> Float[Tensor, "k m"]:
@@ -163,12 +163,13 @@ class Csi(Task):
 
     @property
     def _rates(self) -> Float[Tensor, " s"] | None:
-        """The frequencies if delays are unknown."""
+        """Frequencies by which unknown delays turn phases [Hz]; None if delays are known."""
         return self.frequencies if self.phase == "per_link_and_delay" else None
 
     def _turns(
         self, labels: Complex[Tensor, "#k e s"], values: Complex[Tensor, "#k e s"]
     ) -> Complex[Tensor, "k 1 s"]:
+        """Factors of ``alignment`` that turn labels onto predictions."""
         return alignment(labels, values, self._rates)
 
     @classmethod
@@ -189,8 +190,10 @@ class Csi(Task):
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
         """SNR, SNR with the phase removed and SINAD [dB], and the powers of error and label.
 
-        There is no SNR with the phase where ``phase`` is not known. A label that is zero throughout
-        has no SNR, and is a ``ValueError``.
+        The plain SNR is left out where ``phase`` is not known.
+
+        Raises:
+            ValueError: A label is zero throughout, and so has no SNR.
         """
         check_values(labels, values, self.shape, "channels")
         h = labels.detach().cpu().to(torch.complex128)  # (k, e, s)
@@ -246,7 +249,7 @@ class Csi(Task):
         return scores | {"nmse_db": decibels(error, power).item()}
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Half of the error's power: 3 dB more."""
+        """The scores at half of the error's power, which is an SNR higher by 3 dB."""
         error = scores["error_power"] / 2
         power = scores["label_power"]
         ratios = {

@@ -58,6 +58,7 @@ class TokenLinear(nn.Module):
 
 
 def _linear(inputs: int, width: int) -> nn.Linear | None:
+    """A linear layer without a bias; None without inputs."""
     return nn.Linear(inputs, width, bias=False) if inputs else None
 
 

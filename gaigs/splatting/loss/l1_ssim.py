@@ -54,7 +54,7 @@ class L1Ssim:
 
 
 def find_window(loss: str, directions: Directions | None, pitch: float, pixels: int) -> int:
-    """Edge of an SSIM window on a thinned grid [pixels].
+    """Edge of an SSIM window on a thinned grid [pixels], odd.
 
     Args:
         loss: Name of the loss, for errors.

@@ -133,7 +133,8 @@ class Beamformer:
             inverse = torch.linalg.pinv(basis, rtol=1e-3)  # (k, m)
             squares = labels[links].square()
             doubles = 2 * labels[links]
-            # The part of y² + 2 m y that no covariances give is least at this m, at least 0.
+            # The residual of y² + 2 m y after the fit of covariances is linear in m. Its norm is
+            # least at this m, which cannot be negative.
             square_rest = squares - squares @ inverse @ basis
             double_rest = doubles - doubles @ inverse @ basis
             product = (square_rest * double_rest).sum(1)  # (b,)
@@ -161,7 +162,7 @@ class Beamformer:
     def _amplitudes(
         self, parts: Float[Tensor, "b m"], carrier: float, query: Query, directions: Directions
     ) -> Float[Tensor, "b k"]:
-        """Amplitudes of the beamformer in a few directions."""
+        """Amplitudes of the beamformer in some directions, by ``parts`` of the relative lags."""
         power = parts @ self._stored_basis(parts, carrier, query, directions)  # (b, k)
         least = 1e-6  # of the mean power: sums of tens of float32 terms round at this
         if torch.is_grad_enabled():
@@ -204,7 +205,7 @@ class Beamformer:
 
 
 def _scaled(amplitudes: Float[Tensor, "b k"], shown: Float[Tensor, "b j"]) -> Float[Tensor, "b k"]:
-    """Amplitudes between the least and the largest of those shown, from 0 to 1.
+    """Amplitudes on the scale from the least of ``shown``, 0, to the largest, 1.
 
     Pixels are many, and each pass over them in memory costs as much as the beamformer itself.
     Gradients of amin and amax take four passes, gradients of min and max hardly one; without

@@ -1,7 +1,6 @@
 """Base of poolings that give complex channels: their strength and the signs of their phases."""
 
 import math
-from typing import Any
 
 import torch
 from jaxtyping import Complex, Float
@@ -42,20 +41,20 @@ class ChannelPooling(Pooling):
     @property
     def frequencies(self) -> Float[Tensor, " s"]:
         """The subcarriers [Hz]; ``Model.at_frequencies`` exchanges the scene."""
-        task: Any = self.scene.task
-        return task.frequencies
+        return self.scene.task.frequencies
 
     def received(
         self, query: Query, channels: Complex[Tensor, "b e s"]
     ) -> Complex[Tensor, "b most s"]:
-        """Channels behind the front ends, 0 at the elements of other receivers' arrays alone, and
-        outside a receiver's band.
+        """Channels behind the receivers' front ends, padded to the largest array.
+
+        They are 0 at elements that the receiver's array lacks, and outside its band.
         """
         missing = self.task.elements - channels.shape[1]
         channels = torch.nn.functional.pad(channels, (0, 0, 0, missing))
         hears = [receiver.hears(self.frequencies) for receiver in self.scene.receivers]
-        heard = torch.stack(hears).to(query.receivers.device)[query.receivers, None]  # (b, 1, s)
-        return self.scene.received(query, channels * heard)
+        in_band = torch.stack(hears).to(query.receivers.device)[query.receivers, None]  # (b, 1, s)
+        return self.scene.received(query, channels * in_band)
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:

@@ -179,6 +179,7 @@ class _Seen(NamedTuple):
 
 
 def _see(paths: ReceivedPaths) -> _Seen:
+    """The paths' Gaussians as their receiver's array sees them."""
     pose = paths.receiver.pose.to(paths.means)
     points = pose.local(paths.means)  # (b, n, 3)
     semi_axes = pose.rotation.mT @ paths.semi_axes  # (1 or b, n, 3, 3)
@@ -201,13 +202,13 @@ def _spreads(
 def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Complex[Tensor, "b e s"]:
     """Field at each element and frequency, all paths interfering.
 
-    The wave of a path is spherical about the path's Gaussian, at an array of any shape and
-    orientation. An element at x, in wavelengths from the middle, receives a path of the amplitude
-    A, from the direction u, as
+    The wave of a path is spherical about the path's Gaussian; the array may have any shape and
+    orientation. At an element x the field of a path with the amplitude A is
 
         A exp(-(2 pi)² x' S x / 2 - j 2 pi (|p - x| - |p|)) |p| / |p - x|
 
-    with p the Gaussian's centre and S its covariance in direction cosines.
+    with p the Gaussian's centre and S its covariance in direction cosines. Positions are in
+    wavelengths from the middle of the array.
 
     Args:
         paths: Paths to one receiver.
@@ -234,7 +235,7 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
 
 
 class _PathDifferences(NamedTuple):
-    """Ways to the elements beside the way to the middle."""
+    """Distances to the elements compared with the distance to the middle of the array."""
 
     differences: Float[Tensor, "b n e"]  # |p - x| - |p| [m]
     ratios: Float[Tensor, "b n e"]  # |p| / |p - x|, each at least ``NEAREST``
@@ -243,6 +244,7 @@ class _PathDifferences(NamedTuple):
 def _path_differences(
     points: Float[Tensor, "b n 3"], elements: Float[Tensor, "e 3"]
 ) -> _PathDifferences:
+    """Compares the distances of points in the array's frame, without a loss of digits."""
     to_middle = points.norm(dim=-1, keepdim=True)  # |p|, (b, n, 1)
     # Plain differences: by the matrix product an element far from a near point would lose its
     # digits.
@@ -250,9 +252,9 @@ def _path_differences(
     far_elements = to_elements.clamp_min(NEAREST)
     far_middle = to_middle.clamp_min(NEAREST)
     # |p - x| - |p| = (x² - 2 p . x) / (|p - x| + |p|), without the digits that a difference loses.
-    both = to_elements + to_middle
+    total = to_elements + to_middle
     squares = elements.square().sum(-1) - 2 * points @ elements.T  # (b, n, e)
-    longer = squares / torch.where(both > 0, both, 1)
+    longer = squares / torch.where(total > 0, total, 1)
     longer = longer + (far_elements - to_elements) - (far_middle - to_middle)
     return _PathDifferences(longer, far_middle / far_elements)
 
@@ -285,4 +287,5 @@ def _sum_by_series(
 
 
 def _unit_waves(phases: Float[Tensor, "*shape"]) -> Complex[Tensor, "*shape"]:
+    """exp(j phase)."""
     return torch.polar(torch.ones_like(phases), phases)

@@ -34,14 +34,18 @@ Without it float32 would overflow; at an attenuation of 0 the gradient is 0.
 class Rasterizer(Protocol):
     """The contract of kind ``rasterizer``.
 
-    Front to back by ``depths`` (ties by index), with a_i the opacity and d_i the attenuation in [0,
-    1], G_i the footprint exp(-x' C^-1 x / 2) at the pixel, A_i = min(a_i G_i, ALPHA_MAX), or 0
-    below ALPHA_MIN, eq. (13) and (14) are
+    A rasterizer computes eq. (13) and (14) at each pixel,
 
         map = sum_i signal_i A_i T_i        T_i = prod_{j<i} (1 - A_j) d_j^{G_j}
 
-    x is the pixel minus the splat's centre, u taken to the nearest image where the plane is
-    periodic. Splats that are not ``visible`` do nothing. Every input but depths and visible is
+    over splats i front to back by ``depths`` (ties by index), with
+
+    * G_i = exp(-x' C^-1 x / 2), the footprint: x is the pixel minus the splat's centre, taken to
+      the nearest image where the plane is periodic;
+    * A_i = min(a_i G_i, ALPHA_MAX), or 0 below ALPHA_MIN, with the opacity a_i;
+    * d_i, the attenuation in [0, 1].
+
+    Splats that are not ``visible`` do nothing. Every input but depths and visible is
     differentiable.
 
     Attributes:

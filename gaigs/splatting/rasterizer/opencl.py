@@ -263,7 +263,7 @@ class _Render:
         self.loudest = self._share(np.abs(signal.detach().numpy()).max((1, 2), initial=0))
 
     def _macros(self, period: float | None) -> dict[str, str | int]:
-        """What the kernels are built with."""
+        """Macros with which the kernels are built."""
         macros: dict[str, str | int] = {
             "CHANNELS": self.channels,
             "ATTENUATION": int(self.attenuates),
@@ -358,6 +358,7 @@ class _Render:
         return gradients
 
     def _run(self, kernel, items, *buffers):
+        """Queues a kernel, by its name, on so many work-items."""
         if items:  # OpenCL cannot run 0 items
             self.kernels[kernel](self.queue, (items,), (1,), self.sizes, *buffers)
 
@@ -408,7 +409,7 @@ def _literal(value: float) -> str:
 
 
 def _content(tensor: Tensor) -> tuple[bytes, tuple[int, ...]]:
-    """A tensor's bytes and shape, which tell planes apart."""
+    """A tensor's bytes and shape, as a key by which ``_tiling`` stores its results."""
     return tensor.detach().numpy().tobytes(), tuple(tensor.shape)
 
 

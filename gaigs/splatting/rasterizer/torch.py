@@ -57,10 +57,10 @@ class TorchRasterizer:
 
 
 class _Period(NamedTuple):
-    """A period rounded to the dtype, and the remainder."""
+    """A period as the sum of two numbers."""
 
-    rounded: float
-    rest: float
+    rounded: float  # the nearest number of the tensors' dtype
+    rest: float  # what the rounding leaves
 
 
 class _Tiles:
@@ -96,7 +96,10 @@ class _Tiles:
             self.chunks = self._chunks(touches, triples // (len(opacities) * self.edge**2))
 
     def _find_touched(self, means: Tensor, factors: Tensor, opacities: Tensor) -> Tensor:
-        """True where a splat reaches a tile (tiles, n), and for NaN: the map then shows it."""
+        """True where a splat reaches a tile (tiles, n).
+
+        It is True for NaN as well, so that the map shows the fault.
+        """
         # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box
         # has these halves.
         reach = (2 * (opacities / ALPHA_MIN).log().clamp_min(0)).sqrt()  # (b, n)
@@ -170,7 +173,7 @@ class _Tiles:
 
 
 def _nearest(a: Tensor, b: Tensor, period: _Period | None) -> Tensor:
-    """a - b taken to the nearest image.
+    """a - b, less the whole number of periods that brings it nearest to 0.
 
     The period is subtracted from the exact a - b = offset + rest (Knuth's two-sum), so no digit is
     lost at the seam.

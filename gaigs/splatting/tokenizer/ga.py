@@ -110,7 +110,7 @@ class GATokenizer(nn.Module):
         anchors = (anchors - self.middle) / self.scale
         transmitters = (query.transmitters - self.middle) / self.scale  # (b, 3)
         *blocks, final = self.blocks
-        # With a single block CLS and anchors are the same for all queries until CLS looks.
+        # With a single block CLS and anchors are equal for all queries until the block's attention.
         is_shared = len(anchors) == 1 and not blocks and not self.scene.has_band
         points, types = self._tokens(query, transmitters, anchors, is_shared)
         count = b if is_shared else 1  # of the transmitters, which come first

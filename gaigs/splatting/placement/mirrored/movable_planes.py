@@ -119,7 +119,7 @@ class MovablePlanes(Placement):
         return torch.cat((normals, offsets[:, None]), 1)
 
     def _first_paths(self) -> Bool[Tensor, " n"]:
-        """True for paths that meet faces of the box alone.
+        """True for the paths in use at the start: those that meet faces of the box alone.
 
         Faces across an axis are left out if all transmitters and receivers stand at one coordinate
         of it, such as one height: then no label shows how far away such a face is.
@@ -180,12 +180,12 @@ class MovablePlanes(Placement):
 
     @property
     def used(self) -> Int[Tensor, " k"]:
-        """Planes of the kept paths."""
+        """Numbers of the planes that kept paths meet, ascending."""
         numbers = self.sequences[self.kept].unique()
         return numbers[numbers >= 0]
 
     def sequences_of(self, planes: Int[Tensor, " k"]) -> Bool[Tensor, " n"]:
-        """True for each sequence of these planes alone."""
+        """True for each sequence without any other plane; the direct path always is one."""
         planes = torch.cat((planes, planes.new_tensor([-1]))).to(self.sequences.device)
         return torch.isin(self.sequences, planes).all(1)
 

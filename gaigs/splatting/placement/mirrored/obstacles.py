@@ -81,6 +81,7 @@ class Obstacles(nn.Module):
 
     @property
     def centres(self) -> Float[Tensor, "k 3"]:
+        """Centres from the middle of the room [m]."""
         return self.origin + self.unit * self.places
 
     @property
@@ -164,7 +165,7 @@ class _Depth(torch.autograd.Function):
         a, b, r, near, inside, length = parts
         gradient = gradient * (math.sqrt(math.pi) * length)[:, None]
         # In place where it can be: fresh memory costs more than the sums.
-        rate = near * r  # of E
+        rate = near * r  # factor of E in the depth
         each = rate * inside
         d_densities = each.T @ gradient
         weights = gradient @ densities.T
@@ -173,7 +174,8 @@ class _Depth(torch.autograd.Function):
         slope = rate.mul_(r).mul_(2 / math.sqrt(math.pi))
         e1 = (a + b).mul_(r).square_().neg_().clamp_min_(_FAINTEST).exp_().mul_(slope)
         e0 = (b * r).square_().neg_().clamp_min_(_FAINTEST).exp_().mul_(slope)
-        # r = (2 A)^-1/2, so d r = -r / (2 A) dA; d of the exponent: -dC/2 + (B/A) dB - (B/A)²/2 dA.
+        # By the chain rule: r = (2 A)^-1/2 changes by -r / (2 A) dA, and the exponent of g by
+        # -dC / 2 + (B/A) dB - (B/A)² / 2 dA.
         ratio = b / a
         d_b = (e1 - e0).addcmul_(each, ratio)
         d_a = e1.addcmul_(ratio, d_b, value=-1).addcdiv_(each, a, value=-1).mul_(0.5)
@@ -218,14 +220,15 @@ class _Legs(NamedTuple):
 
 
 def _measure_legs(start: Tensor, end: Tensor, centres: Tensor, log_widths: Tensor) -> _Legs:
+    """The symbols of segments (s, 3) and obstacles (k, 3)."""
     ray = end - start
     # Contiguous columns: an outer product of others takes a CPU four times as long.
     inverse = (-log_widths).exp().T.contiguous()
     places = centres.T.contiguous()
     starts = start.T.contiguous()
     ways = ray.T.contiguous()
-    # C - B²/A is the squared distance of a line from a centre: small differences of large numbers
-    # unless about centres.
+    # C - B²/A is the squared distance of a line from a centre. Differences of places come first:
+    # products of the places themselves would be large numbers with a small difference.
     offsets = [(starts[axis, :, None] - places[axis]).mul_(inverse[axis]) for axis in range(3)]
     rays = [ways[axis, :, None] * inverse[axis] for axis in range(3)]
     # The least squared length [squared widths]: within 1e-4 of a width nothing changes.

@@ -28,7 +28,7 @@ class FoldedLinks(NamedTuple):
 
     @property
     def ways(self) -> Float[Tensor, "b n 3"]:
-        """From the receivers to the last images [m]."""
+        """Vectors from the receivers to the last images [m]: directions and lengths of paths."""
         return self.seen[-1] - self.receivers[:, None]
 
 
@@ -43,14 +43,14 @@ class PathFields(MovablePlanes):
     with
 
     * F: the element's pattern towards the image, times a learnt power of the cosine;
-    * g_k: the gain of a path; except of channels of many numbers, phi_k: its phase; where receivers
-      have several bands, both are of each band;
-    * g_r: the gain of a receiver; of channels, phi_r: its phase;
+    * g_k, phi_k: gain and phase of a path, in each band of the receivers; phi_k is 0 for channels
+      of many numbers;
+    * g_r, phi_r: gain and phase of a receiver; phi_r is 0 unless labels are channels;
     * g_w: the gain of a plane, which falls off as a Gaussian about the plane's middle;
-    * Gamma_w: Fresnel's reflection with a learnt permittivity, of channels at a slab with a learnt
-      thickness. Polarisation is vertical: TE at upright planes, TM at level ones, weighted by n_z²
-      between;
-    * tau_k: the depth of the obstacles along the folded path, of channels with a phase.
+    * Gamma_w: Fresnel's reflection with a learnt permittivity; for channels that of a slab with a
+      learnt thickness. Polarisation is vertical: TE at upright planes, TM at level ones, weighted
+      by n_z² between;
+    * tau_k: the depth of the obstacles along the folded path; complex for channels.
 
     A path that does not meet its planes in their order does not exist.
 
@@ -58,12 +58,11 @@ class PathFields(MovablePlanes):
         is_complex: True for channels.
         bands: Different bands of the receivers [Hz].
         is_bare: True while only the direct path counts, without obstacles.
-        is_heard: True for receivers with training links (r,); others have the gain of a receiver in
-            general.
+        is_heard: True for receivers with training links (r,); others have ``_common_gain``.
         known_blur: Logarithm of the standard deviation of a known path's phase at the start [rad].
-        unknown_blur: The same for a path that adds as power, whose coherence is 0.
-        faint: Largest share of a link's power, obstacles apart, of a path that skips the obstacles:
-            two of three paths.
+        unknown_blur: The same logarithm for a path that adds as power, whose coherence is 0.
+        faint: Share of a link's power, without obstacles, up to which a path skips the obstacles
+            and saves their time: two of three paths.
         fewest_numbers: Numbers of a channel, elements times subcarriers, below which one path
             explains any of them, so that only all places together locate planes.
     """
@@ -100,6 +99,7 @@ class PathFields(MovablePlanes):
         self.skips_faint = not self.is_complex and scene.task.directions is None
 
     def _add_plane_parameters(self, planes: int) -> None:
+        """Adds permittivities, gains and reflecting areas."""
         # Between wood and concrete: a relative permittivity of 4 - 0.3j.
         self.log_permittivities = _filled(math.log(3.0), planes)
         self.log_conductivities = _filled(math.log(0.3), planes)
@@ -109,6 +109,7 @@ class PathFields(MovablePlanes):
         self.log_extents = _filled(math.log(2.0 * self.diagonal), planes, 3)
 
     def _add_path_parameters(self, planes: int) -> None:
+        """Adds gains and phases, slabs, angular spreads, and coherences (``log_blurs``)."""
         paths = len(self.sequences)
         strengths = (len(self.bands), paths) if len(self.bands) > 1 else (paths,)
         self.path_gains = _filled(0.0, *strengths)
@@ -123,6 +124,7 @@ class PathFields(MovablePlanes):
         self.log_blurs = _filled(self.known_blur, paths)
 
     def _add_receiver_parameters(self) -> None:
+        """Adds gains and phases of receivers, directivity, and bandwidth."""
         radios = self.scene.radios
         self.receiver_gains = _filled(0.0, radios)
         self.directivity = _filled(0.0)
@@ -135,6 +137,7 @@ class PathFields(MovablePlanes):
         self.boresights = self._boresights()
 
     def _boresights(self) -> list[Tensor]:
+        """``boresight`` of each receiver; of powers and spectra the z axis."""
         receivers = self.scene.receivers
         if not self.is_complex:
             return [torch.tensor([0.0, 0.0, 1.0])] * len(receivers)
@@ -151,10 +154,10 @@ class PathFields(MovablePlanes):
     def place(
         self, number: int, plane: Float[Tensor, "4"], material: Float[Tensor, "3"] | None = None
     ) -> None:
-        """Puts one of the ``planes``.
+        """Replaces a plane by one in the world's frame, with the material of a slab if given.
 
-        A material is a slab's: logarithms of the permittivity's real part over 1, of its
-        imaginary part, and of the thickness [m].
+        A material has logarithms: of the permittivity's real part over 1, of its imaginary part,
+        and of the thickness [m].
         """
         super().place(number, plane)
         if material is not None:
@@ -175,12 +178,12 @@ class PathFields(MovablePlanes):
     def strengths(
         self, query: Query, folded: Folded, blocked: bool = True
     ) -> Complex[Tensor, "b n"]:
-        """Field of each kept path over free space, after reflections and obstacles; 0 for no path.
+        """Field of each kept path over free space, after reflections and obstacles.
 
-        ``blocked`` is False for the field without obstacles.
+        It is 0 for a path that does not exist. With ``blocked`` False obstacles are left out.
         """
-        own = self.of_bands(self.path_gains, query)
-        gains = own[..., self.kept] + self.gains_at(query.receivers).real[:, None]
+        path_gains = self.of_bands(self.path_gains, query)
+        gains = path_gains[..., self.kept] + self.gains_at(query.receivers).real[:, None]
         fields = torch.complex(gains.exp() * folded.exists, torch.zeros_like(gains))
         fields = folded.reflected(fields, self.coefficients(query, folded))
         if blocked and self.obstacles is not None and not self.is_bare:
@@ -206,7 +209,10 @@ class PathFields(MovablePlanes):
     def _depths(
         self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]
     ) -> Inexact[Tensor, "b n"]:
-        """Depth of each path through the obstacles; 0 for no path and, of levels, a faint one."""
+        """Depth of each path through the obstacles [Np]; 0 for a path that does not exist.
+
+        With ``skips_faint`` it is 0 for faint paths too.
+        """
         depths = torch.zeros_like(strengths.real if obstacles.turns is None else strengths)
         with torch.no_grad():
             is_blocked = strengths != 0
@@ -219,18 +225,22 @@ class PathFields(MovablePlanes):
         starts = folded.start.flatten(0, 1).index_select(0, legs)
         ends = folded.end.flatten(0, 1).index_select(0, legs)
         count, n = strengths.shape
-        # Numbers of the legs' paths, of all links in a row.
+        # Number of each leg's path among the paths of all links, (b n) in a row.
         paths = folded.path + n * torch.arange(count, device=legs.device)[:, None]
         paths = paths.flatten()[legs]
         return depths.flatten().index_add(0, paths, obstacles(starts, ends)).view(count, n)
 
     def passing(self, query: Query) -> Float[Tensor, "b v"]:
-        """Field over free space of the direct path, then at each plane; 0 for no path."""
+        """Fields over free space of the direct path, then of the single reflection at each plane.
+
+        They contain obstacles but no receiver gains, and are 0 where a path does not exist.
+        """
         sequences = self.sequences[self.kept]
         strengths = self.strengths(query, self.folded(query).paths).abs()
         is_short = (sequences >= 0).sum(1) <= 1
+        planes = sequences[is_short].amax(1)  # -1 for the direct path
         fields = strengths.new_zeros(len(query), len(self.origin) + 1)
-        fields[:, sequences[is_short].amax(1) + 1] = strengths[:, is_short]
+        fields[:, planes + 1] = strengths[:, is_short]
         return fields / self.gains_at(query.receivers).real[:, None].exp()
 
     def margins(self, query: Query) -> Complex[Tensor, "b n"]:
@@ -273,7 +283,7 @@ class PathFields(MovablePlanes):
         self.is_heard.fill_(False)[heard] = True
 
     def gains_at(self, receivers: Int[Tensor, " b"]) -> Complex[Tensor, " b"]:
-        """Logarithms of the complex gains of receivers, without phases unless labels have some."""
+        """Logarithms of the receivers' complex gains; the phases are 0 unless labels have some."""
         gains = self._receiver_gains
         if not self.is_heard.all():
             gains = torch.where(self.is_heard, gains, self._common_gain(self.is_heard))
@@ -281,11 +291,12 @@ class PathFields(MovablePlanes):
 
     @property
     def _receiver_gains(self) -> Complex[Tensor, " r"]:
+        """Logarithms of the learnt complex gains of all receivers."""
         gains, phases = self.receiver_gains, self.receiver_phases
         return torch.complex(gains, torch.zeros_like(gains) if phases is None else phases)
 
     def _common_gain(self, known: Tensor) -> Complex[Tensor, ""]:
-        """The gain of a receiver in general: the mean of decibels, or of channels' amplitudes."""
+        """Logarithm of the gain of an unknown receiver: mean decibels, or mean channel gain."""
         gains = self._receiver_gains[known]
         return gains.exp().mean().log() if self.is_complex else gains.mean()
 
@@ -314,7 +325,7 @@ class PathFields(MovablePlanes):
         return gain * cosines**self.directivity
 
     def patterns(self, query: Query, ways: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n"]:
-        """Field gain of the receivers' elements towards points, ``ways`` from the receivers [m]."""
+        """Field gain of the receivers' elements along ``ways``, vectors from the receivers [m]."""
         gains = torch.ones_like(ways[..., 0])
         for number in query.receivers.unique().tolist():
             receiver = self.scene.receivers[number]
@@ -327,12 +338,14 @@ class PathFields(MovablePlanes):
 
 
 def _filled(value: float, *shape: int) -> nn.Parameter:
+    """A parameter whose elements all have one value."""
     return nn.Parameter(torch.full(shape, value))
 
 
 def boresight(receiver: Receiver, middle: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     """Normal of a planar array in its frame, towards a world point [m]; 0 for other arrays."""
     elements = receiver.array.elements.double()
+    # Elements of a plane scatter along two axes; that of the least singular value is the normal.
     _, values, axes = torch.linalg.svd(elements - elements.mean(0), full_matrices=True)
     flat = 1e-6 * values[0]  # float32 places elements no better
     if len(values) < 3 or values[2] > flat or values[1] <= flat:

@@ -31,10 +31,11 @@ class Mirrored(PathFields):
 
     Attributes:
         coherent: True once paths interfere.
-        is_bare: True while channels have only the direct path; ``planned`` are the paths kept after
-            it.
-        found: True once planes were searched in channels.
-        held, tried: Strengths and offsets within ``holding``.
+        is_bare: True while channels have only the direct path.
+        planned: True for paths in use once ``is_bare`` ends (n,).
+        found: True once a search has found the planes.
+        held: Strengths of the first query within ``holding``.
+        tried: Offsets that replace the planes' within ``holding``.
 
     Args:
         scene: Its box and receivers give the first planes.
@@ -109,10 +110,13 @@ class Mirrored(PathFields):
 
     @torch.no_grad()
     def locate(self, *planes: int) -> None:
-        """Lets paths at these planes and at ``located`` ones interfere; others add as powers."""
+        """Lets paths at these planes and at ``located`` ones interfere.
+
+        The others add as powers. Without an argument only the direct path has a phase.
+        """
         located = self.located if planes else self.located & False
         located[list(planes)] = True
-        phased = self.sequences_of(located.nonzero()[:, 0])
+        phased = self.sequences_of(located.nonzero()[:, 0])  # (n,)
         self.path_phases[phased & self._is_blurred] = 0
         known = self.log_blurs.clamp_max(self.known_blur)
         self.log_blurs.copy_(torch.where(phased, known, self.unknown_blur))
@@ -137,10 +141,11 @@ class Mirrored(PathFields):
         receivers: Int[Tensor, " r"],
         receiver_gains: Complex[Tensor, " r"],
     ) -> None:
-        """Starts paths of the first planes from these planes' gains over their slabs' reflections.
+        """Sets the paths' strengths to products of gains of the first planes.
 
         Args:
-            gains: Complex gains of the first planes in each of ``bands``.
+            gains: Complex gains of the first planes over their slabs' reflections, in each of
+                ``bands``.
             receivers: Numbers of receivers.
             receiver_gains: Their gains over the pooling's unit.
         """
@@ -207,7 +212,7 @@ class Mirrored(PathFields):
         return placed if gaussians is None else _beside(placed, gaussians)
 
     def _phasors(self, query: Query, lengths: Float[Tensor, "b n"]) -> Complex[Tensor, "b n"]:
-        """Phases of paths by their lengths [m], and of paths and receivers."""
+        """Phase factors of paths by their lengths [m], learnt phases, and the receivers' phases."""
         turns = lengths / (speed_of_light / carriers(self.scene, query).to(lengths))[:, None]
         phases = -2 * math.pi * (turns - turns.detach().round())
         if self.path_phases is not None:
@@ -223,7 +228,7 @@ class Mirrored(PathFields):
         gains: Complex[Tensor, "b n"],
         coherences: Float[Tensor, " n"],
     ) -> Placed:
-        """Balls at the images, as wide as their angle of spread at their distance."""
+        """Round Gaussians at the images, as wide as the paths' angular spread at their lengths."""
         count = lengths.shape[1]
         signal = lengths.new_zeros(count, self.channels, 1)
         signal[:, 0] = 1

@@ -11,20 +11,21 @@ from torch.nn import functional
 
 
 class Folded(NamedTuple):
-    """Paths through the room; a leg is a straight piece from one bounce to the next.
+    """Paths of n sequences through the room; a leg is a straight piece between two bounces.
 
-    Legs that start at the last bounces of all sequences come first, then those at the last but one,
-    and so on, and at last those from the transmitter.
+    Legs stand in the order of folding, from the receiver back: the legs that start at the last
+    bounces of all sequences, then those that start at the last but one, and so on; at last the n
+    legs that start at the transmitter. A bounce is the start of each leg but these.
     """
 
     # Ends of all legs [m].
     start: Float[Tensor, "b s 3"]
     end: Float[Tensor, "b s 3"]
-    path: Int[Tensor, " s"]  # number of the sequence of each leg
-    # Number of the first sequence that has a last bounce, a last but one, and so on.
+    path: Int[Tensor, " s"]  # number of each leg's sequence
+    # Number of the first sequence with one bounce or more, with two or more, and so on.
     firsts: list[int]
-    planes: Int[Tensor, " w"]  # plane of each bounce, of all legs but the last n
-    normals: Float[Tensor, "w 3"]  # its normal
+    planes: Int[Tensor, " w"]  # number of each bounce's plane
+    normals: Float[Tensor, "w 3"]  # normal of each bounce's plane
     cosines: Float[Tensor, "b w"]  # cosines of the angles of incidence
     # True if a path meets its planes in their order, from inside the room.
     exists: Bool[Tensor, "b n"]
@@ -37,7 +38,7 @@ class Folded(NamedTuple):
     def reflected(
         self, strengths: Complex[Tensor, "b n *s"], coefficients: Complex[Tensor, "b w *s"]
     ) -> Complex[Tensor, "b n *s"]:
-        """Strengths of the sequences after all bounces, by the reflection coefficients there."""
+        """Strengths of the sequences times the reflection coefficients at all their bounces."""
         for first, part in self.parts(coefficients):
             strengths = torch.cat((strengths[:, :first], strengths[:, first:] * part), 1)
         return strengths
@@ -45,7 +46,10 @@ class Folded(NamedTuple):
     def parts(
         self, values: Inexact[Tensor, "b w *s"]
     ) -> Iterator[tuple[int, Inexact[Tensor, "b k *s"]]]:
-        """Values of the last bounces, the last but one, ..., each with its first sequence."""
+        """Splits values of bounces: those of all last bounces, of the last but one, and so on.
+
+        Each part comes with the number of its first sequence; it has all sequences from there on.
+        """
         counts = [self.exists.shape[1] - first for first in self.firsts]
         return zip(self.firsts, values.split(counts, 1), strict=True)
 
@@ -57,7 +61,7 @@ def seen_from(planes: Float[Tensor, "*w 4"], origin: Float[Tensor, "3"]) -> Floa
 
 
 def largest_order(planes: int, most: int) -> int:
-    """Largest order with at most ``most`` sequences of two planes or more."""
+    """Largest order at which ``planes``, two or more, have at most ``most`` sequences."""
     order = 0
     count = 1
     longest = planes  # sequences of the next order
@@ -69,9 +73,9 @@ def largest_order(planes: int, most: int) -> int:
 
 
 def all_sequences(planes: int, order: int) -> Int[Tensor, "n order"]:
-    """All sequences of at most ``order`` planes as a wave meets them, shorter ones first.
+    """All sequences of at most ``order`` planes in the order in which a wave meets them.
 
-    No plane comes twice in a row. Shorter ones have -1 in front.
+    No plane comes twice in a row. Shorter sequences come first, and have -1 in front.
     """
     sequences = []
     for length in range(order + 1):
@@ -112,7 +116,7 @@ def images(
 
 
 def _firsts(sequences: Int[Tensor, "n order"]) -> list[int]:
-    """Number of the first sequence with a plane in each column."""
+    """Number of the first sequence with a plane, not -1, in each column."""
     return (sequences < 0).sum(0).tolist()
 
 
@@ -129,6 +133,7 @@ def fold(
     exist. Nor does a path with an end on the plane, so no path meets two coincident planes in a
     row.
     """
+    # Where each path has arrived on its way back from the receiver (b, n, 3).
     here = receivers[:, None].expand(-1, len(sequences), -1)
     numbers = torch.arange(len(sequences), device=here.device)
     exists = torch.ones(here.shape[:2], dtype=torch.bool, device=here.device)
@@ -144,13 +149,14 @@ def fold(
         plane = sequences[first:, -back]
         n = normals[plane]
         d = offsets[plane]
+        # The line to the image in all planes that are not folded back yet crosses this plane.
         begin = here[:, first:]
         way = seen[-back][:, first:] - begin  # (b, sequences, 3)
-        height = (begin * n).sum(-1) - d
+        height = (begin * n).sum(-1) - d  # of the beginning over the plane
         rise = (way * n).sum(-1)
         length = way.norm(dim=-1)
         with torch.no_grad():
-            beyond = height + rise
+            beyond = height + rise  # height of the image
             # An end within 4 roundings of the distances of both ends and of the plane is on the
             # plane.
             least = 4 * rounding * (begin.norm(dim=-1) + length + d.abs())
@@ -179,7 +185,7 @@ def fold(
 
 
 def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "3"]]:
-    """Normals whose cosines are apart from 1 by more than ``least``."""
+    """Normals without later ones that are parallel: with a cosine within ``least`` of 1."""
     apart: list[Tensor] = []
     for normal in normals:
         if all((normal @ other).abs() < 1 - least for other in apart):
@@ -232,6 +238,9 @@ def reflection_points(
 def polarised(
     normals: Float[Tensor, "*#n 3"], te: Complex[Tensor, "*n"], tm: Complex[Tensor, "*n"]
 ) -> Complex[Tensor, "*n"]:
-    """Coefficients for vertical polarisation: TE at upright planes, TM at level, else a mean."""
+    """Reflection coefficients for vertical polarisation.
+
+    They are TE at upright planes, TM at level ones, and a mean weighted by n_z² between.
+    """
     level = normals[..., 2].square()
     return (1 - level) * te + level * tm

@@ -65,15 +65,15 @@ def read_planes(
 
 
 class _Faces(NamedTuple):
-    """Normals, a point and area of triangles."""
+    """Triangles of a mesh."""
 
-    normals: Float[Tensor, "f 3"]
-    points: Float[Tensor, "f 3"]
-    areas: Float[Tensor, " f"]
+    normals: Float[Tensor, "f 3"]  # of any length
+    points: Float[Tensor, "f 3"]  # a corner of each [m]
+    areas: Float[Tensor, " f"]  # [m²]
 
 
 def _faces(vertices: Float[Tensor, "v 3"], faces: Iterable[Face], shortest: float) -> _Faces:
-    """Triangles of a mesh."""
+    """Triangles of a mesh that are larger than a square of edge ``shortest`` [m]."""
     corners = vertices[torch.tensor(triangles(faces), dtype=torch.long).reshape(-1, 3)]
     normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     areas = normals.norm(dim=1) / 2
@@ -84,7 +84,10 @@ def _faces(vertices: Float[Tensor, "v 3"], faces: Iterable[Face], shortest: floa
 def _merged(
     normals: Float[Tensor, "f 3"], points: Float[Tensor, "f 3"], sizes: Float[Tensor, " f"]
 ) -> Float[Tensor, "k 4"]:
-    """Faces within 0.02 rad and 0.02 m as the plane of the largest, largest total area first."""
+    """Planes of faces, largest total size first.
+
+    Faces within 0.02 rad and 0.02 m of the largest one take its plane.
+    """
     sizes, order = sizes.sort(descending=True, stable=True)
     normals = functional.normalize(normals[order], dim=1)
     offsets = (normals * points[order]).sum(1)
@@ -93,12 +96,12 @@ def _merged(
     while len(sizes):
         cosines = normals @ normals[0]
         gaps = (offsets * cosines.sign() - offsets[0]).abs()
-        near = (cosines.abs() > math.cos(0.02)) & (gaps < 0.02)
+        is_same = (cosines.abs() > math.cos(0.02)) & (gaps < 0.02)
         rows.append([*normals[0].tolist(), offsets[0].item()])
-        totals.append(sizes[near].sum().item())
-        far = slice(1, None) if near.sum() == 1 else ~near  # a slice is no copy
-        normals = normals[far]
-        offsets = offsets[far]
-        sizes = sizes[far]
+        totals.append(sizes[is_same].sum().item())
+        others = slice(1, None) if is_same.sum() == 1 else ~is_same  # a slice is no copy
+        normals = normals[others]
+        offsets = offsets[others]
+        sizes = sizes[others]
     order = torch.tensor(totals).argsort(descending=True, stable=True)
     return torch.tensor(rows).reshape(-1, 4)[order]

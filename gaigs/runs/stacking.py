@@ -1,0 +1,57 @@
+"""Shares of models in a blend, by their errors where they have not learnt."""
+
+import torch
+from jaxtyping import Float, Inexact, Int
+from scipy.optimize import nnls
+from torch import Tensor
+
+from gaigs.core.query import thin_labels
+
+
+def stack(
+    labels: Inexact[Tensor, " k *shape"],
+    values: list[Tensor],
+    places: Int[Tensor, " k"],
+    folds: Int[Tensor, " k"],
+) -> tuple[Float[Tensor, " c"], Float[Tensor, "c k"]]:
+    """Shares of models with the least mean square error, and those by all folds but a link's own.
+
+    Args:
+        labels: Labels of some links.
+        values: Predictions of each model that has not seen them (k, *shape), the simplest first.
+        places: Number of each link's place; all count alike.
+        folds: Number of each link's fold.
+
+    Source: Breiman, Stacked regressions, 1996; van der Laan, Polley and Hubbard, Super learner,
+    2007.
+    """
+    errors = torch.stack([thin_labels(labels - one) for one in values], 1)  # (k, c, m)
+    if labels.is_complex():  # as in an SNR, relative to the channel
+        errors = errors / thin_labels(labels).abs().square().mean(1).sqrt()[:, None, None]
+    products = (errors @ errors.mH).real.double() / errors.shape[2]  # (k, c, c)
+    crossed = products.new_zeros(len(values), len(labels))
+    for fold in folds.unique():
+        others = folds != fold
+        crossed[:, ~others] = shares_of(products[others], places[others])[:, None]
+    return shares_of(products, places), crossed
+
+
+def shares_of(products: Float[Tensor, "k c c"], places: Int[Tensor, " k"]) -> Float[Tensor, " c"]:
+    """Shares w >= 0 of sum 1 with the least w' G w, in tenths; G is the mean of products of errors
+    over places.
+    """
+    _, which, links = places.unique(return_inverse=True, return_counts=True)
+    gram = torch.tensordot(1.0 / links[which].double() / len(links), products, 1)  # (c, c)
+    size = gram.diagonal().mean().clamp_min(1e-30)
+    one = torch.eye(len(gram), dtype=torch.float64)
+    first = one[0]
+    root = torch.linalg.cholesky(gram / size + 1e-9 * one).mH
+    # Few places tell little: as one place more, |w - first|² draws towards the simplest model. The
+    # last row, large in units of the error, is the condition on the sum.
+    draw = max(len(links), 1) ** -0.5
+    matrix = torch.cat((root, draw * one, torch.full_like(one[:1], 1e3)))
+    target = torch.cat((0 * first, draw * first, first.new_tensor([1e3])))
+    found = torch.from_numpy(nnls(matrix.numpy(), target.numpy())[0])
+    tenths = (10 * found / found.sum()).round() / 10
+    tenths[found.argmax()] += 1 - tenths.sum()
+    return tenths
