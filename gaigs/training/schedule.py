@@ -85,7 +85,7 @@ def warmup_and_decay(
 
 
 def _target(option: str, config: Mapping, module: ModuleType, base: type) -> tuple[type, dict]:
-    """The class that a configuration names, and its options."""
+    """The class that ``_target_`` names, and the other options; a ``ValueError`` for another."""
     options = dict(config)
     target = str(options.pop("_target_", None))
     start = f"{module.__name__}."
