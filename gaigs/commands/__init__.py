@@ -88,7 +88,7 @@ def _check_command(command: str) -> None:
 
 @usual_modes()
 def _execute(config: dict, folder: Path, launcher: str | None) -> dict | None:
-    """Executes the command of a checked configuration."""
+    """Executes the command of a configuration; its keys and the command's name are checked."""
     command = config["command"]
     if command == "train":
         from gaigs import runs

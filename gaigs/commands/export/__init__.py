@@ -112,7 +112,7 @@ def check_suffix(file: Path) -> str:
 
 
 def run(config: dict, folder: Path) -> None:
-    """Exports from a finished run into a folder."""
+    """Exports from a finished run, as ``config["export"]`` says, into a folder."""
     if config["folder"] is None:
         raise ValueError("command=export needs the folder of a finished run; add folder=runs/...")
     options = dict(config["export"])

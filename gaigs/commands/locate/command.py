@@ -70,16 +70,17 @@ def locate_test(
             "the run has no test links at this carrier; take another split or locate.frequency"
         )
     known = transmissions(links, at_carrier(links, prints.frequency, "train", "validation"))
-    asked, truth = transmissions(links, test)
+    values, truth = transmissions(links, test)
     start = time.perf_counter()
-    location = call("locate", posterior, options, prints=prints, asked=asked)
+    location = call("locate", posterior, options, prints=prints, values=values)
     seconds = time.perf_counter() - start
 
     _, groups = known.places.unique(dim=0, return_inverse=True)
-    pair = asked, known.values
+    known_values = known.values
     if options["unknown_power"]:
-        pair = without_power(asked), without_power(known.values)
-    guess = neighbours(*pair, known.places, groups)
+        values = without_power(values)
+        known_values = without_power(known_values)
+    guess = neighbours(values, known_values, known.places, groups)
     guesses = {
         "mean": location.mean,
         "median": location.median,
@@ -104,10 +105,10 @@ def locate_test(
     write_columns(folder / "locate.csv", columns)
     drawn = error_figure(truth, location.mean, known.places, errors)
     style.save(drawn, folder / "locate.png")
-    shown = [
-        f"median {numbers[name]['median_m']:.3g} m, mean {numbers[name]['mean_m']:.3g} m"
-        for name in ("locate", "knn")
-    ]
+    shown = []
+    for name in ("locate", "knn"):
+        scores = numbers[name]
+        shown.append(f"median {scores['median_m']:.3g} m, mean {scores['mean_m']:.3g} m")
     print(f"{len(truth)} transmitters: {'; nearest neighbours '.join(shown)}")
     return location
 
@@ -118,7 +119,10 @@ def summary(
     errors: Mapping[str, Float[Tensor, " n"]],
     level: float,
 ) -> dict[str, Any]:
-    """Errors of each guess, the mean place as ``locate``; with it the shares of the regions."""
+    """Median and mean error of each guess [m], by its name; the mean place is called ``locate``.
+
+    It also has the share of transmitters in their regions, and the regions' mean size.
+    """
     numbers: dict[str, Any] = {"locate": {}}
     for name, error in errors.items():
         key = "locate" if name == "mean" else name

@@ -34,7 +34,7 @@ def run(config: dict, folder: Path) -> None:
 
 
 def figure(plan: SitePlan) -> Figure:
-    """The objective from above, as it stands and with the new places."""
+    """Maps of the objective from above: before, and with the new places."""
     with rc_context(style.STYLE):
         count = 2 if len(plan.standing) else 1
         drawn = style.new_figure(count * style.COLUMN, 0.46 * style.PAGE, "compressed")

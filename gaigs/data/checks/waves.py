@@ -32,7 +32,7 @@ class FewWaves(NamedTuple):
 
 
 def direct_distances(sample: Sample) -> Float[Tensor, "n e"]:
-    """Distances of transmitters from their receivers' elements [m]; lacking ones are central."""
+    """Distances from transmitters to elements [m]; to the array's middle for missing elements."""
     elements = pad_sequence([*sample.elements], batch_first=True)  # (r, e, 3)
     places = sample.positions[:, None] + torch.einsum("rwa,rea->rew", sample.rotations, elements)
     return (sample.transmitters[:, None] - places[sample.receivers]).norm(dim=-1)

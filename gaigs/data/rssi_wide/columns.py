@@ -45,22 +45,25 @@ class Columns(NamedTuple):
 
 
 class Axes(NamedTuple):
-    """Columns of x, of y and of the height or the floor; a column of -1 is not there."""
+    """Columns of coordinates."""
 
     x: int
     y: int
-    z: int
-    is_floor: bool
-    is_global: bool
+    z: int  # column of the height or the floor; -1 without one
+    is_floor: bool  # True if z numbers floors
+    is_global: bool  # True if x and y are longitude and latitude
 
     @property
     def columns(self) -> list[int]:
-        """The columns that are there."""
+        """Columns of x, y and, if there is one, z."""
         return [column for column in self[:3] if column >= 0]
 
 
 def plain_name(name: str) -> tuple[str, float | None]:
-    """Name of a column in small letters and digits, and its unit [m]; None if it has no unit."""
+    """A heading's name, in small letters and digits, and its unit in metres: ("x", 0.01) of X [cm].
+
+    The unit is None if there is none, or if it is no length.
+    """
     metres = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048}
     unit = r"[\s_]*[\[(]?\s*(mm|cm|km|m|ft|feet|deg|°)?\s*[\])]?"
     match = re.fullmatch(rf"(?s)(.*?){unit}", name.strip().lower())
@@ -68,7 +71,10 @@ def plain_name(name: str) -> tuple[str, float | None]:
 
 
 def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
-    """Factors of x, y and z to metres, or of x and y to the unit of the system, by headings."""
+    """Factors by which x, y and z become metres; with ``epsg``, x and y the system's own unit.
+
+    Units are those of the headings. A ``ValueError`` for a unit that is not the system's.
+    """
     columns = [axes.x, axes.y, axes.z if axes.z >= 0 else axes.x]
     units = [plain_name(table.names[column])[1] for column in columns]
     metres = 1.0 if epsg is None else metres_of(epsg)
@@ -89,7 +95,11 @@ def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
 
 
 def find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) -> Axes:
-    """The columns of coordinates, by the names given or by usual ones."""
+    """The columns of coordinates: the ``coordinates`` named, else those with usual names.
+
+    Raises:
+        ValueError: Columns are missing or ambiguous, or the latitude comes first.
+    """
     plain = [plain_name(name)[0] for name in table.names]
     has_unit = [plain_name(name)[1] is not None for name in table.names]
     longitudes, latitudes = PAIRS[2]
@@ -151,7 +161,11 @@ def find_gateways(
     ignore: Sequence[str],
     not_heard: float | list[float] | None,
 ) -> Columns:
-    """The columns of gateways, and the marks of "not heard" in them."""
+    """The columns of gateways, and the marks of "not heard" in them.
+
+    Gateways are columns named in ``placed`` and columns of mostly low levels, with any level at
+    all. A ``ValueError`` if there are none, or if a cell of theirs holds something else.
+    """
     reserved = {axes.x, axes.y, axes.z, *(table.column(name) for name in ignore)}
     free = [k for k in range(len(table.names)) if k not in reserved]
     likely = [k for k in free if table.names[k] in placed or _is_weak(table, k)]
@@ -198,6 +212,7 @@ def find_gateways(
     for k in others:
         name = table.names[k]
         ignored.append(f"{name} (powers in W or mW?)" if name in powers else name)
+    # A column without a name, such as of pandas's index, is not worth a remark.
     return Columns(gateways, marks, [*filter(None, silent)], [*filter(None, ignored)])
 
 
