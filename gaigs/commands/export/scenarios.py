@@ -78,6 +78,6 @@ def _fields(
     sizes = np.abs(gains)
     # Weaker paths are rounding errors: float32 has seven digits of a link's strongest path.
     faintest = 1e-6 * sizes.max(1, keepdims=True)
-    # The model's unit is a distance of 1 m; Friis has wavelength / (4 pi) there.
+    # Gains count from free space at 1 m, which has wavelength / (4 pi) (Friis).
     unit = model.pooling.strength.item() * speed_of_light / (4 * math.pi * carrier)
     return np.where(sizes > faintest, unit * gains, 0)
