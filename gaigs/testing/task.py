@@ -49,6 +49,7 @@ def check_task(task: Task, *thinnings: Mapping) -> None:
 
 
 def _check_facts(task: Task) -> None:
+    """Checks the types of the task's attributes and metrics."""
     is_registered = task.name in registry("task").names()
     require(is_registered, f"a task must have its registered name, got {task.name!r}")
     texts = ("quantity", "unit", "normalisation", "monitor", "pair_score")
@@ -68,6 +69,7 @@ def _check_facts(task: Task) -> None:
 
 
 def _check_state(task: Task) -> None:
+    """Checks that a stored state builds the same task."""
     file = io.BytesIO()
     torch.save(task.state(), file)
     file.seek(0)
@@ -79,6 +81,7 @@ def _check_state(task: Task) -> None:
 
 
 def _check_scores(task: Task, perfect: Mapping[str, Tensor], worse: Mapping[str, Tensor]) -> None:
+    """Checks scores of five samples; ``perfect`` are those of the labels themselves."""
     names = ", ".join(perfect)
     has_monitor = task.monitor in perfect
     require(has_monitor, f"scores must have the monitored one, {task.monitor!r}, got {names}")
@@ -97,6 +100,7 @@ def _check_scores(task: Task, perfect: Mapping[str, Tensor], worse: Mapping[str,
 def _check_summaries(
     task: Task, perfect: Mapping[str, Tensor], worse: Mapping[str, Tensor]
 ) -> None:
+    """Checks the task's summaries of scores, and of scores of averaged samples."""
     metrics = type(task).metrics()
     best = task.summarise(perfect)
     second = task.summarise(worse)
@@ -120,6 +124,7 @@ def _check_summaries(
 
 
 def _check_refusals(task: Task, labels: Tensor, values: Tensor) -> None:
+    """Checks that wrong shapes and numbers are refused, and that no samples have no scores."""
     broken = torch.arange(labels.numel()).view_as(labels) == 1
     wrong = {
         "of different number": (labels, values[1:]),
