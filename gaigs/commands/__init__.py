@@ -94,6 +94,11 @@ def _execute(config: dict, folder: Path, launcher: str | None) -> dict | None:
         from gaigs import runs
 
         return runs.run(config, folder, launcher)
+    if config["folder"] is None and command in ("place", "locate", "export", "view"):
+        source = "the folder of a finished run"
+        if command == "view":
+            source += ", or a checkpoint"
+        raise ValueError(f"command={command} needs {source}; add folder=runs/...")
     module = importlib.import_module(f"gaigs.commands.{command}")
     with processes.limited_threads(config["threads"]):
         if command == "view":

@@ -353,7 +353,8 @@ def read_parts(
     """Distinct entries of ``train_index.txt`` and ``test_index.txt``, one a line.
 
     Args:
-        parse: Gives None for a defect.
+        parse: Turns a line into its entry; returns None for a line with a defect.
+        expected: What a line should hold, for errors.
     """
     places: dict[Hashable, str] = {}
     parts = []

@@ -83,7 +83,7 @@ class Holder:
     @property
     def registration(self) -> Registration | None:
         """The component's ``@register`` with its definition; None if an entry point has none."""
-        file = self.file or self._module_file(self.target.partition(":")[0])
+        file = self._source
         try:
             components = registrations(file) if file else []
         except (SyntaxError, ValueError):  # the import names the file
@@ -95,20 +95,21 @@ class Holder:
 
     def read_options(self, given: tuple[str, ...]) -> dict[str, Any]:
         """Options with their defaults, read from the source; ``given`` parameters are left out."""
-        module, _, attribute = self.target.partition(":")
-        file = self.file or self._module_file(module)
+        definition: str | Definition = self.target.partition(":")[2].strip()
         registration = self.registration
-        definition: str | Definition = attribute.strip()
         if registration is not None:
             definition = registration.definition
+        file = self._source
         if file is None or not definition:
             raise UnclearSource
         return read_options(file, definition, given)
 
-    def _module_file(self, module: str) -> Path | None:
-        """The file of an entry point's module; None if it is not found."""
-        if self.folder is None:
-            return None
+    @property
+    def _source(self) -> Path | None:
+        """The file of the component, or of its entry point's module; None if it is not found."""
+        if self.file is not None or self.folder is None:
+            return self.file
+        module = self.target.partition(":")[0]
         place = self.folder.joinpath(*module.strip().split(".")[1:])
         files = (place / "__init__.py", place.with_suffix(".py"))
         return next((file for file in files if file.is_file()), None)

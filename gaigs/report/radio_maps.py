@@ -104,23 +104,24 @@ class _Drawing(NamedTuple):
         return cls(radio_map, gateways, dots, edges[is_low][..., :2], scale)
 
     def draw(self, ax: Axes, name: str) -> Any:
-        """Draws the map of a receiver; returns its image."""
+        """Draws the map of a receiver; returns its image, for a colour bar."""
         index = self.radio_map.receivers.index(name)
         values = self.radio_map.values[index]
         extent, lower, upper = _extent(self.radio_map, self.walls)
-        look = {"cmap": "viridis", "vmin": self.scale.low, "vmax": self.scale.high}
+        colours = {"cmap": "viridis", "vmin": self.scale.low, "vmax": self.scale.high}
         place = {"origin": "lower", "extent": extent, "interpolation": "bilinear"}
-        image = ax.imshow(values, **place, **look)
+        image = ax.imshow(values, **place, **colours)
         levels = _levels(values, self.scale)
         if len(levels):
             lines = {"colors": "white", "linestyles": "solid", "linewidths": 0.4, "alpha": 0.5}
             ax.contour(self.radio_map.x, self.radio_map.y, values, levels, **lines)
+        # A white rim keeps walls visible on dark colours.
         walls = LineCollection(self.walls, colors="black", linewidths=0.9)
         walls.set_path_effects([Stroke(linewidth=1.8, foreground="white"), Normal()])
         ax.add_collection(walls)
-        x, y, label = self.dots[name].T
+        x, y, reading = self.dots[name].T
         ring = {"edgecolors": "black", "linewidths": 0.6, "zorder": 3}
-        ax.scatter(x, y, 14, label, **ring, **look)
+        ax.scatter(x, y, 14, reading, **ring, **colours)
         if name in self.gateways:
             ax.add_line(_gateway_mark(self.gateways[name][:2, None]))
         title = name

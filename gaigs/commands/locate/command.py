@@ -29,8 +29,6 @@ def run(config: dict, folder: Path) -> None:
 
     Writes ``locate.csv``, ``locate.png`` and, for a test, ``locate.json`` into a folder.
     """
-    if config["folder"] is None:
-        raise ValueError("command=locate needs the folder of a finished run; add folder=runs/...")
     model = load(config["folder"], config["trust"])
     links = links_of(config["folder"], config["trust"])
     options = dict(config["locate"])

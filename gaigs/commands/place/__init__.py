@@ -20,8 +20,6 @@ from gaigs.runs import load
 
 def run(config: dict, folder: Path) -> None:
     """Places access points by a finished run; writes ``place.csv`` and ``place.png``."""
-    if config["folder"] is None:
-        raise ValueError("command=place needs the folder of a finished run; add folder=runs/...")
     model = load(config["folder"], config["trust"])
     options = dict(config["place"])
     if isinstance(options["candidates"], str):

@@ -181,10 +181,6 @@ def contents_of(source: str | Path, trust: bool = False) -> Contents:
 
 def run(config: dict) -> None:
     """Serves the view of a run's folder or of a checkpoint, or writes it into one file."""
-    if config["folder"] is None:
-        raise ValueError(
-            "command=view needs the folder of a finished run, or a checkpoint; add folder=runs/..."
-        )
     call("view", show, config["view"], folder=config["folder"], trust=config["trust"])
 
 

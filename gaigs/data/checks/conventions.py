@@ -38,7 +38,7 @@ def conventions(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[
 
 
 def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
-    """Orders and units of subcarriers, and phases that lack a part."""
+    """Conventions of subcarriers: their order and unit, and phases that lack a part."""
     if len(sample.frequencies) > 1:
         name = "subcarriers are in reversed order, or path coefficients are conjugate"
         mend = "h = h[..., ::-1], or of conjugate coefficients h = h.conj()[..., ::-1]"
@@ -60,7 +60,7 @@ def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
 
 
 def of_arrays(sample: Sample) -> Iterator[Hypothesis]:
-    """Orders and units of elements, and orientations."""
+    """Conventions of arrays: order and unit of their elements, and their orientation."""
     yield changing(
         "elements are in reversed order",
         ["labels"],
@@ -242,7 +242,7 @@ def _about_receivers(sample: Sample, move: Move) -> Sample:
 
 
 def _from_receivers(sample: Sample) -> Sample:
-    """The sample with transmitters that are offsets from their receivers."""
+    """The sample if its transmitters are read as offsets from their receivers."""
     return replace(sample, transmitters=sample.transmitters + sample.positions[sample.receivers])
 
 

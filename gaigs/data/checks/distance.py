@@ -82,11 +82,11 @@ def explained(sample: Sample) -> float:
 def compare(
     read: Float[Tensor, " n"], fits: Float[Tensor, " n"], sample: Sample, cells: int = 6
 ) -> Gain:
-    """The gain of another law's errors ``fits`` over the errors ``read`` [dB], of 30 dB at most.
+    """The gain of another law's errors ``fits`` over the errors ``read`` [dB].
 
-    Shadowing is alike at near places, so that each receiver's cells, at most ``cells`` along x and
-    along y, count as single observations. The log likelihood of m of them with a mean error of s is
-    -m log(s), up to a constant.
+    An error above 30 dB counts as 30 dB. Shadowing is alike at near places: all links of a receiver
+    in a cell of the plan, with at most ``cells`` cells along x and along y, are one observation.
+    The log likelihood of m observations with a mean error of s is -m log(s), up to a constant.
     """
     before = read.abs().clamp_max(30).mean().item()
     after = fits.abs().clamp_max(30).mean().item()

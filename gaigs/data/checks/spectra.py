@@ -25,14 +25,11 @@ from gaigs.data.checks.hypotheses import Hypothesis, Sample, sample_of
 from gaigs.data.checks.places import scale_of
 
 
-def check_spectra(links: Any) -> Iterator[Finding]:
-    """Findings about spectra; a ``ValueError`` if all are constant, or too small for SSIM."""
-    yield from check_extremes(links)
-    yield from check_directions(links)
-
-
 def check_extremes(links: Any) -> Iterator[Finding]:
-    """Counts of constant spectra, and of min-max spectra without a pixel of 0 or of 1."""
+    """Counts of constant spectra, and of min-max spectra without a pixel of 0 or of 1.
+
+    A ``ValueError`` if all spectra are constant, or too small for SSIM.
+    """
     task, labels = links.task, links.labels
     if min(task.shape) < SSIM_WINDOW:
         rows, columns = task.shape
@@ -137,10 +134,11 @@ class Trials(NamedTuple):
 def trials(
     links: Any, sample: Sample, directions: "Directions", is_known: bool, limits: Limits
 ) -> Iterator[Trials]:
-    """Rounds of conventions: single ones, axes, and unless ``is_known``, pairs of them.
+    """Rounds of conventions: single ones, then axes, then pairs of both.
 
     Args:
-        is_known: True if the data as read score well, so that they have no two faults at once.
+        is_known: True if the data as read score well, so that they have no two faults at once;
+            there is no round of pairs then.
     """
     axes = [*of_axes(sample, [("tx",), ("rx",), ("tx", "rx")])]
     units = [*of_units([("tx",), ("rx",)])]  # in any unit of both, directions are the same
@@ -149,7 +147,7 @@ def trials(
     columns = column_changes(directions.grid)
     single = [*of_frames(), *units, *orientations, *pixels, *columns]
     single += [*scaling_changes(sample, directions.grid), *order_changes(links)]
-    single += of_receivers(sample, lambda links: directions.scores(links).mean().item())
+    single += of_receivers(sample, lambda changed: directions.scores(changed).mean().item())
     yield Trials(single, limits.of_others, 1)
     yield Trials(axes, limits.of_axes, 1)
     if is_known:

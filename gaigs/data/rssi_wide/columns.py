@@ -163,8 +163,8 @@ def find_gateways(
 ) -> Columns:
     """The columns of gateways, and the marks of "not heard" in them.
 
-    Gateways are columns named in ``placed`` and columns of mostly low levels, with any level at
-    all. A ``ValueError`` if there are none, or if a cell of theirs holds something else.
+    A gateway is a column named in ``placed`` or one of mostly low levels. A column without a level
+    is left out. A ``ValueError`` if there is no gateway, or if one of its cells is no level.
     """
     reserved = {axes.x, axes.y, axes.z, *(table.column(name) for name in ignore)}
     free = [k for k in range(len(table.names)) if k not in reserved]
