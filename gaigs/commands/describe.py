@@ -200,10 +200,10 @@ def draw_places(axis: Axes, links: Links, levels: Levels) -> None:
     x, y = places[:, :2].T.numpy()
     dots = axis.scatter(x, y, 8, colours.numpy(), cmap="viridis", zorder=2)
     axis.figure.colorbar(dots, ax=axis, label=label)
-    stands = torch.stack([receiver.pose.position for receiver in links.receivers])
+    positions = torch.stack([receiver.pose.position for receiver in links.receivers])
     is_estimated = links.uncertainties is not None and links.uncertainties.any()
     axis.plot(
-        *stands[:, :2].T.numpy(),
+        *positions[:, :2].T.numpy(),
         "^",
         color=style.ORANGE,
         markeredgecolor="white",

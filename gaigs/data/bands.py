@@ -20,13 +20,13 @@ from gaigs.io.tables import number_places
 def hold_out_band(
     links: Links, band_train: Sequence[float] | None, band_test: Sequence[float] | None
 ) -> Links:
-    """Channels with the subcarriers of one band, whose ``held_out`` have another band's.
+    """The channels in one band, with the same links in another band as ``held_out``.
 
     Args:
-        band_train: Lowest and highest subcarrier to train and validate on [Hz]; None for all, with
-            none held out.
-        band_test: Lowest and highest subcarrier to test on [Hz], except those to train on; None for
-            all others.
+        band_train: Lowest and highest subcarrier to train and validate on [Hz]. None: all
+            subcarriers, and nothing is held out.
+        band_test: Lowest and highest subcarrier to test on [Hz]; subcarriers of ``band_train`` are
+            left out. None: all others.
 
     Raises:
         ValueError: A band is not two carriers in ascending order, or has no subcarrier.

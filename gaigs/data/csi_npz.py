@@ -229,6 +229,8 @@ def write(folder: str | Path, links: Links) -> None:
     """Writes channels to one receiver as ``room.npz`` in a folder, for ``read``."""
     (receiver,) = links.receivers
     task: Csi = links.task
+    # Offsets of the elements along the world's axes, as the file has no rotation.
+    elements = receiver.array.elements.double() @ receiver.pose.rotation.double().T
     with atomic_write(Path(folder) / "room.npz") as part:
         np.savez(
             part,
@@ -237,7 +239,7 @@ def write(folder: str | Path, links: Links) -> None:
             rx_index=links.query.receivers.numpy(),
             frequencies=task.frequencies.numpy(),
             h=links.labels.numpy(),
-            elements=(receiver.array.elements.double() @ receiver.pose.rotation.double().T).numpy(),
+            elements=elements.numpy(),
         )
 
 
@@ -390,7 +392,7 @@ def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _rule(name: str, array: np.ndarray, receivers: int) -> tuple[str, np.ndarray]:
-    """The range of an array in words, and True for numbers within it."""
+    """What an array may hold, in words for errors, and True for each number that is allowed."""
     if name == "h":
         low, high = 1e-18, 1e18  # float32 can hold their squares
         sizes = np.abs(array)

@@ -107,7 +107,11 @@ def from_sionna_rt(
 def _elements(
     source: Any, rx: Float[ndarray, "k e 3"], tx: Float[ndarray, "n m 3"], carrier: float
 ) -> Float[ndarray, "r a 3"]:
-    """Offsets [m] of the antennas at the end with fewer places: traced ones, else its array's."""
+    """Offsets of the antennas from their device [m], at the end of the links with fewer devices.
+
+    Without a synthetic array, paths are traced to each antenna, whose place is then known. Else
+    all devices have the antennas of the scene's array.
+    """
     fixed, array = (rx, source.rx_array) if len(rx) <= len(tx) else (tx, source.tx_array)
     if not source.synthetic_array:
         return fixed - fixed.mean(1, keepdims=True)
@@ -124,9 +128,9 @@ def _of_map(source: Any, receivers: Any, carrier: float | None, config: Mapping)
                 "a radio map of this Sionna RT keeps no places of transmitters; set receivers, "
                 "positions (k, 3) [m]"
             )
-        stands = _places(source._tx_positions, levels.shape[1])[:, 0]  # (k, 3)
-        names = getattr(source, "_tx_names", range(len(stands)))
-        receivers = {str(name): stand for name, stand in zip(names, stands.tolist(), strict=True)}
+        positions = _places(source._tx_positions, levels.shape[1])[:, 0]  # (k, 3)
+        names = map(str, getattr(source, "_tx_names", range(len(positions))))
+        receivers = dict(zip(names, positions.tolist(), strict=True))
     cells = np.array(source.cell_centers, float).reshape(-1, 3)
     return from_arrays(
         "rssi",

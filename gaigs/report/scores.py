@@ -164,13 +164,14 @@ def verdict(metrics: Mapping) -> str:
     trend = ""
     values = {}
     for other, theirs in baselines:
-        if other == f"{model}_trend":
+        if other == f"{model}_trend":  # the model itself without kriging is no baseline
             trend = f" Before kriging ({other}) it is {theirs[name]:.{digits}f}{unit}."
         else:
             values[other] = theirs[name]
     if values:
         best = (max if metric.higher_is_better else min)(values, key=values.__getitem__)
         gap = scores[name] - values[best]
+        # A gap that is printed as 0 is neither better nor worse.
         size = f"{abs(gap):.{digits}f}"
         is_better = (gap > 0) == metric.higher_is_better
         side = f"{size}{unit} {'better' if is_better else 'worse'} than"

@@ -166,7 +166,8 @@ def write_systems(
         metrics: Metrics of the task by name.
 
     Returns:
-        A table for a terminal. None, and there are no files, unless runs of several models ended.
+        A table for a terminal. None, and no file is written, if fewer than two models have a
+        finished run.
     """
     published = read_published()
     systems = find_systems(runs, baselines, shared, published["names"])

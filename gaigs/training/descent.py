@@ -189,7 +189,7 @@ class Descent(lightning.LightningModule):
 def _overridden(
     option: str, defaults: Mapping[str, float], values: Mapping[str, float]
 ) -> dict[str, float]:
-    """A model's defaults, replaced by ``values``; errors name the ``option`` that gave these."""
+    """A model's defaults with ``values`` in their place; errors name the values' ``option``."""
     for name, value in values.items():
         if name not in defaults:
             listed = ", ".join(sorted(defaults)) or "none"

@@ -16,7 +16,8 @@ from gaigs.core.query import ROUNDING, evenly
 def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor, "m k"]:
     """Axes along which errors of a label's numbers are independent.
 
-    They are scaled to a mean square of 1 a label. Of more than ``most`` errors an even part counts.
+    Along these axes the squares of a label's errors sum to 1 on average. At most ``most`` labels
+    are used, chosen at even steps.
 
     Source: Ledoit and Wolf, A well-conditioned estimator for large-dimensional covariance matrices,
     2004.

@@ -59,7 +59,7 @@ def check_channels(links: Any) -> Iterator[Finding]:
 
 
 def check_signs(sample: Sample) -> Iterator[Finding]:
-    """A finding if channels lack a part, or if a part that is never negative seems an amplitude."""
+    """A finding if no real part of the channels is negative, and one if no imaginary part is."""
     parts = {"real": sample.labels.real, "imaginary": sample.labels.imag}
     for name, part in parts.items():
         if sample.labels.numel() < 100 or part.min() < 0:

@@ -45,7 +45,7 @@ class Columns(NamedTuple):
 
 
 class Axes(NamedTuple):
-    """Columns of coordinates."""
+    """Numbers of the columns that hold coordinates."""
 
     x: int
     y: int
@@ -217,7 +217,7 @@ def find_gateways(
 
 
 def _is_weak(table: tables.Table, column: int) -> bool:
-    """True if a column has no coordinate's name, and half of its numbers are low levels."""
+    """True if half of a column's distinct numbers are low levels, and its name is no coordinate."""
     if plain_name(table.names[column])[0] in HEIGHTS.union(*PAIRS[0], *PAIRS[1], *PAIRS[2]):
         return False
     numbers = table.numbers[:, column]
@@ -229,11 +229,14 @@ def _is_weak(table: tables.Table, column: int) -> bool:
 def _refuse_lists(table: tables.Table, columns: Sequence[int]) -> None:
     """Raises a ``ValueError`` if a cell of these columns holds several levels."""
     for k in columns:
-        for row in np.flatnonzero(np.isinf(table.numbers[:, k]))[:1].tolist():
-            levels = tables.numbers_in(table.text(row, k))
-            if levels and QUIETEST <= min(levels) <= max(levels) <= WEAK:
-                got = f"{table.cell(row, k)}, or set data.ignore"
-                table.refuse({row: got}, "one level [dBm] a cell")
+        texts = np.flatnonzero(np.isinf(table.numbers[:, k]))  # rows whose cell is no number
+        if not len(texts):
+            continue
+        row = int(texts[0])
+        levels = tables.numbers_in(table.text(row, k))
+        if levels and QUIETEST <= min(levels) <= max(levels) <= WEAK:
+            got = f"{table.cell(row, k)}, or set data.ignore"
+            table.refuse({row: got}, "one level [dBm] a cell")
 
 
 def _are_powers(column: Float[ndarray, " n"]) -> bool:

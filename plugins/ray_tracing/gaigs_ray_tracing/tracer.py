@@ -84,6 +84,7 @@ class Tracer:
             "frequency": frequency,
             "settings": [depth, rays, CHUNK, CANDIDATES, tracing.WEAKEST],
         }
+        # Paths to all receivers by place: of places to remember, and of others.
         self.data: dict[tuple[float, ...], list[Traced]] = {}
         self.others: dict[tuple[float, ...], list[Traced]] = {}
         self.seconds = 0.0
@@ -122,6 +123,7 @@ class Tracer:
         distinct = dict.fromkeys(keys)
         missing = [key for key in distinct if key not in self.data and key not in self.others]
         if missing:
+            # The memory is bounded: where it is full, places that are not requested now go.
             if (len(self.others) + len(missing)) * len(self.receivers) > MOST:
                 self.others = {key: self.others[key] for key in keys if key in self.others}
             self.others |= zip(missing, self._trace(missing), strict=True)
