@@ -73,7 +73,8 @@ def from_arrays(
             5400000.0)`` for UTM less that easting and northing; None if unknown.
         height: Height of positions (n, 2) or (k, 2) [m].
         one_radio: True if the receivers are places of one radio that moves, or of radios alike,
-            with one gain. None: of one position a link, see ``gaigs.data.readings.are_one_radio``.
+            with one gain. None: True for receivers at one position a link, see
+            ``gaigs.data.readings.are_one_radio``.
 
     Raises:
         TypeError: An option has a wrong type.

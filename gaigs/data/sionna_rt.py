@@ -49,8 +49,8 @@ def from_sionna_rt(
         receivers: Positions of a radio map's transmitters (k, 3) [m], or by name. None: those that
             the object keeps.
         elements: Offsets of the receiver array's elements along the world's axes (e, 3) [m]. None:
-            those of the array, of paths with ``synthetic_array`` in a device without an
-            orientation; unknown if several antennas share an element.
+            the object's; paths with ``synthetic_array`` count as of a device that is not turned.
+            They are unknown if several antennas share an element.
         phase: See ``gaigs.core.task.csi.Csi``.
         split: Name of a registered split, ``options`` are its own; None: ``random``.
 

@@ -81,7 +81,7 @@ def _check_state(task: Task) -> None:
 
 
 def _check_scores(task: Task, perfect: Mapping[str, Tensor], worse: Mapping[str, Tensor]) -> None:
-    """Checks scores of five samples; ``perfect`` are those of the labels themselves."""
+    """Checks scores of five samples: ``perfect`` for the labels as values, ``worse`` for others."""
     names = ", ".join(perfect)
     has_monitor = task.monitor in perfect
     require(has_monitor, f"scores must have the monitored one, {task.monitor!r}, got {names}")

@@ -204,7 +204,7 @@ def _budgets(trainer) -> list[Budget]:
 
 
 def share_done(trainer) -> Callable[[int], float]:
-    """The share of a training done after some steps: of steps or time, whichever is more."""
+    """A function of the step: the share of the training's steps or of its time, if that is more."""
 
     def share(step: int) -> float:
         by_steps = step / trainer.max_steps if trainer.max_steps > 0 else 0.0

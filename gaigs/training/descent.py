@@ -108,7 +108,7 @@ class Descent(lightning.LightningModule):
         return self.add_up(loss, terms, penalties, batch)
 
     def prepare(self, batch: Batch) -> Batch:
-        """A batch as a step sees it: of some links, thinned, its places moved."""
+        """A batch as a step trains on it: with fewer links, thinned labels and moved places."""
         generator = seeded(self.seed, self.global_step)
         if self.links is not None and len(batch) > self.links:
             order = torch.randperm(len(batch), generator=generator)

@@ -85,7 +85,7 @@ def write_predictions(
 
 
 def _to_predict(scene: Scene, places: object, frequency: float | None) -> Labels:
-    """What to predict at ``places``: of links the test, with labels at held-out subcarriers."""
+    """What to predict at ``places``; if they are links, their test at any held-out subcarriers."""
     query = query_of("predictions", scene, places, frequency)
     if not isinstance(places, Links):
         return Labels(query, scene.task, None, None)

@@ -55,7 +55,7 @@ def weighted_mean(
     """Means of the ``count`` nearest places, weighted by 1 / distance.
 
     Args:
-        apart: Distances of fingerprints from those of the places.
+        apart: Distances of n fingerprints from the fingerprints of the places.
     """
     nearest = apart.topk(min(count, apart.shape[1]), largest=False)
     weights = 1 / nearest.values.clamp_min(1e-6)

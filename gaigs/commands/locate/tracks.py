@@ -86,7 +86,10 @@ class Moves:
         return (self._densities(start, end) @ (logarithm - logarithm.max()).exp()).log()
 
     def _densities(self, start: Int[Tensor, " k"], end: Int[Tensor, " k"]) -> Float[Tensor, "k k"]:
-        """Densities of moves to the candidates ``end`` (rows) from ``start``, over that of none."""
+        """Densities of moves from candidates ``start`` (columns) to ``end`` (rows).
+
+        They are divided by the density of staying.
+        """
         if self._last is not None:  # a walk may stay
             first, second, densities = self._last
             if torch.equal(first, start) and torch.equal(second, end):

@@ -71,9 +71,10 @@ def plain_name(name: str) -> tuple[str, float | None]:
 
 
 def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
-    """Factors by which x, y and z become metres; with ``epsg``, x and y the system's own unit.
+    """Factors from the units in the headings of x, y and z to metres.
 
-    Units are those of the headings. A ``ValueError`` for a unit that is not the system's.
+    If the system ``epsg`` does not count in metres, x and y stay in its unit. A ``ValueError`` if
+    a heading then has another unit.
     """
     columns = [axes.x, axes.y, axes.z if axes.z >= 0 else axes.x]
     units = [plain_name(table.names[column])[1] for column in columns]

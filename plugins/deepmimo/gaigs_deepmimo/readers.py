@@ -34,8 +34,8 @@ def read_channels(
 ) -> Links:
     """Channels from users to the base stations of a scenario; by reciprocity the users transmit.
 
-    Channels are those of DeepMIMO's generator without its factor of 1 / sqrt(subcarriers):
-    isotropic antennas, plane waves over the array, time dependence exp(+j omega t). The links of
+    DeepMIMO's generator gives the same channels times 1 / sqrt(subcarriers): isotropic antennas,
+    plane waves over the array, time dependence exp(+j omega t). The links of
     one user share a row. Users without a path and paths between base stations are left out. There
     is no official split.
 
@@ -102,7 +102,7 @@ def read_strengths(
 ) -> Links:
     """Signal strength of users of 0 dBm at the base stations of a scenario.
 
-    Antennas are isotropic. Files, errors and other options are those of ``deepmimo``.
+    Antennas are isotropic. For files, errors and other options see ``deepmimo``.
 
     Args:
         bandwidth: Width of the band about the scenario's carrier over which power is averaged [Hz].

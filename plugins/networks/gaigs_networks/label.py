@@ -145,8 +145,8 @@ def interpolate(
 ) -> Float[Tensor, "b ..."]:
     """Values of a grid, interpolated linearly in some directions.
 
-    Beyond the first and last row, values are those of that row. Azimuths go round: the last column
-    is beside the first one.
+    Directions beyond the first or last row get the values of that row. Azimuths go round: the last
+    column is beside the first one.
     """
     rows = shares(grid.elevations, directions.elevations).to(values)
     columns = shares(grid.azimuths, directions.azimuths, period=2 * math.pi).to(values)

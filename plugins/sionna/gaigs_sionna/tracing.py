@@ -121,7 +121,7 @@ def trace(
     field runs along the meridians about the vertical. A path that is reflected and passes through
     surfaces equals a straight one from an image of the transmitter, at the path's length in the
     direction of arrival. Length and direction of a diffracted path are exact at the receiver point,
-    and its wave is more curved than that of its image.
+    and its wave is more curved than the wave of the image.
 
     Args:
         reflections: Largest number of reflections of a path, then without diffractions, as in

@@ -40,7 +40,7 @@ class SwiftWrf(Model):
 
     without opacity, depth or order. Each receiver has Gaussians of its own: means m, lower
     triangular factors L and amplitudes a. A network adds to all three for each transmitter: [PE(m),
-    PE(transmitter), receiver] -> layers of one width with ReLU -> a linear head each; those of
+    PE(transmitter), receiver] -> layers of one width with ReLU -> a linear head each. The heads of
     means and factors start at 0. Gaussians start on a Fibonacci lattice over the label's
     directions, each as wide as its neighbours are away, and silent.
 
