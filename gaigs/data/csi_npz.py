@@ -138,7 +138,8 @@ def _with_remark(links: Links, one_radio: bool | None) -> Links:
     """Links with a remark if their receivers are places of one radio.
 
     Raises:
-        ValueError: The option asks for one radio, and several bands have several.
+        ValueError: ``one_radio`` is true, but the channels are of several bands, each of which
+            counts as a radio.
     """
     if one_radio and not links.one_radio:
         raise ValueError("data.one_radio=true takes channels of one band; leave it out")

@@ -77,7 +77,7 @@ def _number(value: object, missing: float | None) -> float | None:
 
 
 def _features(content: Any, properties: dict) -> Iterator[tuple[Rings, dict]]:
-    """The polygons of a GeoJSON object, at any depth."""
+    """The polygons within a GeoJSON object, at any depth, with the properties of their features."""
     match content["type"]:
         case "FeatureCollection":
             parts = content["features"]

@@ -41,7 +41,7 @@ def find_systems(
 ) -> list[System]:
     """Rows of the comparison table: one for runs that differ only in the seed, then baselines.
 
-    A baseline is left out if its printed scores are those of a run of the same model.
+    A baseline is left out if a run of the same model has the same printed scores.
 
     Args:
         baselines, shared: Results of ``gaigs.report.ablation``.

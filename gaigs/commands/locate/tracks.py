@@ -42,13 +42,15 @@ def track(
     is_received: Bool[Tensor, " n"],
     spread: int = 75,
 ) -> tuple[Candidates, Float[Tensor, "n j"]]:
-    """Every m-th candidate, and the logarithms of a track's posterior at these.
+    """The posterior of a track, over a part of the candidates as ``smoothed`` takes only few.
 
     Args:
-        step, is_received: As for ``smoothed``.
-        spread: Number of candidates over which the posterior of a single value still spreads. The
-            candidates that ``smoothed`` links then hold it: regions of tracks reach far beyond the
-            likeliest ones.
+        step, is_received: See ``smoothed``.
+        spread: Number of the part's candidates over which the posterior of a single value spreads.
+            Regions of tracks reach far beyond the likeliest candidates.
+
+    Returns:
+        Every m-th candidate, and the logarithms of the posterior at these j places.
     """
     # The inverse sum of squared probabilities: among c equally likely candidates it is c.
     posteriors = torch.softmax(logarithms[is_received], 1)
