@@ -88,12 +88,17 @@ def _check_command(command: str) -> None:
 
 @usual_modes()
 def _execute(config: dict, folder: Path, launcher: str | None) -> dict | None:
-    """Executes the command of a checked configuration."""
+    """Executes the command of a configuration; its keys and the command's name are checked."""
     command = config["command"]
     if command == "train":
         from gaigs import runs
 
         return runs.run(config, folder, launcher)
+    if config["folder"] is None and command in ("place", "locate", "export", "view"):
+        source = "the folder of a finished run"
+        if command == "view":
+            source += ", or a checkpoint"
+        raise ValueError(f"command={command} needs {source}; add folder=runs/...")
     module = importlib.import_module(f"gaigs.commands.{command}")
     with processes.limited_threads(config["threads"]):
         if command == "view":

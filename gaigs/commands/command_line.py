@@ -31,7 +31,7 @@ class Job(NamedTuple):
     folder: Path  # the run folder
     is_sweep: bool  # True for a job of a multirun
     launcher: str  # class name of Hydra's launcher
-    goes_on: str  # how to resume the run, for messages
+    goes_on: str  # sentence for messages: how to resume the run
 
 
 def run(config: DictConfig) -> float | None:
@@ -66,7 +66,7 @@ def run(config: DictConfig) -> float | None:
 
 
 def describe_job(settings: DictConfig, command: str | None) -> Job:
-    """The job of Hydra's settings."""
+    """The job that Hydra's settings and the name of the command describe."""
     is_sweep = settings.mode is RunMode.MULTIRUN
     mode = "sweep" if is_sweep else "run"
     goes_on = f"the same command with hydra.{mode}.dir={settings[mode].dir} goes on"
@@ -77,7 +77,7 @@ def describe_job(settings: DictConfig, command: str | None) -> Job:
 
 
 def end_stopped(job: Job, stop: KeyboardInterrupt) -> NoReturn:
-    """Ends a job after a signal."""
+    """Ends a job after a signal: the process, or within a launcher's process this job alone."""
     message = f"gaigs: {str(stop) or 'stopped'}; {job.goes_on}"
     number = getattr(stop, "number", signal.SIGINT)
     if job.is_sweep and job.launcher != "BasicLauncher":
@@ -92,7 +92,10 @@ def end_stopped(job: Job, stop: KeyboardInterrupt) -> NoReturn:
 
 
 def end_failed(job: Job, error: Exception, is_verbose: bool) -> NoReturn:
-    """Ends a job after an error."""
+    """Ends a job after an error, with one message or else the traceback.
+
+    A single run ends the process; a job of a sweep raises, so that Hydra goes on with the others.
+    """
     message = processes.advice(error, job.folder, job.goes_on)
     if is_verbose or (message is None and not job.is_sweep):
         traceback.print_exc()
@@ -110,7 +113,7 @@ def end_failed(job: Job, error: Exception, is_verbose: bool) -> NoReturn:
 
 
 def note_task(words: list[str], config: dict) -> None:
-    """A line of the log if the experiment is for another task than the data, which decide."""
+    """Logs a warning if the experiment's name is of another task than the data's labels."""
     parts = [config.get(key) for key in ("task", "data")]
     if not all(isinstance(part, dict) and "name" in part for part in parts):
         return  # the check of the configuration says what is wrong

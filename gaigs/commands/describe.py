@@ -80,15 +80,15 @@ def describe(links: Links) -> Description:
 
 @dataclass(frozen=True)
 class Levels:
-    """One number of each of some links: its label, the label's mean, or a channel's mean power."""
+    """One level for each link: its label, the label's mean, or a channel's mean power."""
 
-    index: Int[Tensor, " k"]  # the links
-    values: Float[Tensor, " k"]  # their numbers
-    title: str  # name and unit of a number
+    index: Int[Tensor, " k"]  # numbers of the links
+    values: Float[Tensor, " k"]  # their levels
+    title: str  # name and unit of a level
 
     @classmethod
     def of(cls, links: Links, most: int = 2000) -> "Levels":
-        """Numbers of all links; of at most so many, evenly spread, if labels have many numbers."""
+        """Levels of all links; of up to ``most``, evenly spread, where labels are arrays."""
         task = links.task
         index = torch.arange(len(links))
         if task.shape:
@@ -96,8 +96,8 @@ class Levels:
         title = with_unit(f"mean {task.quantity}" if task.shape else task.quantity, task.unit)
         if task.dtype.is_complex:
             title = "mean power [dB]"
-        parts = [mean_levels(links, part) for part in index.split(256)]
-        return cls(index, torch.cat(parts), title)
+        values = [mean_levels(links, part) for part in index.split(256)]
+        return cls(index, torch.cat(values), title)
 
 
 def mean_levels(links: Links, index: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
@@ -139,7 +139,7 @@ def extent_lines(links: Links, levels: Levels) -> list[str]:
 
 
 def receiver_lines(links: Links, levels: Levels, most: int = 12) -> list[str]:
-    """A table of the receivers with the most links, at most so many; empty for one receiver."""
+    """A table of the ``most`` receivers with the most links; empty for one receiver."""
     count = len(links.receivers)
     if count == 1:
         return []
@@ -200,10 +200,10 @@ def draw_places(axis: Axes, links: Links, levels: Levels) -> None:
     x, y = places[:, :2].T.numpy()
     dots = axis.scatter(x, y, 8, colours.numpy(), cmap="viridis", zorder=2)
     axis.figure.colorbar(dots, ax=axis, label=label)
-    stands = torch.stack([receiver.pose.position for receiver in links.receivers])
+    positions = torch.stack([receiver.pose.position for receiver in links.receivers])
     is_estimated = links.uncertainties is not None and links.uncertainties.any()
     axis.plot(
-        *stands[:, :2].T.numpy(),
+        *positions[:, :2].T.numpy(),
         "^",
         color=style.ORANGE,
         markeredgecolor="white",
@@ -214,7 +214,10 @@ def draw_places(axis: Axes, links: Links, levels: Levels) -> None:
 
 
 def draw_histogram(axis: Axes, levels: Levels, is_noisy: bool, bins: int = 40) -> None:
-    """Draws the numbers of links of each level; bins of noisy levels hold whole numbers."""
+    """Draws how many links have each level.
+
+    Noisy levels are often whole numbers: their bins hold equally many of these.
+    """
     edges: int | np.ndarray = bins
     low = math.floor(levels.values.min().item())
     high = levels.values.max().item()

@@ -92,7 +92,10 @@ def preset(model: str, task: str) -> list[str]:
 
 
 def resolve(config: DictConfig) -> dict:
-    """A composed configuration in plain dictionaries, unchecked; baselines' names are expanded."""
+    """A composed configuration in plain dictionaries, unchecked.
+
+    A baseline that is a name alone becomes a mapping with that name.
+    """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except MissingMandatoryValue as error:
@@ -123,7 +126,7 @@ def _missing_value(key: str, model: str) -> str:
 
 
 def _choices(options: Mapping) -> tuple[list[str], dict]:
-    """The command-line words that choose parts, and the values of all other options."""
+    """Command-line words that choose parts, and the other options with plain values."""
     choices, values = [], {}
     for key, value in options.items():
         value = storable(value, key)

@@ -25,6 +25,6 @@ def plugin_conf_dirs() -> list[Path]:
 
 
 def files_of(kind: str, name: str) -> list[Path]:
-    """The configuration files of that kind and name, of gaigs and of plug-ins."""
+    """The existing files ``<kind>/<name>.yaml`` of gaigs and of plug-ins."""
     files = (folder / kind / f"{name}.yaml" for folder in (conf_dir(), *plugin_conf_dirs()))
     return [file for file in files if file.is_file()]

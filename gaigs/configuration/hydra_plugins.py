@@ -76,7 +76,7 @@ class Constructors(ConfigSource):
         return self._component_path(config_path) in self.components
 
     def list(self, config_path: str, results_filter: ObjectType | None) -> list[str]:
-        names: list[str] = [*CONSTRUCTED]
+        names: list[str] = [*CONSTRUCTED]  # the groups, at the root
         if config_path:
             components = self.components.values()
             names = [f"{name}.yaml" for kind, name in components if kind == config_path]
@@ -109,12 +109,12 @@ def installed(*names: str) -> str:
 
 
 def known(kind: str, name: str, otherwise: str) -> str:
-    """The name if a configuration file or a component has it, else the other, as for a task."""
+    """``name`` if a configuration file or a component of the kind has it, else ``otherwise``."""
     return name if files_of(kind, name) or name in registry(kind).names() else otherwise
 
 
 def by_task(values: Mapping, otherwise: object, *, _root_: DictConfig) -> object:
-    """The value of a run's task, by the task's name."""
+    """The value for the run's task among ``values`` by task name, else ``otherwise``."""
     return values.get(_root_.task.name, otherwise)
 
 
@@ -128,7 +128,10 @@ def launcher(name: str) -> str:
 
 
 def install() -> None:
-    """Makes Hydra and OmegaConf know the extensions, at import: launchers' workers need them."""
+    """Registers the extensions with Hydra and OmegaConf.
+
+    It is called at import, since the workers of a launcher need them, too.
+    """
     for resolver in (run_folder, known, by_task, launcher):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)
     OmegaConf.register_new_resolver("installed", installed, replace=True, use_cache=True)

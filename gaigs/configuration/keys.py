@@ -40,9 +40,9 @@ KEYS = {
 
 
 def differences(there: Mapping, here: Mapping, prefix: str = "") -> dict[str, tuple]:
-    """The values of two configurations by the keys in which they differ.
+    """Values of two configurations at the keys in which they differ, without ``HARMLESS`` keys.
 
-    Keys are joined by dots and sorted. A part with another name has the key ``name`` alone.
+    Keys are joined by dots and sorted. Where a part has another name, only its names are compared.
     """
     pairs: dict[str, tuple] = {}
     for key in sorted(there.keys() | here.keys()):
@@ -84,7 +84,7 @@ def check(config: dict) -> None:
 
 
 def _check_task(task: dict) -> None:
-    """Checks the keys of the task and their values."""
+    """Raises a ``TypeError`` or a ``ValueError`` for a wrong key or value of the task."""
     kinds = {"name": str, "trend": dict | None, "baselines": list[dict | str]}
     for key, value in task.items():
         if key not in kinds:
@@ -93,7 +93,14 @@ def _check_task(task: dict) -> None:
 
 
 def option_keys(config: Mapping, parts: Iterable[str], prefix: str = "") -> Iterator[str]:
-    """Full keys of all options of some parts; a reference ${...} to another part is left out."""
+    """Full keys of the options below some keys of a configuration, joined by dots.
+
+    Options that refer to another part by ``${...}`` are left out.
+
+    Args:
+        parts: Keys of ``config``.
+        prefix: Full key of ``config``, with a dot at its end; empty at the top.
+    """
     for part in parts:
         value = config[part]
         if isinstance(value, Mapping) and (not prefix or "name" in value):

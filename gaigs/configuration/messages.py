@@ -21,8 +21,9 @@ def explain(error: Exception) -> str | None:
     is_known = isinstance(error, HydraException | OmegaConfBaseException | ValueError)
     frames = traceback.extract_tb(error.__traceback__)
     is_composing = any(frame.name == "load_configuration" for frame in frames)
-    of_system = isinstance(error, MemoryError) or getattr(error, "errno", None) is not None
-    if not is_known and (of_system or not is_composing):
+    is_system_error = isinstance(error, MemoryError) or getattr(error, "errno", None) is not None
+    # Hydra lets errors of YAML files and of plug-ins through, of any type, while it composes.
+    if not is_known and (is_system_error or not is_composing):
         return None
     cause = error.__cause__
     words = " ".join(str(error).split())

@@ -58,15 +58,15 @@ class Split:
         return torch.cat((self.train, self.validation))
 
     def validating(self) -> "Split":
-        """The split whose test are the validation links, for models that have not seen them."""
+        """The split that tests on the validation links, for models that have not seen them."""
         return replace(self, validation=self.validation[:0], test=self.validation)
 
     def only(self, train: Int[Tensor, " k"]) -> "Split":
-        """The split with some training links, and nothing to validate."""
+        """The split with these training links, and nothing to validate."""
         return replace(self, train=train, validation=self.validation[:0])
 
     def choosing(self, validation: Int[Tensor, " v"]) -> "Split":
-        """The split with other validation links, such as some of its own."""
+        """The split with these validation links."""
         return replace(self, validation=validation)
 
 
@@ -168,7 +168,7 @@ class Links:
             ValueError: All training transmitters stand at one point.
         """
         training = self.query[self.split.train]
-        # A place has a link a receiver: by its key, one of them is found in a tenth of the time.
+        # A place has a link to each receiver. Keys find one of these ten times faster than unique.
         _, first = np.unique(training.place_keys, return_index=True)
         train = training.transmitters[first].unique(dim=0)
         if len(train) < 2:
@@ -255,10 +255,10 @@ def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
     parts = registry("split").build(split, links=links)
     _check_split(parts, len(links))
     if links.held_out is not None:
-        tasks: Any = links.task, links.held_out.task
-        bands = [task.frequencies / 1e9 for task in tasks]
-        at = [f"at {band.min():.7g} .. {band.max():.7g} GHz" for band in bands]
-        parts = replace(parts, name=f"{parts.name}, trained {at[0]}, tested {at[1]}")
+        for verb, task in (("trained", links.task), ("tested", links.held_out.task)):
+            band = task.frequencies / 1e9
+            name = f"{parts.name}, {verb} at {band.min():.7g} .. {band.max():.7g} GHz"
+            parts = replace(parts, name=name)
     links = replace(links, split=parts)
     if links.frame is None:
         check_metres("transmitters", links.query.transmitters.unique(dim=0).double().numpy())
@@ -330,10 +330,9 @@ def check_elements(links: Links) -> None:
 def without_constant(links: Links) -> Links:
     """Channels without constant subcarriers, and then without silent links; remarks count them.
 
-    The same holds for the subcarriers that are held out. If all subcarriers of the links are so,
-    they stay.
+    Links at held-out subcarriers lose theirs, too. Links of constant subcarriers alone stay.
     """
-    both = []
+    both = []  # the links, and the same links at held-out subcarriers
     remarks = [links.remarks]
     for part in filter(None, (links, links.held_out)):
         constant = constant_subcarriers(part)
@@ -364,19 +363,21 @@ def without_constant(links: Links) -> Links:
 
 
 def kept_links(links: Links, kept: Bool[Tensor, " n"]) -> Links:
-    """Some of the links, before a split; receivers stay."""
-    number = kept.cumsum(0) - 1
-    given = links.official
-    official = (
-        None if given is None else lambda: tuple(number[part[kept[part]]] for part in given())
-    )
+    """The links where ``kept`` is true, numbered anew, before a split; all receivers stay."""
+    number = kept.cumsum(0) - 1  # new number of each kept link
+    read_parts: Any = links.official
+
+    def official() -> Parts:
+        train, test = read_parts()
+        return number[train[kept[train]]], number[test[kept[test]]]
+
     return replace(
         links,
         query=links.query[kept],
         labels=links.labels[kept],
         rows=None if links.rows is None else links.rows[kept],
         noises=None if links.noises is None else links.noises[kept],
-        official=official,
+        official=None if read_parts is None else official,
     )
 
 
@@ -384,18 +385,20 @@ def only_trained(links: Links) -> Links:
     """Links to receivers that have training links; a remark names the other receivers."""
     split: Any = links.split
     trained = links.query.receivers[split.train].unique()
-    if split.by_receivers:  # which has places for all that it holds out
+    if split.by_receivers:  # held-out receivers have given places, and are predicted untrained
         trained = links.query.receivers.unique()
     if len(trained) == len(links.receivers):
         return links
+    # New number of each receiver (receivers,); -1 without a training link.
     number = torch.full((len(links.receivers),), -1)
-    number = number.index_copy(0, trained, torch.arange(len(trained)))  # (receivers,), anew
+    number = number.index_copy(0, trained, torch.arange(len(trained)))
     is_kept = number[links.query.receivers] >= 0
     index = is_kept.nonzero()[:, 0]
     groups = None if split.groups is None else split.groups[index]
     parts = {}
     for name, part in links.split.parts().items():
         parts[name] = torch.isin(index, part).nonzero()[:, 0]
+    # About a link a receiver: the receivers are places of an end that moves.
     is_moving = len(links) < 1.5 * len(links.receivers)
     if len(links.split.test) and not len(parts["test"]) and is_moving:
         raise ValueError(

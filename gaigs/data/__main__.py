@@ -59,6 +59,7 @@ def main() -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
+    """The command line: a folder, a data set, and its options."""
     parser = argparse.ArgumentParser(
         prog="python -m gaigs.data",
         description="Simulate a room and write its labels in a layout that gaigs reads.",

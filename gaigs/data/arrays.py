@@ -73,7 +73,8 @@ def from_arrays(
             5400000.0)`` for UTM less that easting and northing; None if unknown.
         height: Height of positions (n, 2) or (k, 2) [m].
         one_radio: True if the receivers are places of one radio that moves, or of radios alike,
-            with one gain. None: of one position a link, see ``gaigs.data.readings.are_one_radio``.
+            with one gain. None: True for receivers at one position a link, see
+            ``gaigs.data.readings.are_one_radio``.
 
     Raises:
         TypeError: An option has a wrong type.
@@ -139,7 +140,7 @@ def _warn_of_untrained(receivers: Sequence[Receiver], trained: Sequence[Receiver
 
 
 def _check_options(bandwidth: Any, frame: Any) -> None:
-    """Raises an error unless a band is one and a frame is a ``Frame``."""
+    """Raises a ``TypeError`` for a wrong frame, and a ``ValueError`` for a wrong bandwidth."""
     if frame is not None:
         check_instance("frame", frame, Frame)
     if bandwidth is not None and not 0 <= bandwidth < math.inf:
@@ -166,7 +167,7 @@ def split_configuration(
 
     Args:
         data: Word for the data in messages, in the plural.
-        reader: Function whose options they have.
+        reader: Function that the user calls; messages list its parameters but the last.
     """
     has_rows = test_rows is not None or train_rows is not None
     split = split or ("official" if has_rows else "random")
@@ -190,21 +191,22 @@ def split_configuration(
 
 
 class _Ends(NamedTuple):
-    """Receivers, the receiver of each link if known, deviations of their places [m], and true if
-    each link has a position.
-    """
+    """Receivers, and how the links belong to them."""
 
     receivers: tuple[Receiver, ...]
-    index: Any
-    uncertainties: Float[Tensor, " k"]
-    is_one_each: bool = False
+    index: Any  # receiver of each link; None if the labels' shape tells
+    uncertainties: Float[Tensor, " k"]  # deviations of the receivers' places [m]
+    is_one_each: bool = False  # True if each link came with a position of its receiver
 
     def are_one_radio(
         self, sent: Int[Tensor, " n"], given: bool | None, remarks: list[str]
     ) -> bool:
-        """True if so ``given``, or if each link has a position that says so, with a remark.
+        """True if the receivers are places of one radio: as ``given``, or by ``are_one_radio``.
 
-        ``sent`` are numbers of the links' places of transmitters.
+        A remark is added where nothing was given.
+
+        Args:
+            sent: Number of each link's transmitter place.
         """
         if given is not None or not self.is_one_each:
             return bool(given)
@@ -225,7 +227,8 @@ def _find_ends(
 ) -> _Ends:
     """The receivers that are given, or made from positions or from the shape of labels."""
     receivers = (receivers,) if isinstance(receivers, Receiver) else receivers
-    if isinstance(receivers, Sequence) and all(isinstance(one, Receiver) for one in receivers):
+    is_list = isinstance(receivers, Sequence)
+    if is_list and all(isinstance(receiver, Receiver) for receiver in receivers):
         receivers = tuple(receivers)
         ends = _Ends(receivers, index, torch.zeros(len(receivers)))
     else:
@@ -252,7 +255,13 @@ def _find_stands(
     height: float,
     task: Task,
 ) -> _Stands:
-    """Receivers by their positions, or by labels of a ``shape`` whose ``columns`` may name them."""
+    """Names and positions of the receivers.
+
+    Args:
+        receivers: Positions; a mapping of them by name; or None for as many receivers without a
+            position as ``index`` or the labels' ``shape`` tells.
+        columns: Names of the labels' columns; empty without names.
+    """
     names = [*columns]
     if isinstance(receivers, Mapping):
         names = names or [*receivers]
@@ -363,7 +372,11 @@ class _LinkArrays(NamedTuple):
 
 
 def _one_a_link(labels: Tensor, index: Any, count: int, receivers: int, task: Task) -> _LinkArrays:
-    """Labels one a link, from (n, ...) with an index, or from (n, k, ...)."""
+    """Row, receiver and label of each link.
+
+    Labels are (n, ...) with an index, or (n, k, ...) for n = ``count`` rows and k = ``receivers``;
+    other shapes are a ``ValueError``.
+    """
     shape = tuple(task.shape)
     rows = torch.arange(count)
     if tuple(labels.shape) == (count, receivers, *shape) and index is None:
@@ -388,7 +401,11 @@ def _one_a_link(labels: Tensor, index: Any, count: int, receivers: int, task: Ta
 
 
 def _received(labels: Tensor, task: Task, remarks: list[str]) -> Bool[Tensor, " m"]:
-    """True for links with a label; NaN, and channels of zeros, were not received."""
+    """True for links that were received: their label is not NaN, and no channel of zeros.
+
+    Raises:
+        ValueError: No link was received, or a label is NaN or infinite in part.
+    """
     flat = labels.reshape(len(labels), -1)
     received = ~flat.isnan().all(1)
     if task.dtype.is_complex:

@@ -20,13 +20,13 @@ from gaigs.io.tables import number_places
 def hold_out_band(
     links: Links, band_train: Sequence[float] | None, band_test: Sequence[float] | None
 ) -> Links:
-    """Channels with the subcarriers of one band, whose ``held_out`` have another band's.
+    """The channels in one band, with the same links in another band as ``held_out``.
 
     Args:
-        band_train: Lowest and highest subcarrier to train and validate on [Hz]; None for all, with
-            none held out.
-        band_test: Lowest and highest subcarrier to test on [Hz], except those to train on; None for
-            all others.
+        band_train: Lowest and highest subcarrier to train and validate on [Hz]. None: all
+            subcarriers, and nothing is held out.
+        band_test: Lowest and highest subcarrier to test on [Hz]; subcarriers of ``band_train`` are
+            left out. None: all others.
 
     Raises:
         ValueError: A band is not two carriers in ascending order, or has no subcarrier.
@@ -71,11 +71,11 @@ def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
     frequencies = torch.cat([part.task.frequencies for part in parts]).unique()  # ascending (s,)
     is_end = frequencies[1:] > gap * frequencies[:-1]  # (s - 1,)
     for part in parts:
-        own = part.task.frequencies.sort().values
-        steps = own.diff()
+        sweep = part.task.frequencies.sort().values
+        steps = sweep.diff()
         # Coarse steps of one sweep, such as of an ultra-wideband sounder, are one band.
-        if len(own) > 3 and steps.max() < 1.01 * steps.min():
-            is_end &= (frequencies[1:] <= own[0]) | (frequencies[:-1] >= own[-1])
+        if len(sweep) > 3 and steps.max() < 1.01 * steps.min():
+            is_end &= (frequencies[1:] <= sweep[0]) | (frequencies[:-1] >= sweep[-1])
     ends = is_end.nonzero()[:, 0]
     if len(parts) == 1 and not len(ends):
         return parts[0]
@@ -123,26 +123,27 @@ def _pieces(
     """The links of each receiver of a part within a band, with labels at all subcarriers."""
     for number, antenna in enumerate(part.receivers):
         receiver = replace(antenna, band=band)
-        own = receiver.hears(part.task.frequencies)
-        is_received = (part.labels[..., own] != 0).flatten(1).any(1)
+        in_part = receiver.hears(part.task.frequencies)
+        is_received = (part.labels[..., in_part] != 0).flatten(1).any(1)
         links = kept_links(part, is_received & (part.query.receivers == number))
         if not len(links):
             continue
-        given = part.task.frequencies[own].sort()
-        heard = receiver.hears(frequencies)
-        if not torch.equal(given.values, frequencies[heard]):
+        given = part.task.frequencies[in_part].sort()
+        in_all = receiver.hears(frequencies)
+        if not torch.equal(given.values, frequencies[in_all]):
             raise ValueError(
                 f"files of one band must have the same subcarriers, got {len(given.values)} of "
-                f"{int(heard.sum())} near {given.values[0] / 1e9:.4g} GHz; join their arrays, or "
+                f"{int(in_all.sum())} near {given.values[0] / 1e9:.4g} GHz; join their arrays, or "
                 "leave the others out"
             )
+        # Channels are 0 outside the receiver's band.
         labels = links.labels.new_zeros(*links.labels.shape[:2], len(frequencies))
-        labels[..., heard] = links.labels[..., own][..., given.indices]
+        labels[..., in_all] = links.labels[..., in_part][..., given.indices]
         yield replace(links, receivers=(receiver,), labels=labels)
 
 
 def _name(receivers: Sequence[Receiver], frequencies: Float[Tensor, " s"] | None) -> list[str]:
-    """Names of receivers by their places and, with frequencies [Hz], by their bands."""
+    """Names ``rx0``, ``rx1`` ... by place and, with frequencies [Hz], by band: ``rx0 2.4 GHz``."""
     places = [receiver.pose.position.tolist() for receiver in receivers]
     names = []
     for receiver, place in zip(receivers, number_places(places)[1], strict=True):
@@ -171,6 +172,7 @@ def _within(task: Csi, option: str, band: Sequence[float]) -> Bool[Tensor, " s"]
 
 
 def _has_signal(links: Links, subcarriers: Bool[Tensor, " s"]) -> Bool[Tensor, " n"]:
+    """True for each link that is not 0 at all of some subcarriers."""
     return links.labels[..., subcarriers].abs().amax((1, 2)) > 0
 
 

@@ -33,6 +33,7 @@ def check_fit(links: Links, scene: Scene | None = None) -> None:
 
 
 def _antennas(receivers: tuple[Receiver, ...]) -> list[tuple]:
+    """What decides a receiver's labels: pose, elements and pattern, without its name."""
     antennas = []
     for receiver in receivers:
         pose = receiver.pose

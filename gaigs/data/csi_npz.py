@@ -27,13 +27,13 @@ from gaigs.registry import listed, register, suggest
 
 
 class Layout(NamedTuple):
-    """Numbers of an array, ``real``, ``whole`` or ``complex``, and its shape.
+    """The expected numbers and shape of an array.
 
     Letters of shapes: n links, k receivers, s subcarriers, e elements, m antennas, p paths.
     """
 
-    kind: str
-    sizes: tuple[str | int, ...]
+    kind: str  # "real", "whole" or "complex"
+    sizes: tuple[str | int, ...]  # sizes of the axes, or letters for any size
 
     def __str__(self) -> str:
         shape = str(self.sizes).replace("'", "")
@@ -111,7 +111,7 @@ def read(
         ValueError: The file has a defect; the message names array, row and value.
     """
     several = not isinstance(file, str | Path)
-    files = [find_file(one, "a file of channels") for one in (file if several else [file])]
+    files = [find_file(path, "a file of channels") for path in (file if several else [file])]
     arrays = arrays or {}
     known = ARRAYS | RESPONSES
     if unknown := [suggest(name, known) for name in arrays if name not in known]:
@@ -126,15 +126,21 @@ def read(
             f"data.file must be one file where data.band_train is given, else one or more, got "
             f"{len(files)}"
         )
-    links = [to_links(one, *_load(one, arrays, parts), phase) for one in files]
+    links = [to_links(path, *_load(path, arrays, parts), phase) for path in files]
     if one_radio is not None:
-        links = [replace(one, one_radio=one_radio) for one in links]
+        links = [replace(part, one_radio=one_radio) for part in links]
     if band_train is None and band_test is None:
         return _with_remark(in_bands(links, band_gap), one_radio)
     return _with_remark(hold_out_band(links[0], band_train, band_test), one_radio)
 
 
 def _with_remark(links: Links, one_radio: bool | None) -> Links:
+    """Links with a remark if their receivers are places of one radio.
+
+    Raises:
+        ValueError: ``one_radio`` is true, but the channels are of several bands, each of which
+            counts as a radio.
+    """
     if one_radio and not links.one_radio:
         raise ValueError("data.one_radio=true takes channels of one band; leave it out")
     added = "; the receivers are places of one radio" if links.one_radio else ""
@@ -224,6 +230,8 @@ def write(folder: str | Path, links: Links) -> None:
     """Writes channels to one receiver as ``room.npz`` in a folder, for ``read``."""
     (receiver,) = links.receivers
     task: Csi = links.task
+    # Offsets of the elements along the world's axes, as the file has no rotation.
+    elements = receiver.array.elements.double() @ receiver.pose.rotation.double().T
     with atomic_write(Path(folder) / "room.npz") as part:
         np.savez(
             part,
@@ -232,7 +240,7 @@ def write(folder: str | Path, links: Links) -> None:
             rx_index=links.query.receivers.numpy(),
             frequencies=task.frequencies.numpy(),
             h=links.labels.numpy(),
-            elements=(receiver.array.elements.double() @ receiver.pose.rotation.double().T).numpy(),
+            elements=elements.numpy(),
         )
 
 
@@ -294,6 +302,7 @@ def _names_in_file(name: str, given: Mapping[str, str | list]) -> list[str]:
 def _read_array(
     content: ArrayFile, names: Sequence[str], layout: Layout, axis: str | None
 ) -> np.ndarray:
+    """An array, or two of real and imaginary part joined; a ``ValueError`` if the file has none."""
     for name in names:
         count = content.names.count(name)
         if count != 1:
@@ -306,7 +315,10 @@ def _read_array(
 
 
 def _from_matlab(array: np.ndarray, layout: Layout) -> np.ndarray:
-    """MATLAB has no vectors, drops a last axis of 1, and stores whole numbers as doubles."""
+    """An array of MATLAB as numpy writes it.
+
+    MATLAB has no vectors, drops a last axis of 1, and stores whole numbers as doubles.
+    """
     axes = len(layout.sizes)
     if axes == 1 and array.size == max(array.shape, default=0):
         array = array.reshape(-1)
@@ -317,7 +329,10 @@ def _from_matlab(array: np.ndarray, layout: Layout) -> np.ndarray:
 
 
 def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raises a ``ValueError`` for other kinds and shapes; the first array with a size fixes it."""
+    """Raises a ``ValueError`` for arrays unlike their layout.
+
+    The first array with a letter in its shape fixes the letter's size.
+    """
     known: dict[object, int] = {}
     kinds = {"real": "iuf", "whole": "iu", "complex": "c"}  # of numpy's data types
     for name, array in arrays.items():
@@ -352,7 +367,11 @@ def _fits(shape: Sequence[int], sizes: Sequence[str | int]) -> bool:
 
 
 def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Converts arrays to the types of the computation."""
+    """Converts arrays in place to the types of the computation.
+
+    Raises:
+        ValueError: A number is NaN or out of range, frequencies repeat, or all channels are 0.
+    """
     dtypes = {"h": np.complex64, "rx_index": np.int64}
     for name, array in arrays.items():
         # Numbers too large for a type become infinite, which fails below.
@@ -374,7 +393,7 @@ def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _rule(name: str, array: np.ndarray, receivers: int) -> tuple[str, np.ndarray]:
-    """The range of an array in words, and True for numbers within it."""
+    """What an array may hold, in words for errors, and True for each number that is allowed."""
     if name == "h":
         low, high = 1e-18, 1e18  # float32 can hold their squares
         sizes = np.abs(array)
@@ -408,7 +427,11 @@ def _require(file: Path, name: str, array: np.ndarray, expected: str, holds: np.
 
 
 def _move_missing_elements_last(file: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Sorts the elements of each receiver, so that labels end with those that it lacks."""
+    """Sorts the elements of each receiver in place: the elements that it lacks come last.
+
+    Raises:
+        ValueError: A receiver has no element, or a channel is not 0 at a lacking one.
+    """
     if arrays.get("elements", np.zeros(0)).ndim < 3:
         return
     missing = np.isnan(arrays["elements"]).all(-1)

@@ -124,7 +124,7 @@ def _columns(table: Table, receivers: Any, ignore: list[str], is_long: bool) -> 
         placed = {}
         for name, position in receivers.items():
             if position is not None:
-                placed[str(name)] = [str(one) for one in np.ravel(position).tolist()]
+                placed[str(name)] = [*map(str, np.ravel(position).tolist())]
         levels = [] if is_long else [str(name) for name in receivers if str(name) in table.names]
         return {"gateways": placed or None, "levels": levels, "ignore": ignore}
     if is_frame(receivers):
@@ -158,7 +158,7 @@ def _coordinates(table: Table, x: Any, y: Any, z: Any) -> list[str] | None:
 
 
 def _in_python(text: str) -> str:
-    """A message with keywords in place of a reader's options."""
+    """A message with Python's keywords in place of command-line options ``data.key=value``."""
     text = re.sub(r"data\.coordinates(=\[x,y\])?", "x=, y= and z=", text)
     text = text.replace("data.gateways", "receivers")
     return re.sub(r"data\.(\w+)=\[?(\w+)\]?", r"\1='\2'", text).replace("data.", "")

@@ -13,7 +13,7 @@ from gaigs.core.task.csi import Csi
 
 
 class FrontEnds(NamedTuple):
-    """Responses of receivers, and what was found."""
+    """Learnt responses of the receivers' front ends."""
 
     # Factors of each receiver's channels, 1 where nothing was learnt.
     responses: Complex[Tensor, "r e s"]

@@ -36,11 +36,11 @@ class Prior:
 
 
 class Laws(NamedTuple):
-    """Laws constant + slope log10(distance), by correlation and candidate, with their evidence."""
+    """Laws constant + slope log10(distance) for c correlations and g candidate places."""
 
-    evidence: Float[Tensor, "c g"]
-    slopes: Float[Tensor, "c g"]
-    constants: Float[Tensor, "c g"]
+    evidence: Float[Tensor, "c g"]  # log likelihood, up to a constant
+    slopes: Float[Tensor, "c g"]  # [dB per decade]
+    constants: Float[Tensor, "c g"]  # [dBm]
 
 
 def estimate_place(
@@ -68,8 +68,9 @@ def estimate_place(
     high = high + low.new_tensor([margin, margin, prior.above])
     apart = torch.cdist(places, places)
     apart = apart / max(1.0, extent / prior.site)
-    parts = [share * (-apart / length).exp() for length, share in prior.correlations]
-    shadowing = torch.stack(parts)  # (c, n, n)
+    # Gudmundson: shadowing is correlated by exp(-distance / length); the rest is noise.
+    correlated = [share * (-apart / length).exp() for length, share in prior.correlations]
+    shadowing = torch.stack(correlated)  # (c, n, n)
     shadowing.diagonal(dim1=1, dim2=2).fill_(1)
     factors = torch.linalg.cholesky(shadowing)
     lower, upper = low, high
@@ -109,8 +110,10 @@ def _fit_laws(
     """
     columns = torch.cat((torch.ones_like(levels)[:, None], levels[:, None], decades), 1)
     columns = columns.expand(len(factors), -1, -1)  # (c, n, 2 + g)
+    # Whitened by the Cholesky factors, generalised least squares become ordinary ones.
     white = torch.linalg.solve_triangular(factors, columns, upper=False)
-    one, level, logs = white[:, :, :1], white[:, :, 1:2], white[:, :, 2:]
+    one, level, logs = white.tensor_split([1, 2], dim=2)
+    # The prior of the slope as an observation of this weight; the constant has none.
     weight = (prior.shadowing / prior.slope_deviation) ** 2
     ones = one.square().sum(1)  # (c, 1)
     mixed = (one * logs).sum(1)  # (c, g)

@@ -35,10 +35,10 @@ def read_polygons(file: Path, frame: Frame | None, mend: str) -> list[tuple[Ring
         ) from error
     if not polygons:
         raise ValueError(f"{file} has no polygon\n{mend} as Polygon or MultiPolygon")
-    found = []
+    in_metres = []
     for rings, properties in polygons:
-        found.append(([_in_metres(file, ring, frame, mend) for ring in rings], properties))
-    return found
+        in_metres.append(([_in_metres(file, ring, frame, mend) for ring in rings], properties))
+    return in_metres
 
 
 def read_buildings(
@@ -77,7 +77,7 @@ def _number(value: object, missing: float | None) -> float | None:
 
 
 def _features(content: Any, properties: dict) -> Iterator[tuple[Rings, dict]]:
-    """The polygons of a GeoJSON object, at any depth."""
+    """The polygons within a GeoJSON object, at any depth, with the properties of their features."""
     match content["type"]:
         case "FeatureCollection":
             parts = content["features"]
@@ -87,7 +87,7 @@ def _features(content: Any, properties: dict) -> Iterator[tuple[Rings, dict]]:
             parts = [content["geometry"]] if content["geometry"] else []
             properties = content.get("properties") or {}
         case "MultiPolygon":
-            parts = [{"type": "Polygon", "coordinates": one} for one in content["coordinates"]]
+            parts = [{"type": "Polygon", "coordinates": rings} for rings in content["coordinates"]]
         case "Polygon":
             rings = [np.array(ring, dtype=float) for ring in content["coordinates"]]
             yield rings, properties
@@ -101,7 +101,10 @@ def _features(content: Any, properties: dict) -> Iterator[tuple[Rings, dict]]:
 def _in_metres(
     file: Path, ring: Float[ndarray, "k d"], frame: Frame | None, mend: str
 ) -> Float[ndarray, "k 3"]:
-    """Positions in the room's metres; the height is NaN where there is none."""
+    """Positions in the world frame [m]; a missing height is NaN.
+
+    Positions with a frame are longitude and latitude if they can be, else easting and northing.
+    """
     if ring.ndim != 2 or ring.shape[1] not in (2, 3) or not np.isfinite(ring).all():
         raise ValueError(f"{file}: a position must be two or three finite numbers")
     x, y = ring[:, 0], ring[:, 1]

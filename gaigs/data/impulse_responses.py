@@ -52,8 +52,8 @@ def lacks_carrier(
 ) -> bool:
     """True if gains of lines of sight are without the phase of their delay at the carrier.
 
-    Ray tracers may give gains so; all phases are then alike. Fewer than ten lines of sight leave it
-    to ``otherwise``.
+    Some ray tracers give such gains; all phases are then alike. With fewer than ten lines of sight
+    the answer is ``otherwise``.
     """
     if len(fields) < 10:
         return otherwise
@@ -95,7 +95,7 @@ def from_sionna(
     responses = _with_fixed_end(_without_missing_delays(_to_responses(arrays), needs_delays))
     tx = responses.tx
     rx = responses.rx
-    # Links run over the transmitters, and over the receivers of each.
+    # Links are sorted by transmitter, then by receiver.
     gains = _by_links(responses.gains)  # (links, e, p)
     delays = _by_links(responses.delays)
     subcarriers = arrays["frequencies"]
@@ -103,7 +103,7 @@ def from_sionna(
     frequencies = subcarriers + (carrier if is_relative else 0.0)
     distances = np.linalg.norm(tx[:, None] - rx, axis=2).reshape(-1)  # (links,)
 
-    # The element next to the receiver's position.
+    # Distances count from the receiver's position: its nearest element stands for the array.
     near = 0
     if "elements" in arrays and arrays["elements"].ndim == 2:
         near = int(np.linalg.norm(arrays["elements"], axis=1).argmin())
@@ -131,6 +131,7 @@ def from_sionna(
 
 
 def _read_carrier(arrays: Mapping[str, np.ndarray]) -> float:
+    """The carrier [Hz]; a ``ValueError`` also for other arrays that are not real."""
     for name, array in arrays.items():
         if name != "a" and array.dtype.kind not in "iuf":
             raise ValueError(f"{name}: expected real numbers, got {array.dtype}")
@@ -142,7 +143,7 @@ def _read_carrier(arrays: Mapping[str, np.ndarray]) -> float:
 
 
 def _to_responses(arrays: Mapping[str, np.ndarray]) -> Responses:
-    """Impulse responses of arrays, once their shapes are checked; gains become complex."""
+    """Impulse responses of arrays; real and imaginary part are joined, and shapes are checked."""
     a, tau, tx, rx = (arrays[name] for name in ("a", "tau", "tx", "rx"))
     if a.dtype.kind == "f" and a.ndim == 7 and len(a) == 2:
         a = a[0] + 1j * a[1]
@@ -167,7 +168,7 @@ def _to_responses(arrays: Mapping[str, np.ndarray]) -> Responses:
 
 
 def _without_missing_delays(responses: Responses, needs_delays: bool) -> Responses:
-    """Checked delays, 0 where a path is missing."""
+    """Responses with delays of 0 where a path is missing; a ``ValueError`` for wrong delays."""
     gains = responses.gains
     exists = gains != 0
     delays = np.where(exists, responses.delays, 0)
@@ -185,7 +186,11 @@ def _without_missing_delays(responses: Responses, needs_delays: bool) -> Respons
 
 
 def _with_fixed_end(responses: Responses) -> Responses:
-    """Receivers at the end with fewer places; the transmitters have one antenna each."""
+    """Responses whose receivers are the end with fewer places.
+
+    Raises:
+        ValueError: The other end has several antennas at a place.
+    """
     gains, delays, tx, rx = responses
     if len(tx) < len(rx):
         gains = gains.transpose(2, 3, 0, 1, 4)
@@ -198,7 +203,7 @@ def _with_fixed_end(responses: Responses) -> Responses:
 
 
 def _by_links(array: ndarray) -> ndarray:
-    """Rows by transmitters, and receivers of each, from the first of a transmitter's antennas."""
+    """Values (k, e, n, m, p) as (n x k, e, p), of the first antenna m of each transmitter n."""
     single = array[:, :, :, 0]  # (k, e, n, p)
     by_links = single.transpose(2, 0, 1, 3)  # (n, k, e, p)
     return by_links.reshape(-1, *by_links.shape[2:])

@@ -21,10 +21,10 @@ def links(source: Any = None, /, **options: Any) -> Links:
             ``"rssi_csv"``; a data frame of levels [dBm], or a mapping of its columns; ``Paths`` or
             a ``RadioMap`` of Sionna RT; None for arrays.
         options: Options of reader and split by their names, and ``split``, the name of a registered
-            split. For a data frame those of ``gaigs.data.frames.from_frame``: ``x``, ``y``, ``z``,
-            ``receivers``. For Sionna RT those of ``gaigs.data.sionna_rt.from_sionna_rt``:
-            ``frequencies``. For arrays those of ``gaigs.data.arrays.from_arrays``: ``task``,
-            ``transmitters`` (n, 3) [m], ``receivers``, ``labels``.
+            split. For a data frame such as ``x``, ``y``, ``z`` and ``receivers``, see
+            ``gaigs.data.frames.from_frame``. For Sionna RT such as ``frequencies``, see
+            ``gaigs.data.sionna_rt.from_sionna_rt``. For arrays such as ``task``, ``transmitters``
+            (n, 3) [m], ``receivers`` and ``labels``, see ``gaigs.data.arrays.from_arrays``.
 
     Raises:
         FileNotFoundError: The reader finds no data.

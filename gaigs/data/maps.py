@@ -10,7 +10,7 @@ from gaigs.core.geometry import is_utm
 
 
 def find_pyproj() -> Any:
-    """The module, for coordinate systems; an ``ImportError`` if it is not installed."""
+    """The module pyproj; an ``ImportError`` with the command to install it where it is missing."""
     try:
         import pyproj
     except ImportError:
@@ -51,10 +51,10 @@ def are_degrees(points: Float[ndarray, "n d"]) -> bool:
         return False
     x, y = np.abs(points[:, :2]).max(0)
     span = np.ptp(points[:, :2], axis=0).max()
-    rests = np.abs(points[:, :2] - points[:, :2].round(4))
     is_on_earth = max(x, y) <= 180 and min(x, y) <= 90
     is_small = 0 < span < min(0.3, max(x, y) / 100)
-    return bool(is_on_earth and is_small and (rests > 1e-5).mean() > 0.3)
+    beyond_four = np.abs(points[:, :2] - points[:, :2].round(4))  # the fifth decimal and further
+    return bool(is_on_earth and is_small and (beyond_four > 1e-5).mean() > 0.3)
 
 
 def check_metres(

@@ -152,6 +152,7 @@ def _check_elements(elements: object) -> None:
 
 
 def _read_receiver(file: Path) -> Receiver:
+    """The one gateway of a file, with a single antenna; a ``ValueError`` for none or several."""
     expected = "one gateway with position [m] and orientation (quaternion x, y, z, w)"
     entries = read_mapping(file, expected).items()
     gateways = [(name, pose) for name, pose in entries if isinstance(pose, dict)]
@@ -185,7 +186,7 @@ def _read_frequencies(file: Path, count: int) -> Float[Tensor, " n"]:
 
 
 def _find_images(root: Path, count: int) -> list[Path]:
-    """The image of each position; a ``ValueError`` where one is missing, too many or twice."""
+    """The image of each position; a ``ValueError`` if images are missing, repeated or too many."""
     folder = root / "spectrum"
     names = [f"{number:05d}.png" for number in range(1, count + 1)]
     images: dict[str, list[Path]] = {}

@@ -27,16 +27,21 @@ def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiv
 
 
 def are_one_radio(places: int, links: int, sent: int, given: bool | None = None) -> bool:
-    """True if receivers at some places are one radio that moves, or radios alike.
+    """True if the receivers are places of one radio that moves, or of radios alike.
 
-    Without a word of the user, 12 places or more are that have fewer than 12 links each. A place of
-    a survey hears several access points: of ``sent`` places of transmitters each has fewer than two
-    links, or they are beacons, at most a quarter of the receivers' places.
+    Args:
+        places: Number of places of receivers: 12 or more for one radio, of less than 12 links each.
+        links: Number of links.
+        sent: Number of places of transmitters. For one radio each has less than two links; or they
+            are few beacons, at most a quarter of ``places``. In a survey of access points a place
+            has several links.
+        given: The user's answer, which counts; None without one.
     """
     if given is not None:
         return given
-    are_pairs = links < 2 * sent or 4 * sent <= places
-    return 12 <= places and links < 12 * places and are_pairs
+    has_few_links = links < 2 * sent
+    are_beacons = 4 * sent <= places
+    return 12 <= places and links < 12 * places and (has_few_links or are_beacons)
 
 
 def to_dbm(
@@ -78,7 +83,10 @@ def marks_given(not_heard: float | Sequence[float]) -> list[float]:
 
 
 def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
-    """The known name of each name: the same, or the only one alike in letters and digits."""
+    """The known name for each name: the same, or the only one with the same letters and digits.
+
+    Names without a match are left out.
+    """
 
     def plain(name):
         return re.sub(r"[\s_:-]", "", name.casefold())
@@ -96,7 +104,7 @@ def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
 
 
 def suggested(name: str, others: Iterable[str]) -> str:
-    """A name, with the most similar one of others that have the same digits."""
+    """A name in quotes, with the most similar other name of the same digits, if there is one."""
     digits = re.findall(r"\d+", name)
     return suggest(name, [other for other in others if re.findall(r"\d+", other) == digits])
 
@@ -125,19 +133,20 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     usual = (100.0, 127.0, -200.0, -999.0)
     marks = values[outside & ((counts > 1) | np.isin(values, usual))].tolist()
     values, counts = values[~outside], counts[~outside]
+    # Loud marks: 0, and repeated values, far above all levels.
     loud = values >= -1
     if 0 < loud.sum() <= min(3, len(values) - 1) and values[loud][0] > values[~loud][-1] + 10:
         marks += values[loud & ((counts > 1) | (values == 0))].tolist()
     lowest = float(values.min(initial=0))
     inside = np.where((levels >= QUIETEST) & (levels <= LOUDEST), levels, np.nan)
     has_several = [len(np.unique(column[~np.isnan(column)])) > 1 for column in inside.T]
-    inside = inside[:, has_several]
+    inside = inside[:, has_several]  # a column of one value tells nothing
     marks += _usual_marks(inside, lowest)
     return marks + _lowest_marks(inside, marks)
 
 
 def _usual_marks(levels: Float[ndarray, "n k"], lowest: float) -> list[float]:
-    """Usual values, or the lowest, that are far from other levels or far more frequent."""
+    """Marks among usual values and the ``lowest`` one: far from other levels, or more frequent."""
     usual = (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)  # marks of "not heard" [dBm]
     values, counts = np.unique(levels[~np.isnan(levels)], return_counts=True)
     marks = []

@@ -83,9 +83,9 @@ def read(
     numbered = {end: tables.number_places(points[end]) for end in ENDS}
     fixed = fixed or ("rx" if len(numbered["rx"][0]) <= len(numbered["tx"][0]) else "tx")
     moving = "tx" if fixed == "rx" else "rx"
-    places, at = numbered[fixed]
+    places, place_numbers = numbered[fixed]
     received = torch.tensor([value not in marks for value in dbm])
-    present, receivers = at[received].unique(return_inverse=True)
+    present, receivers = place_numbers[received].unique(return_inverse=True)
     transmitters = torch.tensor(points[moving])[received]
     one_radio = are_one_radio(
         len(present), len(transmitters), len(transmitters.unique(dim=0)), one_radio
@@ -147,12 +147,14 @@ def _read_table(file: Path, marks: list[float]) -> tuple[dict[str, list], list[f
                 f"{file}, line 1: expected one column {name}, got {count} in "
                 f"{tables.quote(lines[0])}"
             )
-    at = [names.index(name) for name in COLUMNS]
-    everything = tables.split_rows(file, lines, names, 1, delimiter)
-    rows = {number: [cells[k] for k in at] for number, cells in everything.items()}
-    ends = {number: cells[:6] for number, cells in rows.items()}
+    columns = [names.index(name) for name in COLUMNS]
+    ends = {}
+    levels = {}
+    for number, cells in tables.split_rows(file, lines, names, 1, delimiter).items():
+        chosen = [cells[column] for column in columns]
+        ends[number] = chosen[:6]
+        levels[number] = chosen[6:]
     positions = tables.to_coordinates(file, ends, COLUMNS)
-    levels = {number: cells[6:] for number, cells in rows.items()}
     mend = "list them in data.not_heard"
     readings = to_dbm(file, levels, COLUMNS[6:], QUIETEST, marks, mend)
     dbm = [value for (value,) in readings]

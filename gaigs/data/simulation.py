@@ -251,7 +251,7 @@ def draw_places(
     count: int,
     seed: int,
 ) -> Float[Tensor, "count 3"]:
-    """Two or more random places [m], uniform over the free part of a box."""
+    """Random places [m], two or more, uniform over the free part of a box."""
     if count < 2:
         raise ValueError(
             f"transmitters must be at least 2, one to train and one to test on, got {count}"
@@ -271,7 +271,10 @@ def draw_places(
 
 
 def sample_band(bandwidth: float, longest: float) -> Float[Tensor, " f"]:
-    """Frequencies about a band's middle [Hz] that alias no beat of paths up to a length [m]."""
+    """Frequencies of a band relative to its middle [Hz], for paths of up to ``longest`` [m].
+
+    They are dense enough that the interference of two paths is not aliased.
+    """
     if not 0 < bandwidth < math.inf:
         raise ValueError(
             f"bandwidth must be positive [Hz], got {bandwidth}; "

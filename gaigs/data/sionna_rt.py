@@ -21,7 +21,7 @@ def is_traced(source: object) -> bool:
 
 
 def _has(source: object, *names: str) -> bool:
-    # Of the class: attributes of a traced object are computed when they are read.
+    """True if the class of an object has all attributes: an object computes them when asked."""
     return all(hasattr(type(source), name) for name in names)
 
 
@@ -49,8 +49,8 @@ def from_sionna_rt(
         receivers: Positions of a radio map's transmitters (k, 3) [m], or by name. None: those that
             the object keeps.
         elements: Offsets of the receiver array's elements along the world's axes (e, 3) [m]. None:
-            those of the array, of paths with ``synthetic_array`` in a device without an
-            orientation; unknown if several antennas share an element.
+            the object's; paths with ``synthetic_array`` count as of a device that is not turned.
+            They are unknown if several antennas share an element.
         phase: See ``gaigs.core.task.csi.Csi``.
         split: Name of a registered split, ``options`` are its own; None: ``random``.
 
@@ -76,9 +76,12 @@ def from_sionna_rt(
     # (k, e, n, m, p, 1): fields with the carrier's phase, which ``Paths.a`` lacks.
     gains, delays = source.cir(normalize_delays=False, out_type="numpy")
     if frequencies is None:
-        levels = _decibels(np.square(np.abs(gains[..., 0])).sum(-1).mean((1, 3)))  # (k, n)
-        few, many, levels = (rx, tx, levels.T) if len(rx) <= len(tx) else (tx, rx, levels)
-        ends = {"transmitters": many.mean(1), "receivers": few.mean(1)}
+        powers = np.square(np.abs(gains[..., 0])).sum(-1)  # (k, e, n, m)
+        levels = _decibels(powers.mean((1, 3)))  # (k, n)
+        ends = {"transmitters": rx.mean(1), "receivers": tx.mean(1)}
+        if len(rx) <= len(tx):
+            ends = {"transmitters": tx.mean(1), "receivers": rx.mean(1)}
+            levels = levels.T
         return from_arrays("rssi", labels=levels, frequency=carrier, split=config, **ends)
     arrays = {
         "a": gains,
@@ -90,8 +93,10 @@ def from_sionna_rt(
     }
     offsets = _elements(source, rx, tx, carrier) if elements is None else np.array(elements, float)
     count = gains.shape[1 if len(rx) <= len(tx) else 3]
+    # With two polarisations several antennas share an element.
     is_known = elements is not None or count == offsets.shape[1] > 1
-    arrays |= {"elements": offsets} if is_known else {}
+    if is_known:
+        arrays["elements"] = offsets
     links = divide(to_links(Path("paths"), arrays, [], phase), config)
     if not is_known or elements is not None or not source.synthetic_array:
         return links
@@ -102,7 +107,11 @@ def from_sionna_rt(
 def _elements(
     source: Any, rx: Float[ndarray, "k e 3"], tx: Float[ndarray, "n m 3"], carrier: float
 ) -> Float[ndarray, "r a 3"]:
-    """Offsets of the antennas of the end with fewer places [m], its array's if it is synthetic."""
+    """Offsets of the antennas from their device [m], at the end of the links with fewer devices.
+
+    Without a synthetic array, paths are traced to each antenna, whose place is then known. Else
+    all devices have the antennas of the scene's array.
+    """
     fixed, array = (rx, source.rx_array) if len(rx) <= len(tx) else (tx, source.tx_array)
     if not source.synthetic_array:
         return fixed - fixed.mean(1, keepdims=True)
@@ -119,9 +128,9 @@ def _of_map(source: Any, receivers: Any, carrier: float | None, config: Mapping)
                 "a radio map of this Sionna RT keeps no places of transmitters; set receivers, "
                 "positions (k, 3) [m]"
             )
-        stands = _places(source._tx_positions, levels.shape[1])[:, 0]  # (k, 3)
-        names = getattr(source, "_tx_names", range(len(stands)))
-        receivers = {str(name): stand for name, stand in zip(names, stands.tolist(), strict=True)}
+        positions = _places(source._tx_positions, levels.shape[1])[:, 0]  # (k, 3)
+        names = map(str, getattr(source, "_tx_names", range(len(positions))))
+        receivers = dict(zip(names, positions.tolist(), strict=True))
     cells = np.array(source.cell_centers, float).reshape(-1, 3)
     return from_arrays(
         "rssi",
@@ -134,12 +143,12 @@ def _of_map(source: Any, receivers: Any, carrier: float | None, config: Mapping)
 
 
 def _places(points: Any, count: int) -> Float[ndarray, "k e 3"]:
-    """Positions of the antennas of each end; of a synthetic array its middle alone."""
+    """Positions of the e antennas at ``count`` places, from (3, count * e) of Sionna RT."""
     return np.array(points, float).reshape(3, -1).T.reshape(count, -1, 3)
 
 
 def _decibels(powers: Float[ndarray, "*shape"]) -> Float[ndarray, "*shape"]:
-    """Powers in decibels, NaN for none."""
+    """Powers in decibels; NaN for a power of 0."""
     with np.errstate(divide="ignore"):
         levels = 10 * np.log10(powers)
     return np.where(powers > 0, levels, np.nan)

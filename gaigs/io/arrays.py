@@ -19,7 +19,7 @@ class ArrayFile(NamedTuple):
 
 
 class ArrayFormat(NamedTuple):
-    """A format of files."""
+    """A format of files of arrays."""
 
     # Opens a file as a context manager.
     open: Callable[[Path], contextlib.AbstractContextManager[ArrayFile]]
@@ -42,6 +42,7 @@ def array_format(file: Path) -> ArrayFormat:
 
 @contextlib.contextmanager
 def _open_npz(file: Path) -> Iterator[ArrayFile]:
+    """An .npz file; a ``ValueError`` if it is a single array, or when a damaged array is read."""
     # Opened here, since numpy leaves a damaged file open; it warns of headers written by Python 2.
     with file.open("rb") as stream, warnings.catch_warnings(action="ignore"):
         content = np.load(stream, allow_pickle=False)
@@ -71,6 +72,7 @@ def _open_mat(file: Path) -> Iterator[ArrayFile]:
 
 @contextlib.contextmanager
 def _open_hdf5(file: Path) -> Iterator[ArrayFile]:
+    """An HDF5 file, such as MATLAB's from version 7.3 on; an ``ImportError`` without h5py."""
     try:
         import h5py
     except ModuleNotFoundError as error:
@@ -78,7 +80,8 @@ def _open_hdf5(file: Path) -> Iterator[ArrayFile]:
     with h5py.File(file, "r") as content:
         names: list[str] = []
 
-        def note(name: str, item: object) -> None:
+        def note_array(name: str, item: object) -> None:
+            # MATLAB keeps the entries of cell arrays below #refs#.
             if isinstance(item, h5py.Dataset) and not name.startswith("#refs#"):
                 names.append(name)
 
@@ -90,5 +93,5 @@ def _open_hdf5(file: Path) -> Iterator[ArrayFile]:
             # MATLAB's arrays have reversed axes, and an attribute.
             return array.T if "MATLAB_class" in content[name].attrs else array
 
-        content.visititems(note)
+        content.visititems(note_array)
         yield ArrayFile(names, read)

@@ -125,7 +125,11 @@ def _set_parameters(number: int, name: str, points: int, active: int) -> dict:
 
 
 def _matrices(users: Float[np.ndarray, "n 3"], station: Station) -> dict[str, np.ndarray]:
-    """All matrices of one base station, strongest paths first; NaN where there is no path."""
+    """The arrays of one base station by DeepMIMO's names, strongest paths first.
+
+    ``power`` [dB], ``phase`` [deg], ``delay`` [s], angles [deg] and ``inter`` are (n, p);
+    ``inter_pos`` [m] is (n, p, k, 3). They are NaN where there is no path.
+    """
     order = np.argsort(-np.abs(station.fields), axis=1, kind="stable")  # (n, p)
     fields = np.take_along_axis(station.fields, order, 1)
     bounces = np.take_along_axis(station.bounces, order[..., None, None], 1)  # (n, p, k, 3)
@@ -147,11 +151,11 @@ def _matrices(users: Float[np.ndarray, "n 3"], station: Station) -> dict[str, np
         "delay": np.linalg.norm(legs, axis=-1).sum(2) / speed_of_light,
         "inter": (10.0**count - 1) / 9,  # a digit of 1 for each reflection
     }
-    # Arrivals and departures both point away from their end.
+    # Arrivals and departures both point away from their end. Elevations count from the z axis.
     for end, ray in (("aoa", -last), ("aod", legs[:, :, 0])):
-        level = np.hypot(ray[..., 0], ray[..., 1])
+        horizontal = np.hypot(ray[..., 0], ray[..., 1])
         matrices[f"{end}_az"] = np.rad2deg(np.arctan2(ray[..., 1], ray[..., 0]))
-        matrices[f"{end}_el"] = np.rad2deg(np.arctan2(level, ray[..., 2]))
+        matrices[f"{end}_el"] = np.rad2deg(np.arctan2(horizontal, ray[..., 2]))
     matrices = {key: np.where(exists, array, np.nan) for key, array in matrices.items()}
     matrices["inter_pos"] = np.where(exists[..., None, None], bounces, np.nan)
     return matrices | {"rx_pos": users, "tx_pos": station.position[None]}

@@ -15,8 +15,8 @@ LOCK = ".lock"
 def atomic_write(path: str | Path) -> Iterator[Path]:
     """Yields a temporary path with the same ending, which replaces the file once it is on the disk.
 
-    Each writer has a path of its own: of several the last replaces the file. If writing fails or is
-    interrupted, the temporary file is removed and the old file stays.
+    Several writers do not disturb each other; the last one to end replaces the file. If writing
+    fails or is interrupted, the temporary file is removed and the old file stays.
     """
     path = Path(path)
     part = path.with_name(f"{path.stem}.gaigs-{secrets.token_hex(4)}.part{path.suffix}")
@@ -37,9 +37,8 @@ def atomic_write(path: str | Path) -> Iterator[Path]:
         if not isinstance(error, OSError):
             raise
         message = _unwritten(path, error)
-        raise (
-            OSError(message) if error.errno is None else OSError(error.errno, message)
-        ) from error
+        arguments = [message] if error.errno is None else [error.errno, message]
+        raise OSError(*arguments) from error
 
 
 def remove_parts(folder: Path) -> None:
@@ -55,7 +54,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def file_message(error: OSError, folder: Path) -> str:
-    """The message of a file's error, of a plain system error with file, cause and remedy."""
+    """The message for an ``OSError``: gaigs's own, or file, cause and remedy of a system error."""
     if error.errno is None or error.strerror != os.strerror(error.errno):
         return str(error.strerror or error)
     path = error.filename or f"a file in {folder}"
@@ -69,6 +68,7 @@ def file_message(error: OSError, folder: Path) -> str:
 
 
 def _unwritten(path: object, error: OSError) -> str:
+    """The message for a file that could not be written: cause and remedy."""
     cause = error.strerror or error
     return (
         f"{path} could not be written ({cause})\n"

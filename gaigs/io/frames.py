@@ -23,7 +23,7 @@ def is_frame(value: object) -> bool:
 
 
 def _is_exchanged(value: object) -> bool:
-    """True for a frame of any library that others can convert."""
+    """True for a frame with Arrow's stream or the data frame interchange protocol."""
     return hasattr(value, "__arrow_c_stream__") or hasattr(value, "__dataframe__")
 
 
@@ -54,16 +54,19 @@ def read_frame(frame: Any, name: str = "data frame") -> Table:
 
 
 def _read_columns(frame: Any, name: str) -> tuple[list[str], list[ndarray]]:
-    """Names and columns of a frame."""
+    """Names of a frame's columns, and the columns; no columns if two have one name."""
     if not isinstance(frame, Mapping) and not hasattr(frame, "column_names"):
         # pandas: a pivoted table has its places in the index.
         index = getattr(getattr(frame, "index", None), "names", [])
         levels = [level for level in index if level is not None and level not in frame.columns]
         frame = frame.reset_index(level=levels) if levels else frame
     keys = _keys(frame)
+    # Columns that numpy cannot read go through pyarrow.
     if keys and not isinstance(frame, Mapping) and not hasattr(frame[keys[0]], "__array__"):
         keys = []
-    if not keys and _is_exchanged(frame) and len(getattr(frame, "columns", "?")):
+    # A frame that lists no columns may have some; an empty list has none to convert.
+    is_empty = len(getattr(frame, "columns", "?")) == 0
+    if not keys and _is_exchanged(frame) and not is_empty:
         frame = _by_pyarrow(frame)
         keys = _keys(frame)
     names = [str(key) for key in keys]
@@ -79,7 +82,7 @@ def _read_columns(frame: Any, name: str) -> tuple[list[str], list[ndarray]]:
 
 
 def _keys(frame: Any) -> list:
-    """Names of columns, as the frame writes them; empty if it does not."""
+    """Keys of a frame's columns, text or not; empty if the frame lists none."""
     if isinstance(frame, Mapping):
         return [*frame]
     if hasattr(frame, "column_names") and not callable(frame.column_names):
@@ -88,7 +91,7 @@ def _keys(frame: Any) -> list:
 
 
 def _by_pyarrow(frame: Any) -> Any:
-    """The table of pyarrow of a frame that has the PyCapsule or the interchange protocol."""
+    """A frame for which ``_is_exchanged`` is true, as a table of pyarrow."""
     try:
         import pyarrow
         from pyarrow import interchange

@@ -15,7 +15,7 @@ from torch import Tensor
 class GreyImages:
     """PNGs of grey values (rows, columns), decoded when first requested and then kept.
 
-    They take one or two bytes a pixel. 8-bit values count in 255, 16-bit ones in 65535. Colour
+    A pixel takes one or two bytes; white is 255 in 8-bit images and 65535 in 16-bit ones. Colour
     images have equal channels, and no pixel is transparent.
     """
 
@@ -53,8 +53,9 @@ class GreyImages:
             scale = 257 if dtype == np.uint16 and grey.dtype == np.uint8 else 1  # 255 is 65535
             self._pixels[k] = grey.astype(dtype) * dtype.type(scale)
             self._decoded[k] = True
-        most = np.iinfo(self._pixels.dtype).max
-        return torch.from_numpy(self._pixels[indices.numpy()].astype(np.float32) / np.float32(most))
+        white = np.float32(np.iinfo(self._pixels.dtype).max)
+        pixels = self._pixels[indices.numpy()].astype(np.float32)  # (k, rows, columns)
+        return torch.from_numpy(pixels / white)
 
 
 def _grey(file: Path, image: Image.Image) -> UInt[np.ndarray, "rows columns"]:

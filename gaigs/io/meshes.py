@@ -100,7 +100,10 @@ def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3
 
 
 def _joined(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]]:
-    """Lines with their last number; those that end in a backslash are joined with the next one."""
+    """Numbers and texts of lines; a line that ends in a backslash is joined with the next one.
+
+    A joined line has the number of its last part, from 1.
+    """
     begun = ""
     number = 0
     for number, part in enumerate(lines, 1):
@@ -116,6 +119,7 @@ def _joined(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]]:
 
 
 def _vertex(words: Sequence[str]) -> list[float]:
+    """The position [m] of a line ``v x y z``; a ``ValueError`` says what was expected."""
     if len(words) < 3 or not all(map(NUMBER.fullmatch, words[:3])):
         raise ValueError("numbers x y z")
     point = [float(word) for word in words[:3]]
@@ -125,7 +129,10 @@ def _vertex(words: Sequence[str]) -> list[float]:
 
 
 def _face(words: Sequence[str], count: int) -> Face:
-    """Vertices of a face among the ``count`` before it."""
+    """Vertices, from 0, of a line ``f i j k`` with ``count`` vertices before it.
+
+    A ``ValueError`` says what was expected.
+    """
     try:
         numbers = [int(word.split("/")[0]) for word in words]
     except ValueError:

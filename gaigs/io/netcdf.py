@@ -12,7 +12,10 @@ from gaigs.io.files import atomic_write
 
 
 class Variable(NamedTuple):
-    """Real numbers or texts, a name for each dimension, and attributes of the CF conventions."""
+    """A variable of a NetCDF file: real numbers or texts, with attributes by the CF conventions.
+
+    ``dimensions`` has a name for each axis of ``values``.
+    """
 
     dimensions: tuple[str, ...]
     values: ndarray
@@ -44,5 +47,6 @@ def write_netcdf(
 
 
 def _describe(part: Any, attributes: Mapping[str, Any]) -> None:
+    """Gives attributes to a file or a variable; texts as UTF-8."""
     for key, value in attributes.items():
         setattr(part, key, value.encode() if isinstance(value, str) else value)

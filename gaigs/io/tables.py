@@ -40,7 +40,7 @@ def quote(value: object) -> str:
 
 
 def shortened(names: Sequence[str], most: int = 10) -> str:
-    """Names joined by commas; of many the first, and the number of the others."""
+    """Names joined by commas: the first ``most`` of them, then the number of the others."""
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more
 
@@ -167,7 +167,10 @@ def split_cells(line: str, delimiter: str = ",") -> list[str]:
 def split_rows(
     file: Path, lines: Sequence[str], names: Sequence[str], skip: int, delimiter: str
 ) -> dict[int, list[str]]:
-    """Cells of all lines but the first few, one a name. A comma that separates none is decimal."""
+    """Cells of each line after the first ``skip``; a ``ValueError`` unless a line has one a name.
+
+    Where another mark separates the cells, commas are decimal ones.
+    """
     rows: dict[int, list[str]] = {}
     wrong: dict[int, str] = {}
     for number, line in enumerate(lines[skip:], skip + 1):
@@ -180,7 +183,7 @@ def split_rows(
 
 
 def miscounted(line: str, cells: Sequence[str], count: int) -> str:
-    """A line with the number of its cells, which is not ``count``, and the probable reason."""
+    """The message's end for a line without ``count`` cells: their number, the line, the reason."""
     others = [word for mark, word in SEPARATORS.items() if len(split_cells(line, mark)) == count]
     reason = f"; columns separated by {others[0]}?" if others else ""
     if len(cells) > count and all(re.fullmatch(r"[+-]?\d+", cell) for cell in cells):
@@ -189,13 +192,13 @@ def miscounted(line: str, cells: Sequence[str], count: int) -> str:
 
 
 def numbers_in(cell: str) -> list[float]:
-    """The numbers of a cell that has several, and nothing else but marks between them."""
+    """The numbers of a cell such as ``[-60; -61]``; empty unless it has two or more of them."""
     numbers = [to_number(part) for part in re.split(r"[;|/\s]+", cell.strip("[]() "))]
     return numbers if len(numbers) > 1 and not any(map(math.isnan, numbers)) else []
 
 
 def described(cell: str) -> str:
-    """The text of a cell that is no number as expected, with the reason if it is plain."""
+    """A cell that is not the expected number, quoted for errors, with the reason if it is plain."""
     if numbers_in(cell):
         return f"{quote(cell)}, several numbers,"
     if re.fullmatch(r"[+-]?\d+,\d+", cell):
@@ -204,7 +207,7 @@ def described(cell: str) -> str:
 
 
 class Table(NamedTuple):
-    """A table in numbers, a column a name."""
+    """A table of numbers with named columns."""
 
     file: Path  # file, or a word for a table in memory
     names: list[str]  # names of the columns
@@ -249,14 +252,15 @@ def write_table(file: Path, rows: Iterable[Sequence]) -> None:
 def inert(text: str) -> str:
     """A text that no spreadsheet takes for a formula.
 
-    An apostrophe more stands before =, +, -, @, a tab or a return. Numbers stay as they are.
+    A text that starts with =, +, -, @, a tab or a return gets an apostrophe in front, and so does
+    such a text behind apostrophes. Numbers stay as they are.
     """
     starts = text.lstrip("'").startswith(("=", "+", "-", "@", "\t", "\r"))
     return f"'{text}" if starts and text != "-inf" and math.isnan(to_number(text)) else text
 
 
 def original(text: str) -> str:
-    """The text before ``inert``, without its apostrophe."""
+    """The text from which ``inert`` made this one."""
     return text[1:] if text.startswith("'") and inert(text[1:]) == text else text
 
 
@@ -306,7 +310,10 @@ def to_level(cell: str, has_commas: bool = False) -> float:
 def to_numbers(
     file: Path, rows: Rows, names: Sequence[str], holds: Callable[[float], bool], expected: str
 ) -> list[list[float]]:
-    """Cells of a table as numbers, NaN without one; a ``ValueError`` where one is out of range."""
+    """Cells of a table as numbers, NaN for other texts.
+
+    Raises a ``ValueError`` with the first cell for which ``holds`` is false in each wrong line.
+    """
     numbers: list[list[float]] = []
     wrong: dict[int, str] = {}
     for line, cells in rows.items():
@@ -346,7 +353,8 @@ def read_parts(
     """Distinct entries of ``train_index.txt`` and ``test_index.txt``, one a line.
 
     Args:
-        parse: Gives None for a defect.
+        parse: Turns a line into its entry; returns None for a line with a defect.
+        expected: What a line should hold, for errors.
     """
     places: dict[Hashable, str] = {}
     parts = []

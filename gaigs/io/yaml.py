@@ -46,7 +46,7 @@ def read_mapping(file: Path, content: str) -> dict[str, object]:
 
 
 def to_vector(place: str, value: object, axes: str) -> list[float]:
-    """A list of finite numbers, one for each axis; the error of another value names its place."""
+    """A list of one finite number for each axis; the ``ValueError`` of another value says where."""
     items = value if isinstance(value, list) else []
     octal = re.compile(r"[+-]?0[0-9]+")  # 010 is 8 in YAML 1.1 and 10 in YAML 1.2
     numbers = [
@@ -61,7 +61,7 @@ def to_vector(place: str, value: object, axes: str) -> list[float]:
 
 
 def to_position(place: str, value: object) -> list[float]:
-    """A list of coordinates [m] near enough for float32; the error names its place."""
+    """Coordinates x, y, z [m] within ``FAR``; the ``ValueError`` of another value says where."""
     numbers = to_vector(place, value, "xyz")
     if max(map(abs, numbers)) >= FAR:
         raise ValueError(f"{place}: expected {WITHIN}, got {quote(value)}")

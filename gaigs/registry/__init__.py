@@ -181,6 +181,7 @@ class Registry:
         return call(f"{self.kind} {name!r}", self.get(name), options, **context)
 
     def _load(self, holder: Holder) -> Callable:
+        """Imports a component; a ``ValueError`` if its source is not the recorded one."""
         if holder.root is not None:
             self._check_recorded(holder)
             # A package in ./plugins may import another one there.
@@ -208,6 +209,7 @@ class Registry:
             raise ValueError(f"{holder.where} is not {source}\nif you trust that file, {advice}")
 
     def _import(self, holder: Holder) -> Callable:
+        """The component of a holder's module, which is imported; ``_load`` wraps its errors."""
         name, _, attribute = holder.target.partition(":")
         module = importlib.import_module(name.strip())
         if holder.file is not None and not holder.file.samefile(module.__file__):
@@ -220,6 +222,7 @@ class Registry:
         return note_arguments(self.kind, holder.name, component)
 
     def _taken(self, name: str, holder: str, asker: str) -> ValueError:
+        """The error for two components of one name; both are named by file or by class."""
         claim = f"is held by {holder}, and {asker} asks for it"
         return ValueError(f"{self.kind} {name!r} {claim}; choose another name")
 
@@ -283,8 +286,8 @@ def only_recorded(recorded: Mapping[str, str] | None) -> Iterator[None]:
 def digests(*configurations: object) -> dict[str, str]:
     """Digests of the sources of components outside gaigs that configurations name.
 
-    Keys are kind and name. For a component of a notebook or a script, the statement that registers
-    it counts, a class or a function as a rule.
+    Keys are ``"kind name"``. The source of a component of a notebook or a script is the statement
+    that registers it, as a rule its class or function.
     """
     names = _texts(configurations)
     sources_by_key = {}
@@ -312,4 +315,5 @@ def _texts(value: object) -> set[str]:
 
 
 def _origin(component: Callable) -> str:
+    """Module and qualified name of a component, for errors."""
     return f"{component.__module__}.{component.__qualname__}"

@@ -52,7 +52,7 @@ def check_known(
 
 
 def named_parameters(function: Callable) -> dict[str, inspect.Parameter]:
-    """Parameters with a name of their own."""
+    """Parameters that a keyword can give, without ``**keywords``."""
     parameters = _signature(function).parameters.items()
     return {key: p for key, p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
 
@@ -68,6 +68,7 @@ def _takes_all(function: Callable) -> bool:
 
 
 def _signature(function: Callable) -> inspect.Signature:
+    """The parameters of a function; annotations in quotes are evaluated where possible."""
     try:
         return inspect.signature(function, eval_str=True)
     except Exception:  # of an annotation in quotes, e.g. a name that only type checkers import
@@ -78,13 +79,13 @@ def _names_its_option(error: BaseException, function: Callable) -> bool:
     """True for an error of gaigs or of a plug-in, whose message names the option."""
     if isinstance(error, ArithmeticError | MemoryError | SystemExit):
         return False
-    if "tried to allocate" in str(error):
+    if "tried to allocate" in str(error):  # torch's words where memory is short
         return False
     return function.__module__.partition(".")[0] not in ("lightning", "torch")
 
 
 def _suspects(message: str, options: Mapping) -> str:
-    """The options that a message names by key or value; all options without one."""
+    """The options that a message names by key or value, else the keys of all options."""
     suspects = [
         f"{key}={value}"
         for key, value in options.items()

@@ -59,7 +59,7 @@ class Holder:
 
     @property
     def folder(self) -> Path | None:
-        """Folder of an entry point's top-level package, which is not imported; None without one."""
+        """Folder of the target's top-level package, which is not imported; None if not found."""
         if self.root is not None:
             return self.root / self.package
         spec = find_spec(self.package)  # imports nothing, as the name has no dots
@@ -67,12 +67,14 @@ class Holder:
 
     @property
     def digest(self) -> str:
-        """Digest of the sources: the file in ./plugins or the package, with imported plug-ins."""
+        """SHA-256 of the sources: the component's own, and those in ./plugins that it imports.
+
+        Its own are all files of its package, or its file if it is in no package.
+        """
         place = self.file or self.folder
         if self.file is not None and self.root is not None:
             plugins = self.root / "plugins"
             place = plugins / self.file.relative_to(plugins).parts[0]
-            place = self.file if self.file.parent == plugins else place
         digest = hashlib.sha256()
         for file in sorted(_with_imports(place)) if place else ():
             digest.update(file.read_bytes())
@@ -80,8 +82,8 @@ class Holder:
 
     @property
     def registration(self) -> Registration | None:
-        """The decorator of the component; None without one, as entry points may be."""
-        file = self.file or self._module_file(self.target.partition(":")[0])
+        """The component's ``@register`` with its definition; None if an entry point has none."""
+        file = self._source
         try:
             components = registrations(file) if file else []
         except (SyntaxError, ValueError):  # the import names the file
@@ -92,21 +94,22 @@ class Holder:
         return None
 
     def read_options(self, given: tuple[str, ...]) -> dict[str, Any]:
-        """Options with their defaults, from the source, but for the parameters ``given``."""
-        module, _, attribute = self.target.partition(":")
-        file = self.file or self._module_file(module)
+        """Options with their defaults, read from the source; ``given`` parameters are left out."""
+        definition: str | Definition = self.target.partition(":")[2].strip()
         registration = self.registration
-        definition: str | Definition = attribute.strip()
         if registration is not None:
             definition = registration.definition
+        file = self._source
         if file is None or not definition:
             raise UnclearSource
         return read_options(file, definition, given)
 
-    def _module_file(self, module: str) -> Path | None:
-        """The file of an entry point's module; None if it is not found."""
-        if self.folder is None:
-            return None
+    @property
+    def _source(self) -> Path | None:
+        """The file of the component, or of its entry point's module; None if it is not found."""
+        if self.file is not None or self.folder is None:
+            return self.file
+        module = self.target.partition(":")[0]
         place = self.folder.joinpath(*module.strip().split(".")[1:])
         files = (place / "__init__.py", place.with_suffix(".py"))
         return next((file for file in files if file.is_file()), None)
@@ -154,7 +157,8 @@ def _built_in_holders(kind: str) -> list[Holder]:
 
 
 def _installed_holders(kind: str) -> list[Holder]:
-    # An installation changes a folder of sys.path.
+    """Holders of a kind by the entry points of installed packages."""
+    # The key of the cache: an installation changes a folder of sys.path.
     path = tuple(
         (folder, os.stat(folder or ".").st_mtime_ns)
         for folder in sys.path
@@ -188,8 +192,8 @@ def _dropped_holders(kind: str | None = None) -> tuple[list[Holder], list[str]]:
                 for group, name, target in points:
                     holders.append(Holder(group, name, where, target, root=source))
             else:
-                for one in registrations(file):
-                    holders.append(Holder(one.kind, one.name, where, module, file, root))
+                for found in registrations(file):
+                    holders.append(Holder(found.kind, found.name, where, module, file, root))
         except Exception as error:  # any error of a parser
             unreadable.append(f"{where}: {str(error) or type(error).__name__}")
     return [holder for holder in holders if kind in (None, holder.kind)], unreadable
@@ -208,7 +212,10 @@ def _project_entry_points(file: Path, *_state: int) -> list[tuple[str, str, str]
 
 
 def _plugin_files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
-    """Modules with their files in a folder and its packages; of a project its pyproject.toml."""
+    """Names and files of the modules in a folder and its packages.
+
+    A project, a folder with a pyproject.toml, gives its name and that file instead.
+    """
     for path in sorted(folder.glob("[!_.]*")):
         if path.suffix == ".py":
             yield f"{package}.{path.stem}", path
@@ -220,7 +227,7 @@ def _plugin_files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
 
 
 def sources(folder: Path, project: str = "[!_.]*") -> list[Path]:
-    """The folders with the packages of the projects in a folder: ``src`` if it exists."""
+    """The folder ``src`` of each project in a folder, or the project's own if it has no ``src``."""
     places = [file.parent for file in sorted(folder.glob(f"{project}/pyproject.toml"))]
     return [place / "src" if (place / "src").is_dir() else place for place in places]
 
@@ -236,6 +243,7 @@ def _with_imports(place: Path) -> set[Path]:
         files = {place} if place.is_file() else {*place.rglob("*.py")}
         for file in files - known:
             text = file.read_text(errors="replace")
+            # Words of import statements: too many are harmless, as only existing files count.
             words: set[str] = set()
             for line in re.findall(r"^\s*(?:from|import)\s(.*)", text, re.M):
                 words |= {*re.findall(r"(?:plugins\.)?(\w+)", line)}

@@ -35,10 +35,9 @@ def check_instance(name: str, value: object, kind: type) -> None:
 
 
 def check_type(name: str, value: Any, annotation: Any) -> None:
-    """Checks a value against an annotation in ``PLAIN`` or a union of them.
+    """Raises a ``TypeError`` unless a value suits an annotation in ``PLAIN`` or a union of them.
 
-    Other annotations are not checked. In a union with other classes, their objects are accepted,
-    too.
+    Other annotations are not checked. A union with other classes accepts their objects, too.
     """
     allowed = _allowed(value, annotation)
     if not allowed:

@@ -104,18 +104,21 @@ def registering_statement(component: Callable) -> str:
     except SyntaxError:  # the file has been edited meanwhile
         return ""
     around = [node for node in statements if _first_line(node) <= line <= (node.end_lineno or 0)]
-    named = [node for node in statements if getattr(node, "name", None) == component.__name__]
     innermost = [max(around, key=_first_line)] if around else []
+    # A call register(...)(Name) stands apart from the definition of Name.
+    named = [node for node in statements if getattr(node, "name", None) == component.__name__]
     chosen = dict.fromkeys([*innermost, *named[-1:]])
     return "\n".join(ast.get_source_segment(text, node) or "" for node in chosen)
 
 
 def _first_line(node: ast.stmt) -> int:
+    """The line of a statement or of its first decorator."""
     decorators = getattr(node, "decorator_list", [])
     return min(part.lineno for part in (node, *decorators))
 
 
 def _parsed(file: Path) -> ast.Module:
+    """The syntax tree of a file, parsed anew once the file has changed."""
     state = file.stat()
     return _parse(file, state.st_mtime_ns, state.st_ctime_ns, state.st_size)
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable
 
 
 def suggest(word: str, known: Iterable[str]) -> str:
-    """A word in quotes, with the most similar known word."""
+    """A word in quotes, with the most similar known word if there is one."""
     near = similar(word, known)
     return f"{word!r} (did you mean {near[0]!r}?)" if near else repr(word)
 

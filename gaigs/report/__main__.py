@@ -17,10 +17,10 @@ def main() -> None:
     parser.add_argument(
         "--format", default="png", help="of the figure files: png, pdf or svg, or several: png,pdf"
     )
-    given = parser.parse_args()
+    arguments = parser.parse_args()
     try:
-        with figure_formats(given.format.split(",")):
-            tables = report(given.folder)
+        with figure_formats(arguments.format.split(",")):
+            tables = report(arguments.folder)
     except (FileNotFoundError, ValueError) as error:
         parser.error(str(error))
     Console(emoji=False).print(tables)

@@ -62,6 +62,7 @@ def _common(keys: Sequence[str], sources: Sequence[Mapping]) -> dict[str, object
 
 
 def _row(run: Run, varied: Sequence[str], facts: Sequence[str]) -> dict:
+    """The row of a run: name, overrides ``varied``, ``facts``, scores, p value and costs."""
     row = {"run": run.name, "status": "unfinished", "model": ""}
     row |= {key: run.overrides.get(key, "") for key in varied}
     if run.metrics is None:
@@ -79,14 +80,14 @@ def _row(run: Run, varied: Sequence[str], facts: Sequence[str]) -> dict:
 
 
 def _p_value(metrics: Mapping) -> float | None:
-    """Probability of the run's difference from the best baseline by chance, by its first metric."""
+    """p value of the run's main metric against the best baseline; None without a paired test."""
     name, _ = headline(metrics["task"], metrics["models"])
     test = metrics.get("paired") or {"p": {}}
     return test["p"].get(next(iter(metrics["models"])), {}).get(name)
 
 
 def _baselines(metrics: Mapping | None, has_split: bool) -> list[dict]:
-    """Rows of the baselines of a run, without the run's model before its kriging."""
+    """Rows of a run's baselines. The model before its kriging, ``<model>_trend``, is left out."""
     if metrics is None:
         return []
     first, *names = metrics["models"]
@@ -101,28 +102,32 @@ def _baselines(metrics: Mapping | None, has_split: bool) -> list[dict]:
 
 
 def over_seeds(runs: Sequence[Run], shared: Mapping) -> list[dict]:
-    """Rows of groups of runs that differ in ``seed`` alone, where two seeds or more have ended."""
+    """A row of means for each group of runs that differ in ``seed`` alone, with two seeds or more.
+
+    Args:
+        shared: Settings that all runs share, which rows leave out.
+    """
     ended = [run for run in runs if run.metrics is not None]
     names = columns_of([run.overrides for run in ended])
     varied = [name for name in names if name != "seed" and name not in shared]
     rows = []
     for group in by_seed(ended):
         metrics = [run.metrics for run in group]
-        if len({one["seed"] for one in metrics}) < 2:
+        if len({entry["seed"] for entry in metrics}) < 2:
             continue
-        scores = [next(iter(one["models"].values())) for one in metrics]
+        scores = [next(iter(entry["models"].values())) for entry in metrics]
         row = {"status": "seeds", "model": next(iter(metrics[0]["models"]))}
         row |= {name: group[0].overrides.get(name, "") for name in varied}
         if "split" not in shared:
-            splits = {one["split"] for one in metrics}
+            splits = {entry["split"] for entry in metrics}
             row["split"] = splits.pop() if len(splits) == 1 else f"{len(splits)} splits"
         row["runs"] = len(group)
         for name in scores[0]:
             if all(name in score for score in scores):
                 row[name] = Spread.of([score[name] for score in scores])
-        tests = [_p_value(one) for one in metrics]
+        tests = [_p_value(entry) for entry in metrics]
         if None not in tests:
-            row["p"] = max(filter(None, tests))
+            row["p"] = max(filter(None, tests))  # the least certain seed
         rows.append(row)
     return rows
 
@@ -136,8 +141,14 @@ def write_ablation(
 ) -> list[Table]:
     """Writes ``ablation.csv``, ``.md`` and, once a run has ended, ``.tex`` and a figure of speed.
 
-    ``rows`` and ``shared`` are results of ``ablation``, ``metrics`` of the task. The result are
-    tables for a terminal of 80 columns. All columns are in the CSV file alone.
+    All columns are in the CSV file alone.
+
+    Args:
+        rows, shared: Results of ``ablation``.
+        metrics: Metrics of the task by name; empty before a run has ended.
+
+    Returns:
+        Tables for a terminal of 80 columns.
     """
     intervals = {
         "p": "p against best",
@@ -221,13 +232,14 @@ def _numbers(rows: Sequence[Mapping], key: str) -> Float[ndarray, " rows"]:
 
 
 def _text(value: float | int | str | Spread | None, separator: str) -> str:
+    """A cell of a table; the least value of several seeds follows behind a separator."""
     if isinstance(value, Spread):
         return f"{written(value)}{separator}least {written(value.least)}"
     return written(value)
 
 
 def _without_errors(row: Mapping) -> dict:
-    """A row with the standard errors of coverages beside these, and not in columns of their own."""
+    """A row without columns of standard errors; coverages have theirs behind ±."""
     shown = {key: value for key, value in row.items() if not key.endswith("_error")}
     for key in row.keys() & {"coverage_50", "coverage_90"}:
         error = row.get(f"{key}_error")
@@ -237,6 +249,7 @@ def _without_errors(row: Mapping) -> dict:
 
 
 def _markdown(rows: Sequence[Mapping], titles: Mapping[str, str], hidden: set[str]) -> str:
+    """A Markdown table of the columns that are not hidden, with their titles."""
     columns = [column for column in columns_of(rows) if column not in hidden]
     lines = [[titles.get(column, column) for column in columns]]
     for row in rows:
@@ -250,7 +263,13 @@ def _latex(
     metrics: Mapping[str, Metric],
     shared: Mapping,
 ) -> str:
-    """Runs, or their means over seeds, above the baselines: settings, metrics, training time."""
+    """A LaTeX table: settings and metrics of runs, or of their means over seeds, then of baselines.
+
+    Args:
+        results: Rows of runs, or of groups of seeds.
+        rows: Rows with the baselines among them.
+        shared: Settings that all runs share, for the caption.
+    """
     shown = [row for row in results if row["status"] in ("done", "seeds")]
     rule = len(shown) + 1
     shown += [row for row in rows if row["status"] == "baseline"]
@@ -289,6 +308,7 @@ def _latex(
 def _terminal(
     title: str, rows: Sequence[Mapping], titles: Mapping[str, str], hidden: set[str], caption: str
 ) -> Table:
+    """A table for the terminal; columns of costs are left out until it is at most 80 wide."""
     columns = [column for column in columns_of(rows) if column not in hidden]
     styles = [{"unfinished": "red", "baseline": "dim"}.get(row["status"]) for row in rows]
     console = Console(width=1000)

@@ -59,7 +59,7 @@ class CsiFigures(TaskFigures):
 
 
 def _looks(marker: str = "") -> dict[str, dict[str, Any]]:
-    """Looks of predicted channels and labels, by name.
+    """Matplotlib's options for the curves ``prediction`` and ``label``.
 
     A thin dark line upon a broad pale one: both are visible where they coincide, in grey print too.
     """
@@ -191,7 +191,8 @@ def _strongest(shown: Examples) -> list[int]:
 
 def _pairs(shown: Examples) -> Complex[ndarray, "k 2 s"]:
     """Prediction and label of each link at the label's strongest element."""
-    rows, elements = np.arange(len(shown.labels)), _strongest(shown)
+    rows = np.arange(len(shown.labels))
+    elements = _strongest(shown)
     return np.stack((shown.predictions[rows, elements], shown.labels[rows, elements]), 1)
 
 
@@ -206,7 +207,7 @@ def _titles(shown: Examples) -> list[str]:
 
 
 def decibels(amplitudes: Inexact[ndarray, "..."]) -> Float[ndarray, "..."]:
-    """Magnitudes [dB]; of 0 it is -inf, which leaves a gap in a line."""
+    """Magnitudes [dB]; -inf for 0, which leaves a gap in a line."""
     with np.errstate(divide="ignore"):
         return 20 * np.log10(np.abs(amplitudes))
 
@@ -223,7 +224,15 @@ def _limits(levels: Float[ndarray, "... 2 n"]) -> tuple[float, float]:
 def impulse_response(
     channels: Complex[ndarray, "... s"], frequencies: Float[ndarray, " s"]
 ) -> tuple[Float[ndarray, " d"], Complex[ndarray, "... d"]]:
-    """Delays [s], and the mean over subcarriers of h exp(2 pi i f tau), with a Hann window."""
+    """The impulse response of channels: mean over subcarriers of w(f) h(f) exp(2 pi i f tau).
+
+    Args:
+        channels: Channels h at the subcarriers.
+        frequencies: Subcarriers f, two or more [Hz].
+
+    Returns:
+        Delays tau [s], and the response at them. The window w is a Hann window over the band.
+    """
     start = frequencies.min()
     spacing = np.median(np.diff(np.unique(frequencies)))
     # The window is 0 one spacing outside of the band, so that both end subcarriers count.
@@ -245,9 +254,9 @@ def impulse_response(
 def error_against_power(
     powers: Float[ndarray, " k"], errors: Mapping[str, Float[ndarray, " k"]], split: str
 ) -> Figure:
-    """Power of each test link's error over its channel's, of the run's model and the best baseline.
+    """Power of each test link's error against the power of its channel [dB].
 
-    The run's model is the first one.
+    It has the run's model, the first of ``errors``, and the best baseline.
     """
     model, *others = errors
     baselines = [name for name in others if name != f"{model}_trend"]

@@ -40,7 +40,7 @@ def cdf(
     limits: tuple[float | None, float | None],
     higher_is_better: bool = False,
 ) -> Figure:
-    """The curves of ``draw_cdf``, with the name of the split at the foot."""
+    """A figure of ``draw_cdf``, with a legend, and the name of the split at the foot."""
     with rc_context(STYLE):
         figure = new_figure(COLUMN, COLUMN)
         ax = figure.subplots()
@@ -65,7 +65,7 @@ def draw_cdf(
     limits: tuple[float | None, float | None],
     higher_is_better: bool = False,
 ) -> None:
-    """Share of test samples with at most a given value, one step curve a model, medians marked.
+    """Draws the share of test samples up to each value, a curve for each model with its median.
 
     The run's own model and the best others have a colour, see ``named_ones``; the rest is grey.
 
@@ -102,7 +102,7 @@ def draw_cdf(
 
 
 def plot_scores(result: Any, ax: Any = None, metric: str | None = None) -> Any:
-    """How large errors are: the distribution of a score over the test links, by model.
+    """Draws how large errors are: the distribution of a score over the test links, by model.
 
     Args:
         result: An ``Evaluation``.
@@ -171,7 +171,7 @@ def _score_title(name: str) -> str:
 
 
 def _of_group(curves: Mapping[str, Curve], group: str) -> dict[str, Curve]:
-    """Curves whose names begin with a group, without it; the loss comes first."""
+    """Curves of a group by their names without ``<group>/``; the loss comes first."""
     start = f"{group}/"
     names = [name.removeprefix(start) for name in curves if name.startswith(start)]
     names.sort(key=lambda name: name != "loss")
@@ -186,11 +186,16 @@ def speed_against_error(
     baselines: Mapping[str, float],
     models: Sequence[str] = (),
 ) -> Figure:
-    """Score of each run against each kind of time, one panel a kind; NaN if a time is unknown.
+    """Score of each run against its times, a panel for each kind of time.
 
-    A kind that no run has, as the training of look-ups, has no panel. The baselines' scores are
-    horizontal lines, named by their model first. Runs of several models, one a run, have the
-    models' colours.
+    Args:
+        names: Name of each run.
+        scores: Score of each run.
+        times: Times of the runs by kind, NaN if unknown. A kind that no run has, such as the
+            training of look-ups, has no panel.
+        score_label: Name of the score with its unit.
+        baselines: Scores of baselines, drawn as horizontal lines; names begin with the model's.
+        models: Model of each run, for colours; empty if they do not matter.
     """
     times = {label: values for label, values in times.items() if np.isfinite(values).any()} or times
     systems = looks(dict.fromkeys([*models, *(name.partition(" ")[0] for name in baselines)]))
@@ -267,7 +272,7 @@ def _round_ticks(axis: Axis, steps: Sequence[int]) -> None:
 
 
 def _draw_smoothed(ax: Axes, steps: ndarray, values: ndarray, **line) -> None:
-    """A running mean over a fiftieth of the points, drawn over the points."""
+    """Draws points, and over them their running mean over a fiftieth of the points."""
     window = max(1, len(values) // 50)
     if window > 1:
         ax.plot(steps, values, color=line["color"], alpha=0.2, linewidth=0.5)

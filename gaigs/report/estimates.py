@@ -21,31 +21,32 @@ from gaigs.report.style import BLUE, LINES, PAGE, STYLE, ask, new_figure
 def plot_estimate(
     result: Estimate, ax: Any = None, receiver: str | int | None = None, place: int = 0
 ) -> Any:
-    """What is predicted, and how surely.
+    """Draws predictions with their intervals.
 
-    One real number a link is drawn for all places with its interval, a colour a receiver. Of a
-    spectrum or a channel one place is drawn, of a channel at its strongest element.
+    Real numbers are drawn for all places, a colour for each receiver. A spectrum or a channel is
+    drawn for one place, a channel at its strongest element.
 
     Args:
         result: Estimate of ``model.predict``.
         ax: Axes; None: a figure of its own.
-        receiver: Name or index of the receiver; None: all of real numbers, or else the first.
-        place: Number of the place, of a spectrum or a channel.
+        receiver: Name or index of the receiver; None: all receivers for real numbers, else the
+            first.
+        place: Number of the place, for a spectrum or a channel.
     """
-    asked = result.asked
-    if asked is None:
+    request = result.asked
+    if request is None:
         raise ValueError("only estimates of model.predict know their places")
     kinds = {"": _draw_numbers, "elevation azimuth": _draw_spectrum}
-    draw = (kinds | {"element subcarrier": _draw_channel}).get(" ".join(asked.axes))
+    draw = (kinds | {"element subcarrier": _draw_channel}).get(" ".join(request.axes))
     if draw is None:
-        raise ValueError(f"there is no picture of axes {', '.join(asked.axes)}; use .to_xarray()")
-    names = asked.receivers if asked.has_axis else np.array([""])
+        raise ValueError(f"there is no picture of axes {', '.join(request.axes)}; use .to_xarray()")
+    names = request.receivers if request.has_axis else np.array([""])
     chosen = np.arange(len(names))
-    if receiver is not None and asked.has_axis:
+    if receiver is not None and request.has_axis:
         chosen = as_receivers(receiver, names.tolist()).reshape(-1).numpy()
-    rank = result.value.ndim - len(asked.axes)  # axes of places and receivers
-    count = result.value[(..., *[0] * len(asked.axes))].numel() // len(names)
-    if asked.axes and not 0 <= place < count:
+    rank = result.value.ndim - len(request.axes)  # axes of places and receivers
+    count = result.value[(..., *[0] * len(request.axes))].numel() // len(names)
+    if request.axes and not 0 <= place < count:
         raise ValueError(f"place must be from 0 to {count - 1}, got {place}")
     parts = {}
     for name in ("value", "std", "lower", "upper", "radius"):
@@ -53,20 +54,20 @@ def plot_estimate(
         if part is not None:
             values = part.detach().cpu().numpy()
             values = values.reshape(-1, len(names), *values.shape[rank:])[:, chosen]
-            parts[name] = values[place, 0] if asked.axes else values
+            parts[name] = values[place, 0] if request.axes else values
     with rc_context(STYLE):
         if ax is None:
             figure = new_figure(0.7 * PAGE, 0.45 * PAGE)
             ax = figure.subplots()
             ask(figure, "What is predicted, and how surely?")
-        draw(ax, parts, asked.axes, with_unit(asked.quantity, asked.unit), names[chosen])
+        draw(ax, parts, request.axes, with_unit(request.quantity, request.unit), names[chosen])
     return ax
 
 
 def _draw_numbers(
     ax: Axes, parts: Mapping[str, Shaped[ndarray, "n r"]], axes: Any, title: str, names: ndarray
 ) -> None:
-    """Values with their intervals by the number of the place."""
+    """Draws values (n, r) with their intervals by the number of the place."""
     x = np.arange(len(parts["value"]))
     for number, name in enumerate(names):
         values, low, high = (parts[part][:, number] for part in ("value", "lower", "upper"))
@@ -84,7 +85,7 @@ def _draw_numbers(
 def _draw_spectrum(
     ax: Axes, parts: Mapping[str, ndarray], axes: Mapping[str, Axis], title: str, names: ndarray
 ) -> None:
-    """A spectrum, with the mean of its deviations in the title."""
+    """Draws a spectrum, with the mean of its deviations in the title."""
     across = pixel_edges(axes["azimuth"].values, -np.inf, np.inf)
     up = pixel_edges(axes["elevation"].values, -90, 90)
     image = draw_plane(ax, across, up, parts["value"])
@@ -96,7 +97,10 @@ def _draw_spectrum(
 def _draw_channel(
     ax: Axes, parts: Mapping[str, ndarray], axes: Mapping[str, Axis], title: str, names: ndarray
 ) -> None:
-    """Magnitude over frequency at the strongest element, and what the disc about it spans."""
+    """Draws a channel's magnitude over frequency at its strongest element.
+
+    The interval of a complex number is a disc: the band spans magnitudes within it.
+    """
     element = int(np.nansum(abs(parts["value"]) ** 2, 1).argmax())
     value = abs(parts["value"][element])
     radius = parts["radius"][element]

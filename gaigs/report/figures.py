@@ -12,7 +12,7 @@ registered: dict[type[Task], type["TaskFigures"]] = {}
 
 
 class TaskFigures:
-    """Figures of a task. A subclass overrides the methods for which it has figures."""
+    """Base of a task's figures. A subclass overrides the methods for which it has figures."""
 
     def of_run(self, task: Any, folder: Path, links: Links) -> dict[str, Any]:
         """Figures of one run by file name, drawn from the files in its folder."""

@@ -18,9 +18,9 @@ from gaigs.report.style import PAGE, STYLE, ask, looks, new_figure
 
 
 def intervals(folder: Path, task: Task, split: str) -> Figure | None:
-    """Shares of labels within intervals of each level, and errors of test links by deviation.
+    """A figure of how often intervals hold labels, and of errors against stated deviations.
 
-    The result is None for a run without intervals.
+    None for a run without intervals.
     """
     file = folder / "predictions.npz"
     shares = own_scores(file, "shares")
@@ -58,11 +58,12 @@ def intervals(folder: Path, task: Task, split: str) -> Figure | None:
 
 
 def _magnitudes(numbers: Shaped[ndarray, "..."]) -> Float[ndarray, "k numbers"]:
+    """Magnitudes of the numbers of each of k labels."""
     return np.abs(numbers).astype(float).reshape(len(numbers), -1)
 
 
 def _draw_shares(ax: Axes, shares: Mapping[str, Float[ndarray, " levels"]]) -> None:
-    """Shares of labels inside, one line a model."""
+    """Draws the share of labels inside intervals against their level, a line for each model."""
     count = len(next(iter(shares.values())))
     levels = np.linspace(0, 1, count + 2)[1:-1]
     for name, (colour, dash) in looks(shares).items():
@@ -78,7 +79,11 @@ def _draw_errors(
     colour: str,
     groups: int = 12,
 ) -> int:
-    """Root mean square errors of groups of links, by deviation; returns the number of groups."""
+    """Draws root mean square errors of groups of links, sorted by deviation.
+
+    Returns:
+        The number of groups.
+    """
     parts = [part for part in np.array_split(np.argsort(stated), groups) if len(part)]
     across = np.array([np.sqrt((stated[part] ** 2).mean()) for part in parts])
     up = np.array([np.sqrt((errors[part] ** 2).mean()) for part in parts])

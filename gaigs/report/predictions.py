@@ -10,7 +10,7 @@ from numpy import ndarray
 
 
 def as_baseline(name: str) -> str:
-    """The name of a baseline for a reader where a system has the same name."""
+    """The shown name of a baseline beside a system of the same name."""
     return f"{name} (baseline)"
 
 
@@ -51,7 +51,10 @@ class Examples(NamedTuple):
 
 
 def read_examples(file: Path, kind: str) -> Examples:
-    """The samples at three ranks of the score ``<kind>_<model>`` of the run's model."""
+    """The samples at the 10th percentile, the median and the 90th percentile of a score.
+
+    The score is ``<kind>_<model>`` of the run's own model.
+    """
     scores = next(iter(own_scores(file, kind).values()))
     order = np.argsort(scores)
     names = {}

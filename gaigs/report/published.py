@@ -8,10 +8,10 @@ from gaigs.configuration import conf_dir, plugin_conf_dirs
 
 
 def read_published() -> dict[str, dict]:
-    """Contents of ``published.yaml`` of gaigs and of plug-ins.
+    """The joined contents of ``published.yaml`` of gaigs and of plug-ins.
 
-    ``names`` of models are in the order of the rows. ``scores`` and ``costs`` have for each task
-    columns with ``title``, ``source``, and ``figures`` by model.
+    ``names`` has shown names of models in the order of the rows. ``scores`` and ``costs`` have for
+    each task a list of columns, each with ``title``, ``source``, and ``figures`` by model.
     """
     published: dict[str, dict] = {"names": {}, "scores": {}, "costs": {}}
     for folder in (conf_dir(), *plugin_conf_dirs()):
@@ -28,7 +28,7 @@ def read_published() -> dict[str, dict]:
 
 
 def _add(published: dict[str, dict], file: Path) -> None:
-    """Adds the content of a file."""
+    """Adds the content of a file to ``published``."""
     content = yaml.safe_load(file.read_text())
     published["names"].update(content.get("names", {}))
     for part in ("scores", "costs"):

@@ -104,23 +104,24 @@ class _Drawing(NamedTuple):
         return cls(radio_map, gateways, dots, edges[is_low][..., :2], scale)
 
     def draw(self, ax: Axes, name: str) -> Any:
-        """Draws the map of a receiver; returns its image."""
+        """Draws the map of a receiver; returns its image, for a colour bar."""
         index = self.radio_map.receivers.index(name)
         values = self.radio_map.values[index]
         extent, lower, upper = _extent(self.radio_map, self.walls)
-        look = {"cmap": "viridis", "vmin": self.scale.low, "vmax": self.scale.high}
+        colours = {"cmap": "viridis", "vmin": self.scale.low, "vmax": self.scale.high}
         place = {"origin": "lower", "extent": extent, "interpolation": "bilinear"}
-        image = ax.imshow(values, **place, **look)
+        image = ax.imshow(values, **place, **colours)
         levels = _levels(values, self.scale)
         if len(levels):
             lines = {"colors": "white", "linestyles": "solid", "linewidths": 0.4, "alpha": 0.5}
             ax.contour(self.radio_map.x, self.radio_map.y, values, levels, **lines)
+        # A white rim keeps walls visible on dark colours.
         walls = LineCollection(self.walls, colors="black", linewidths=0.9)
         walls.set_path_effects([Stroke(linewidth=1.8, foreground="white"), Normal()])
         ax.add_collection(walls)
-        x, y, label = self.dots[name].T
+        x, y, reading = self.dots[name].T
         ring = {"edgecolors": "black", "linewidths": 0.6, "zorder": 3}
-        ax.scatter(x, y, 14, label, **ring, **look)
+        ax.scatter(x, y, 14, reading, **ring, **colours)
         if name in self.gateways:
             ax.add_line(_gateway_mark(self.gateways[name][:2, None]))
         title = name
@@ -139,7 +140,7 @@ class _Drawing(NamedTuple):
 
 
 def _gateway_mark(places: Float[ndarray, "2 k"]) -> Line2D:
-    """Receivers on a map, at some places [m]."""
+    """The mark of receivers on a map, at places x and y [m]."""
     look = {"color": ORANGE, "markersize": 8, "markeredgecolor": "white"}
     return Line2D(*places, linestyle="", marker="^", **look)
 
@@ -196,7 +197,7 @@ def plot_radio_map(
     deviation: bool = False,
     links: Links | None = None,
 ) -> Any:
-    """Where receivers hear a transmitter, a panel a receiver.
+    """Draws where receivers hear a transmitter, a panel for each receiver.
 
     Args:
         result: The map.
@@ -210,7 +211,7 @@ def plot_radio_map(
         floor = floor.only(as_receivers(receiver, floor.receivers).reshape(-1).numpy())
     gateways, readings, edges = {}, {}, np.zeros((0, 2, 3), np.float32)
     if links is not None:
-        gateways = {one.name: one.pose.position.numpy() for one in links.receivers}
+        gateways = {receiver.name: receiver.pose.position.numpy() for receiver in links.receivers}
         edges = links.edges.numpy()
         if not deviation and links.split is not None:
             test = links.split.test
@@ -233,7 +234,7 @@ def plot_radio_map(
 
 
 def _title(radio_map: RadioMap, receivers: int) -> str:
-    """What a radio map shows, of how many receivers."""
+    """The sentence below a radio map: quantity, height, carrier and number of receivers."""
     carrier = "" if radio_map.frequency is None else f" at {radio_map.frequency / 1e9:.6g} GHz"
     place = f"z = {radio_map.height:.2f} m{carrier}"
     title = f"Predicted {radio_map.quantity} of a transmitter at {place}"
@@ -264,17 +265,17 @@ def _extent(radio_map: RadioMap, walls: Float[ndarray, "s 2 2"]) -> _Extent:
 
 
 class _Scale(NamedTuple):
-    """Ends of a scale of colours, and the distance of two contours [task.unit]."""
+    """A scale of colours, in the unit of the map."""
 
     low: float
     high: float
-    step: float
+    step: float  # distance of two contours
 
 
 def _scale(
     values: Float[ndarray, "..."], readings: Float[ndarray, " k"], error_unit: str
 ) -> _Scale:
-    """Round numbers about the middle 98 % of map and readings."""
+    """A scale that holds the middle 98 % of map and readings, with round ends."""
     parts = [np.quantile(part, (0.01, 0.99)) for part in (values, readings) if part.size]
     quantiles = np.concatenate(parts)
     low = quantiles.min()
@@ -289,7 +290,7 @@ def _scale(
 
 
 def _levels(values: Float[ndarray, "rows columns"], scale: _Scale) -> Float[ndarray, " k"]:
-    """Contours that cross a map, at most 20 beyond each end of the colour scale."""
+    """Levels of the contours that cross a map, at most 20 beyond each end of the scale."""
     lowest = max(values.min(), scale.low - 20 * scale.step)
     highest = min(values.max(), scale.high + 20 * scale.step)
     first = np.floor(lowest / scale.step)

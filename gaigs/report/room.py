@@ -23,7 +23,7 @@ from gaigs.splatting.gaussians import SH_DC, Gaussians
 
 
 class _View(NamedTuple):
-    """A panel with x to the right."""
+    """A panel that shows the room along one axis, with x to the right."""
 
     ax: Axes
     up: int  # number of the upward axis
@@ -35,14 +35,15 @@ class _View(NamedTuple):
 
 
 class _Views(NamedTuple):
-    """Plan and side view of one scale, and the length of arrows in them [m]."""
+    """Plan and side view to one scale."""
 
     figure: Figure
     panels: tuple[_View, _View]
-    arrow: float
+    arrow: float  # length of arrows in them [m]
 
     @property
     def axes(self) -> list[Axes]:
+        """Matplotlib's axes of both panels."""
         return [view.ax for view in self.panels]
 
 
@@ -79,7 +80,11 @@ class _Content(NamedTuple):
         return np.concatenate(corners)
 
     def draw(self, view: _View, arrow: float) -> list[AxesImage | EllipseCollection]:
-        """Draws all in a panel; returns what a colour bar explains, Gaussians last."""
+        """Draws all in a panel.
+
+        Returns:
+            Images that need a colour bar: obstacles, then Gaussians.
+        """
         coloured: list[AxesImage | EllipseCollection] = []
         if self.matter is not None:
             coloured.append(_draw_matter(view, self.matter))
@@ -92,7 +97,12 @@ class _Content(NamedTuple):
         return coloured
 
     def draw_bars(self, drawn: Sequence[list], axes: Sequence[Axes]) -> None:
-        """Draws the colour bars of panels, whose results of ``draw`` are ``drawn``."""
+        """Draws the colour bars of panels.
+
+        Args:
+            drawn: Result of ``draw`` for each panel.
+            axes: Axes of the panels.
+        """
         figure = axes[0].figure
         bar: dict[str, Any] = {"ax": axes, "extend": "max", "aspect": 30, "shrink": 0.7}
         if self.cloud is not None:
@@ -142,7 +152,7 @@ def room(
 def plot_room(
     result: LearntRoom, ax: Any = None, links: Links | None = None, show_paths: bool = False
 ) -> Any:
-    """What a model has learnt of the room.
+    """Draws what a model has learnt of the room.
 
     Args:
         result: Planes, obstacles and paths, as of ``model.learnt_room(links)``.
@@ -196,6 +206,7 @@ def paths(links: Links, learnt: LearntRoom) -> Figure:
 
 
 def _receivers(links: Links) -> Float[ndarray, "receivers 3"]:
+    """Positions of the receivers [m]."""
     return np.stack([receiver.pose.position.numpy() for receiver in links.receivers])
 
 
@@ -235,7 +246,7 @@ def _draw_links(view: _View, links: Links, arrow: float) -> None:
     dots = {"color": ORANGE, "markersize": 3, "label": "transmitters, test"}
     view.ax.plot(*view.project(test).T, ".", **dots)
     has_directions = links.task.directions is not None
-    has_axes = all(len(one.array) > 1 or has_directions for one in links.receivers)
+    has_axes = all(len(receiver.array) > 1 or has_directions for receiver in links.receivers)
     label = "receivers, axes of the array" if has_axes else "receivers"
     _draw_receivers(view, _receivers(links), label)
     for receiver in links.receivers if has_axes else ():
@@ -252,7 +263,7 @@ def _rims(corners: Float[ndarray, "k 3"]) -> tuple[Float[ndarray, "2 3"], float]
 
 
 def _fit(ax: Axes, ends: Float[ndarray, "2 3"], up: int) -> None:
-    """Sets the axes of a panel."""
+    """Sets the limits of a panel to a box, and its label; ``up`` is the number of its y axis."""
     ax.set(xlim=ends[:, 0], ylim=ends[:, up], ylabel="xyz"[up] + " [m]", aspect="equal")
 
 
@@ -278,6 +289,7 @@ def _legend(views: _Views) -> None:
 
 
 def _draw_gaussians(view: _View, cloud: _Cloud) -> EllipseCollection:
+    """Draws Gaussians as ellipses of one standard deviation, coloured by strength."""
     flat = [0, view.up]
     covariances = cloud.covariances[:, flat][:, :, flat]  # (k, 2, 2)
     variances, axes = np.linalg.eigh(covariances)  # ascending
@@ -302,7 +314,7 @@ def _draw_gaussians(view: _View, cloud: _Cloud) -> EllipseCollection:
 
 
 def _draw_planes(view: _View, planes: Sequence[LearntPlane]) -> None:
-    """Outlines with their share of the power, except of planes that face the reader."""
+    """Draws planes with their share of the power, except those seen from the front."""
     # The limit is above 1 / sqrt(2), so that each plane is in one view at least.
     shown = [plane for plane in planes if abs(plane.normal[view.along]) < 0.77]
     if not shown:
@@ -339,7 +351,10 @@ def _draw_planes(view: _View, planes: Sequence[LearntPlane]) -> None:
 def _free_place(
     view: _View, plane: LearntPlane, outward: Float[ndarray, "2"], taken: Sequence[ndarray]
 ) -> Float[ndarray, "2"]:
-    """A place for the label of a plane at its outer edge, clear of others if there is one."""
+    """A place at the outer edge of a plane for its label, away from labels at ``taken`` places.
+
+    If there is none, it is the middle of the edge. ``outward`` is the plane's normal in the panel.
+    """
     width = np.ptp(view.ax.get_xlim())
     height = np.ptp(view.ax.get_ylim())
     needed = np.array((0.14 * width, 0.04 * max(width, height)))  # of a label
@@ -357,7 +372,7 @@ def _free_place(
 
 
 def _draw_matter(view: _View, matter: Matter) -> AxesImage:
-    """Loss of a path through all obstacles along the line of sight [dB]."""
+    """Draws the loss of a path through all obstacles along the line of sight [dB]."""
     left, right = view.ax.get_xlim()
     bottom, top = view.ax.get_ylim()
     pixel = max(right - left, top - bottom) / 300
@@ -379,7 +394,7 @@ def _bells(values: Float[ndarray, " n"], matter: Matter, axis: int) -> Float[nda
 
 
 def _draw_paths(view: _View, paths: Sequence[LearntPath]) -> LineCollection:
-    """The strongest on top."""
+    """Draws paths coloured by power, the strongest on top."""
     ordered = sorted(paths, key=lambda path: path.power_db)
     powers = np.array([path.power_db for path in ordered])
     lowest = min(-10.0, powers.min())
@@ -396,7 +411,7 @@ def _draw_paths(view: _View, paths: Sequence[LearntPath]) -> LineCollection:
 
 
 def _draw_axes(view: _View, position: Float[ndarray, "3"], axes: Float[ndarray, "3 3"]) -> None:
-    """Arrows from a position along axes, one a row, with their names."""
+    """Draws an arrow from a position along each axis (a row), with its name."""
     start = view.project(position)
     ends = view.project(axes)  # (3, 2)
     lengths = np.hypot(*ends.T)

@@ -91,6 +91,7 @@ def _by_number(run: Run) -> list[str | int]:
 
 
 def _read_run(folder: Path, name: str) -> Run:
+    """The run in a folder; a ``ValueError`` if its files are damaged or of two configurations."""
     file = folder / "metrics.json"
     configs = []
     for path in (folder / "config.yaml", folder / ".hydra" / "config.yaml"):
@@ -126,10 +127,13 @@ def _read_yaml(file: Path, kind: type) -> Any:
 
 
 def _correct(overrides: dict[str, str], config: dict) -> list[str]:
-    """Replaces overrides by the configuration's values; returns a sentence for each that differed.
+    """Replaces overrides in place by the configuration's values.
 
     Presets without a name of their own, such as experiments, are not in the configuration. A
     tokenizer that no part reads becomes ``none``.
+
+    Returns:
+        A sentence for each override that differed.
     """
     doubts = []
     absent = object()  # None is a value
@@ -171,11 +175,10 @@ def _has_unread_tokenizer(config: Mapping) -> bool:
 
 
 def _add_differing_options(runs: list[Run]) -> None:
-    """Adds options to ``overrides`` where runs of one group differ in them.
+    """Adds options to ``overrides`` in which runs of one group differ.
 
-    Runs of a group have the same overrides but for the seed, so the options come from
-    ``config.yaml`` alone.
-    Runs with another value than most of the group get a doubt.
+    A group has the same overrides except the seed, so that such options come from ``config.yaml``
+    alone. Runs with another value than most of the group get a doubt.
     """
     for group in by_seed(runs):
         configs = {run.folder: _compared(run.config) for run in group}
@@ -202,7 +205,7 @@ def _add_differing_options(runs: list[Run]) -> None:
 
 
 def _compared(config: Mapping) -> dict:
-    """A configuration without what is repeated in it, and without what no part reads."""
+    """A configuration without a model's copies of other parts, and without an unread tokenizer."""
     parts = {**config}
     if _has_unread_tokenizer(config):
         parts.pop("tokenizer", None)

@@ -35,7 +35,7 @@ class ScalarFigures(TaskFigures):
             receiver = run["receiver"]
             labels = run["labels"]
             predictions = run["prediction"]
-        gateways = {one.name: one.pose.position.numpy() for one in links.receivers}
+        gateways = {antenna.name: antenna.pose.position.numpy() for antenna in links.receivers}
         # Of many receivers those with the most test readings, in their order.
         counts = np.bincount(receiver, minlength=len(gateways))
         shown = np.sort((-counts).argsort(kind="stable")[:max_receivers])
@@ -47,7 +47,7 @@ class ScalarFigures(TaskFigures):
         pages = predicted_against_measured(
             labels[is_shown], predictions[is_shown], receiver[is_shown], [*gateways], task
         )
-        # The last hundredth would squeeze all others.
+        # The largest hundredth of errors would squeeze all others.
         furthest = float(max(np.quantile(error, 0.99) for error in errors.values())) or None
         title = with_unit("|error|", task.error_unit)
         figures = {"error_cdf": cdf(errors, title, "readings", links.split.name, (0, furthest))}
@@ -72,13 +72,14 @@ def predicted_against_measured(
     max_dots: int = 400,
     max_panels: int = 9,
 ) -> list[Figure]:
-    """Test readings over label and prediction, one panel a receiver, all on the same axes.
+    """Predictions against labels of test readings, a panel for each receiver, on the same axes.
 
     A receiver without readings has no panel.
 
     Args:
         labels: Labels [task.unit].
-        predictions: Predictions, likewise.
+        predictions: Predictions [task.unit].
+        receiver: Receiver of each reading.
         names: Names of the receivers.
         max_dots: Largest number of readings of a receiver that are drawn as dots, which do not hide
             each other; more are counted in cells.
@@ -128,10 +129,10 @@ def predicted_against_measured(
 class _Cells(NamedTuple):
     """Squares over label and prediction, in which readings are counted."""
 
-    width: float  # [task.unit]
-    edges: Float[ndarray, " n+1"]  # along both axes [task.unit]
-    limits: tuple[np.floating, np.floating]  # of predictions that are drawn in their place
-    counts: dict[int, Float[ndarray, "n n"]]  # (prediction, label), by index of the receiver
+    width: float  # width of a square [task.unit]
+    edges: Float[ndarray, " n+1"]  # edges along both axes [task.unit]
+    limits: tuple[np.floating, np.floating]  # predictions beyond them are drawn at them [task.unit]
+    counts: dict[int, Float[ndarray, "n n"]]  # counts (prediction, label), by receiver
 
 
 def _cells(
@@ -163,7 +164,7 @@ def _cells(
 
 
 def _draw_counts(figure: Figure, axes: list[Axes], image: Any, label: str) -> None:
-    """The colour bar of numbers of readings, with round ticks."""
+    """Draws the colour bar of an image of counts, with round ticks."""
     bar = figure.colorbar(image, ax=axes, label=label, format="{x:g}", aspect=30, shrink=0.7)
     ticks = np.outer(10.0 ** np.arange(7), (1, 2, 5)).ravel()
     bar.set_ticks(ticks[ticks <= image.norm.vmax])

@@ -38,7 +38,13 @@ def task_class(name: str) -> type[Task]:
 
 
 def headline(task: str, models: Mapping[str, Mapping]) -> tuple[str, Metric]:
-    """The first of a task's metrics that the first model has: not all channels have an SNR."""
+    """Name and metric of a run's main score: the first metric of the task that its model has.
+
+    Channels of unknown phase, for example, have no SNR.
+
+    Args:
+        models: Scores by the model's name, the run's model first.
+    """
     known = task_class(task).metrics()
     scores = next(iter(models.values()))
     name = next((name for name in known if name in scores), next(iter(known)))
@@ -46,7 +52,7 @@ def headline(task: str, models: Mapping[str, Mapping]) -> tuple[str, Metric]:
 
 
 def monitor_names(task: str) -> tuple[str, str | None]:
-    """The score that picks the best checkpoint, and the metric that is its mean or None."""
+    """The score that chooses the best checkpoint; and the metric of its mean, None without one."""
     kind = task_class(task)
     known = kind.metrics()
     # For some tasks the monitor is a property of the instance.
@@ -55,7 +61,10 @@ def monitor_names(task: str) -> tuple[str, str | None]:
 
 
 def metrics_table(metrics: Mapping) -> Group:
-    """Models down, metrics across, the best of each in bold; below it the same at each receiver."""
+    """Tables of scores, models down and metrics across; then one metric at each receiver.
+
+    The best value of each metric is bold.
+    """
     known = task_class(metrics["task"]).metrics()
     models = metrics["models"]
     first, metric = headline(metrics["task"], models)
@@ -73,7 +82,7 @@ def metrics_table(metrics: Mapping) -> Group:
             columns.append(_texts(models, name, shown))
     if test := metrics.get("paired"):
         table.add_column(stacked(f"p against {test['baseline']}"), justify="right")
-        columns.append({one: f"{p[first]:.2g}" for one, p in test["p"].items() if first in p})
+        columns.append({model: f"{p[first]:.2g}" for model, p in test["p"].items() if first in p})
     if validation := metrics.get("validation"):
         table.add_column(stacked(f"{metric.title}, validation"), justify="right")
         columns.append(_texts(validation, first, metric))
@@ -84,7 +93,7 @@ def metrics_table(metrics: Mapping) -> Group:
 
 
 def _receivers_table(receivers: Mapping, name: str, metric: Metric, max_rows: int = 20) -> Table:
-    """Receivers down, models across: one metric; of many receivers the first."""
+    """A table of one metric at the first ``max_rows`` receivers, receivers down, models across."""
     table = Table("receiver", title=f"{escape(metric.title)} at each receiver")
     if len(receivers) > max_rows:
         table.caption = (
@@ -101,13 +110,13 @@ def _receivers_table(receivers: Mapping, name: str, metric: Metric, max_rows: in
 def _texts(
     models: Mapping[str, Mapping], name: str, metric: Metric, bold: str = "[bold]{}[/bold]"
 ) -> dict[str, str]:
-    """One metric by model, the best in the format ``bold``."""
+    """One metric as text by model, the best value in the format ``bold``."""
     values = [scores[name] for scores in models.values()]
     return dict(zip(models, best_in_bold(values, metric.higher_is_better, bold), strict=True))
 
 
 def score_frame(metrics: Mapping) -> Any:
-    """The scores as a ``pandas.DataFrame``, each beside the ``p`` of its paired test."""
+    """The scores as a ``pandas.DataFrame``, each beside the p value of its paired test."""
     pandas = library("pandas", "to_dataframe")
     test = metrics.get("paired") or {"p": {}}
     rows: dict[str, dict] = {}
@@ -145,7 +154,7 @@ def score_latex(metrics: Mapping) -> str:
 
 
 def verdict(metrics: Mapping) -> str:
-    """A sentence: the run's model beside the best baseline, and before its kriging."""
+    """A sentence on the main score of a run: its model, the best baseline, and before kriging."""
     (model, scores), *baselines = metrics["models"].items()
     name, metric = headline(metrics["task"], metrics["models"])
     quantity, _, unit = metric.title.removesuffix("]").partition(" [")
@@ -155,13 +164,14 @@ def verdict(metrics: Mapping) -> str:
     trend = ""
     values = {}
     for other, theirs in baselines:
-        if other == f"{model}_trend":
+        if other == f"{model}_trend":  # the model itself without kriging is no baseline
             trend = f" Before kriging ({other}) it is {theirs[name]:.{digits}f}{unit}."
         else:
             values[other] = theirs[name]
     if values:
-        best = (max if metric.higher_is_better else min)(values, key=lambda one: values[one])
+        best = (max if metric.higher_is_better else min)(values, key=values.__getitem__)
         gap = scores[name] - values[best]
+        # A gap that is printed as 0 is neither better nor worse.
         size = f"{abs(gap):.{digits}f}"
         is_better = (gap > 0) == metric.higher_is_better
         side = f"{size}{unit} {'better' if is_better else 'worse'} than"

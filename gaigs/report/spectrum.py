@@ -64,7 +64,7 @@ def spectra(
     azimuths: Float[ndarray, " columns"],
     polar: bool = False,
 ) -> Figure:
-    """Label, prediction and signed error over azimuth and elevation [deg], one transmitter a row.
+    """Label, prediction and signed error over azimuth and elevation [deg], a row a transmitter.
 
     A polar figure has the zenith in the middle. Amplitudes outside [0, 1] take the colour of the
     nearer end.
@@ -107,7 +107,7 @@ def side_by_side(
     elevations: Float[ndarray, " rows"],
     azimuths: Float[ndarray, " columns"],
 ) -> Figure:
-    """Spectra by title on one grid [deg], such as a measured one and several predictions."""
+    """Spectra on one grid [deg], such as a label and several predictions, each with its title."""
     columns = min(4, len(shown))
     rows = ceil(len(shown) / columns)
     edges = pixel_edges(azimuths, -np.inf, np.inf), pixel_edges(elevations, -90, 90)
@@ -134,7 +134,7 @@ def pixel_edges(
 
 
 def _colours(limit: float | None) -> dict[str, Any]:
-    """A scale of amplitudes; or with a limit, of signed errors up to it."""
+    """Colours for amplitudes; or with a limit, for signed errors up to it."""
     if limit is None:
         return {"cmap": "viridis", "vmin": 0, "vmax": 1}
     return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
@@ -147,6 +147,7 @@ def draw_plane(
     values: Float[ndarray, "rows columns"],
     limit: float | None = None,
 ) -> QuadMesh:
+    """Draws a spectrum over the edges of its pixels [deg]; or errors of at most ``limit``."""
     image = ax.pcolormesh(azimuths, elevations, values, rasterized=True, **_colours(limit))
     ax.xaxis.set_major_locator(MultipleLocator(90))
     ax.yaxis.set_major_locator(MultipleLocator(30))
@@ -161,6 +162,7 @@ def _draw_sky(
     values: Float[ndarray, "rows columns"],
     limit: float | None = None,
 ) -> QuadMesh:
+    """Draws a spectrum as ``draw_plane``, but on polar axes with the zenith in the middle."""
     turns = np.deg2rad(azimuths)
     image = ax.pcolormesh(turns, 90 - elevations, values, rasterized=True, **_colours(limit))
     # The middle of the error's scale is white itself.

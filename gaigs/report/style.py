@@ -83,7 +83,7 @@ MARKERS = [_marker(number) for number in range(25)]
 
 @contextmanager
 def shown() -> Iterator[None]:
-    """The style of all figures; pyplot shows the figures of ``new_figure``."""
+    """Within this context figures have the style, and ``new_figure`` makes them by pyplot."""
     token = _is_shown.set(True)
     try:
         with rc_context(STYLE):
@@ -93,7 +93,7 @@ def shown() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float, layout: str = "constrained") -> Figure:
-    """An empty figure [inch]."""
+    """An empty figure; width and height [inch]."""
     if not _is_shown.get():
         return Figure(figsize=(width, height), layout=layout)
     from matplotlib import pyplot  # of a window or a notebook
@@ -102,9 +102,9 @@ def new_figure(width: float, height: float, layout: str = "constrained") -> Figu
 
 
 def ask(figure: Figure, question: str, note: str = "") -> None:
-    """The question that a figure answers as its title, and a note at its foot.
+    """Gives a figure the question that it answers as its title, and a note at its foot.
 
-    The note stands in the figure's legend if there is one, which would cover it elsewhere.
+    The note goes into the figure's legend if there is one, which would cover it elsewhere.
     """
     figure.suptitle(question, size=8, weight="bold")
     if note and figure.legends:
@@ -126,7 +126,7 @@ def save(figure: Figure, file: Path) -> list[Path]:
 
 
 def panels(figure: Figure, count: int, columns: int, xlabel: str, ylabel: str) -> list[Axes]:
-    """Panels with common axes, row by row; only outer ones have labels and numbers."""
+    """Adds panels with common axes, row by row; only outer ones have labels and numbers."""
     rows = math.ceil(count / columns)
     axes = [*figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).flat]
     for ax in axes[count:]:
@@ -141,11 +141,12 @@ def panels(figure: Figure, count: int, columns: int, xlabel: str, ylabel: str) -
 
 
 def numbered(name: str, pages: Sequence[Figure]) -> dict[str, Figure]:
+    """Pages by file name: ``name``, ``name_2``, ``name_3`` ..."""
     return {f"{name}_{page}" if page > 1 else name: figure for page, figure in enumerate(pages, 1)}
 
 
 def even_pages(items: Sequence, most: int) -> list[Sequence]:
-    """Parts of ``items`` for pages of at most ``most`` panels, which are of one size."""
+    """Items of each page, at most ``most``, as evenly as possible."""
     pages = math.ceil(len(items) / most) or 1
     size = math.ceil(len(items) / pages) or 1
     return [items[first : first + size] for first in range(0, len(items), size)]
@@ -154,13 +155,17 @@ def even_pages(items: Sequence, most: int) -> list[Sequence]:
 def scaled_panels(
     count: int, width: float, height: float, xlabel: str, ylabel: str
 ) -> tuple[Figure, list[Axes]]:
-    """Panels of an extent in one unit with common axes, as large as a page allows."""
+    """A figure of panels to one scale with common axes, as large as a page allows.
+
+    Args:
+        width, height: Extent of a panel, in the unit of its axes.
+    """
     bar = 1.5  # inches beside all panels
     title = 0.25  # inches above each panel
     foot = 1.0  # inches above and below all panels
 
     def scale(columns: int) -> float:
-        """Inches of one unit."""
+        """Inches for one unit, with so many columns."""
         rows = math.ceil(count / columns)
         return min((PAGE - bar) / (columns * width), 5.6 / (rows * height), 3 / height)
 
@@ -180,9 +185,9 @@ def wrapped(label: str, width: int = 48) -> str:
 def named_ones(
     scores: Mapping[str, float], higher_is_better: bool, own: str | None = None, most: int = 6
 ) -> list[str]:
-    """Lines of a figure that have a colour and a name, best first: more colours are confused.
+    """Names of the lines that get a colour and a label, best first; the others are grey.
 
-    ``own`` is always among them.
+    There are at most ``most``, as more colours are confused; ``own`` is always among them.
     """
     ranked = sorted(scores, key=lambda name: scores[name], reverse=higher_is_better)
     first = [] if own is None else [own]
@@ -191,7 +196,7 @@ def named_ones(
 
 
 def looks(systems: Iterable[str]) -> dict[str, tuple]:
-    """Colour and dash of systems by name, alike in all figures, different in one of up to 36.
+    """Colour and dash of systems by name: the same in all figures, and all different if up to 36.
 
     A baseline looks as the system of its name. A model without its kriging has the model's colour,
     and dots.
@@ -218,22 +223,25 @@ def distinct_looks(named: Sequence[str], systems: Iterable[str]) -> dict[str, tu
 
     Where systems share a colour, the one that is not a known model takes a free one.
     """
-    found = looks(systems)
+    looks_by_name = looks(systems)
     models = _models(named)
     known = _places()
     taken = set()
     for name in sorted(named, key=lambda name: models[name] not in known):
-        colour, dash = found[name]
+        colour, dash = looks_by_name[name]
         if colour in taken and not name.endswith("_trend"):
             free = [colour for colour, _ in LINES[:6] if colour not in taken]
             colour = next(iter(free), colour)
         taken.add(colour)
-        found[name] = colour, dash
-    return found
+        looks_by_name[name] = colour, dash
+    return looks_by_name
 
 
 def _models(systems: Iterable[str]) -> dict[str, str]:
-    """The model of each system; the first variant, as "GAI-GS split=a", is the model itself."""
+    """The model of each system by name, for its look.
+
+    A variant such as "GAI-GS split=a" counts as its model, unless the model itself is among them.
+    """
     titles = {title: name for name, title in _titles().items()}
     models = {}
     for name in systems:
@@ -248,14 +256,14 @@ def _models(systems: Iterable[str]) -> dict[str, str]:
 
 @cache
 def _titles() -> dict[str, str]:
-    """Titles of models by name."""
+    """Titles of models by their registered names."""
     content = yaml.safe_load((conf_dir() / "published.yaml").read_text(encoding="utf-8"))
     return content["names"]
 
 
 @cache
 def _places() -> dict[str, int]:
-    """Numbers of known systems in ``LINES``: our two predictors unbroken, others as they come."""
+    """Place in ``LINES`` of each known model; gaigs's two predictors have unbroken lines."""
     places = {
         "gaigs": 0,
         "mirrored": 26,

@@ -39,10 +39,13 @@ class System(NamedTuple):
 def find_systems(
     runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapping, names: Mapping
 ) -> list[System]:
-    """Rows of the comparison table, one for all runs that differ only in the seed.
+    """Rows of the comparison table: one for runs that differ only in the seed, then baselines.
 
-    Rows are in the order of ``names``, which has readers' names by models' registered names. Then
-    come baselines, without those whose printed scores equal those of a run of the same model.
+    A baseline is left out if a run of the same model has the same printed scores.
+
+    Args:
+        baselines, shared: Results of ``gaigs.report.ablation``.
+        names: Shown names by registered ones, in the order of the rows.
     """
     systems = [_system(group, shared, names) for group in by_seed(runs)]
     order = {model: place for place, model in enumerate(names)}
@@ -102,7 +105,14 @@ def _costs(metrics: Mapping) -> dict[str, float | None]:
 def _cells(
     systems: Sequence[System], published: Sequence[Mapping], titles: Mapping[str, str]
 ) -> list[dict]:
-    """Rows by title: published figures of systems in their usual setting, then ours, if known."""
+    """Rows by title: published figures, then measured values; titles without any are left out.
+
+    Published figures belong to runs in their usual setting alone.
+
+    Args:
+        published: Columns as ``read_published`` gives them.
+        titles: Titles of metrics or costs by name.
+    """
     rows = []
     for system in systems:
         row: dict[str, float | Spread | None] = {}
@@ -127,7 +137,10 @@ def _lines(
     metrics: Mapping[str, Metric],
     bold: str = "[bold]{}[/bold]",
 ) -> list[list[str]]:
-    """Lines of a table as text; the best value of each metric that several systems have is bold."""
+    """Lines of a table as text, names first.
+
+    The best value of a metric is bold if two systems or more have the metric.
+    """
     known = {metric.title: metric for metric in metrics.values()}
     columns: list[Sequence[str]] = [names]
     for title in rows[0]:
@@ -148,8 +161,13 @@ def write_systems(
 ) -> Table | None:
     """Writes ``systems.md``, ``systems.csv`` and the figures that compare the systems.
 
-    ``baselines`` and ``shared`` are results of ``gaigs.report.ablation``, ``metrics`` of the task.
-    The result is None, and there are no files, unless runs of several models have ended.
+    Args:
+        baselines, shared: Results of ``gaigs.report.ablation``.
+        metrics: Metrics of the task by name.
+
+    Returns:
+        A table for a terminal. None, and no file is written, if fewer than two models have a
+        finished run.
     """
     published = read_published()
     systems = find_systems(runs, baselines, shared, published["names"])
@@ -225,10 +243,10 @@ def _figures(
     curves = {}
     for name, run in runs.items():
         validations = read_validations(run.folder, monitor)
-        known = [one for one in validations if math.isfinite(one.seconds)]
-        if known:
-            times = tuple(one.seconds for one in known)
-            curves[name] = times, tuple(one.score for one in known)
+        timed = [validation for validation in validations if math.isfinite(validation.seconds)]
+        if timed:
+            times = tuple(validation.seconds for validation in timed)
+            curves[name] = times, tuple(validation.score for validation in timed)
     if curves and mean is not None:
         scores = _baseline_scores(runs, [*curves], mean)
         figures["curves"] = learning_curves(curves, scores, metrics[mean])
@@ -236,7 +254,7 @@ def _figures(
 
 
 def _first_seeds(systems: Sequence[System]) -> dict[str, Run]:
-    """The run of each system with the first common seed, or else its first run, by name."""
+    """A run of each system by name: with the lowest seed that all have, or else its first one."""
     counts: Counter[int] = Counter()
     for system in systems:
         counts.update({run.metrics["seed"] for run in system.runs})
@@ -264,7 +282,11 @@ def _have_same_labels(files: Sequence[Path]) -> bool:
 def _baseline_scores(
     runs: Mapping[str, Run], drawn: Sequence[str], metric: str
 ) -> dict[str, float]:
-    """Validation scores of the baselines, by name, without the models that have curves."""
+    """Validation scores of the baselines by name, without models that have a curve.
+
+    Args:
+        drawn: Names of the systems with a curve.
+    """
     models = {next(iter(runs[name].metrics["models"])) for name in drawn}
     models |= {f"{model}_trend" for model in models}  # a run's model without its kriging
     validations = (run.metrics.get("validation") for run in runs.values())

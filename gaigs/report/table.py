@@ -14,14 +14,15 @@ from gaigs.io import tables
 
 
 class Spread(NamedTuple):
-    """A number of two runs or more: mean, standard deviation of the sample, least value."""
+    """A score of two runs or more."""
 
     mean: float
-    deviation: float
-    least: float
+    deviation: float  # standard deviation of the sample
+    least: float  # least value
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "Spread":
+        """The spread of values, one a run."""
         return cls(statistics.mean(values), statistics.stdev(values), min(values))
 
 
@@ -41,7 +42,7 @@ def best_in_bold(
     higher_is_better: bool,
     bold: str = "[bold]{}[/bold]",
 ) -> list[str]:
-    """Values of a column as text; all that print as the best one are in the format ``bold``."""
+    """Values of a column as text; the best and all that print alike are in the format ``bold``."""
     numbers = [value.mean if isinstance(value, Spread) else value for value in values]
     known = [number for number in numbers if number is not None and not math.isnan(number)]
     best = (max if higher_is_better else min)(known, default=None)
@@ -61,10 +62,11 @@ def columns_of(rows: Iterable[Mapping]) -> list[str]:
 
 
 def write_csv(file: Path, rows: Sequence[Mapping], endings: Sequence[str] = ()) -> None:
-    """Writes a line for each row; a column is there if a row has it.
+    """Writes rows as a CSV table with all columns that a row has.
 
-    Columns of a ``Spread`` follow its mean: deviation and least value, or the first alone. Their
-    names have the ``endings``.
+    Args:
+        endings: Endings of the names of columns for the deviation and the least value of a
+            ``Spread``, which follow its mean; one ending for the deviation alone.
     """
     spread = set()
     for row in rows:

@@ -14,11 +14,11 @@ Curve = tuple[ndarray, ndarray]
 
 
 class Validation(NamedTuple):
-    """The mean score after a step, and the time since the start [s], NaN if unknown."""
+    """The score of a validation."""
 
     step: int
-    seconds: float
-    score: float
+    seconds: float  # time since the start of the training [s]; NaN if unknown
+    score: float  # mean over the validation links
 
 
 def read_curves(paths: Sequence[Path]) -> dict[str, Curve]:

@@ -20,12 +20,15 @@ def rows_of(links: Links) -> Int[Tensor, " n"]:
 
 
 def places_of(links: Links) -> Int[Tensor, " n"]:
-    """First row at each link's place: a place that is measured in several rows is one group."""
+    """The group of each link: all links of a place, and of a row, are in one group.
+
+    A group is named by its first row.
+    """
     rows = rows_of(links)
     last = rows.new_full((len(rows),), int(rows.max()))
-    # Links of one row stay together, even at several places.
+    # First joins the rows of a place, then the places of a row.
     for numbers in (links.query.place_keys, rows):
-        _, which = numbers.unique(return_inverse=True)
+        _, which = numbers.unique(return_inverse=True)  # (n,)
         first = last.scatter_reduce(0, which, rows, "amin")
         rows = first[which]
     return rows
@@ -44,7 +47,7 @@ def part(
     """Holds out whole groups of links, first for the test and then in the same way for validation.
 
     Args:
-        name: Name of the protocol, with its own options.
+        name: Name of the split with its own options; the common ones are appended.
         links: All links.
         groups: Number of each link's group.
         test: Fraction of the links to test on; 0 for none.
@@ -52,7 +55,7 @@ def part(
             links as many more as intervals of 90 % need, see ``hold_out``.
         seed: Seed of all random numbers.
         train: Groups to train and validate on; None for all that do not test.
-        rows: As of ``drawn``.
+        rows: Row of each link, for an order that repeated places do not change; see ``drawn``.
     """
     check("test", test, 0 <= test < 1, "in [0, 1)")
     check_validation(validation)
@@ -82,23 +85,23 @@ def drawn(
     generator: torch.Generator,
     rows: Int[Tensor, " n"] | None = None,
 ) -> Int[Tensor, " g"]:
-    """Groups of some links in random order.
+    """The groups of the numbered links in random order.
 
-    With ``rows``, numbers of groups, it is the order of rows: a repeated place
-    changes no other draw.
+    With ``rows``, where groups are named by their first rows, all rows are shuffled: then the order
+    of the other groups does not depend on repeated places.
     """
-    present = groups[links] if rows is None else torch.cat((groups[links], rows[links]))
-    present = present.unique()
-    order = present[torch.randperm(len(present), generator=generator)]
+    shuffled = groups[links] if rows is None else torch.cat((groups[links], rows[links]))
+    shuffled = shuffled.unique()
+    order = shuffled[torch.randperm(len(shuffled), generator=generator)]
     return order[torch.isin(order, groups[links])]
 
 
 class Parted(NamedTuple):
-    """Ascending links that are kept and held out, and the fraction to call the latter by."""
+    """Links that are kept and links that are held out, ascending."""
 
     kept: Int[Tensor, " k"]
     held: Int[Tensor, " h"]
-    fraction: float
+    fraction: float  # the fraction held out, for the split's name
 
 
 def hold_out(
@@ -111,12 +114,17 @@ def hold_out(
     at_most: bool = False,
     rows: Int[Tensor, " n"] | None = None,
 ) -> Parted:
-    """Holds out random whole groups, as near to a fraction of some ascending links as possible.
+    """Holds out random whole groups of links.
 
-    With ``at_most`` it is not more than the fraction, if one group is not. The groups are those of
-    all links of the data; there must be two or more. Links count by their ``votes``. Without a
-    fraction it is 0.1, but the nine links that intervals of 90 % need where these are no more than
-    0.3. An error calls the fraction ``name``.
+    Args:
+        name: Option that gives the fraction, for errors.
+        links: Ascending numbers of the links to divide, of two groups or more.
+        groups: Group of each link of the data.
+        votes: Weight of each link of the data.
+        fraction: Fraction of the links' votes to hold out, as nearly as groups allow. None: 0.1, or
+            up to 0.3 if the nine links that intervals of 90 % need take it.
+        at_most: True to hold out no more than the fraction, but one group at least.
+        rows: See ``drawn``.
     """
     if fraction == 0:
         return Parted(links, links[:0], 0.0)
@@ -130,9 +138,10 @@ def hold_out(
             f"cubes, add measurements{without}"
         )
     _, numbers = torch.cat((order, groups[links])).unique(return_inverse=True)
-    sizes = votes.new_zeros(len(order)).index_add(0, numbers[len(order) :], votes[links])
-    # Single precision: sums of thirds are whole numbers but for rounding.
-    filled = sizes[numbers[: len(order)]].cumsum(0).float()
+    of_order, of_links = numbers.tensor_split([len(order)])
+    sizes = votes.new_zeros(len(order)).index_add(0, of_links, votes[links])
+    # Votes in the first 1, 2, ... groups. Sums of thirds are whole numbers in single precision.
+    filled = sizes[of_order].cumsum(0).float()
     total = filled[-1].item()
     filled = filled[:-1]  # one group at least is kept
     surplus = filled - usual * total

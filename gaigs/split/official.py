@@ -14,8 +14,8 @@ def official(
     Args:
         length: Rows in a run that validates; more than 1 if the test is a separate run. Runs are
             shorter where fewer than four would validate.
-        validation: Fraction of the training links to validate on, with runs the most; 0 for none.
-            None: 0.1, and of few links more, see ``gaigs.split.hold_out``.
+        validation: Fraction of the training links to validate on; with runs, an upper bound of it.
+            0 for none. None: 0.1, or more if there are few links, see ``gaigs.split.hold_out``.
 
     Raises:
         ValueError: The data have no such parts, or an option is out of range.

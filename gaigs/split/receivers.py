@@ -49,7 +49,7 @@ def receivers(
             f"split=receivers tests at receivers of known places, of which the data have "
             f"{len(order)}; give others by data.gateways, or take split=random"
         )
-    of_links = links.query.receivers
+    of_links = links.query.receivers  # receiver of each link
     rest = of_links[~torch.isin(of_links, held)].unique()
     if len(rest) < 2:
         raise ValueError(
@@ -89,7 +89,11 @@ def _held(
     test: float,
     fold: str | None,
 ) -> tuple[Int[Tensor, " h"], str]:
-    """Numbers of the receivers that test, from a random ``order``, and the protocol's name."""
+    """Numbers of the receivers that test, and the name of the split.
+
+    Args:
+        order: All receivers in random order, from which fraction and fold take theirs.
+    """
     names = [receiver.name for receiver in links.receivers]
     if hold and fold is not None:
         raise ValueError("split.hold and split.fold both choose receivers; leave one out")

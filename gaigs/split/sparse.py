@@ -9,7 +9,9 @@ from gaigs.split import part, places_of, rows_of
 def sparse(
     links: Links, train: int, test: float = 0.2, validation: float | None = None, seed: int = 0
 ) -> Split:
-    """Few random places train and validate, nested; test places are those of ``random``.
+    """Few random places train and validate; the same places test as with ``random``.
+
+    Fewer places are a part of more places, with the same seed.
 
     Args:
         train: Places to train and validate on. Other options and errors are as for

@@ -20,13 +20,13 @@ def require(holds: object, rule: str) -> None:
 
 
 def require_empty(got: Sequence[int], shapes: Collection[Sequence[int]], rule: str) -> None:
-    """Requires one of the shapes of an answer to a batch without links."""
+    """Requires that the answer to a batch without links has one of some shapes."""
     remedy = "with b = 0, flatten(1) works and reshape(b, -1) does not"
     require(tuple(got) in shapes, f"{rule}, got {tuple(got)}; {remedy}")
 
 
 def require_refusal(call: Callable[[], object], rule: str) -> None:
-    """Requires a ``ValueError`` of a call, or a type checker's error."""
+    """Requires that a call raises a ``ValueError``, or a ``TypeError`` as type checkers do."""
     try:
         call()
     except (ValueError, TypeError):
@@ -44,7 +44,7 @@ def require_close(actual: Tensor, expected: Tensor, tolerance: float, rule: str)
 
 
 def require_same(actual: Tensor, expected: Tensor, rule: str) -> None:
-    """Requires equal bits; on a GPU, which adds in any order, equality but for rounding."""
+    """Requires equal tensors; on a GPU, which adds in any order, equality but for rounding."""
     rounds = actual.is_floating_point() or actual.is_complex()
     if actual.device.type == "cpu" or not rounds:
         require(torch.equal(actual, expected), rule)
@@ -54,10 +54,13 @@ def require_same(actual: Tensor, expected: Tensor, rule: str) -> None:
 
 
 def _largest(values: Tensor) -> float:
+    """Largest magnitude; 0 for an empty tensor."""
     return values.abs().max().item() if values.numel() else 0.0
 
 
 def _require_within(actual: Tensor, expected: Tensor, most: float, rule: str) -> None:
+    """Requires errors of at most ``most``; the message has the rule and the largest error."""
+
     def explain(detail: str) -> str:
         return f"{rule}\n{detail}"
 
@@ -106,7 +109,10 @@ def require_independence(
 
 
 def require_gradients(outputs: Iterable[Tensor | None], leaves: Mapping[str, Tensor]) -> None:
-    """Requires finite gradients of a fixed function of the outputs; an unused leaf needs none."""
+    """Requires finite gradients of the outputs at the leaves, which are given by name.
+
+    A leaf on which no output depends needs no gradient.
+    """
     sums = []
     for output in outputs:
         if output is not None and output.requires_grad and output.numel():
@@ -132,7 +138,7 @@ def require_groups(groups: Mapping[str, Iterable[nn.Parameter]], module: nn.Modu
 
 
 def fixed_sum(values: Tensor) -> Tensor:
-    """A real sum with fixed, different weights, so that no two gradients cancel."""
+    """A real weighted sum; its weights are all different, so that no two gradients cancel."""
     if values.is_complex():
         values = torch.view_as_real(values.resolve_conj())
     weights = torch.arange(values.numel(), dtype=torch.float64).cos().to(values)

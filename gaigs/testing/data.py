@@ -39,27 +39,29 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
         Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)),
         Pose.from_xyzw((5.0, 4.0, 1.0), (0, 0.6, 0.8, 0)),
     )
-    made: Task
+    of_labels: Task
     match task:
         case "spectrum":
             grid = Grid.degrees(range(4, 90, 5), range(0, 360, 10))
-            made = Spectrum(grid.elevations, grid.azimuths, "none" if carrier is None else MIN_MAX)
+            scale = "none" if carrier is None else MIN_MAX
+            of_labels = Spectrum(grid.elevations, grid.azimuths, scale)
             if carrier is not None:
                 array = Array.planar(3, 3, speed_of_light / carrier / 2, "cosine")
             labels = torch.rand(24, *grid.shape, generator=generator)
             rows = None
         case "rssi":
-            made = Rssi()
+            of_labels = Rssi()
             places = places[:12].repeat_interleave(2, 0)
             labels = -60 - 10 * torch.rand(24, generator=generator)
         case "csi":
             array = Array.planar(2, 2, speed_of_light / 2.44e9 / 2)
             places = places[:12].repeat_interleave(2, 0)
             frequencies = 2.44e9 + torch.linspace(-1e7, 1e7, 5, dtype=torch.float64)
-            made = Csi(len(array), frequencies)
-            noise = torch.randn(24, *made.shape, dtype=torch.complex64, generator=generator)
-            turned = [pose.to(array.elements).world(array.elements) for pose in poses]
-            elements = torch.stack(turned)[receivers]  # (24, 4, 3) [m]
+            of_labels = Csi(len(array), frequencies)
+            shape = (24, *of_labels.shape)
+            noise = torch.randn(shape, dtype=torch.complex64, generator=generator)
+            by_receiver = [pose.to(array.elements).world(array.elements) for pose in poses]
+            elements = torch.stack(by_receiver)[receivers]  # (24, 4, 3) [m]
             labels = _direct_waves(places, elements, frequencies) + 0.1 * noise
         case _:
             raise ValueError(f"task must be spectrum, rssi or csi, got {task!r}")
@@ -67,7 +69,7 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
         query=Query(places, receivers, None if carrier is None else torch.full((24,), carrier)),
         receivers=tuple(Receiver(f"gateway{i}", pose, array) for i, pose in enumerate(poses)),
         labels=labels,
-        task=made,
+        task=of_labels,
         rows=rows,
         official=lambda: torch.arange(24).split((20, 4)),
         split=Split("example", *torch.arange(24).split((16, 4, 4))),
@@ -124,6 +126,7 @@ def check_parts(parts: dict[str, Tensor], n: int) -> None:
 
 
 def _check_query(links: Links) -> None:
+    """Checks shapes, dtypes and ranges of transmitters, receivers and frequencies."""
     n = len(links)
     index = links.query.receivers
     require_tensor("transmitters", links.query.transmitters, (n, 3), torch.float32)
@@ -141,6 +144,7 @@ def _check_query(links: Links) -> None:
 
 
 def _check_receivers(links: Links) -> None:
+    """Checks that receivers have different names, and finite positions and elements."""
     names = [receiver.name for receiver in links.receivers]
     require(len({*names}) == len(names), "receivers must have different names")
     for receiver in links.receivers:
@@ -153,6 +157,7 @@ def _check_receivers(links: Links) -> None:
 
 
 def _check_rows(links: Links) -> None:
+    """Checks that rows are numbers from 0, and that links of one row have one transmitter place."""
     if links.rows is None:
         return
     rows = links.rows
@@ -169,6 +174,7 @@ def _check_rows(links: Links) -> None:
 
 
 def _check_labels(links: Links) -> None:
+    """Checks that labels can be read twice, alone and as a batch, and that each has a score."""
     task = links.task
     index = torch.linspace(0, len(links) - 1, 9).long().flip(0)
     labels = links.labels[index]

@@ -60,7 +60,7 @@ def check_model(
 
 
 def _hard_query(links: Links, query: Query) -> Query:
-    """The places of a query, the receiver's own and one a kilometre away, to one receiver."""
+    """A query with two places more, the receiver's own and one a kilometre from it on each axis."""
     receiver = links.receivers[query.receivers[0]].pose.position[None]
     places = torch.cat((query.transmitters, receiver, receiver + 1e3))
     count = len(places)
@@ -77,7 +77,7 @@ def _predict(model: Model, query: Query, places: Tensor, **options: Any) -> Tens
 
 
 def _check_predictions(model: Model, links: Links, query: Query) -> None:
-    """Predictions for a query, and for the same positions one by one, as a grid, and for none."""
+    """Checks predictions for a query; for its positions one by one and as a grid; and for none."""
     task = links.task
     places = query.transmitters
     values = model.train().predict(query)
@@ -98,7 +98,7 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
 
 
 def _check_arguments(model: Model, links: Links, query: Query) -> None:
-    """Directions and subcarriers as arguments, and what must be refused."""
+    """Checks directions and subcarriers as arguments, and that impossible ones are refused."""
     task = links.task
     places = query.transmitters
     values = model.predict(query)
@@ -127,7 +127,7 @@ def _check_arguments(model: Model, links: Links, query: Query) -> None:
 
 
 def _check_evaluation(model: Model, batch: Batch, mixed: Batch) -> None:
-    """``evaluate`` and ``forward`` agree, for links to one receiver and to several."""
+    """Checks that ``evaluate`` and ``forward`` agree, for links to one receiver and to several."""
     model.eval()
     values = model.evaluate(batch)
     labels = batch.labels
@@ -148,7 +148,7 @@ def _check_evaluation(model: Model, batch: Batch, mixed: Batch) -> None:
 
 
 def _check_directions(model: Model, batch: Batch) -> None:
-    """Values do not depend on the other directions, nor on how many are evaluated at a time."""
+    """Checks that values depend neither on the other directions nor on ``chunk``."""
     values = model.evaluate(batch)
     if isinstance(batch.directions, Grid):
         rows, columns = slice(1, None, 3), slice(2, None, 4)
@@ -172,7 +172,7 @@ def _check_directions(model: Model, batch: Batch) -> None:
 
 
 def _check_report(model: Model, batch: Batch) -> None:
-    """Attributes and optional methods that a run reads."""
+    """Checks attributes and optional methods that a run reads."""
     facts = model.facts()
     is_table = isinstance(facts, dict)
     require(is_table, f"facts must be a dictionary, got {type(facts).__name__}")
@@ -193,6 +193,7 @@ def _check_report(model: Model, batch: Batch) -> None:
 
 
 def _check_training(model: Model, batch: Batch) -> None:
+    """Checks values, penalties and gradients of a training step."""
     value, penalties = model.train()(batch)
     labels = batch.labels
     require_tensor("the value", value, labels.shape, labels.dtype, labels.device)

@@ -45,6 +45,7 @@ def example_gaussians(scene: Scene, count: int) -> Gaussians:
 
 
 def _check_call(placement: nn.Module, gaussians: Gaussians | None, query: Query) -> None:
+    """Checks the placed Gaussians of a query, and that queries do not depend on each other."""
     count = 0 if gaussians is None else len(gaussians)
     placed = placement(gaussians, query)
     is_placed = isinstance(placed, Placed)
@@ -73,7 +74,7 @@ def _check_call(placement: nn.Module, gaussians: Gaussians | None, query: Query)
 
 
 def _check_fields(placed: Placed, n: int, transmitters: Tensor) -> None:
-    """Shapes, dtypes and ranges of n placed Gaussians for b queries."""
+    """Checks shapes, dtypes and ranges of n placed Gaussians for b queries."""
     together = ("quats", "scales", "opacities", "signal")
     missing = [name for name in together if getattr(placed, name) is None]
     rule = f"{', '.join(together)} must be given together, and {', '.join(missing)} is missing"

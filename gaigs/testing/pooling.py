@@ -68,18 +68,19 @@ def check_pooling(
 
 
 class _PoolingInputs(NamedTuple):
-    """What a pooling is called with, and silence of the same shape, with their leaves by name."""
+    """Arguments of a pooling: received maps or paths, and silence of the same shape."""
 
-    noun: str
+    noun: str  # "maps" or "paths", for messages
     received: Tensor | ReceivedPaths
-    leaves: dict[str, Tensor]
+    leaves: dict[str, Tensor]  # tensors of ``received`` that get gradients, by name
     silence: Tensor | ReceivedPaths
-    silent: Tensor
+    silent: Tensor  # the tensor of ``silence`` that gets a gradient
 
 
 def _map_inputs(
     channels: int, grid: Grid | None, query: Query, dtype: torch.dtype
 ) -> _PoolingInputs:
+    """Random maps over a grid, one a link."""
     generator = torch.Generator().manual_seed(0)
     image = torch.randn(len(query), channels, *grid.shape, generator=generator)
     image = image.to(query.transmitters.device, dtype).requires_grad_()
@@ -88,6 +89,7 @@ def _map_inputs(
 
 
 def _path_inputs(receiver: Receiver, query: Query, dtype: torch.dtype) -> _PoolingInputs:
+    """Paths of ``example_paths``, and the same paths with amplitudes of 0."""
     paths = example_paths(receiver, query, dtype)
     names = ("means", "semi_axes", "amplitudes", "lengths", "coherences", "bandwidth")
     leaves = {name: getattr(paths, name).requires_grad_() for name in names}
@@ -114,8 +116,13 @@ def _check_attributes(pooling: Pooling, task: Task) -> Grid | None:
 
 
 def _check_values(pooling: Pooling, task: Task, inputs: _PoolingInputs, query: Query) -> Tensor:
-    """Values and gradients for all queries, the last one, none, and silence."""
-    noun, received = inputs.noun, inputs.received
+    """Checks values and gradients for all queries, the last one, none, and silence.
+
+    Returns:
+        The values for all queries.
+    """
+    noun = inputs.noun
+    received = inputs.received
     value = pooling(received, query)
     real = _real_dtype(received)
     dtype = real.to_complex() if task.dtype.is_complex else real
@@ -137,7 +144,7 @@ def _check_values(pooling: Pooling, task: Task, inputs: _PoolingInputs, query: Q
 def _check_directions(
     pooling: Pooling, task: Task, received: Tensor | ReceivedPaths, query: Query, value: Tensor
 ) -> None:
-    """Values for a list of the label's directions."""
+    """Checks values for a list of the label's directions."""
     tolerance = PRECISION[_real_dtype(received)]
     if isinstance(received, Tensor) and pooling.grid is None:
         row = received.flatten(2)[:, :, None, ::3]  # (b, c, 1, k)
@@ -156,7 +163,7 @@ def _check_directions(
 def _check_hard_maps(
     pooling: Pooling, image: Float[Tensor, "b c rows columns"], query: Query
 ) -> None:
-    """Levels and their gradients are finite, and float32 where the map is of half precision."""
+    """Checks that extreme maps give finite levels and gradients, in single precision at least."""
     decades = torch.linspace(-6, 6, image[0].numel()).reshape(image.shape[1:]).to(image)
     maps = {
         "a silent map": 0 * image,
@@ -179,7 +186,7 @@ def _real_dtype(received: Tensor | ReceivedPaths) -> torch.dtype:
 
 
 def rows_of(received: Tensor | ReceivedPaths, rows: slice) -> Tensor | ReceivedPaths:
-    """Maps or paths of a few queries."""
+    """Maps or paths of some queries."""
     if isinstance(received, Tensor):
         return received[rows]
     names = ("means", "semi_axes", "amplitudes", "lengths", "carriers")

@@ -49,6 +49,7 @@ def check_task(task: Task, *thinnings: Mapping) -> None:
 
 
 def _check_facts(task: Task) -> None:
+    """Checks the types of the task's attributes and metrics."""
     is_registered = task.name in registry("task").names()
     require(is_registered, f"a task must have its registered name, got {task.name!r}")
     texts = ("quantity", "unit", "normalisation", "monitor", "pair_score")
@@ -68,6 +69,7 @@ def _check_facts(task: Task) -> None:
 
 
 def _check_state(task: Task) -> None:
+    """Checks that a stored state builds the same task."""
     file = io.BytesIO()
     torch.save(task.state(), file)
     file.seek(0)
@@ -79,6 +81,7 @@ def _check_state(task: Task) -> None:
 
 
 def _check_scores(task: Task, perfect: Mapping[str, Tensor], worse: Mapping[str, Tensor]) -> None:
+    """Checks scores of five samples: ``perfect`` for the labels as values, ``worse`` for others."""
     names = ", ".join(perfect)
     has_monitor = task.monitor in perfect
     require(has_monitor, f"scores must have the monitored one, {task.monitor!r}, got {names}")
@@ -97,6 +100,7 @@ def _check_scores(task: Task, perfect: Mapping[str, Tensor], worse: Mapping[str,
 def _check_summaries(
     task: Task, perfect: Mapping[str, Tensor], worse: Mapping[str, Tensor]
 ) -> None:
+    """Checks the task's summaries of scores, and of scores of averaged samples."""
     metrics = type(task).metrics()
     best = task.summarise(perfect)
     second = task.summarise(worse)
@@ -120,6 +124,7 @@ def _check_summaries(
 
 
 def _check_refusals(task: Task, labels: Tensor, values: Tensor) -> None:
+    """Checks that wrong shapes and numbers are refused, and that no samples have no scores."""
     broken = torch.arange(labels.numel()).view_as(labels) == 1
     wrong = {
         "of different number": (labels, values[1:]),
@@ -137,9 +142,10 @@ def _check_refusals(task: Task, labels: Tensor, values: Tensor) -> None:
 
 
 def _check_thinning(task: Task, options: dict) -> None:
-    """Checks that labels, each the number of its pixel, and directions are thinned alike."""
+    """Checks that a task's thinning keeps the same pixels of labels and of directions."""
     thin = task.thinning(**options)
     count = max(1, int(np.prod(task.shape)))
+    # Each label has the number of its pixel as value, which shows where a kept value is from.
     numbers = torch.arange(count, dtype=torch.float64).reshape(task.shape).expand(2, *task.shape)
     query = Query(torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), torch.tensor([0, 1]))
     batch = Batch(query, task.directions, numbers, (0.5, 0.25))

@@ -124,6 +124,7 @@ class Budget(Callback):
         return elapsed
 
     def _stop_in_time(self, trainer) -> None:
+        """Asks Lightning to stop after this step once the whole time is spent."""
         trainer.should_stop = trainer.should_stop or self.share >= 1
 
 
@@ -180,30 +181,30 @@ def seconds(option: str, duration: object) -> float:
 
 
 def watched(config: Mapping) -> contextlib.AbstractContextManager[stages.Timekeeper]:
-    """The watch of a run: its limit ``max_time``, and bars unless the trainer has none."""
+    """The timekeeper of a run: its limit is ``max_time``; it draws bars if the trainer does."""
     limit = math.inf if config.get("max_time") is None else seconds("max_time", config["max_time"])
     return stages.watched(limit, is_first() and config["trainer"].get("enable_progress_bar", True))
 
 
 def time_share(trainer) -> float | None:
     """The spent share of the time, the same in all processes; None without a limit of time."""
-    shares = (one.share for one in _budgets(trainer) if math.isfinite(one.limit))
+    shares = (budget.share for budget in _budgets(trainer) if math.isfinite(budget.limit))
     return next(shares, None)
 
 
 def is_time_up(trainer) -> bool:
     """True if the time of a training is up, by the clock of the first process."""
     strategy = trainer.strategy
-    return any(strategy.broadcast(one.seconds) >= one.limit for one in _budgets(trainer))
+    return any(strategy.broadcast(budget.seconds) >= budget.limit for budget in _budgets(trainer))
 
 
 def _budgets(trainer) -> list[Budget]:
-    """The trainer's budget, if it has one."""
+    """The trainer's callbacks that are a ``Budget``: one or none."""
     return [callback for callback in trainer.callbacks if isinstance(callback, Budget)]
 
 
 def share_done(trainer) -> Callable[[int], float]:
-    """The share of a training done after some steps: of steps or time, whichever is more."""
+    """A function of the step: the share of the training's steps or of its time, if that is more."""
 
     def share(step: int) -> float:
         by_steps = step / trainer.max_steps if trainer.max_steps > 0 else 0.0

@@ -51,7 +51,7 @@ class KeepBest(Checkpoint):
 
     def on_train_start(self, trainer, module) -> None:
         """Scores the start of a model that predicts untrained, too."""
-        self._stop_in_time(trainer)  # a run that was killed once it had stopped
+        self._stop_without_progress(trainer)  # a run that was killed once it had stopped
         if trainer.enable_validation and self.best == -math.inf and module.model.predicts_untrained:
             self._validate(trainer, module)
 
@@ -67,7 +67,7 @@ class KeepBest(Checkpoint):
             self.is_behind = self.best + rate * (1 - self.share) < self.rival
         if self.is_behind:
             log.info("step %d: a law of distance stays ahead of the room", trainer.global_step)
-        self._stop_in_time(trainer)
+        self._stop_without_progress(trainer)
 
     def on_train_end(self, trainer, module) -> None:
         """Scores the last step too, if no validation was due at it."""
@@ -76,6 +76,7 @@ class KeepBest(Checkpoint):
 
     @torch.no_grad()
     def _validate(self, trainer, module) -> None:
+        """Scores all validation links outside of Lightning's own validations."""
         module.eval()
         scores = MeanScores(module.task)
         for batch in trainer.val_dataloaders:
@@ -98,7 +99,8 @@ class KeepBest(Checkpoint):
             save(trainer, self.path)
         return is_better
 
-    def _stop_in_time(self, trainer) -> None:
+    def _stop_without_progress(self, trainer) -> None:
+        """Asks Lightning to stop behind the rival, or ``patience`` validations after the best."""
         if self.is_behind or (self.patience is not None and self.waited >= self.patience):
             trainer.should_stop = True
 
@@ -149,16 +151,16 @@ class KeepLast(Checkpoint):
 
     def on_train_batch_end(self, trainer, module, *_) -> None:
         if not (trainer.enable_validation and trainer.global_step % trainer.val_check_batch == 0):
-            self._rest(trainer)
+            self._save_if_due(trainer)
 
     def on_validation_end(self, trainer, module) -> None:
         if not trainer.sanity_checking:
-            self._rest(trainer)
+            self._save_if_due(trainer)
 
     def on_fit_end(self, trainer, module) -> None:
         save(trainer, self.path)
 
-    def _rest(self, trainer) -> None:
+    def _save_if_due(self, trainer) -> None:
         """Writes a checkpoint between two steps if it is time; at a signal the training stops."""
         any_of = partial(trainer.strategy.reduce_boolean_decision, all=False)
         is_due = trainer.is_global_zero and time.monotonic() >= self.saved + self.every

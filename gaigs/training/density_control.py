@@ -11,8 +11,8 @@ class DensityControl(Callback):
     """Prunes, clones and splits Gaussians on a schedule.
 
     The pull at a Gaussian is its mean positional gradient since the last round times its distance
-    to the receivers' middle. Of those pulled harder than ``gradient``, wide ones split and narrow
-    ones are cloned.
+    to the receivers' middle. Where it exceeds ``gradient``, a wide Gaussian is split and a narrow
+    one is cloned.
 
     Args:
         every: Steps between two rounds.

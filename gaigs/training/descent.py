@@ -108,7 +108,7 @@ class Descent(lightning.LightningModule):
         return self.add_up(loss, terms, penalties, batch)
 
     def prepare(self, batch: Batch) -> Batch:
-        """A batch as a step sees it: of some links, thinned, its places moved."""
+        """A batch as a step trains on it: with fewer links, thinned labels and moved places."""
         generator = seeded(self.seed, self.global_step)
         if self.links is not None and len(batch) > self.links:
             order = torch.randperm(len(batch), generator=generator)
@@ -189,7 +189,7 @@ class Descent(lightning.LightningModule):
 def _overridden(
     option: str, defaults: Mapping[str, float], values: Mapping[str, float]
 ) -> dict[str, float]:
-    """A model's defaults with some of them replaced."""
+    """A model's defaults with ``values`` in their place; errors name the values' ``option``."""
     for name, value in values.items():
         if name not in defaults:
             listed = ", ".join(sorted(defaults)) or "none"

@@ -12,11 +12,10 @@ from gaigs.model import Model
 
 @torch.no_grad()
 def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
-    """Names the first quantity of a step's loss that is not finite, by a hook at each part of the
-    model.
+    """The name of the first quantity in a step's loss that is not finite.
 
-    It is the places, a parameter, the output of a part, the prediction, a penalty, or a term of the
-    loss.
+    It is looked for in this order: places, parameters, outputs of the model's parts (by hooks), the
+    prediction, penalties, terms of the loss.
     """
     if not is_finite(batch.query.transmitters):
         return "the places as training.jitter moves them"
@@ -40,10 +39,10 @@ def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
     finally:
         for hook in hooks:
             hook.remove()
-    rest = {"the prediction": value}
-    rest |= {f"the penalty {name}": penalty for name, penalty in penalties.items()}
-    rest |= {f"the term {name}": term for name, term in terms.items()}
-    broken += [name for name, tensor in rest.items() if not is_finite(tensor)]
+    results = {"the prediction": value}
+    results |= {f"the penalty {name}": penalty for name, penalty in penalties.items()}
+    results |= {f"the term {name}": term for name, term in terms.items()}
+    broken += [name for name, tensor in results.items() if not is_finite(tensor)]
     return broken[0] if broken else "their sum"
 
 

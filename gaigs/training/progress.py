@@ -36,6 +36,7 @@ class ProgressLine(ProgressBar):
         self.line.update(self.task, **self._done(trainer), scores=scores)
 
     def _done(self, trainer) -> dict:
+        """The line's fields after a step: share of the training, count and rate of steps."""
         step = trainer.global_step
         last = trainer.max_steps
         count = f"{step:{len(str(last))}d}/{last}" if last > 0 else f"{step} steps"

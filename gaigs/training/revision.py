@@ -90,15 +90,15 @@ class Revision(Callback):
 
             try:
                 with _stopping_when_time_is_up(trainer, module.model):
-                    done = module.model.revise(number, train, validation, loss)
+                    outcome = module.model.revise(number, train, validation, loss)
             except _TimeUp:
                 module.model.load_state_dict(before)
-                done = "the time is up within a revision, which is not made"
+                outcome = "the time is up within a revision, which is not made"
             module.train()
-            log.info("step %d: %s", trainer.global_step, done)
+            log.info("step %d: %s", trainer.global_step, outcome)
 
     def _batch(self, trainer, module, index: Int[Tensor, " k"], number: int) -> Batch | None:
-        """Some of the links, thinned as in a step; None for an empty part."""
+        """Up to ``max_links`` random links of a part, thinned as in a step; None if it is empty."""
         if not len(index):
             return None
         generator = seeded(self.seed, number, len(index))

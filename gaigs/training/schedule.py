@@ -54,10 +54,10 @@ def make_schedule(
 
     Args:
         config: Options of ``warmup_and_decay``; or ``_target_``, a class of
-            ``torch.optim.lr_scheduler``, with its own.
+            ``torch.optim.lr_scheduler``, with the options of that class.
         optimizer: The optimizer.
-        share_done: Share of the training done after a number of steps; a class of torch counts
-            steps alone.
+        share_done: Share of the training that is done after a number of steps. Classes of torch do
+            not use it: they count steps.
     """
     if "_target_" not in config:
         given = {"optimizer": optimizer, "share_done": share_done}
@@ -69,8 +69,9 @@ def make_schedule(
 def warmup_and_decay(
     optimizer: Optimizer, share_done: Callable[[int], float], warmup: int, final: float
 ) -> LRScheduler:
-    """Rates rise linearly over ``warmup`` steps, and fall exponentially to the fraction ``final``
-    of themselves.
+    """A schedule of rates that rise linearly over ``warmup`` steps, and also fall exponentially.
+
+    At the end of the training a rate is the fraction ``final`` of the optimizer's.
     """
     if not 0 < final <= 1:
         raise ValueError(f"training.schedule.final must be in (0, 1], got {final}")
@@ -85,7 +86,7 @@ def warmup_and_decay(
 
 
 def _target(option: str, config: Mapping, module: ModuleType, base: type) -> tuple[type, dict]:
-    """The class that a configuration names, and its options."""
+    """The class that ``_target_`` names, and the other options; a ``ValueError`` for another."""
     options = dict(config)
     target = str(options.pop("_target_", None))
     start = f"{module.__name__}."

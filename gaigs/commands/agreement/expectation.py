@@ -70,14 +70,13 @@ def on_split(
 class NearestLinks(NamedTuple):
     """The nearest known link of each test link."""
 
-    # To the nearest known link of the same receiver and carrier [m].
-    distances: Float[ndarray, " k"]
-    separations: ndarray  # to the same link, in measurements
-    missing: int  # number of test links without one
+    distances: Float[ndarray, " k"]  # to the nearest known link of its receiver and carrier [m]
+    separations: ndarray  # measurements between the two links
+    missing: int  # number of test links without a known link of their receiver and carrier
 
 
 def nearest_known(links: Links) -> NearestLinks:
-    """The nearest known link of each test link of the same receiver and carrier."""
+    """For each test link, the nearest known link of its receiver and carrier."""
     places = links.query.transmitters.double().numpy()
     order = visits(links)
     test = links.split.test.numpy()
@@ -85,12 +84,12 @@ def nearest_known(links: Links) -> NearestLinks:
     distances = [np.zeros(0)]
     separations = [np.zeros(0)]
     for group in groups_of(links):
-        asked = np.intersect1d(group, test)
-        there = np.intersect1d(group, known)
-        if len(asked) and len(there):
-            distance, nearest = cKDTree(places[there]).query(places[asked])
+        tested = np.intersect1d(group, test)
+        candidates = np.intersect1d(group, known)
+        if len(tested) and len(candidates):
+            distance, nearest = cKDTree(places[candidates]).query(places[tested])
             distances.append(distance)
-            separations.append(np.abs(order[asked] - order[there[nearest]]))
+            separations.append(np.abs(order[tested] - order[candidates[nearest]]))
     all_distances = np.concatenate(distances)
     missing = len(test) - len(all_distances)
     return NearestLinks(all_distances, np.concatenate(separations), missing)
@@ -103,14 +102,19 @@ def drawn_scores(
     random: np.random.Generator,
     fewest: int = 20_000,
 ) -> dict[str, Tensor]:
-    """Scores of random pairs of random cells, at least so many."""
+    """Scores of ``fewest`` random pairs, or one a test link if these are more.
+
+    Args:
+        cells: Cell of each test link; cells are drawn from them with replacement.
+        score: Name of the score by which pairs were compared.
+    """
     numbers, counts = np.unique(random.choice(cells, max(fewest, len(cells))), return_counts=True)
-    parts = []
+    by_cell = []
     for cell, count in zip(numbers, counts, strict=True):
         scores = agreement.scores[int(cell)]
         which = torch.from_numpy(random.integers(len(scores[score]), size=count))
-        parts.append({name: values[which] for name, values in scores.items()})
-    return joined_scores(parts)
+        by_cell.append({name: values[which] for name, values in scores.items()})
+    return joined_scores(by_cell)
 
 
 def baseline_rows(links: Links, baselines: list[Mapping]) -> dict[str, dict[str, float]]:

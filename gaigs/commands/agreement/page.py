@@ -16,7 +16,7 @@ from gaigs.report.table import markdown
 
 
 class Cell(NamedTuple):
-    """Pairs of labels of similar distance and separation."""
+    """Pairs of labels whose places, and whose numbers of measurement, are similarly far apart."""
 
     # Distance of their places, from and to below [m]; 0 and 0 for one place.
     distance: tuple[float, float]
@@ -27,7 +27,7 @@ class Cell(NamedTuple):
     quantiles: tuple[float, float, float]
 
     def text(self, score: str) -> str:
-        """The cell in a table."""
+        """The cell as a table shows it: median, percentiles and number of pairs."""
         low, median, high = (_number(value, score) for value in self.quantiles)
         return f"{median} ({low} to {high}), {self.pairs:,}"
 
@@ -65,7 +65,7 @@ def write(
 
 
 def table_of_cells(cells: Sequence[Cell], score: str) -> list[list[str]]:
-    """Lines of a table: distances down, separations across."""
+    """Rows of a table with its heading: distances down, separations across."""
     texts = {(cell.distance, cell.separation): cell.text(score) for cell in cells}
     columns = sorted({cell.separation for cell in cells})
     lines = [["distance [m]", *map(_separation, columns)]]
@@ -109,10 +109,12 @@ def figure(score: str, cells: Sequence[Cell]) -> Figure:
 
 
 def _number(value: float, title: str) -> str:
+    """A score with two decimals if its title ends with a unit, else with three."""
     return f"{value:z.{2 if title.endswith(']') else 3}f}"
 
 
 def _distance(bounds: tuple[float, float]) -> str:
+    """The label of a row; bounds in m, 0 and 0 for pairs at one place."""
     low, high = bounds
     if not high:
         return "same place"
@@ -120,6 +122,7 @@ def _distance(bounds: tuple[float, float]) -> str:
 
 
 def _separation(bounds: tuple[int, float]) -> str:
+    """The label of a column; bounds in measurements, the upper one infinite in the last column."""
     low, high = bounds
     if math.isinf(high):
         return f"over {low - 1:,}" if low else "any"

@@ -24,7 +24,8 @@ class Agreement:
 
     # Upper edges of the rows [m]; the first row holds pairs at one place, its edge is next to 0.
     distances: ndarray
-    separations: ndarray  # last separations of the columns but the last, ascending; in measurements
+    # Largest separation in each column but the last, ascending [measurements].
+    separations: ndarray
     pairs: Int[ndarray, "rows columns"]  # number of pairs in each cell
     share: float  # share of the pairs that were counted
     # Scores of the compared pairs by cell (row times columns plus column) and by the score's name.
@@ -188,7 +189,12 @@ class Reservoir:
         self.ends = {cell: np.zeros((0, 2), int) for cell in range(cells)}
 
     def add(self, cells: ndarray, keys: ndarray, rows: ndarray, columns: ndarray) -> None:
-        """Offers the pairs of all rows with all columns, by rows, with their cells and keys."""
+        """Offers all pairs of a link of ``rows`` with a link of ``columns``.
+
+        Args:
+            cells: Cell of each pair, row by row.
+            keys: Random number of each pair in [0, 1).
+        """
         small = np.flatnonzero(keys < self.bounds[cells])
         for cell in np.unique(cells[small]):
             here = small[cells[small] == cell]
@@ -212,7 +218,11 @@ def draw(
     block: int,
     random: np.random.Generator,
 ) -> tuple[Int[ndarray, " cells"], dict[int, Int[ndarray, "k 2"]]]:
-    """Number of pairs in each cell, and random pairs of each cell: earlier and later link."""
+    """Counts the pairs of each cell, and draws up to ``most`` of them.
+
+    Returns:
+        The number of pairs in each cell; and the drawn pairs by cell, as earlier and later link.
+    """
     size = agreement.pairs.size
     counts = np.zeros(size + 1, int)  # the last cell holds links that are not a pair
     reservoir = Reservoir(size, most)
@@ -245,7 +255,7 @@ def compare(links: Links, earlier: ndarray, later: ndarray) -> dict[str, Tensor]
 
 
 def joined_scores(parts: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
-    """Scores of several parts, one after another."""
+    """Scores of several parts by name, joined."""
     scores = {}
     for name in parts[0]:
         scores[name] = torch.cat([part[name] for part in parts])

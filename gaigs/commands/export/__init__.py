@@ -112,9 +112,7 @@ def check_suffix(file: Path) -> str:
 
 
 def run(config: dict, folder: Path) -> None:
-    """Exports from a finished run into a folder."""
-    if config["folder"] is None:
-        raise ValueError("command=export needs the folder of a finished run; add folder=runs/...")
+    """Exports from a finished run, as ``config["export"]`` says, into a folder."""
     options = dict(config["export"])
     form, places = options.pop("format"), options.pop("places")
     if form is None:

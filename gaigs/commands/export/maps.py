@@ -28,8 +28,10 @@ log = logging.getLogger(__name__)
 
 def layers(floor: RadioMap) -> dict[str, RadioMap]:
     """Maps of the ``value`` and, if the model states them, of the ``deviation``."""
-    parts = {"value": floor}
-    return parts if floor.deviations is None else parts | {"deviation": deviation_map(floor)}
+    kinds = {"value": floor}
+    if floor.deviations is not None:
+        kinds["deviation"] = deviation_map(floor)
+    return kinds
 
 
 def title(floor: RadioMap) -> str:
@@ -40,7 +42,7 @@ def title(floor: RadioMap) -> str:
 
 
 def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
-    """Bands of value and deviation, one receiver after the other, north up.
+    """Writes a GeoTIFF with a band of value and deviation for each receiver, north up.
 
     Coordinates are in the frame's projected system.
 
@@ -80,10 +82,10 @@ def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 
 
 def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
-    """A point for each place, with value and deviation at each receiver.
+    """Writes a GeoJSON point for each place, with value and deviation at each receiver.
 
-    Keys are ``ap`` and ``ap deviation`` or, if a receiver has such a name, ``ap value`` and ``ap
-    deviation``.
+    Keys for a receiver ``ap`` are ``ap`` and ``ap deviation``; if another receiver has such a name,
+    they are ``ap value`` and ``ap deviation``.
 
     Source: RFC 7946: longitudes and latitudes of WGS 84. Without a frame, coordinates are metres.
     """
@@ -92,7 +94,7 @@ def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
         transformer = find_pyproj().Transformer.from_crs(scene.frame.epsg, 4326, always_xy=True)
         x, y = transformer.transform(x, y)
     kinds = layers(floor)
-    # Names that are also another's with "deviation": every key then ends with its kind.
+    # A receiver may be called "ap deviation" beside one called "ap".
     full_names = {" ".join(pair) for pair in itertools.product(floor.receivers, kinds)}
     collide = full_names & {*floor.receivers}
     columns = {}
@@ -116,7 +118,7 @@ def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 
 
 def write_map_netcdf(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
-    """``value`` and ``deviation`` by receiver, y and x.
+    """Writes a NetCDF file with ``value`` and ``deviation`` by receiver, y and x.
 
     Source: NetCDF Climate and Forecast Metadata Conventions 1.11.
     """
@@ -149,7 +151,7 @@ def write_map_netcdf(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 
 def write_figures(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     """Writes the maps as figures, pages of one PDF or a PNG each; returns the files."""
-    gateways = {one.name: one.pose.position.numpy() for one in scene.receivers}
+    gateways = {receiver.name: receiver.pose.position.numpy() for receiver in scene.receivers}
     pages = map_pages(floor, gateways, {}, np.zeros((0, 2, 3), np.float32))
     if file.suffix.lower() == ".pdf":
         with atomic_write(file) as part, rc_context(style.STYLE), PdfPages(part) as document:

@@ -85,6 +85,7 @@ def write_predictions(
 
 
 def _to_predict(scene: Scene, places: object, frequency: float | None) -> Labels:
+    """What to predict at ``places``; if they are links, their test at any held-out subcarriers."""
     query = query_of("predictions", scene, places, frequency)
     if not isinstance(places, Links):
         return Labels(query, scene.task, None, None)
@@ -96,14 +97,14 @@ def _to_predict(scene: Scene, places: object, frequency: float | None) -> Labels
 
 
 def _blank(part: Tensor | None, absent: Bool[Tensor, " n *shape"]) -> Tensor | None:
-    """A part of an estimate with NaN for elements that a receiver's array lacks."""
+    """Channels with NaN at elements that a receiver's array lacks; numbers of links as they are."""
     if part is None or part.ndim < 3:
         return part
     return part.cpu().masked_fill(absent, math.nan)
 
 
 def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -> Query:
-    """The links of ``places``, one or more, as for ``write_predictions``.
+    """The query of ``places``, as for ``write_predictions``; a ``ValueError`` if it is empty.
 
     Args:
         kind: Name of the file in errors.
@@ -127,7 +128,11 @@ def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -
 def tabulate(
     query: Query, scene: Scene, task: Task, estimate: Estimate, measured: Tensor | None
 ) -> dict[str, Variable]:
-    """Columns of links, axes of labels, and values by links and axes, complex ones in parts."""
+    """The variables of a file of predictions.
+
+    They are columns of links (n,); axes of labels, each by its own name; and values, deviations,
+    bounds, radii and labels by links and axes, complex ones as ``_real`` and ``_imag``.
+    """
     axes = {}
     for name, axis in task.axes().items():
         axes[name] = Variable((name,), axis.values, {"units": axis.unit} if axis.unit else {})
@@ -207,4 +212,5 @@ def _rows(
 
 
 def _shown(value: Any, digits: int = 7) -> str:
+    """A text as it is, and a number with so many digits."""
     return value if isinstance(value, str) else f"{value:.{digits}g}"

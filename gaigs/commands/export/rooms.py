@@ -69,7 +69,7 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
 
 
 def _carrier(mirrored: MirroredSplatting, frequency: float | None) -> float:
-    """The carrier of a scene's materials [Hz]."""
+    """The carrier of a scene's materials [Hz]; a ``ValueError`` if neither option nor data tell."""
     if frequency is None:
         frequency = mirrored.scene.middle_frequency
     if frequency is None:
@@ -99,10 +99,10 @@ def mirrored_of(kind: str, model: Model) -> MirroredSplatting:
 
 @torch.no_grad()
 def traced_gains(model: MirroredSplatting, rest: float) -> Complex[Tensor, " receivers"]:
-    """Gain of each receiver's channels over those that Sionna RT traces.
+    """Factor of each receiver by which traced channels of Sionna RT become the model's channels.
 
     Args:
-        rest: Loss that no sheet has, of ``fit_sheets`` [Np].
+        rest: Loss of obstacles outside all sheets, from ``fit_sheets`` [Np].
     """
     placement = model.placement
     nepers = placement.receiver_gains + placement.path_gains[..., 0].mean() + rest
@@ -111,23 +111,23 @@ def traced_gains(model: MirroredSplatting, rest: float) -> Complex[Tensor, " rec
 
 
 def _gain_comments(model: MirroredSplatting, rest: float) -> list[str]:
-    """The steps from traced channels to the channels of each receiver."""
+    """Comments of a scene: the factor that turns traced channels into each receiver's channels."""
     conjugated = ", then conjugated" if model.pooling.array_sign > 0 else ""
     gains = traced_gains(model, rest).tolist()
     comments = []
     for receiver, gain in zip(model.scene.receivers, gains, strict=True):
         angle = math.degrees(cmath.phase(gain))
-        turned = f"{abs(gain):.4g}, turned by {angle:.2f} degrees"
-        comments.append(f"Channels of {receiver.name} are those traced times {turned}{conjugated}.")
+        factor = f"{abs(gain):.4g}, turned by {angle:.2f} degrees"
+        comments.append(f"Channels of {receiver.name} are those traced times {factor}{conjugated}.")
     return comments
 
 
 class Bsdf(NamedTuple):
-    """The matter of a mesh as a BSDF of Mitsuba: its name, its type and its properties."""
+    """The material of a mesh as a BSDF of Mitsuba (how its surface reflects and transmits)."""
 
     name: str
-    kind: str
-    properties: tuple[tuple[str, str | float], ...]
+    kind: str  # Mitsuba's type
+    properties: tuple[tuple[str, str | float], ...]  # names and values
 
 
 def itu_bsdf(material: Material, frequency: float) -> Bsdf:
@@ -150,7 +150,10 @@ def itu_bsdf(material: Material, frequency: float) -> Bsdf:
 
 
 def sheet_bsdf(sheet: Sheet) -> Bsdf:
-    """A sheet of obstacles, which scatters what it does not transmit: Sionna RT leaves it out."""
+    """The material of a sheet of obstacles: it transmits, and scatters the rest.
+
+    Sionna RT leaves scattered power out by default, so that a sheet only dims waves.
+    """
     thickness = 1e-5  # [m]; thin against the wavelength, so that only the conductance counts
     impedance = 376.73  # of free space [ohm]
     properties = (

@@ -40,8 +40,8 @@ def write_scenario(
         )
     check_empty(folder)
     receivers = mirrored.scene.receivers
-    asked = query_of("scenarios", mirrored.scene, places, frequency).transmitters.tolist()
-    users = torch.tensor(number_places(asked)[0])
+    query = query_of("scenarios", mirrored.scene, places, frequency)
+    users = torch.tensor(number_places(query.transmitters.tolist())[0])  # each place once
     carrier = mirrored.scene.task.frequencies.mean()  # type: ignore[attr-defined]
     stations = []
     for number, receiver in enumerate(receivers):
@@ -76,7 +76,8 @@ def _fields(
         amplitudes.append(paths.amplitudes)
     gains = torch.cat(amplitudes).cpu().to(torch.complex128).numpy()  # (users, paths)
     sizes = np.abs(gains)
-    # Float32 rounds by as much of a link's strongest path.
+    # Weaker paths are rounding errors: float32 has seven digits of a link's strongest path.
     faintest = 1e-6 * sizes.max(1, keepdims=True)
+    # Gains count from free space at 1 m, which has wavelength / (4 pi) (Friis).
     unit = model.pooling.strength.item() * speed_of_light / (4 * math.pi * carrier)
     return np.where(sizes > faintest, unit * gains, 0)

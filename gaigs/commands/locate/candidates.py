@@ -54,22 +54,24 @@ class PlaceDensity:
 
     def logarithm(
         self,
-        asked: Float[Tensor, "g 3"],
+        places: Float[Tensor, "g 3"],
         width: float,
         folds: Int[Tensor, " g"] | None = None,
     ) -> Float[Tensor, " g"]:
-        """Logarithm of the density at places, for normal densities of a width [m].
+        """Logarithm of the density at places.
 
-        Known places of a place's own fold do not count, if there are ``folds``.
+        Args:
+            width: Standard deviation of the normal density about each known place [m].
+            folds: Fold of each place; known places of the same fold do not count. None: all count.
         """
         axes = self.has_extent
-        squares = distances(asked[:, axes], self.places[:, axes]).square_()  # (g, k)
+        squares = distances(places[:, axes], self.places[:, axes]).square_()  # (g, k)
         if len(self.floors):
-            is_other = self._floor(asked)[:, None] != self._floor(self.places)
+            is_other = self._floor(places)[:, None] != self._floor(self.places)
             squares = squares.masked_fill(is_other, math.inf)
         if folds is not None:
             squares = squares.masked_fill(folds[:, None] == self.folds, math.inf)
-        # log sum over k of (1 - e) / k N(asked; place, width), and e / volume
+        # The log of: sum over known places of (1 - e) / k N(place; known, width), plus e / volume.
         share = math.log(1 - self.elsewhere) - math.log(len(self.places))
         peak = share - int(axes.sum()) * math.log(width * math.sqrt(2 * math.pi))
         near = torch.logsumexp(squares / (-2 * width**2), 1) + peak  # (g,)
@@ -77,7 +79,7 @@ class PlaceDensity:
         return torch.logaddexp(near, (self.elsewhere / volume).log())
 
     def likeliest_width(self, spacing: float, most: int = 1000, tried: int = 24) -> float:
-        """The width under which known places are most likely, given the other folds' places [m].
+        """The width [m] that makes the known places of each fold likeliest, given the other folds.
 
         Args:
             spacing: Median distance from a known place to the next [m].
@@ -93,6 +95,7 @@ class PlaceDensity:
         return max(torch.logspace(*ends, tried).tolist(), key=mean_logarithm)
 
     def _floor(self, places: Float[Tensor, "g 3"]) -> Int[Tensor, " g"]:
+        """Number of the floor nearest to each place."""
         return (places[:, 2:] - self.floors).abs().argmin(1)
 
 
@@ -103,7 +106,11 @@ def near_candidates(
     links: Links,
     known: Int[Tensor, " k"],
 ) -> Candidates:
-    """A grid with a quarter of the places, and random places about known links' places."""
+    """Candidates of the prior ``PlaceDensity``: a quarter on a grid, the others near known places.
+
+    Args:
+        known: Known links, whose transmitters are the known places.
+    """
     places, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)
     folds = torch.zeros(len(places), dtype=torch.long)
     folds = folds.index_copy(0, which, folds_of(links, known))

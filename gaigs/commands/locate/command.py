@@ -29,8 +29,6 @@ def run(config: dict, folder: Path) -> None:
 
     Writes ``locate.csv``, ``locate.png`` and, for a test, ``locate.json`` into a folder.
     """
-    if config["folder"] is None:
-        raise ValueError("command=locate needs the folder of a finished run; add folder=runs/...")
     model = load(config["folder"], config["trust"])
     links = links_of(config["folder"], config["trust"])
     options = dict(config["locate"])
@@ -70,16 +68,17 @@ def locate_test(
             "the run has no test links at this carrier; take another split or locate.frequency"
         )
     known = transmissions(links, at_carrier(links, prints.frequency, "train", "validation"))
-    asked, truth = transmissions(links, test)
+    values, truth = transmissions(links, test)
     start = time.perf_counter()
-    location = call("locate", posterior, options, prints=prints, asked=asked)
+    location = call("locate", posterior, options, prints=prints, values=values)
     seconds = time.perf_counter() - start
 
     _, groups = known.places.unique(dim=0, return_inverse=True)
-    pair = asked, known.values
+    known_values = known.values
     if options["unknown_power"]:
-        pair = without_power(asked), without_power(known.values)
-    guess = neighbours(*pair, known.places, groups)
+        values = without_power(values)
+        known_values = without_power(known_values)
+    guess = neighbours(values, known_values, known.places, groups)
     guesses = {
         "mean": location.mean,
         "median": location.median,
@@ -104,10 +103,10 @@ def locate_test(
     write_columns(folder / "locate.csv", columns)
     drawn = error_figure(truth, location.mean, known.places, errors)
     style.save(drawn, folder / "locate.png")
-    shown = [
-        f"median {numbers[name]['median_m']:.3g} m, mean {numbers[name]['mean_m']:.3g} m"
-        for name in ("locate", "knn")
-    ]
+    shown = []
+    for name in ("locate", "knn"):
+        scores = numbers[name]
+        shown.append(f"median {scores['median_m']:.3g} m, mean {scores['mean_m']:.3g} m")
     print(f"{len(truth)} transmitters: {'; nearest neighbours '.join(shown)}")
     return location
 
@@ -118,7 +117,10 @@ def summary(
     errors: Mapping[str, Float[Tensor, " n"]],
     level: float,
 ) -> dict[str, Any]:
-    """Errors of each guess, the mean place as ``locate``; with it the shares of the regions."""
+    """Median and mean error of each guess [m], by its name; the mean place is called ``locate``.
+
+    It also has the share of transmitters in their regions, and the regions' mean size.
+    """
     numbers: dict[str, Any] = {"locate": {}}
     for name, error in errors.items():
         key = "locate" if name == "mean" else name

@@ -35,7 +35,7 @@ class Cells(NamedTuple):
 
     @classmethod
     def around(cls, places: Float[ndarray, "g 2"], most: int = 1500) -> "Cells":
-        """Square cells that hold almost all places, at most so many."""
+        """Square cells, about ``most`` of them, that hold almost all places."""
         low, high = np.quantile(places, (0.001, 0.999), 0)
         extent = high - low
         # The map of a corridor has at least 15 % of its length as its width.

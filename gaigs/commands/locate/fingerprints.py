@@ -22,8 +22,8 @@ class LocatedFold(NamedTuple):
     """Held-out fingerprints of a fold, located in the map of a model that does not know them."""
 
     candidates: Candidates  # candidates of this map
-    # Logarithms there, with known and with unknown power; the likelihood is chosen without these
-    # fingerprints.
+    # Log likelihoods at them, with known and with unknown power. Their degrees and temper are
+    # chosen without these fingerprints.
     likelihoods: Float[Tensor, "2 n g"]
     truth: Float[Tensor, "n 3"]  # places of the fingerprints [m]
 
@@ -81,13 +81,13 @@ class Fingerprints:
         return sum(len(fold.truth) for fold in self.held)
 
     def drops(self, unknown_power: bool = False, step: float | None = None) -> Float[Tensor, " h"]:
-        """Logarithms of the best candidate's density over the density at the true place, ascending.
+        """Log ratios of the highest posterior density to the density at the true place, ascending.
 
-        One for each held-out fingerprint. Options as for ``locate``; with ``step``
-        fingerprints are values of a ``walk``.
+        There is one for each held-out fingerprint; with a ``step`` [m], fingerprints are the values
+        of a ``walk``. Results are kept, as a walk takes long.
         """
         if (unknown_power, step) not in self._drops:
-            parts = [torch.zeros(0, dtype=torch.float64)]
+            drops = [torch.zeros(0, dtype=torch.float64)]
             for candidates, likelihoods, truth in self.held:
                 logarithms = likelihoods[int(unknown_power)] + candidates.prior.double()
                 if step is not None:
@@ -98,13 +98,13 @@ class Fingerprints:
                 # Candidates are a sample of the prior: their density is not their probability.
                 heights = logarithms - candidates.prior + candidates.density  # (n, g)
                 nearest = candidates.nearest(truth)[:, None]
-                parts.append(heights.amax(1) - heights.gather(1, nearest)[:, 0])
-            self._drops[unknown_power, step] = torch.cat(parts).sort().values
+                drops.append(heights.amax(1) - heights.gather(1, nearest)[:, 0])
+            self._drops[unknown_power, step] = torch.cat(drops).sort().values
         return self._drops[unknown_power, step]
 
 
 class Transmissions(NamedTuple):
-    """Fingerprints of transmissions, and where these were sent."""
+    """Fingerprints of transmissions, and the places of their transmitters."""
 
     # Labels as ``Task.fingerprint`` gives them, NaN where a receiver has none.
     values: Float[Tensor, "n r m"]
@@ -120,7 +120,7 @@ def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor
 
 
 def transmissions(links: Links, index: Int[Tensor, " k"]) -> Transmissions:
-    """Transmissions of some links, with the labels of these."""
+    """The transmissions that links belong to, with the labels of these links alone."""
     rows, which = rows_of(links)[index].unique(return_inverse=True)
     labels = torch.cat([links.task.fingerprint(links.labels[part]) for part in index.split(256)])
     values = labels.new_full((len(rows), len(links.receivers), labels.shape[1]), math.nan)
@@ -133,7 +133,7 @@ def transmissions(links: Links, index: Int[Tensor, " k"]) -> Transmissions:
 def receptions(
     links: Links, index: Int[Tensor, " k"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n r"]]:
-    """Places of the transmissions of some links, and 1 for each receiver that has one, else 0."""
+    """Places of the transmissions that links belong to [m]; and 1 for each receiver with a link."""
     rows, which = rows_of(links)[index].unique(return_inverse=True)
     places = torch.zeros(len(rows), 3)
     places[which] = links.query.transmitters[index]

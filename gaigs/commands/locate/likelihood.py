@@ -16,7 +16,8 @@ from gaigs.core.query import ROUNDING, evenly
 def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor, "m k"]:
     """Axes along which errors of a label's numbers are independent.
 
-    They are scaled to a mean square of 1 a label. Of more than ``most`` errors an even part counts.
+    Along these axes the squares of a label's errors sum to 1 on average. At most ``most`` labels
+    are used, chosen at even steps.
 
     Source: Ledoit and Wolf, A well-conditioned estimator for large-dimensional covariance matrices,
     2004.
@@ -47,23 +48,23 @@ class Mismatch(NamedTuple):
 
 
 def mismatch(
-    prints: Fingerprints, asked: Float[Tensor, "n r k"], unknown_power: bool = False
+    prints: Fingerprints, received: Float[Tensor, "n r k"], unknown_power: bool = False
 ) -> Mismatch:
     """Differences of values from a map's predictions, and the probability of their reception.
 
     Args:
         prints: The map, g candidates.
-        asked: Values along ``prints.axes``, NaN where a receiver has received none.
+        received: Values along ``prints.axes``, NaN where a receiver has received none.
         unknown_power: True if the transmission's power is unknown. Squared errors are then the
             least over all offsets of a value's levels, or all factors of predicted spectra or
             channels, and reception tells nothing.
     """
-    is_received = ~asked[..., 0].isnan()  # (n, r)
+    is_received = ~received[..., 0].isnan()  # (n, r)
     if prints.task.shape:
-        squares = _array_squares(prints, asked, is_received, unknown_power)
+        squares = _array_squares(prints, received, is_received, unknown_power)
         log_deviations = torch.zeros_like(squares)
     else:
-        squares, log_deviations = _level_squares(prints, asked, is_received, unknown_power)
+        squares, log_deviations = _level_squares(prints, received, is_received, unknown_power)
     counts = is_received.float().sum(1)
     reception = torch.zeros_like(squares)
     if not unknown_power:
@@ -78,21 +79,21 @@ def mismatch(
 
 def _level_squares(
     prints: Fingerprints,
-    asked: Float[Tensor, "n r 1"],
+    received: Float[Tensor, "n r 1"],
     is_received: Bool[Tensor, "n r"],
     unknown_power: bool,
 ) -> tuple[Float[Tensor, "n g"], Float[Tensor, "n g"]]:
-    """``squares`` and ``log_deviations`` of labels of one number."""
-    total = torch.zeros(len(asked), len(prints.values))
+    """``Mismatch.squares`` and ``Mismatch.log_deviations`` of labels of one number."""
+    total = torch.zeros(len(received), len(prints.values))
     log_deviations = torch.zeros_like(total)
     errors_sum = torch.zeros_like(total)
     weights_sum = torch.zeros_like(total)
-    for receiver in range(asked.shape[1]):
+    for receiver in range(received.shape[1]):
         rows = is_received[:, receiver]
         values = prints.values[:, receiver]
         smallest = ROUNDING * values.abs().max()  # for labels without any error
         deviations = prints.deviations[:, receiver].clamp_min(smallest)
-        errors = (asked[rows, receiver] - values[:, 0]) / deviations  # (k, g)
+        errors = (received[rows, receiver] - values[:, 0]) / deviations  # (k, g)
         total[rows] += errors.square()
         errors_sum[rows] += errors / deviations
         weights_sum[rows] += deviations.square().reciprocal()
@@ -106,21 +107,22 @@ def _level_squares(
 
 def _array_squares(
     prints: Fingerprints,
-    asked: Float[Tensor, "n r k"],
+    received: Float[Tensor, "n r k"],
     is_received: Bool[Tensor, "n r"],
     unknown_power: bool,
 ) -> Float[Tensor, "n g"]:
-    """``squares`` of labels of several numbers."""
-    products = torch.zeros(len(asked), len(prints.values))
+    """``Mismatch.squares`` of labels of several numbers."""
+    products = torch.zeros(len(received), len(prints.values))
     predicted_powers = torch.zeros_like(products)
-    powers = torch.zeros(len(asked), 1)
-    for receiver in range(asked.shape[1]):
+    powers = torch.zeros(len(received), 1)
+    for receiver in range(received.shape[1]):
         rows = is_received[:, receiver]
         values = prints.values[:, receiver]
-        products[rows] += asked[rows, receiver] @ values.mT
+        products[rows] += received[rows, receiver] @ values.mT
         predicted_powers[rows] += values.square().sum(1)
-        powers[rows] += asked[rows, receiver].square().sum(1, keepdim=True)
+        powers[rows] += received[rows, receiver].square().sum(1, keepdim=True)
     if not unknown_power:
+        # (x - y)² = x² - 2 x y + y²
         return predicted_powers - 2 * products + powers
     # The part of the value that no factor of the prediction gives: 1 - (x y)² / (x² y²).
     tiny = torch.finfo(torch.float32).tiny
@@ -129,13 +131,13 @@ def _array_squares(
 
 
 def log_likelihood(difference: Mismatch, degrees: float, temper: float) -> Float[Tensor, "n g"]:
-    """Student's t of all receivers together, to a power, and the chance of their reception.
+    """Log likelihood of candidates: Student's t of all receivers together, and their reception.
 
     Args:
         difference: Values and predictions compared.
         degrees: Degrees of freedom. The fewer, the less one unlike place or receiver counts.
-        temper: The power, below 1 where receivers' errors are correlated: their evidence counts
-            less than independent errors would.
+        temper: Power of Student's t. It is below 1 where receivers' errors are correlated: their
+            evidence counts less than independent errors would.
     """
     exponent = (degrees + difference.counts[:, None]) / 2
     together = exponent * torch.log1p(difference.squares / degrees) + difference.log_deviations
@@ -150,7 +152,7 @@ class UnseenPrints(NamedTuple):
     truth: Float[Tensor, "n 3"]  # places of the fingerprints [m]
 
     def score(self, degrees: float, temper: float, draws: int = 128) -> float:
-        """Sum of the energy scores of the posteriors by a likelihood [m].
+        """Sum of the energy scores of the posteriors that a likelihood gives; lower is better [m].
 
         Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation,
         2007, section 4.3.
@@ -199,9 +201,10 @@ def choose_likelihood(
     total = scores.sum(0)
     held = []
     for trial, score in zip(trials, scores, strict=True):
+        # The other folds choose; a single fold has to choose for itself.
         others = total - score if len(trials) > 1 else score
         choice = choices[int(others.argmin())]
-        parts = [log_likelihood(part, *choice).float() for part in trial.differences]
-        held.append(LocatedFold(trial.prints.candidates, torch.stack(parts), trial.truth))
+        likelihoods = [log_likelihood(part, *choice).float() for part in trial.differences]
+        held.append(LocatedFold(trial.prints.candidates, torch.stack(likelihoods), trial.truth))
     best_degrees, best_temper = choices[int(total.argmin())]
     return replace(prints, degrees=best_degrees, temper=best_temper, held=tuple(held))

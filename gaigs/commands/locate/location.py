@@ -54,7 +54,7 @@ class Location:
         return f"<{self.summary()}>"
 
     def summary(self) -> str:
-        """One sentence on the first value."""
+        """One sentence: the place and the region of the first value."""
         count = len(self.median)
         place = ", ".join(f"{x:.2f}" for x in self.median[0].tolist())
         which = "transmitter" if count == 1 else f"{count} transmitters, the first"

@@ -17,7 +17,7 @@ def without_power(values: Float[Tensor, "n r m"]) -> Float[Tensor, "n r m"]:
 
 
 def neighbours(
-    asked: Float[Tensor, "n r m"],
+    values: Float[Tensor, "n r m"],
     known: Float[Tensor, "k r m"],
     places: Float[Tensor, "k 3"],
     groups: Int[Tensor, " k"],
@@ -29,8 +29,9 @@ def neighbours(
     transmissions, without their own group.
 
     Args:
-        asked: Fingerprints to locate. A receiver that has not received a transmission counts as the
-            least known value.
+        values: Fingerprints to locate. A receiver that has not received a transmission counts as
+            the least known value.
+        known: Fingerprints at the known ``places`` [m].
         groups: Groups of known fingerprints that are left out together.
         most: Largest number of known transmissions that choose the number of neighbours.
     """
@@ -44,14 +45,18 @@ def neighbours(
         return (weighted_mean(apart, places, count) - places[chosen]).norm(dim=1).mean().item()
 
     count = min(COUNTS, key=error)
-    values = asked.where(~asked.isnan(), least).flatten(1)  # (n, r m)
-    return weighted_mean(torch.cdist(values, filled), places, count)
+    complete = values.where(~values.isnan(), least).flatten(1)  # (n, r m)
+    return weighted_mean(torch.cdist(complete, filled), places, count)
 
 
 def weighted_mean(
     apart: Float[Tensor, "n k"], places: Float[Tensor, "k 3"], count: int
 ) -> Float[Tensor, "n 3"]:
-    """Means of the nearest places, weighted by 1 / distance."""
+    """Means of the ``count`` nearest places, weighted by 1 / distance.
+
+    Args:
+        apart: Distances of n fingerprints from the fingerprints of the places.
+    """
     nearest = apart.topk(min(count, apart.shape[1]), largest=False)
     weights = 1 / nearest.values.clamp_min(1e-6)
     shares = weights / weights.sum(1, keepdim=True)

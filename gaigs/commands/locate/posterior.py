@@ -79,9 +79,9 @@ def locate(
         prints = model
     else:
         prints = fingerprints(model, links, region)
-    asked = as_fingerprints(value, prints, step is not None)
+    values = as_fingerprints(value, prints, step is not None)
     if not prints.task.shape and not unknown_power:
-        excess = excess_of(asked, prints)
+        excess = excess_of(values, prints)
         if excess is not None:
             unit = prints.task.error_unit
             warnings.warn(
@@ -90,11 +90,11 @@ def locate(
                 ExtrapolationWarning,
                 stacklevel=4,  # as for a radio map
             )
-    return posterior(prints, asked, unknown_power, step, level)
+    return posterior(prints, values, unknown_power, step, level)
 
 
 def excess_of(
-    asked: Float[Tensor, "n r 1"], prints: Fingerprints, deviations: float = 5.0
+    values: Float[Tensor, "n r 1"], prints: Fingerprints, deviations: float = 5.0
 ) -> float | None:
     """Largest excess of readings over the range of all predictions; None if it is plausible.
 
@@ -103,48 +103,52 @@ def excess_of(
             predictions is plausible, too.
     """
     lowest, highest = prints.values.aminmax()
-    excess = torch.maximum(asked - highest, lowest - asked).nan_to_num(0).max()
+    excess = torch.maximum(values - highest, lowest - values).nan_to_num(0).max()
     allowed = max(deviations * prints.deviations.max(), (highest - lowest) / 2)
     return excess.item() if excess > allowed else None
 
 
 def posterior(
     prints: Fingerprints,
-    asked: Float[Tensor, "n r m"],
+    values: Float[Tensor, "n r m"],
     unknown_power: bool,
     step: float | None,
     level: float,
 ) -> Location:
-    """``locate`` for the fingerprints of values."""
+    """Locations of fingerprints, as ``Task.fingerprint`` gives them, by the options of ``locate``.
+
+    Raises:
+        ValueError: ``level`` or ``step`` is out of range.
+    """
     check_type("level", level, float)
     check_type("step", step, float | None)
     if not 0 < level < 1:
         raise ValueError(f"level must be a probability between 0 and 1 such as 0.9, got {level!r}")
     if step is not None and not 0 < step < math.inf:
         raise ValueError(f"step must be above 0 m, got {step!r}")
-    step = step if len(asked) > 1 else None  # one value is no track
+    step = step if len(values) > 1 else None  # one value is no track
     drop = conformal_drop(prints, unknown_power, step, level)
     is_calibrated = prints.held_out_count >= fewest(level)
-    parts = []
+    locations = []
     # In parts: a value takes 60 bytes a candidate, and its posterior 9. A track is one part.
-    for part in asked.split(64 if step is None else len(asked)):
+    for part in values.split(64 if step is None else len(values)):
         difference = mismatch(prints, part @ prints.axes, unknown_power)
         candidates = prints.candidates
         logarithms = log_likelihood(difference, prints.degrees, prints.temper) + candidates.prior
         if step is not None:
             is_received = ~part.isnan().all((1, 2))
             candidates, logarithms = track(candidates, logarithms, step, is_received)
-        parts.append(located(candidates, logarithms, level, drop, is_calibrated))
-    return replace(joined(parts), frame=prints.frame)
+        locations.append(located(candidates, logarithms, level, drop, is_calibrated))
+    return replace(joined(locations), frame=prints.frame)
 
 
 def conformal_drop(
     prints: Fingerprints, unknown_power: bool, step: float | None, level: float
 ) -> Float[Tensor, ""] | None:
-    """Log density below the maximum at which a region ends, from held-out fingerprints.
+    """How far below its maximum the log density is at the edge of a region.
 
-    A region of all candidates above this holds the transmitter with probability ``level``. None
-    without held-out fingerprints.
+    The region of all denser candidates holds the transmitter with probability ``level``, as
+    held-out fingerprints show. None without these.
     """
     drops = prints.drops(unknown_power, step)
     count = prints.held_out_count
@@ -162,9 +166,16 @@ def located(
     drop: Float[Tensor, ""] | None,
     is_calibrated: bool,
 ) -> Location:
-    """Places and regions of some values, from the logarithms of their posteriors."""
+    """Places and regions of n values.
+
+    Args:
+        logarithms: Logarithms of the posteriors, up to a constant for each value.
+        drop: Edge of the regions, from ``conformal_drop``.
+        is_calibrated: True if the drop alone sets a region; else the posterior may widen it.
+    """
     places = candidates.places
     probabilities = torch.softmax(logarithms, 1)
+    # Posterior density: candidates are a sample of the prior, and denser where it is higher.
     heights = logarithms - candidates.prior + candidates.density  # (n, g)
     order = heights.argsort(1, descending=True)
     # The highest densities that hold the level together.

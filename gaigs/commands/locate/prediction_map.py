@@ -95,7 +95,7 @@ def fingerprints(
 
 
 def box_of(model: Model, region: object) -> Float[Tensor, "2 3"]:
-    """Corners of a region [m], or of the box of the training transmitters."""
+    """Corners of a region [m]; without one, of the box of the training transmitters."""
     if region is None:
         return torch.stack((model.scene.lower, model.scene.upper))
     box = as_positions("region", region).reshape(-1, 3)
@@ -114,7 +114,7 @@ def affordable_points(
     fewest: int = 1000,
     seconds: float = 60.0,
 ) -> int:
-    """Number of candidate places that a model predicts within some seconds."""
+    """Number of candidate places, ``fewest`` to ``most``, that a model predicts in ``seconds``."""
     places = even_places(box[0], box[1], 512)
     predicted(model, places[:2], frequency)  # the first prediction compiles and loads
     start = time.perf_counter()
@@ -213,10 +213,11 @@ class PrintFold(NamedTuple):
     prints: Fingerprints  # map of a model that does not know them
     values: Float[Tensor, "n r m"]  # their values
     truth: Float[Tensor, "n 3"]  # their places [m]
-    errors: Float[Tensor, "k r m"]  # values less predictions at known places, of these and others
+    # Values less predictions, also of fingerprints outside the region.
+    errors: Float[Tensor, "k r m"]
 
     def half(self, number: int) -> "PrintFold":
-        """Every second fingerprint."""
+        """Every second fingerprint, from the first (0) or the second (1) on."""
         return PrintFold(self.prints, *(part[number::2] for part in self[1:]))
 
 
@@ -228,21 +229,25 @@ def held_out_folds(
     located: int = 200,  # largest number of them that are located
     enough: int = 300,  # number of located fingerprints after which no fold is added
 ) -> list[PrintFold]:
-    """Folds of known links with the maps of models that do not know them."""
+    """Held-out fingerprints by fold, each with the map of a model that does not know them.
+
+    A single fold is divided in two, so that each half can calibrate the other.
+    """
     links = maker.links
     folds: list[PrintFold] = []
-    for one, part, others in stages.track(model.unseen(links), "folds", model.fold_count):
-        one.calibration = model.calibration
+    for unseen, part, others in stages.track(model.unseen(links), "folds", model.fold_count):
+        unseen.calibration = model.calibration
         # Known links of a transmission that has a link in the part are held out with it.
         rows = rows_of(links)
         values, truth = transmissions(links, known[torch.isin(rows[known], rows[part])])
         chosen = evenly(torch.arange(len(truth)), most)
         others = others[torch.isin(others, known)]
         if len(chosen) and (len(others) or maker.is_region):
-            errors = values[chosen] - predicted(one, truth[chosen], maker.frequency).values
-            if maker.is_region:  # a value from elsewhere is not like those that will be asked
+            errors = values[chosen] - predicted(unseen, truth[chosen], maker.frequency).values
+            if maker.is_region:  # values to locate come from the region
                 chosen = chosen[maker.contains(truth[chosen])]
-            folds.append(PrintFold(maker.make(one, others), values[chosen], truth[chosen], errors))
+            prints = maker.make(unseen, others)
+            folds.append(PrintFold(prints, values[chosen], truth[chosen], errors))
         if sum(min(len(fold.truth), located) for fold in folds) >= enough:
             break
     if len(folds) == 1 and len(folds[0].values) > 1:
@@ -251,7 +256,7 @@ def held_out_folds(
 
 
 def trials_of(folds: Sequence[PrintFold], most: int = 200) -> list[UnseenPrints]:
-    """Held-out fingerprints compared with the maps of their folds, at most so many of each."""
+    """Up to ``most`` held-out fingerprints of each fold, compared with the fold's map."""
     trials = []
     for number, fold in enumerate(folds):
         # Along the axes of their own errors, fingerprints would be too near their predictions.
@@ -259,14 +264,18 @@ def trials_of(folds: Sequence[PrintFold], most: int = 200) -> list[UnseenPrints]
         prints = along(fold.prints, others)
         chosen = evenly(torch.arange(len(fold.truth)), most)
         if len(chosen):
-            asked = fold.values[chosen] @ prints.axes
-            differences = [mismatch(prints, asked, unknown) for unknown in (False, True)]
+            values = fold.values[chosen] @ prints.axes
+            differences = [mismatch(prints, values, unknown) for unknown in (False, True)]
             trials.append(UnseenPrints(prints, differences, fold.truth[chosen]))
     return trials
 
 
 def along(prints: Fingerprints, errors: Sequence[Float[Tensor, "_ r m"]]) -> Fingerprints:
-    """A map along the axes of some errors; without any, along the axes of its own differences."""
+    """A map along the axes on which errors of a label's numbers are independent.
+
+    Args:
+        errors: Errors of fingerprints; without any, the map's deviations from its mean count.
+    """
     if not prints.task.shape:
         return replace(prints, axes=torch.eye(1))
     if not errors:

@@ -12,12 +12,14 @@ from gaigs.kriging.links import distances
 
 
 def walk(places: Float[Tensor, "n 3"], step: float, most: int = 10) -> Int[Tensor, " k"]:
-    """A walk through places, always to the nearest one that is not yet on it.
+    """Numbers of places in the order of a walk, always to the nearest place not yet visited.
 
-    It stays for as many values as moves of ``step`` along each axis take to the next place: errors
-    of values that are received near each other have much in common.
+    The walk stays at each place for as many values as steps take to the next one: errors of values
+    that are received near each other have much in common.
 
-    At most ``most`` values are at each place; ``step`` is in metres.
+    Args:
+        step: Standard deviation of a move along each axis [m].
+        most: Largest number of values at each place.
     """
     apart = distances(places, places)
     is_free = torch.ones(len(places), dtype=torch.bool)
@@ -40,15 +42,17 @@ def track(
     is_received: Bool[Tensor, " n"],
     spread: int = 75,
 ) -> tuple[Candidates, Float[Tensor, "n j"]]:
-    """An even part of the candidates, and the logarithms of a track's posterior there.
+    """The posterior of a track, over a part of the candidates as ``smoothed`` takes only few.
 
     Args:
-        step, is_received: As for ``smoothed``.
-        spread: Number of candidates over which the posterior of a single value still spreads. The
-            candidates that ``smoothed`` links then hold it: regions of tracks reach far beyond the
-            likeliest ones.
+        step, is_received: See ``smoothed``.
+        spread: Number of the part's candidates over which the posterior of a single value spreads.
+            Regions of tracks reach far beyond the likeliest candidates.
+
+    Returns:
+        Every m-th candidate, and the logarithms of the posterior at these j places.
     """
-    # The inverse of the sum of squares counts candidates of equal probability.
+    # The inverse sum of squared probabilities: among c equally likely candidates it is c.
     posteriors = torch.softmax(logarithms[is_received], 1)
     count = posteriors.square().sum(1).reciprocal().median()
     even = torch.arange(0, len(candidates.places), max(1, int(count / spread)))
@@ -84,6 +88,10 @@ class Moves:
         return (self._densities(start, end) @ (logarithm - logarithm.max()).exp()).log()
 
     def _densities(self, start: Int[Tensor, " k"], end: Int[Tensor, " k"]) -> Float[Tensor, "k k"]:
+        """Densities of moves from candidates ``start`` (columns) to ``end`` (rows).
+
+        They are divided by the density of staying.
+        """
         if self._last is not None:  # a walk may stay
             first, second, densities = self._last
             if torch.equal(first, start) and torch.equal(second, end):
@@ -142,7 +150,10 @@ def straight_lines(
     places: Float[Tensor, "g 3"],
     is_received: Bool[Tensor, " n"],
 ) -> Float[Tensor, "n 3"]:
-    """Places on straight lines between the likeliest ones of the received values around."""
+    """The place of each value on the line between its received neighbours in time [m].
+
+    The likeliest places of the received values before and after it are the line's ends.
+    """
     received = is_received.nonzero()[:, 0]
     numbers = torch.arange(len(is_received))
     after = torch.searchsorted(received, numbers).clamp_max(len(received) - 1)

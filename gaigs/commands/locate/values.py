@@ -13,7 +13,8 @@ from gaigs.commands.locate.fingerprints import Fingerprints
 from gaigs.core.query import as_receivers, as_tensor
 from gaigs.core.task import check_range
 from gaigs.data import Links
-from gaigs.io.tables import find_file, read_table, refuse, shortened
+from gaigs.data.rssi_wide.columns import refuse_cells
+from gaigs.io.tables import find_file, read_table, shortened
 
 
 def as_fingerprints(
@@ -41,12 +42,12 @@ def as_fingerprints(
         raise ValueError("value must be finite, or NaN where a receiver has not heard it")
     labels = values.flatten(0, 1)  # (n r, *shape)
     check_range(prints.task, labels, "value")
-    asked = prints.task.fingerprint(labels).unflatten(0, values.shape[:2])
-    return asked.masked_fill(is_missing[..., None], math.nan)
+    numbers = prints.task.fingerprint(labels).unflatten(0, values.shape[:2])
+    return numbers.masked_fill(is_missing[..., None], math.nan)
 
 
 def in_order(value: Mapping, prints: Fingerprints) -> Tensor:
-    """Labels in the order of the receivers, from labels by the receivers' names."""
+    """Labels in the order of the receivers, from labels by name; NaN for names that are missing."""
     if not value:
         raise ValueError("value must have the label of one receiver or more, got none")
     which = as_receivers([*value], prints.receivers)
@@ -80,10 +81,13 @@ def as_values(value: object, prints: Fingerprints) -> Tensor:
 
 
 def read_value(file: Path, links: Links) -> object:
-    """Values for ``locate`` from a file.
+    """Received values of a file, as ``locate`` takes them.
 
-    It is an array (n, r, *shape) of NumPy or, for RSSI, a table with a column for each receiver's
-    name, whose cells are empty where it has received nothing.
+    A ``.npy`` file gives its array (n, r, *shape). For labels of one number, a table with a column
+    for each receiver gives its columns by name, NaN for an empty cell.
+
+    Args:
+        links: Links of the model, whose task and receivers' names the file must have.
     """
     content = "received values" if links.task.is_scalar else "a .npy array of received values"
     file = find_file(file, content, "locate.value")
@@ -103,9 +107,7 @@ def read_value(file: Path, links: Links) -> object:
             f"{file}, line 1: expected names of receivers, {shortened(names)}, "
             f"got {shortened(others)}"
         )
-    is_text = np.isinf(table.numbers)  # (rows, columns)
-    wrong = {}
-    for row in is_text.any(1).nonzero()[0].tolist():
-        wrong[row + 2] = table.cell(row, int(is_text[row].argmax()))
-    refuse(file, wrong, "a level [dBm], or an empty cell")
+    # A table has infinity for a cell that is neither empty nor a number.
+    columns = range(len(table.names))
+    refuse_cells(table, columns, np.isinf(table.numbers), "a level [dBm], or an empty cell")
     return dict(zip(table.names, table.numbers.T, strict=True))

@@ -20,8 +20,6 @@ from gaigs.runs import load
 
 def run(config: dict, folder: Path) -> None:
     """Places access points by a finished run; writes ``place.csv`` and ``place.png``."""
-    if config["folder"] is None:
-        raise ValueError("command=place needs the folder of a finished run; add folder=runs/...")
     model = load(config["folder"], config["trust"])
     options = dict(config["place"])
     if isinstance(options["candidates"], str):
@@ -34,7 +32,7 @@ def run(config: dict, folder: Path) -> None:
 
 
 def figure(plan: SitePlan) -> Figure:
-    """The objective from above, as it stands and with the new places."""
+    """Maps of the objective from above: before, and with the new places."""
     with rc_context(style.STYLE):
         count = 2 if len(plan.standing) else 1
         drawn = style.new_figure(count * style.COLUMN, 0.46 * style.PAGE, "compressed")

@@ -32,19 +32,19 @@ class Coverage:
         self.thresholds = values.new_tensor([threshold])  # (t,)
 
     def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g t"]:
-        """Factors of some receivers."""
+        """Probability that each reading is below each threshold; a set has the product."""
         above = self.thresholds - self.values[index, :, None]  # (k, g, t)
         return torch.special.ndtr(above / self.deviations[index, :, None])
 
     def quality(self, products: Float[Tensor, "*sets g t"]) -> Float[Tensor, "*sets g"]:
-        """Quality of each place, by products of factors."""
+        """Quality of each place from the product of the factors of a set [%]."""
         return 100 * (1 - products[..., 0])
 
 
 class MeanLevel(Coverage):
     """Expected reading of the best receiver [dBm].
 
-    It is a level below all readings, and the integral above it of the chance to be covered.
+    For a level a below all readings it is a + integral from a on of P(best reading > t) dt.
     """
 
     def __init__(
@@ -86,7 +86,7 @@ class LocationError:
         self.squares = torch.cdist(places, places).square().to(values)  # (g, g)
 
     def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g g"]:
-        """Factors of some receivers."""
+        """Likeness of the readings at each two places, at each receiver; a set has the product."""
         means, variances = self.values[index], self.deviations[index].square()
         variances = variances[:, :, None] + variances[:, None]  # (k, g, g)
         apart = means[:, :, None] - means[:, None]
@@ -102,12 +102,15 @@ class LocationError:
 def choose(
     rule: Coverage | LocationError, standing: int, count: int
 ) -> tuple[Int[Tensor, " n"], Float[Tensor, "n1 g"]]:
-    """Receivers that are best beside the first, which stand; the qualities before and after each.
+    """Chooses ``count`` receivers beside the first ``standing`` ones.
 
     Each is the best beside those before it; then single ones are exchanged as long as that helps.
     Coverage and mean level are monotone and submodular, so they gain at least 1 - 1/e of what the
     best set gains (Nemhauser, Wolsey and Fisher, An analysis of approximations for maximizing
     submodular set functions, 1978, which has both steps).
+
+    Returns:
+        The chosen receivers, and the quality of each place before and after each of them.
     """
     rows = torch.arange(len(rule.values))
     before, candidates = rows[:standing], rows[standing:]
@@ -130,7 +133,11 @@ def extend(
     count: int,
     most: int = 4_000_000,
 ) -> tuple[Int[Tensor, " n"], float]:
-    """A set with ``count`` candidates more, each the best beside those before it, and its score."""
+    """Adds ``count`` candidates to a set, each the best beside those before it.
+
+    Returns:
+        The larger set and its score, the mean quality over places, higher for better.
+    """
     score = -torch.inf
     for _ in track(range(count), "receivers to place"):
         free = candidates[~torch.isin(candidates, members)]
@@ -145,7 +152,7 @@ def extend(
 
 
 def product_of(rule: Coverage | LocationError, members: Int[Tensor, " k"]) -> Float[Tensor, "g t"]:
-    """The product of the factors of a set."""
+    """The product of the factors of a set's receivers; ones for an empty set."""
     product = torch.ones_like(rule.factors(torch.zeros(1, dtype=torch.int64))[0])
     for receiver in members[:, None]:
         product = product * rule.factors(receiver)[0]

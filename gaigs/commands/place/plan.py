@@ -62,6 +62,7 @@ class SitePlan:
 
     @property
     def score_unit(self) -> str:
+        """Unit of ``scores``."""
         return {"coverage": "%", "locate": "m"}.get(self.objective, self.unit)
 
     def __repr__(self) -> str:
@@ -172,7 +173,12 @@ def place(
 
 
 def candidate_places(scene: Scene, candidates: object, usual: int = 64) -> Float[Tensor, "c 3"]:
-    """Candidates of the argument of ``place``."""
+    """The candidates [m] that the argument of ``place`` means: places, or points along the walls.
+
+    Args:
+        candidates: Places, a distance [m], or None.
+        usual: Number of points along the walls without a distance.
+    """
     if candidates is not None and np.ndim(candidates):
         return as_positions("candidates", candidates).reshape(-1, 3)
     x, y = torch.stack(scene.box)[:, :2].T.numpy()

@@ -53,7 +53,7 @@ def read_area(file: Path, model: Model | None, count: int = 1000) -> Float[Tenso
 def _places_inside(
     polygons: list[Rings], corners: Float[ndarray, "k 2"], count: int
 ) -> Float[ndarray, "g 2"]:
-    """About ``count`` even places within polygons, at least one."""
+    """About ``count`` even places within polygons; one of their corners if none is inside."""
     lower = torch.tensor([*corners.min(0), 0.0])
     upper = torch.tensor([*corners.max(0), 0.0])
     tried = count

@@ -24,74 +24,78 @@ class Measured(NamedTuple):
 
 
 class ReceiverReadings(NamedTuple):
-    """Readings of one receiver, and its process at the asked places."""
+    """Readings of one receiver, and its process at g places, over which the error is the mean."""
 
     process: Process
     rows: Int[Tensor, " n"]  # numbers of the readings
     places: Int[Tensor, " n"]  # number of each reading's measured place
-    # Variances of the process at the asked places without any reading.
-    variances: Float[Tensor, " g"]
-    chances: Float[Tensor, " g"]  # probability that the receiver receives the asked places
+    variances: Float[Tensor, " g"]  # variances at the places without any reading
+    chances: Float[Tensor, " g"]  # probability that the receiver receives each place
 
     def deviations(self, whitened: Float[Tensor, "n g"]) -> Float[Tensor, " g"]:
         """Standard deviations of new readings, from ``Process.whitened`` of the known ones."""
         variances = (self.variances - whitened.square().sum(0)).clamp_min(0)
         return (variances + self.process.noise).sqrt()
 
-    def rises(self, asked: Float[Tensor, "g d"]) -> Iterator[tuple[int, Float[Tensor, ""]]]:
-        """Numbers of the measured places, and the rise of the summed deviations without each."""
-        whitened, factor = self.process.whitened(asked, self.rows)
+    def rises(self, places: Float[Tensor, "g d"]) -> Iterator[tuple[int, Float[Tensor, ""]]]:
+        """For each measured place, its number and the rise of the summed deviations without it."""
+        whitened, factor = self.process.whitened(places, self.rows)
         deviations = self.deviations(whitened)
         weights = torch.linalg.solve_triangular(factor.mT, whitened, upper=True)  # (n, g)
         inverse = torch.cholesky_inverse(factor)  # (n, n)
         for number in self.places.unique().tolist():  # all readings of a place go together
-            there = (self.places == number).nonzero()[:, 0]
-            gone = weights[there]
-            # Variances rise by w' (inverse of these rows)^-1 w; roots by half of it over
-            # themselves.
-            block = inverse[there[:, None], there]
-            rises = (gone * torch.linalg.solve(block, gone)).sum(0)  # (g,)
+            removed = (self.places == number).nonzero()[:, 0]
+            lost = weights[removed]
+            # Without rows R, variances rise by w_R' ((K^-1)_RR)^-1 w_R with w = K^-1 k (block
+            # inversion); a root rises by half of that over itself, to first order.
+            block = inverse[removed[:, None], removed]
+            rises = (lost * torch.linalg.solve(block, lost)).sum(0)  # (g,)
             yield number, self.chances @ (rises / (2 * deviations))
 
 
 def measured_places(
     processes: Sequence[Process],
-    asked: Float[Tensor, "g d"],  # places over which the error is the mean
-    factor: float,  # mean absolute error of a label over its standard deviation
-    most: int = 1500,  # largest number of readings of a receiver that count, an even part of more
-    tolerated: float = 1.05,  # largest factor on the mean error without the superfluous places
+    evaluated: Float[Tensor, "g d"],
+    factor: float,
+    most: int = 1500,
+    tolerated: float = 1.05,
 ) -> Measured:
-    """The measured places, and how much each lowers the mean error at the asked places.
+    """The measured places, and how much each of them lowers the mean error.
 
-    Superfluous are the places of the least losses that may all be left out while the mean error
-    stays below ``tolerated`` times its value.
+    Args:
+        evaluated: Coordinates of the places over which the error is the mean.
+        factor: Mean absolute error of a label over its standard deviation.
+        most: Largest number of readings of a receiver that count; of more, an even part.
+        tolerated: Largest factor on the mean error without the superfluous places. These are the
+            places of the least losses.
     """
     rows = []
     places = []
     for process in processes:
-        index = evenly(torch.arange(len(process.places)), most).to(asked.device)
+        index = evenly(torch.arange(len(process.places)), most).to(evaluated.device)
         rows.append(index)
         places.append(process.places[index, :3])
     known = torch.cat(places).unique(dim=0)
-    chances = reception_chances(processes, asked)
+    chances = reception_chances(processes, evaluated)
     readings = []
     for process, index, measured, chance in zip(processes, rows, places, chances, strict=True):
         which = distances(measured, known).argmin(1)
-        parts = [process.covariances(part, part).diagonal() for part in asked.split(16)]
-        readings.append(ReceiverReadings(process, index, which, torch.cat(parts), chance))
+        # In parts: only the diagonal of the covariances is needed.
+        variances = [process.covariances(part, part).diagonal() for part in evaluated.split(16)]
+        readings.append(ReceiverReadings(process, index, which, torch.cat(variances), chance))
 
     def error(is_kept: Bool[Tensor, " k"]) -> float:
-        """Mean standard deviation at the asked places, with the kept places alone."""
+        """Mean standard deviation with readings of the kept places alone."""
         deviations = []
         for receiver in readings:
             rows = receiver.rows[is_kept[receiver.places]]
-            whitened, _ = receiver.process.whitened(asked, rows)
+            whitened, _ = receiver.process.whitened(evaluated, rows)
             deviations.append(receiver.deviations(whitened))
         return mean_of_received(torch.stack(deviations), chances)
 
     losses = known.new_zeros(len(known))
     for receiver in track(readings, "places to leave out"):
-        for number, rise in receiver.rises(asked):
+        for number, rise in receiver.rises(evaluated):
             losses[number] += rise / chances.sum()
 
     # Bisection: the places of the least losses that may be left out together.

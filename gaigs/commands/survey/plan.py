@@ -44,9 +44,9 @@ class SurveyPlan:
             (k,).
         unit: Unit of the errors.
         frame: Place of x and y on a map; None if unknown.
-        known_error: Expected mean error over the region, or else the box of the training
-            transmitters, now.
-        scatter: Part of the error that no measurement lowers, as labels of one place scatter by it.
+        known_error: Expected mean error before any new place, over the region or else the box of
+            the training transmitters.
+        scatter: Part of the error that no measurement lowers: labels of one place scatter by it.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -105,7 +105,12 @@ class SurveyPlan:
 
 
 def write_places(file: Path, title: str, rows: Iterable[tuple], frame: Frame | None) -> None:
-    """Writes uses, places and numbers or None, with easting and northing if there is a frame."""
+    """Writes a CSV table of places [m], with easting and northing if there is a frame.
+
+    Args:
+        title: Heading of the last column.
+        rows: Use, place and number of each row; None for no number.
+    """
     on_map = [] if frame is None else ["easting", "northing"]
     lines = [["use", "x", "y", "z", *on_map, title]]
     for use, place, number in rows:
@@ -181,27 +186,30 @@ def survey(
     processes = [] if model is None else processes_of(model)
     check_memory(len(places.candidates), len(processes))
     if model is None:
-        asked = places.all.double()
-        selection = Selection([default_process(asked)], asked, places, mean_absolute(1.0))
+        everywhere = places.all.double()
+        process = default_process(everywhere)
+        selection = Selection([process], everywhere, places, mean_absolute(1.0))
         chosen, _ = selection.choose(count)
         none = places.candidates[:0]
         return SurveyPlan(places.candidates[chosen], None, none, none[:, 0], none[:, 0].bool())
 
-    asked = coordinates_of(model, places.all, frequency).to(processes[0].places)
+    everywhere = coordinates_of(model, places.all, frequency).to(processes[0].places)
     centres: Sequence = [None] * len(processes)
-    if model.scene.task.is_scalar:
-        centres = model.scene.positions(asked)
-    spacing = Spacing(processes, asked[: len(places.candidates)])
+    if model.scene.task.is_scalar:  # levels fall with the distance from the receiver
+        centres = model.scene.positions(everywhere)
+    spacing = Spacing(processes, everywhere[: len(places.candidates)])
     pairs = zip(processes, centres, strict=True)
     processes = [with_trend(*pair) for pair in pairs]
     factor = error_factor(model)
-    selection = Selection(processes, asked, places, factor)
+    selection = Selection(processes, everywhere, places, factor)
     scatter = selection.scatter()
     chosen, errors = selection.choose(count, spacing, scatter / (1 - stop))
-    box = asked[places.evaluated]
+    # Measured places count over the region, or the whole room if there are candidates alone.
+    evaluated = everywhere[places.evaluated]
     if region is None and candidates is not None:
-        box = coordinates_of(model, training_grid(model), frequency).to(processes[0].places)
-    measured = measured_places(processes, box, factor)
+        grid = coordinates_of(model, training_grid(model), frequency)
+        evaluated = grid.to(processes[0].places)
+    measured = measured_places(processes, evaluated, factor)
     return SurveyPlan(
         places.candidates[chosen],
         errors,
@@ -224,17 +232,17 @@ class SurveyPlaces(NamedTuple):
 
     @property
     def all(self) -> Float[Tensor, "g 3"]:
-        """Candidates first."""
+        """The candidates, then the other places."""
         return torch.cat((self.candidates, self.others))
 
     @property
     def evaluated(self) -> slice:
-        """Where the error is stated, among all."""
+        """Slice of ``all`` with the places over which the error is stated."""
         return slice(len(self.candidates) if len(self.others) else 0, None)
 
 
 def survey_places(model: Model | None, region: object, candidates: object) -> SurveyPlaces:
-    """Places of the arguments of ``survey``."""
+    """The places that the arguments of ``survey`` mean; a ``ValueError`` without any."""
     none = torch.zeros(0, 3)
     even = none
     if region is not None:
@@ -264,7 +272,7 @@ def training_grid(model: Model) -> Float[Tensor, "g 3"]:
 
 
 def check_memory(candidates: int, receivers: int, limit: float = 2e9) -> None:
-    """A ``ValueError`` unless the covariances of all receivers take at most ``limit`` bytes."""
+    """Raises a ``ValueError`` unless all receivers' covariances take at most ``limit`` bytes."""
     most = int((limit / 8 / max(1, receivers)) ** 0.5)
     if not 0 < candidates <= most:
         raise ValueError(
@@ -300,21 +308,24 @@ def error_factor(model: Model) -> float:
 
 
 class Selection:
-    """Covariances of all receivers at places, given the readings and the chosen candidates.
+    """The choice of candidates, one by one, by the posterior covariances of all receivers.
 
     Args:
+        processes: Process of each receiver, with its readings.
+        everywhere: Coordinates of ``places.all``.
+        places: Candidates, and places over which the error is stated.
         factor: Mean absolute error of a label over its standard deviation.
     """
 
     def __init__(
         self,
         processes: Sequence[Process],
-        asked: Float[Tensor, "g d"],
+        everywhere: Float[Tensor, "g d"],
         places: SurveyPlaces,
         factor: float,
     ):
-        self.posteriors = [posterior(process, asked) for process in processes]
-        self.chances = reception_chances(processes, asked)  # (r, g)
+        self.posteriors = [posterior(process, everywhere) for process in processes]  # r of (g, g)
+        self.chances = reception_chances(processes, everywhere)  # (r, g)
         self.noises = [process.noise for process in processes]
         self.evaluated = places.evaluated
         self.factor = factor
@@ -323,7 +334,11 @@ class Selection:
     def choose(
         self, count: int, spacing: "Spacing | None" = None, enough: float = -math.inf
     ) -> tuple[list[int], Float[Tensor, " n1"]]:
-        """Numbers of the best candidates, until the error is ``enough``; the errors around each."""
+        """Chooses up to ``count`` candidates, until the error is at most ``enough``.
+
+        Returns:
+            Numbers of the candidates; and the expected error before and after each.
+        """
         numbers = []
         errors = [self.error()]
         for _ in track(range(min(count, len(self.is_free))), "places to measure"):
@@ -340,7 +355,7 @@ class Selection:
         return numbers, torch.tensor(errors)
 
     def error(self) -> float:
-        """Expected mean error of a new reading."""
+        """Expected mean error of a new reading, in the unit of labels."""
         variances = torch.stack([part.diagonal()[self.evaluated] for part in self.posteriors])
         variances = variances.clamp_min(0)  # (r, e)
         deviations = (variances + variances.new_tensor(self.noises)[:, None]).sqrt()
@@ -373,14 +388,14 @@ class Selection:
 
 
 class Spacing:
-    """Distances of candidates from the chosen ones, by the correlation of their labels.
+    """Keeps the places of a plan apart, by the correlation of their labels.
 
     A second place nearby mostly averages noise, and a hyperparameter that is wrong makes it look
     better than a place farther off.
 
     Args:
         processes: Processes of the receivers, without their trends.
-        asked: Coordinates of the candidates.
+        candidates: Coordinates of the candidates.
         most: Largest mean correlation of two places of a plan; the default is
             reached at half a correlation length.
     """
@@ -388,16 +403,19 @@ class Spacing:
     def __init__(
         self,
         processes: Sequence[Process],
-        asked: Float[Tensor, "c d"],
+        candidates: Float[Tensor, "c d"],
         most: float = math.exp(-0.5),
     ):
         self.processes = processes
-        self.asked = asked
+        self.candidates = candidates
         self.most = most
-        self.nearest = torch.zeros(len(asked))  # largest correlation with a chosen place
+        self.nearest = torch.zeros(len(candidates))  # largest correlation with a chosen place
 
     def apart(self, is_free: Bool[Tensor, " c"]) -> Bool[Tensor, " c"]:
-        """Free candidates that are apart; once there is none, half the distance counts."""
+        """True for free candidates away from the chosen ones.
+
+        Once there is none, half the distance is enough: the root of the largest correlation.
+        """
         while self.most < 0.99:
             is_apart = is_free & (self.nearest <= self.most)
             if is_apart.any():
@@ -406,10 +424,10 @@ class Spacing:
         return is_free
 
     def add(self, number: int) -> None:
-        """Adds a chosen candidate."""
-        chosen = self.asked[number : number + 1]
-        total = torch.zeros_like(self.asked[:, 0])
+        """Adds a chosen candidate by its number."""
+        chosen = self.candidates[number : number + 1]
+        total = torch.zeros_like(self.candidates[:, 0])
         for process in self.processes:
             variance = process.covariances(chosen, chosen)[0, 0]
-            total += process.covariances(chosen, self.asked)[0] / variance
+            total += process.covariances(chosen, self.candidates)[0] / variance
         self.nearest = torch.maximum(self.nearest, (total / len(self.processes)).cpu().float())

@@ -15,7 +15,7 @@ from gaigs.registry import name_of
 
 
 def processes_of(model: Model) -> list[Process]:
-    """The processes of a model's receivers; raises a ``ValueError`` for a model without."""
+    """The processes of a model's receivers; a ``ValueError`` for a model that has none."""
     processes = []
     for receiver in range(len(model.scene.receivers)):
         process = model.process_at(receiver)
@@ -32,9 +32,9 @@ def processes_of(model: Model) -> list[Process]:
 def default_process(
     points: Float[Tensor, "g 3"], length: float = 0.25, nugget: float = 0.6
 ) -> Process:
-    """A process without readings and with an unknown constant.
+    """A process without readings, for a survey before which nothing is measured.
 
-    Its places spread evenly over the points' box.
+    Its mean is unknown, so that a plan spreads places evenly over the points' box.
 
     Args:
         points: Candidates and other places [m].
@@ -51,10 +51,10 @@ def default_process(
 
 
 def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process:
-    """The process with the coefficients of its trend, which readings have to determine too.
+    """The process with an unknown trend, which readings have to determine, too.
 
-    They are a constant and, for labels of one number, a slope over the logarithm of the distance to
-    the receiver, with a standard deviation of twice the readings': as much as receivers of
+    The trend is a constant and, with a receiver's position [m], a slope over the decimal logarithm
+    of the distance. Both have twice the standard deviation of a reading: as much as receivers of
     one survey may differ.
     """
     first = process.places[:1]
@@ -62,6 +62,7 @@ def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process
     scale = 2 * variance**0.5
 
     def decades(places: Tensor) -> Tensor:
+        """Decimal logarithms of distances to the receiver, from 0.1 m on (n,)."""
         return (places[:, :3] - receiver).norm(dim=1).clamp_min(0.1).log10()
 
     middle = decades(process.places).mean() if receiver is not None else 0.0
@@ -75,26 +76,26 @@ def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process
     return replace(process, covariances=covariances)
 
 
-def posterior(process: Process, asked: Float[Tensor, "g d"]) -> Float[Tensor, "g g"]:
-    """Covariances of the process at places, given its readings; of many an even part."""
+def posterior(process: Process, places: Float[Tensor, "g d"]) -> Float[Tensor, "g g"]:
+    """Covariances of the process at places, given its readings; ``LIMIT`` of them at most."""
     rows = evenly(torch.arange(len(process.places)), LIMIT).to(process.places.device)
-    whitened, _ = process.whitened(asked, rows)
-    return process.covariances(asked, asked) - whitened.mT @ whitened
+    whitened, _ = process.whitened(places, rows)
+    return process.covariances(places, places) - whitened.mT @ whitened
 
 
 def reception_chances(
-    processes: Sequence[Process], asked: Float[Tensor, "g d"]
+    processes: Sequence[Process], points: Float[Tensor, "g d"]
 ) -> Float[Tensor, "r g"]:
-    """Probability that each receiver receives a place, by the measured places around it.
+    """Probability that each receiver receives a point, by the measured places around it.
 
-    Measured places are those at the asked carrier, or the nearest one.
+    Of measured places, those at the carrier of the points count, or at the nearest carrier.
     """
     places = torch.cat([process.places for process in processes])  # (k, d)
     if not len(places):
-        return asked.new_ones(len(processes), len(asked))
+        return points.new_ones(len(processes), len(points))
     counts = torch.tensor([len(process.places) for process in processes])
     receivers = torch.repeat_interleave(counts).to(places.device)  # (k,)
-    carrier_distances = (places[:, 3:] - asked[:1, 3:]).abs().sum(1)
+    carrier_distances = (places[:, 3:] - points[:1, 3:]).abs().sum(1)
     at_carrier = carrier_distances <= carrier_distances.min() + 1e-6
     known, rows = places[at_carrier, :3].unique(dim=0, return_inverse=True)
     is_received = known.new_zeros(len(known), len(processes))
@@ -102,7 +103,7 @@ def reception_chances(
     for receiver, process in enumerate(processes):
         if process.is_part:  # places of its other readings are unknown
             is_received[:, receiver] = 1
-    return reception_probability(asked, known, is_received, is_received.mean(0)).mT
+    return reception_probability(points, known, is_received, is_received.mean(0)).mT
 
 
 def mean_of_received(values: Float[Tensor, "r g"], chances: Float[Tensor, "r g"]) -> float:

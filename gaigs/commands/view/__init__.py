@@ -30,7 +30,7 @@ class View:
     """A picture of one model or of two side by side; in a notebook it shows itself.
 
     Attributes:
-        contents: One a model.
+        contents: What is shown of each model.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -43,7 +43,7 @@ class View:
     @cached_property
     def facts(self) -> list[dict]:
         """Facts that do not depend on the transmitter, for each model."""
-        return [each.facts() for each in self.contents]
+        return [contents.facts() for contents in self.contents]
 
     def save(self, path: str | Path) -> None:
         """Writes one HTML file with all predictions of some places.
@@ -148,9 +148,9 @@ def view(model: Model, links: Links | None = None, other: Model | None = None) -
     if links is not None:
         check_instance("links", links, Links)
     contents = []
-    for one in models:
-        name = name_of(one.trend if isinstance(one, Kriging) else one)
-        contents.append(Contents(one, links, name))
+    for shown in models:
+        name = name_of(shown.trend if isinstance(shown, Kriging) else shown)
+        contents.append(Contents(shown, links, name))
     return View(side_by_side(contents))
 
 
@@ -181,17 +181,13 @@ def contents_of(source: str | Path, trust: bool = False) -> Contents:
 
 def run(config: dict) -> None:
     """Serves the view of a run's folder or of a checkpoint, or writes it into one file."""
-    if config["folder"] is None:
-        raise ValueError(
-            "command=view needs the folder of a finished run, or a checkpoint; add folder=runs/..."
-        )
     call("view", show, config["view"], folder=config["folder"], trust=config["trust"])
 
 
 def show(
     folder: str, trust: bool, other: str | None = None, out: str | None = None, port: int = 8080
 ) -> None:
-    """One run, or two side by side: in a file ``out``, or without one by a server."""
+    """Shows one run, or two side by side: in a file ``out``, or by a server if it is None."""
     sources = [folder] if other is None else [folder, other]
     shown = View(side_by_side([contents_of(source, trust) for source in sources]))
     if out is None:

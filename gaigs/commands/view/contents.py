@@ -152,8 +152,8 @@ class Contents:
             receiver: Number of the receiver; levels cover all receivers.
             step: Rows and columns from one shown pixel of a spectrum to the next.
         """
-        asked = None if self.kind == "level" else receiver
-        shown = self._estimate(torch.tensor([place]), asked)
+        # The page shows levels of all receivers at once.
+        shown = self._estimate(torch.tensor([place]), None if self.kind == "level" else receiver)
         value = shown.value
         std = shown.std
         answer: dict[str, Any] = {}
@@ -169,7 +169,7 @@ class Contents:
             answer["std"] = None if std is None else plain(level(std)[0])
             snr = shown.snr_db
             answer["snr"] = None if snr is None else plain(snr[0].clamp_max(140))
-        names = [one.name for one in self.scene.receivers]
+        names = [antenna.name for antenna in self.scene.receivers]
         query, _ = Query.from_positions(
             [place], receiver, self.frequency, names, self.scene.frequencies
         )
@@ -186,24 +186,25 @@ class Contents:
         Raises:
             ValueError: The model predicts for its own receivers alone.
         """
-        asked = receiver, *position
-        if self.last is None or self.last[0] != asked:
+        key = receiver, *position
+        if self.last is None or self.last[0] != key:
             known = self.scene.receivers[receiver]
             place = as_positions("receiver", position).to(known.pose.position)
-            one = replace(known, pose=replace(known.pose, position=place))
+            moved = replace(known, pose=replace(known.pose, position=place))
             with self.lock:
-                model = self.model.at_receivers([one])
-            self.last = asked, Contents(model, points=self.points)
+                model = self.model.at_receivers([moved])
+            self.last = key, Contents(model, points=self.points)
         return self.last[1]
 
     def answer_at(self, place: list[float], receiver: int, position: list[float]) -> dict:
         """``answer`` with a receiver at another position [m]; the others stay."""
         answer = self.moved(receiver, position).answer(place, 0)
         if self.kind == "level":
-            own = self.answer(place, receiver)
+            unmoved = self.answer(place, receiver)
             for name in ("levels", "stds"):
-                values, new = own[name], answer[name]
-                if None in (values, new):
+                values = unmoved[name]
+                new = answer[name]
+                if values is None or new is None:
                     answer[name] = None
                 else:
                     answer[name] = [*values[:receiver], *new, *values[receiver + 1 :]]
@@ -259,7 +260,9 @@ class Contents:
         return Shown(*(None if part is None else part.cpu() for part in parts))
 
     def _curve(self, channel: Tensor, element: int) -> dict:
-        """Magnitude [dB] over delay [ns] at an element; of one subcarrier over the elements."""
+        """Curve of a channel: |h| [dB] over delay [ns] at an element, or with one subcarrier over
+        the elements.
+        """
         if channel.shape[1] == 1:
             x = np.arange(1, len(channel) + 1)
             responses = channel[:, 0].numpy()
@@ -276,7 +279,7 @@ class Contents:
 
 
 def kind_of(task: Task) -> str | None:
-    """The drawing of a label: spectrum, level or channel; None for other labels."""
+    """How the page draws labels: as a spectrum, a level or a channel; None: not at all."""
     if task.directions is not None:
         return "spectrum"
     if task.is_scalar:
@@ -304,7 +307,7 @@ def plane_facts(plane: LearntPlane) -> dict:
 
 
 def gaussian_splats(gaussians: Gaussians, most: int = 3000) -> dict:
-    """The strongest Gaussians, at most so many, and the number of all."""
+    """The ``most`` strongest Gaussians as the page draws them, and the number of all."""
     with torch.no_grad():
         strengths = gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)
         strongest = strengths.topk(min(most, len(strengths))).indices
@@ -314,7 +317,7 @@ def gaussian_splats(gaussians: Gaussians, most: int = 3000) -> dict:
 
 
 def obstacle_splats(matter: Matter) -> dict:
-    """Obstacles, as opaque as a path through their middle loses."""
+    """Obstacles as the page draws them: the opacity is the power that a central path loses."""
     centres, widths, densities = matter
     losses = densities * math.sqrt(2 * math.pi) * np.exp(np.log(widths).mean(1))  # [dB]
     covariances = widths[:, :, None] ** 2 * np.eye(3)
@@ -331,7 +334,11 @@ def plain(values: Any) -> Any:
 
 
 def grey(image: Float[Tensor, "rows columns"], step: int = 1) -> dict:
-    """An image as bytes, 255 for an amplitude of 1: changes from pixel to pixel, to pack well."""
+    """Every ``step``-th row and column of an image, as the page decodes them.
+
+    Pixels are bytes, 255 for an amplitude of 1. Each is stored as the change from the pixel before,
+    since changes pack well.
+    """
     levels = (255 * image[::step, ::step].clamp(0, 1)).round().to(torch.uint8).numpy()
     changes = np.diff(levels.ravel(), prepend=np.uint8(0))
     return {
@@ -347,7 +354,7 @@ def splats(
     opacities: Float[ndarray, " n"],
     strengths: Float[ndarray, " n"],
 ) -> dict:
-    """Gaussians by the upper triangles of their covariances [m²]."""
+    """Gaussians as the page draws them; covariances [m²] by their upper triangles."""
     rows, columns = np.triu_indices(3)
     parts = {"means": means, "covariances": covariances[:, rows, columns], "opacities": opacities}
     parts["strengths"] = strengths
@@ -360,6 +367,6 @@ def loudest(channel: Tensor) -> Tensor:
 
 
 def level(channels: Tensor) -> Tensor:
-    """Mean power of channels (b, elements, subcarriers) [dB], -240 dB and more."""
+    """Mean power of channels (b, elements, subcarriers) [dB]; at least -240 dB, for JSON."""
     power = channels.abs().square().flatten(1).mean(1)  # (b,)
     return 10 * power.clamp_min(1e-12**2).log10()

@@ -54,21 +54,27 @@ def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServe
     return ThreadingHTTPServer(("127.0.0.1", port), Handler)
 
 
-def respond(contents: list[Contents], path: str, asked: dict[str, Any]) -> str:
-    """The answer at a path, as JSON; ``at`` is a place of the receiver other than its own [m]."""
-    run = contents[int(asked["run"])]
-    receiver = int(asked.get("receiver", 0))
-    position = [float(x) for x in asked["at"].split(",")] if "at" in asked else None
+def respond(contents: list[Contents], path: str, query: dict[str, Any]) -> str:
+    """The JSON answer to a request; a ``ValueError`` for an unknown path.
+
+    Args:
+        contents: What is shown of each model.
+        query: Values of the URL: numbers of ``run`` and ``receiver``; ``at``, the place where the
+            receiver was dragged [m]; and what the path needs, ``place``, ``height`` or ``number``.
+    """
+    run = contents[int(query["run"])]
+    receiver = int(query.get("receiver", 0))
+    position = [float(x) for x in query["at"].split(",")] if "at" in query else None
     match path:
         case "/answer":
-            place = [float(x) for x in asked["place"].split(",")]
+            place = [float(x) for x in query["place"].split(",")]
             if position is not None:
                 return json.dumps(run.answer_at(place, receiver, position))
             return json.dumps(run.answer(place, receiver))
         case "/slice":
             if position is not None:
                 run, receiver = run.moved(receiver, position), 0
-            return json.dumps(run.slice(float(asked["height"]), receiver))
+            return json.dumps(run.slice(float(query["height"]), receiver))
         case "/comparison":
-            return json.dumps(run.comparison(int(asked["number"])))
+            return json.dumps(run.comparison(int(query["number"])))
     raise ValueError(f"no answer at {path}")

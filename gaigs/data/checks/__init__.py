@@ -7,7 +7,7 @@ from gaigs.data.checks.channels import check_channels
 from gaigs.data.checks.finding import Finding
 from gaigs.data.checks.levels import check_levels
 from gaigs.data.checks.places import check_arrays, check_constant, check_edges, check_places
-from gaigs.data.checks.spectra import check_spectra
+from gaigs.data.checks.spectra import check_directions, check_extremes
 
 __all__ = ["Finding", "check"]
 
@@ -21,7 +21,8 @@ def check(links: Any) -> Iterator[Finding]:
         yield from check_constant(links)
     match links.task.name:
         case "spectrum":
-            yield from check_spectra(links)
+            yield from check_extremes(links)
+            yield from check_directions(links)
         case "csi":
             yield from check_channels(links)
         case "rssi":

@@ -33,11 +33,11 @@ from gaigs.data.checks.waves import (
 class Measure(NamedTuple):
     """A measure of how well geometry explains channels."""
 
-    measure: Callable[[Sample], float]  # share from 0 to 1 of a sample
+    measure: Callable[[Sample], float]  # share of a sample that geometry explains, 0 to 1
     least: float  # smallest share that tells a convention
     enough: float  # share above which the data need no other convention
-    sentence: str  # what the share means, with a place for it
-    meaning: str  # the same in short
+    sentence: str  # sentence for users, with {} for the share
+    meaning: str  # what the share is of, in short
 
 
 def check_channels(links: Any) -> Iterator[Finding]:
@@ -59,7 +59,7 @@ def check_channels(links: Any) -> Iterator[Finding]:
 
 
 def check_signs(sample: Sample) -> Iterator[Finding]:
-    """A finding if channels lack a part, or if a part that is never negative seems an amplitude."""
+    """A finding if no real part of the channels is negative, and one if no imaginary part is."""
     parts = {"real": sample.labels.real, "imaginary": sample.labels.imag}
     for name, part in parts.items():
         if sample.labels.numel() < 100 or part.min() < 0:
@@ -74,15 +74,20 @@ def check_signs(sample: Sample) -> Iterator[Finding]:
 
 
 def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterator[Finding]:
-    """Findings if phases of channels do not follow the geometry, or differ from the declared."""
+    """Findings if phases of channels do not follow the geometry, or are not as ``data.phase`` says.
+
+    Args:
+        train: Links of the sample.
+    """
     task = links.task
-    few = sample.some(192)
+    few = sample.thinned(192)
     is_known = task.phase == "known"
     has_gain = task.phase != "per_link_and_delay"
     receivers, labels = sample.receivers, sample.labels
     everywhere = Scene(links.receivers, torch.zeros(3), torch.zeros(3), 0.0, task)
     waves = direct_waves(everywhere, links.query[train], task.frequencies)
-    sign = phase_sign(labels, waves, receivers) if is_known else 0
+    sign = phase_sign(labels, waves, receivers) if is_known else 0  # 0 if neither sign fits
+    # Another convention may explain phases over all links, or else the phases within each link.
     explained = "the direct wave explains {} of the channels"
     over_links = Measure(coherence, 0.1, 0.8, explained, "in the mean over links")
     finding = best_convention(few, over_links) if is_known else None
@@ -95,6 +100,7 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
         yield finding
     if finding is not None or not has_gain:
         return
+    # Elements or subcarriers with fixed phases, such as of cables, by receiver.
     strange = strange_parts(labels, waves, receivers, task.frequencies, sign) if sign else {}
     if strange:
         # Another convention may explain as much with a calibrated array.
@@ -104,6 +110,7 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
             yield finding
             return
     is_fixed = any(part.elements or part.delay is not None for part in strange.values())
+    # Without fixed phases each packet may have a phase, or a delay, of its own.
     phase = None
     if not is_fixed:
         phase = unknown_phase(labels, waves, receivers, task.frequencies, task.phase)
@@ -166,7 +173,8 @@ def best_convention(sample: Sample, score: Measure) -> Finding | None:
     read = score.measure(sample)
     if read > score.enough or len(sample.labels) < MANY:
         return None
-    few = sample.some(64)
+    # Few links choose eight conventions, and all links the best of these.
+    few = sample.thinned(64)
     tried = []
     for convention in conventions(few, score.measure):
         changed = convention.change(few)

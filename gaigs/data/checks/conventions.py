@@ -38,7 +38,7 @@ def conventions(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[
 
 
 def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
-    """Orders and units of subcarriers, and phases that lack a part."""
+    """Conventions of subcarriers: their order and unit, and phases that lack a part."""
     if len(sample.frequencies) > 1:
         name = "subcarriers are in reversed order, or path coefficients are conjugate"
         mend = "h = h[..., ::-1], or of conjugate coefficients h = h.conj()[..., ::-1]"
@@ -54,12 +54,13 @@ def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
         return  # phases were taken off, or never stored
     name = "the carrier's phase over the delay is missing"
     mend = "multiply each path by np.exp(-2j * np.pi * carrier * tau) before the sum"
+    # The distance counts from the array's middle, or of several elements from each of them.
     for at_elements in (False, True)[: sample.labels.shape[1]]:
         yield Hypothesis(name, partial(_with_carrier, at_elements=at_elements), mend)
 
 
 def of_arrays(sample: Sample) -> Iterator[Hypothesis]:
-    """Orders and units of elements, and orientations."""
+    """Conventions of arrays: order and unit of their elements, and their orientation."""
     yield changing(
         "elements are in reversed order",
         ["labels"],
@@ -206,12 +207,12 @@ def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator
 
 
 def changing(name: str, parts: Sequence[str], move: Move, mend: str) -> Hypothesis:
-    """A convention under which some parts of a sample are moved."""
+    """A convention that moves the fields ``parts`` of a ``Sample``."""
     return Hypothesis(name, partial(_changed, parts=parts, move=move), mend)
 
 
 def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hypothesis:
-    """Points of some ends times a matrix, which ``mend`` writes in numpy."""
+    """A convention that multiplies points of ``ends`` by a matrix; ``mend`` does so in numpy."""
     parts = {"tx": "transmitters", "rx": "positions", "elements": "elements"}
     lines = "; ".join(f"{end} = {end}{mend}" for end in ends)
     return changing(
@@ -220,11 +221,13 @@ def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hy
 
 
 def _scaled(ends: Sequence[str], unit: str, factor: float) -> Hypothesis:
+    """The convention that points of ``ends`` are in a unit of ``factor`` metres."""
     subject = ", ".join(ends[:-1]) + " and " * (len(ends) > 1) + ends[-1]
     return _everywhere(ends, f"{subject} are in {unit}", f" * {factor:.4g}", factor * torch.eye(3))
 
 
 def _changed(sample: Sample, parts: Sequence[str], move: Move) -> Sample:
+    """The sample with ``move`` of the fields ``parts``, or of each array in a tuple of arrays."""
     moved = {}
     for name in parts:
         value = getattr(sample, name)
@@ -233,24 +236,29 @@ def _changed(sample: Sample, parts: Sequence[str], move: Move) -> Sample:
 
 
 def _about_receivers(sample: Sample, move: Move) -> Sample:
+    """The sample with transmitters moved relative to their receivers."""
     stands = sample.positions[sample.receivers]
     return replace(sample, transmitters=stands + move(sample.transmitters - stands))
 
 
 def _from_receivers(sample: Sample) -> Sample:
+    """The sample if its transmitters are read as offsets from their receivers."""
     return replace(sample, transmitters=sample.transmitters + sample.positions[sample.receivers])
 
 
 def _mirrored(
     points: Float[Tensor, "r 3"], ends: Float[Tensor, "3"], axes: Sequence[int]
 ) -> Float[Tensor, "r 3"]:
+    """Points whose coordinates along ``axes`` count from the other end; ``ends`` are low + high."""
     moved = points.clone()
     moved[:, axes] = (ends - points)[:, axes]
     return moved
 
 
 def _transposed(labels: Complex[Tensor, "n e s"], rows: int) -> Complex[Tensor, "n e s"]:
-    return labels.unflatten(1, (rows, -1)).transpose(1, 2).flatten(1, 2)
+    """Channels whose elements are read by columns of a planar array, instead of by rows."""
+    planar = labels.unflatten(1, (rows, -1))  # (n, rows, columns, s)
+    return planar.transpose(1, 2).flatten(1, 2)
 
 
 def _rolled(rotations: Float[Tensor, "r 3 3"], by: int) -> Float[Tensor, "r 3 3"]:

@@ -18,30 +18,30 @@ class Law(NamedTuple):
 
 
 class Gain(NamedTuple):
-    """Mean errors of data as read and by another convention [dB], and gain of log likelihood."""
+    """How much better levels follow the distance under another convention."""
 
-    read: float
-    fits: float
-    evidence: float
+    read: float  # mean error of the data as read [dB]
+    fits: float  # mean error under the other convention [dB]
+    evidence: float  # gain of the log likelihood
 
     def is_clear(self, share: float = 0.85, evidence: float = 8.0) -> bool:
-        """True if the error falls to a share of it, and by more than chance explains."""
+        """True if the error falls below a share of it, and the evidence exceeds a bound."""
         return self.fits < share * self.read and self.evidence > evidence
 
 
 def decades(sample: Sample) -> Float[Tensor, " n"]:
-    """Logarithm of each link's distance [m]."""
+    """Decimal logarithm of each link's distance in metres, as of ``decades_of``."""
     return decades_of((sample.transmitters - sample.positions[sample.receivers]).norm(dim=1))
 
 
 def decades_of(distances: Float[Tensor, "*h n"]) -> Float[Tensor, "*h n"]:
-    """Logarithms of distances [m]; below a hundredth of the median distance the law ends."""
+    """Decimal logarithms of distances [m]; shorter ones count as a hundredth of the median."""
     least = 0.01 * distances.median(-1, keepdim=True).values
     return torch.maximum(distances, least).clamp_min(1e-9).log10()
 
 
 def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = False) -> Law:
-    """The law of distance of each receiver, by Huber's weights: a few wrong levels do not bend it.
+    """The law of distance of each receiver, which a few wrong levels do not bend (Huber's weights).
 
     Args:
         logarithms: Logarithms of the links' distances, under h conventions at once.
@@ -58,6 +58,7 @@ def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = 
         others = torch.stack((torch.ones_like(x), azimuths.cos(), azimuths.sin()), 1)
     levels = sample.labels.expand_as(logarithms)
     weights = torch.ones_like(logarithms)
+    # Least squares, weighted anew each time: an error beyond 1.345 deviations counts linearly.
     for _ in range(5):
         x = _without(others, logarithms, weights, sample)
         y = _without(others, levels, weights, sample)
@@ -65,6 +66,7 @@ def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = 
         # Levels fall with the distance, by its sixth power at most.
         slopes = (_sums(weights * x * y, sample) / squares.clamp_min(1e-9)).clamp(-60, 0)
         errors = y - slopes[..., sample.receivers] * x
+        # 1.4826 medians of normal absolute errors are a standard deviation.
         scale = 1.4826 * errors.abs().median(-1, keepdim=True).values
         weights = (1.345 * scale.clamp_min(0.1) / errors.abs().clamp_min(1e-9)).clamp_max(1)
     return Law(slopes, errors)
@@ -80,18 +82,20 @@ def explained(sample: Sample) -> float:
 def compare(
     read: Float[Tensor, " n"], fits: Float[Tensor, " n"], sample: Sample, cells: int = 6
 ) -> Gain:
-    """Gain of errors about one law over those about another; above 30 dB they count as 30 dB.
+    """The gain of another law's errors ``fits`` over the errors ``read`` [dB].
 
-    Shadowing is alike at near places, so that each receiver's cells, at most ``cells`` along x and
-    along y, count as single observations. The log likelihood of m of them with a mean error of s is
-    -m log(s), up to a constant.
+    An error above 30 dB counts as 30 dB. Shadowing is alike at near places: all links of a receiver
+    in a cell of the plan, with at most ``cells`` cells along x and along y, are one observation.
+    The log likelihood of m observations with a mean error of s is -m log(s), up to a constant.
     """
     before = read.abs().clamp_max(30).mean().item()
     after = fits.abs().clamp_max(30).mean().item()
     places = sample.transmitters[:, :2]
     low, high = places.amin(0), places.amax(0)
-    cell = ((places - low) / (high - low).max().clamp_min(1e-9) * cells).long().clamp_max(cells - 1)
-    observed = len(((sample.receivers * cells + cell[:, 0]) * cells + cell[:, 1]).unique())
+    relative = (places - low) / (high - low).max().clamp_min(1e-9)
+    cell = (relative * cells).long().clamp_max(cells - 1)  # (n, 2)
+    keys = (sample.receivers * cells + cell[:, 0]) * cells + cell[:, 1]
+    observed = len(keys.unique())
     return Gain(before, after, observed * math.log(max(before, 1e-9) / max(after, 1e-9)))
 
 
@@ -107,7 +111,7 @@ def _without(
     weights: Float[Tensor, "*h n"],
     sample: Sample,
 ) -> Float[Tensor, "*h n"]:
-    """Values less their weighted least-squares fit by some columns at each receiver."""
+    """Values less their weighted least-squares fit by the columns ``others`` at each receiver."""
     if others.shape[-1] == 1:
         means = _sums(weights * values, sample) / _sums(weights, sample).clamp_min(1e-9)
         return values - means[..., sample.receivers]

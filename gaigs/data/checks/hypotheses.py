@@ -13,7 +13,7 @@ from gaigs.core.query import evenly
 
 @dataclass(frozen=True)
 class Sample:
-    """Some links, evenly spread, in the form that hypotheses change."""
+    """Links, evenly spread over the data, in the form that hypotheses change."""
 
     index: Int[Tensor, " n"]  # numbers of the links among all
     transmitters: Float[Tensor, "n 3"]  # positions of the links' transmitters [m]
@@ -32,7 +32,7 @@ class Sample:
         return torch.einsum("nw,nwa->na", offsets, self.rotations[self.receivers])
 
     def at(self, index: Int[Tensor, " k"]) -> "Sample":
-        """Some of the links."""
+        """The links of these numbers within the sample."""
         return replace(
             self,
             index=self.index[index],
@@ -41,27 +41,27 @@ class Sample:
             labels=self.labels[index],
         )
 
-    def some(self, most: int) -> "Sample":
+    def thinned(self, most: int) -> "Sample":
         """At most ``most`` of the links, evenly spread."""
         return self.at(evenly(torch.arange(len(self.labels)), most))
 
 
 class Hypothesis(NamedTuple):
-    """Another convention: its name, the sample read by it, and what mends the data."""
+    """A convention under which the data may have been written."""
 
     name: str
-    change: Callable[[Sample], Sample]
-    mend: str
+    change: Callable[[Sample], Sample]  # gives the sample as read by the convention
+    mend: str  # line of numpy that mends the data
 
 
 def sample_of(links: Any, most: int) -> Sample:
-    """At most ``most`` links, evenly spread over those that are not tested; numbers are float64."""
+    """At most ``most`` links, evenly spread over all but test links, in double precision."""
     known = torch.arange(len(links)) if links.split is None else links.split.known.sort().values
     return sample_at(links, evenly(known, most))
 
 
 def sample_at(links: Any, index: Int[Tensor, " n"]) -> Sample:
-    """Links of these numbers; numbers are float64."""
+    """The links of these numbers as a sample, in double precision."""
     poses = [receiver.pose for receiver in links.receivers]
     labels = links.labels[index]
     return Sample(

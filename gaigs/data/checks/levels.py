@@ -43,15 +43,16 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
         f"{int((levels > 0).sum())} levels are above 0 dBm, {levels.min():.3g} to "
         f"{levels.max():.3g}"
     )
-    known = sample_of_given(links)
+    placed = sample_of_given(links)
+    sample = None if placed is None else placed[0]
     # Powers span decades, decibels of one survey seldom a factor of 100; amplitudes are small, too.
     if high > 100 * max(low, 1e-300) or levels.max() < 0.1:
-        yield _linear_unit(known, text, math.log10(np.median(levels)))
+        yield _linear_unit(sample, text, 10 * math.log10(np.median(levels)))
         return
-    is_inverted = known is None
-    if known is not None:
-        inverted = replace(known[0], labels=-known[0].labels)
-        is_inverted = explained(inverted) >= explained(known[0])
+    is_inverted = sample is None
+    if sample is not None:
+        inverted = replace(sample, labels=-sample.labels)
+        is_inverted = explained(inverted) >= explained(sample)
     if is_inverted:
         mend = "was a sign lost, or are they path losses? levels = -levels"
         yield Finding("sign of levels", text, mend)
@@ -60,30 +61,35 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
     yield Finding("unit of levels", f"{text}, and fall with the distance", mend)
 
 
-def _linear_unit(known: tuple[Sample, list[str]] | None, text: str, middle: float) -> Finding:
-    """The finding that levels are linear (volts, watts, mW) instead of decibels, with its mend.
+def _linear_unit(sample: Sample | None, text: str, median: float) -> Finding:
+    """The finding that levels are volts, watts or mW instead of decibels, with its mend.
 
-    ``middle`` is the decimal logarithm of the median level.
+    Args:
+        sample: Links of receivers at given places; None if there are none.
+        text: What was found so far.
+        median: 10 log10 of the median level.
     """
     score = "share of the spread that the distance explains"
     read = fits = slope = 0.0
-    if known:
-        sample = known[0]
+    if sample is not None:
+        # Linear levels do not follow the logarithm of the distance, but their decibels do.
         positive = sample.at((sample.labels > 0).nonzero()[:, 0])
-        decibels = replace(positive, labels=10 * positive.labels.log10())  # levels as powers
+        decibels = replace(positive, labels=10 * positive.labels.log10())
         read = explained(sample)
         fits = explained(decibels)
         slope = fit_law(decades(decibels), decibels).slopes.median().item()
         text += f"; the distance explains {read:.0%} of their spread, "
         text += f"{fits:.0%} of that of their logarithm"
-    # Power falls by 20 dB a decade in free space, and amplitude by half of that.
+    # In free space power falls by 20 dB a decade of distance; 10 log10 of an amplitude by 10.
     if -14 < slope < -4 and fits > 0.1:
         unit = "volts"
         mend = "levels = 20 * np.log10(levels) + 13 at 50 ohm"
-    elif 10 * middle + 30 < -20:
+    # Else the first unit that gives a level that receivers can have: below -20 dBm of watts,
+    elif median + 30 < -20:
         unit = "watts"
         mend = "levels = 10 * np.log10(levels / 1e-3), or 10 * np.log10(levels) of mW"
-    elif 10 * middle < -10:
+    # below -10 dBm of mW.
+    elif median < -10:
         unit = "mW"
         mend = "levels = 10 * np.log10(levels)"
     else:
@@ -93,12 +99,13 @@ def _linear_unit(known: tuple[Sample, list[str]] | None, text: str, middle: floa
 
 
 def check_signs(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
-    """A finding about some positive levels whose negatives are usual."""
+    """A finding about positive levels that seem to have lost their sign."""
     positive = levels > 0
     usual = levels[~positive]
     if not positive.any():
         return
     low, high = np.quantile(usual.numpy(), (0.01, 0.99)).tolist()
+    # The negative is within the usual range, and the level itself is far above it.
     lost = positive & (-levels >= low - 10) & (-levels <= high + 10) & (levels > high + 30)
     if lost.any():
         text = f"{int(lost.sum())} levels are above 0 dBm, and usual with the other sign"
@@ -132,25 +139,27 @@ def check_columns(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterator[Finding]:
     """Findings about levels far from near places' levels, and about an order of rows."""
     sample = sample_of(replace(links, split=None), most)
-    near = apart_from_neighbours(sample)
+    excess = above_neighbours(sample)
     is_placed = torch.ones(len(links.receivers), dtype=torch.bool)
     if links.uncertainties is not None:
         is_placed = links.uncertainties == 0
     errors = fit_law(decades(sample), sample).errors
-    errors = torch.where(is_placed[sample.receivers], errors, near)
-    # Beside a receiver levels are above their neighbours, and the law knows.
-    both = torch.where(near * errors > 0, torch.minimum(near.abs(), errors.abs()), 0.0)
-    scales = torch.stack([_scale(near, sample), _scale(errors, sample)]).amax(0)  # (r,)
-    wrong = (both > (6 * scales[sample.receivers]).clamp_min(50)).nonzero()[:, 0]
+    errors = torch.where(is_placed[sample.receivers], errors, excess)
+    # A wrong level is far from its neighbours and from the law of distance, on the same side.
+    # Beside a receiver levels are far above their neighbours, but follow the law.
+    is_alike = excess * errors > 0
+    outlying = torch.where(is_alike, torch.minimum(excess.abs(), errors.abs()), 0.0)  # (n,)
+    scales = torch.stack([_scale(excess, sample), _scale(errors, sample)]).amax(0)  # (r,)
+    wrong = (outlying > (6 * scales[sample.receivers]).clamp_min(50)).nonzero()[:, 0]
     if not len(wrong):
-        yield from check_places_of_levels(sample, near, is_placed)
+        yield from check_places_of_levels(sample, excess, is_placed)
         return
     named = []
-    for number in wrong[both[wrong].argsort(descending=True)][:shown].tolist():
+    for number in wrong[outlying[wrong].argsort(descending=True)][:shown].tolist():
         row = "" if links.rows is None else f"row {int(links.rows[sample.index[number]])} "
         at = ", ".join(f"{x:.4g}" for x in sample.transmitters[number].tolist())
         level = sample.labels[number].item()
-        usual = level - near[number].item()
+        usual = level - excess[number].item()
         name = links.receivers[int(sample.receivers[number])].name
         named.append(f"{row}({at}) at {name}: {level:.3g} dBm, its neighbours {usual:.3g} dBm")
     more = f" and {len(wrong) - shown} more" if len(wrong) > shown else ""
@@ -160,9 +169,12 @@ def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterato
     )
 
 
-def apart_from_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, " n"]:
-    """Each level less the median of its nearest ones [dB]; 0 at receivers with under 6 links."""
-    apart = torch.zeros_like(sample.labels)
+def above_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, " n"]:
+    """Each level less the median of its neighbours' levels [dB].
+
+    Neighbours are the nearest links of the same receiver; a receiver with under 6 links gives 0.
+    """
+    excess = torch.zeros_like(sample.labels)
     for number in range(len(sample.positions)):
         links = (sample.receivers == number).nonzero()[:, 0]
         if len(links) < 6:
@@ -170,18 +182,26 @@ def apart_from_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, 
         places = sample.transmitters[links].numpy()
         _, near = cKDTree(places).query(places, k=min(neighbours + 1, len(links)))
         levels = sample.labels[links]
-        apart[links] = levels - levels[torch.from_numpy(near[:, 1:])].median(1).values
-    return apart
+        # The nearest link is the link itself.
+        neighbouring = levels[torch.from_numpy(near[:, 1:])]  # (k, neighbours)
+        excess[links] = levels - neighbouring.median(1).values
+    return excess
 
 
 def check_places_of_levels(
-    sample: Sample, near: Float[Tensor, " n"], is_placed: Bool[Tensor, " r"]
+    sample: Sample, excess: Float[Tensor, " n"], is_placed: Bool[Tensor, " r"]
 ) -> Iterator[Finding]:
-    """A finding if levels follow neither distance nor neighbours, as in a wrong order of rows."""
-    counts = is_placed[sample.receivers] & (near != 0)
-    constant = torch.zeros_like(near)
+    """A finding if levels follow neither distance nor neighbours, as in a wrong order of rows.
+
+    Args:
+        excess: Levels above their neighbours [dB], as of ``above_neighbours``.
+        is_placed: True for receivers at given places; the others do not count.
+    """
+    counts = is_placed[sample.receivers] & (excess != 0)
+    # A law of equal distances leaves levels less their receiver's mean.
+    constant = torch.zeros_like(excess)
     flat = fit_law(constant, sample).errors[counts]
-    if not counts.any() or near[counts].abs().mean() < 0.95 * flat.abs().mean():
+    if not counts.any() or excess[counts].abs().mean() < 0.95 * flat.abs().mean():
         return
     # The regression of levels on logarithms of distances, both less their receiver's mean.
     logarithms = fit_law(constant, replace(sample, labels=decades(sample))).errors[counts]

@@ -25,9 +25,8 @@ def check_places(links: Any) -> Iterator[Finding]:
             "give a fixed receiver one place for all its links",
         )
     sites = sites_of(links.query)
-    given = _given(links)
-    stands = _stands(links)
-    tree = cKDTree(stands[given].double().numpy())
+    measured = _measured(links)
+    tree = cKDTree(_positions(links)[measured].double().numpy())
     near = tree.query(sites.double().numpy())[0] < 0.01
     # One may be measured beside a receiver; radios that move meet at the same places.
     if len(sites) > 1 and near.sum() > 1 and not links.one_radio:
@@ -36,18 +35,18 @@ def check_places(links: Any) -> Iterator[Finding]:
     # Antennas of one mast may share their place; levels show whether they do.
     if links.task.is_scalar:
         return
-    for one, other in sorted(tree.query_pairs(0.01)):
-        a, b = given[one], given[other]
-        turned = (receivers[a].pose.rotation - receivers[b].pose.rotation).norm()
-        if turned < 0.01 and receivers[a].band == receivers[b].band:
-            text = f"{receivers[a].name} and {receivers[b].name} stand at one place"
+    for pair in sorted(tree.query_pairs(0.01)):
+        first, second = (receivers[measured[number]] for number in pair)
+        rotated = (first.pose.rotation - second.pose.rotation).norm()
+        if rotated < 0.01 and first.band == second.band:
+            text = f"{first.name} and {second.name} stand at one place"
             yield Finding("receivers at one place", text)
 
 
 def check_extent(links: Any) -> Iterator[Finding]:
     """Findings about an unusual extent of the places, and receivers far from all of them."""
     sites = sites_of(links.query)
-    given = _given(links)
+    measured = _measured(links)
     extent = sites.amax(0) - sites.amin(0)
     span = extent.max().item()
     across = extent[:2].max().item()
@@ -65,9 +64,9 @@ def check_extent(links: Any) -> Iterator[Finding]:
     elif links.task.is_scalar and scale_of(sites):  # spectra and channels show it themselves
         text = f"places span {span:.3g} m, as if {scale_of(sites)}"
         yield Finding("unit of places", text, "give them in metres")
-    if len(sites) > 1 and given:
-        stands = _stands(links)[given]
-        closest = torch.cdist(sites.double(), stands.double()).min().item()
+    if len(sites) > 1 and measured:
+        positions = _positions(links)[measured]
+        closest = torch.cdist(sites.double(), positions.double()).min().item()
         if closest > 10 * max(span, 1e-6):
             text = f"receivers are {closest:.3g} m from all places, which span {span:.3g} m"
             yield Finding("receivers far away", text, "are units and origin alike?")
@@ -80,8 +79,10 @@ def scale_of(places: Float[Tensor, "n 3"]) -> str:
         margin = 0.15 * (upper - lower)  # places seldom reach the walls of the room that was scaled
         if 0 <= low - lower <= margin and 0 <= upper - high <= margin:
             return f"scaled to {lower:g}..{upper:g} along each axis"
-    apart = (places.std(0, correction=0) - 1).abs().max()
-    return "standardised along each axis" if max(apart, places.mean(0).abs().max()) < 0.1 else ""
+    # Standardised coordinates have deviation 1 and mean 0.
+    off_deviation = (places.std(0, correction=0) - 1).abs().max()
+    off_mean = places.mean(0).abs().max()
+    return "standardised along each axis" if max(off_deviation, off_mean) < 0.1 else ""
 
 
 def sites_of(query: Query) -> Float[Tensor, "k 3"]:
@@ -95,7 +96,7 @@ def sites_of(query: Query) -> Float[Tensor, "k 3"]:
 def check_arrays(links: Any) -> Iterator[Finding]:
     """Findings about elements in another unit or frame, and coordinates that float32 rounds."""
     transmitters = links.query.transmitters
-    places = torch.cat((transmitters, _stands(links)))
+    places = torch.cat((transmitters, _positions(links)))
     room = _diagonal(places)
     carriers = links.query.frequencies
     wavelength = speed_of_light / carriers.max().item() if carriers is not None else 0.0
@@ -152,14 +153,14 @@ def check_walls(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> It
 
 
 def check_edges(links: Any) -> Iterator[Finding]:
-    """``check_walls`` of the walls that came with the data."""
+    """Findings of ``check_walls`` about the walls that came with the data."""
     if len(links.edges):
-        places = torch.cat((links.query.transmitters, _stands(links)))
+        places = torch.cat((links.query.transmitters, _positions(links)))
         yield from check_walls(links.edges.flatten(0, 1), places)
 
 
 def check_constant(links: Any) -> Iterator[Finding]:
-    """A finding if labels have the same number throughout."""
+    """A finding about labels of several numbers that are all equal."""
     labels = links.labels[evenly(torch.arange(len(links)), 256)].flatten(1)  # (k, m)
     constant = (labels == labels[:, :1]).all(1)
     if labels.shape[1] > 1 and constant.any():
@@ -167,16 +168,18 @@ def check_constant(links: Any) -> Iterator[Finding]:
         yield Finding("constant labels", text)
 
 
-def _given(links: Any) -> list[int]:
+def _measured(links: Any) -> list[int]:
     """Receivers whose place was measured, and not estimated from levels."""
     numbers = range(len(links.receivers))
     return [k for k in numbers if links.uncertainties is None or not links.uncertainties[k]]
 
 
-def _stands(links: Any) -> Float[Tensor, "r 3"]:
+def _positions(links: Any) -> Float[Tensor, "r 3"]:
+    """Positions of all receivers [m]."""
     positions = [receiver.pose.position for receiver in links.receivers]
     return torch.stack(positions).to(links.query.transmitters)
 
 
 def _diagonal(points: Float[Tensor, "k d"]) -> float:
+    """Diagonal of the box around points [m]."""
     return (points.amax(0) - points.amin(0)).norm().item()

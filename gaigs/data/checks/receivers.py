@@ -19,11 +19,14 @@ from gaigs.io.tables import shortened
 
 
 def check_receivers(links: Any) -> Iterator[Finding]:
-    """Findings about receivers' places that levels contradict: the first kind that explains it."""
-    known = sample_of_given(links)
-    if known is None:
+    """Findings about places of receivers that levels contradict.
+
+    The first explanation counts: another convention or order, another origin, or single receivers.
+    """
+    placed = sample_of_given(links)
+    if placed is None:
         return
-    sample, names = known
+    sample, names = placed
     findings = [*check_conventions(sample)]
     exchanged = [*check_order(sample, names)]
     # Gateways in the corners of a mirrored room seem exchanged, too: the clearly closer fit counts.
@@ -34,10 +37,10 @@ def check_receivers(links: Any) -> Iterator[Finding]:
 
 def check_power(links: Any) -> Iterator[Finding]:
     """A finding if no usual transmitter has such levels at such distances, as with mm or km."""
-    known = sample_of_given(links)
-    if known is None or links.frame is not None:
+    placed = sample_of_given(links)
+    if placed is None or links.frame is not None:
         return
-    sample = known[0]
+    sample = placed[0]
     offsets = sample.transmitters - sample.positions[sample.receivers]
     distances = offsets.norm(dim=1).clamp_min(1e-3)
     carriers = links.query.frequencies
@@ -46,8 +49,10 @@ def check_power(links: Any) -> Iterator[Finding]:
     def powers(supposed: float) -> Float[Tensor, " n"]:
         """Transmitted powers in free space [dBm], by the carrier or a supposed one [Hz]."""
         wavelength = speed_of_light / (carrier or supposed)
+        # Friis: the loss is 20 log10(4 pi d / wavelength).
         return sample.labels + 20 * (4 * math.pi * distances / wavelength).log10()
 
+    # A low carrier supposes a small loss: even so the power may be too high; and the reverse.
     strong = powers(1e8).quantile(0.95).item()
     weak = powers(6e9).quantile(0.95).item()
     usual = f"levels of {sample.labels.median():.3g} dBm at {distances.median():.3g} m"
@@ -159,8 +164,9 @@ def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain
     for _ in range(3):  # three grids, each finer by a factor of three
         steps = torch.arange(-cells, cells + 1) * width
         shifts = shift + torch.cartesian_prod(steps, steps)  # (g, 2)
-        level = (offsets[:, :2] - shifts[:, None]).square().sum(-1)  # (g, n)
-        errors = fit_law(decades_of((level + offsets[:, 2].square()).sqrt()), sample).errors
+        horizontal = (offsets[:, :2] - shifts[:, None]).square().sum(-1)  # (g, n)
+        distances = (horizontal + offsets[:, 2].square()).sqrt()
+        errors = fit_law(decades_of(distances), sample).errors
         best = errors.abs().clamp_max(30).mean(1).argmin()
         shift, fits = shifts[best], errors[best]
         width = width / 3
@@ -168,9 +174,9 @@ def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain
 
 
 def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) -> Gain | None:
-    """The gain of errors about another law, if neither chance nor directional antennas explain it.
+    """The gain of another law's errors ``fits``; None if chance or directional antennas explain it.
 
-    A law of places that were fitted to the levels has to be clearly better.
+    With ``is_fitted`` its places were fitted to the levels, and it has to be clearly better.
     """
     logarithms = decades(sample)
     gain = compare(fit_law(logarithms, sample).errors, fits, sample)
@@ -183,6 +189,7 @@ def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) ->
 
 
 def _finding(fault: str, subject: str, gain: Gain, under: str, mend: str) -> Finding:
+    """The finding that levels of a subject follow the distance better under another convention."""
     text = (
         f"{subject} follow the distance to {gain.fits:.2g} dB instead of {gain.read:.2g} dB {under}"
     )

@@ -25,14 +25,11 @@ from gaigs.data.checks.hypotheses import Hypothesis, Sample, sample_of
 from gaigs.data.checks.places import scale_of
 
 
-def check_spectra(links: Any) -> Iterator[Finding]:
-    """Findings about spectra; a ``ValueError`` if all are constant, or too small for SSIM."""
-    yield from check_extremes(links)
-    yield from check_directions(links)
-
-
 def check_extremes(links: Any) -> Iterator[Finding]:
-    """Counts of constant spectra, and of min-max spectra without a pixel of 0 or of 1."""
+    """Counts of constant spectra, and of min-max spectra without a pixel of 0 or of 1.
+
+    A ``ValueError`` if all spectra are constant, or too small for SSIM.
+    """
     task, labels = links.task, links.labels
     if min(task.shape) < SSIM_WINDOW:
         rows, columns = task.shape
@@ -63,7 +60,7 @@ def check_extremes(links: Any) -> Iterator[Finding]:
 
 @dataclass(frozen=True)
 class Limits:
-    """What it takes to name another convention."""
+    """Limits of the check of directions."""
 
     fewest: int = 16  # fewest spectra that are checked
     near: int = 32  # fewest spectra that show whether near places are alike
@@ -137,7 +134,12 @@ class Trials(NamedTuple):
 def trials(
     links: Any, sample: Sample, directions: "Directions", is_known: bool, limits: Limits
 ) -> Iterator[Trials]:
-    """All conventions: single ones, axes, and unless the read one is known, pairs."""
+    """Rounds of conventions: single ones, then axes, then pairs of both.
+
+    Args:
+        is_known: True if the data as read score well, so that they have no two faults at once;
+            there is no round of pairs then.
+    """
     axes = [*of_axes(sample, [("tx",), ("rx",), ("tx", "rx")])]
     units = [*of_units([("tx",), ("rx",)])]  # in any unit of both, directions are the same
     orientations = [*of_orientations(sample)]
@@ -145,7 +147,7 @@ def trials(
     columns = column_changes(directions.grid)
     single = [*of_frames(), *units, *orientations, *pixels, *columns]
     single += [*scaling_changes(sample, directions.grid), *order_changes(links)]
-    single += of_receivers(sample, lambda links: directions.scores(links).mean().item())
+    single += of_receivers(sample, lambda changed: directions.scores(changed).mean().item())
     yield Trials(single, limits.of_others, 1)
     yield Trials(axes, limits.of_axes, 1)
     if is_known:
@@ -226,10 +228,11 @@ class Directions:
         rareness = ((brighter + least).log() / math.log(least)).clamp_min(0)
         low, high = self.grid.elevations.aminmax()
         seen = (elevations > low - self.grid.pitch) & (elevations < high + self.grid.pitch)
-        rareness = rareness * seen
+        rareness = rareness * seen  # (spectrum, transmitter)
+        # Towards each transmitter, the mean over all spectra of its receiver.
         same = (sample.receivers[:, None] == sample.receivers).float()
-        others = (rareness * same).sum(0) / same.sum(0)  # towards a transmitter in all spectra
-        return rareness.diagonal() - others
+        usual = (rareness * same).sum(0) / same.sum(0)
+        return rareness.diagonal() - usual
 
 
 def both(first: Hypothesis, second: Hypothesis) -> Hypothesis:
@@ -261,7 +264,7 @@ def column_changes(grid: Grid) -> list[Hypothesis]:
     """Other azimuths of the spectra's columns."""
 
     def moved(turn: float, sign: int) -> Callable[[Sample], Sample]:
-        """Labels whose columns stand at the azimuths turn + sign * those read."""
+        """A function that reads columns at azimuths ``turn`` + ``sign`` * (the azimuths read)."""
         azimuths = sign * (grid.azimuths - turn)
         source = torch.cos(azimuths[:, None] - grid.azimuths).argmax(1)  # (columns,)
         return lambda read: replace(read, labels=read.labels[:, :, source])
@@ -318,28 +321,33 @@ def scaling_changes(sample: Sample, grid: Grid) -> list[Hypothesis]:
 
 
 def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sample], Sample]]:
-    """Functions that undo a scaling of the transmitters, from random triples of links.
+    """Functions that undo a scaling of the transmitters, each by another guess of the scaling.
 
-    Each triple of links to the receiver with the most links gives one candidate: positive scales s
-    and offsets t of the axes. The direction u of a link's brightest pixel is that of s x + t, x
-    being the stored transmitter, so u x (s x + t) = 0. This is linear in (s, t) and leaves two
-    independent equations a link: three links fix the six unknowns up to a common factor. Many
-    triples are drawn because a reflection may be a link's brightest pixel.
+    A stored place p stands at s p + t from the receiver, with a scale s and an offset t for each
+    axis. Seen from there it is in the direction u of the link's brightest pixel, so that
+    (s p + t) x u = 0: two independent linear equations in the six unknowns (s, t). Three links
+    solve them, up to a common factor that no direction shows. Triples are drawn at random, since a
+    link's brightest pixel may be a reflection.
+
+    Args:
+        sample: Spectra as ranks; the receiver with the most links counts.
+        draws: Triples of links, each with one guess; only positive scales are returned.
     """
     receiver = int(sample.receivers.bincount().argmax())
     links = (sample.receivers == receiver).nonzero()[:, 0]
     brightest = sample.labels[links].flatten(1).argmax(1)
     pixels = grid.flatten()[brightest]
     local = from_spherical(pixels.azimuths, pixels.elevations).double()
-    towards = local @ sample.rotations[receiver].T  # (k, 3)
+    directions = local @ sample.rotations[receiver].T  # u, world frame (k, 3)
+    # Column i is e_i x u with the unit vector e_i, so that the matrix times v is v x u.
     units = torch.eye(3, dtype=torch.float64).expand(len(links), 3, 3)
-    crossed = torch.linalg.cross(units, towards[:, None].expand(-1, 3, -1)).mT
-    # The columns of ``crossed`` (k, 3, 3) are e x u; the equations are in s and t.
-    equations = torch.cat((crossed * sample.transmitters[links, None], crossed), 2)  # (k, 3, 6)
+    crossed = torch.linalg.cross(units, directions[:, None].expand(-1, 3, -1)).mT  # (k, 3, 3)
+    of_scales = crossed * sample.transmitters[links, None]  # coefficients of s
+    equations = torch.cat((of_scales, crossed), 2)  # (k, 3, 6)
     generator = torch.Generator().manual_seed(0)
     threes = [torch.randperm(len(links), generator=generator)[:3] for _ in range(draws)]
-    threes = torch.stack(threes)
-    systems = equations[threes].flatten(1, 2)  # (draws, 9, 6)
+    systems = equations[torch.stack(threes)].flatten(1, 2)  # (draws, 9, 6)
+    # The solution of A x = 0 is the last right singular vector; its sign is free.
     solutions = torch.linalg.svd(systems).Vh[:, -1]  # (draws, 6)
     solutions = solutions * solutions[:, :1].sgn()
     changes: list[Callable[[Sample], Sample]] = []

@@ -16,9 +16,9 @@ from gaigs.io.tables import shortened
 
 
 def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
-    """True for each guard or null subcarrier: all links have one value there, or 0.
+    """True for each guard or null subcarrier: at each element all links have one value there.
 
-    An element may have another value than others. Fewer than five links tell nothing.
+    Values that are 0 but for rounding count as one. With fewer than five links none is constant.
     """
     count = len(links.task.frequencies)
     chosen = torch.arange(count)
@@ -31,7 +31,7 @@ def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
         absent = absent[..., chosen]  # (n, e, k)
         strengths = values.abs().amax((1, 2))[:, None, None]
         values = values[..., chosen]
-        # Of a link that has the element and the subcarrier (1, e, k).
+        # The value of the first link that has the element and the subcarrier (1, e, k).
         first = values.gather(0, absent.int().argmin(0, keepdim=True))
         is_same = ((values == first) | absent).all(0).all(0)
         is_faint = (values.abs() <= 1e-6 * strengths).all(0).all(0)  # 0 but for rounding
@@ -42,7 +42,7 @@ def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
 
 
 def constant_sentence(constant: Bool[Tensor, " s"], frequencies: Float[Tensor, " s"]) -> str:
-    """What was found about constant subcarriers."""
+    """The sentence about constant subcarriers, with {} for what they are or become."""
     named = shortened([f"{carrier / 1e9:.6g}" for carrier in frequencies[constant].tolist()])
     return (
         f"{int(constant.sum())} of {len(constant)} subcarriers have one value in every link, {{}}: "
@@ -51,7 +51,7 @@ def constant_sentence(constant: Bool[Tensor, " s"], frequencies: Float[Tensor, "
 
 
 def check_constant_subcarriers(links: Any) -> Iterator[Finding]:
-    """A finding about subcarriers that are no channel."""
+    """A finding about ``constant_subcarriers``."""
     constant = constant_subcarriers(links)
     if constant.any() and not constant.all():
         text = constant_sentence(constant, links.task.frequencies)

@@ -16,26 +16,29 @@ from gaigs.data.checks.distance import explained
 from gaigs.data.checks.hypotheses import Sample
 
 
-class Turned(NamedTuple):
-    """Channels of unit power, and the direct wave's phases exp(-j 2 pi f d / c)."""
+class FewWaves(NamedTuple):
+    """Channels of unit power at few elements and subcarriers, and the direct wave there.
+
+    The wave is exp(-j 2 pi f d / c), of the distance d alone.
+    """
 
     channels: Complex[Tensor, "n e s"]
     waves: Complex[Tensor, "n e s"]
     frequencies: Float[Tensor, " s"]
 
-    def still(self) -> tuple[Complex[Tensor, "n e s"], Complex[Tensor, "n e s"]]:
-        """Channels without the direct wave's phase, for each sign that it may have."""
+    def without_waves(self) -> tuple[Complex[Tensor, "n e s"], Complex[Tensor, "n e s"]]:
+        """Channels without the direct wave's phase: by its sign exp(-j ...), and by the other."""
         return self.channels * self.waves.conj(), self.channels * self.waves
 
 
 def direct_distances(sample: Sample) -> Float[Tensor, "n e"]:
-    """Distances of transmitters from their receivers' elements, lacking ones in the middle [m]."""
+    """Distances from transmitters to elements [m]; to the array's middle for missing elements."""
     elements = pad_sequence([*sample.elements], batch_first=True)  # (r, e, 3)
     places = sample.positions[:, None] + torch.einsum("rwa,rea->rew", sample.rotations, elements)
     return (sample.transmitters[:, None] - places[sample.receivers]).norm(dim=-1)
 
 
-def turned(sample: Sample, elements: int = 8, subcarriers: int = 6) -> Turned:
+def waves_at_few(sample: Sample, elements: int = 8, subcarriers: int = 6) -> FewWaves:
     """Channels and direct waves at a few elements and subcarriers, evenly spread."""
     chosen = evenly(torch.arange(sample.labels.shape[1]), elements)
     tones = evenly(torch.arange(len(sample.frequencies)), subcarriers)
@@ -46,7 +49,9 @@ def turned(sample: Sample, elements: int = 8, subcarriers: int = 6) -> Turned:
     channels = sample.labels[:, chosen][..., tones] * exists
     powers = channels.abs().square().mean((1, 2), keepdim=True)
     channels = channels / torch.where(powers > 0, powers, 1).sqrt()
-    return Turned(channels, torch.polar(torch.ones_like(phases), phases), sample.frequencies[tones])
+    return FewWaves(
+        channels, torch.polar(torch.ones_like(phases), phases), sample.frequencies[tones]
+    )
 
 
 def has_extent(sample: Sample) -> bool:
@@ -74,12 +79,12 @@ def shares(sample: Sample, is_calibrated: bool = False) -> Float[Tensor, "2 r"]:
     """
     counts = sample.receivers.bincount(minlength=len(sample.positions))
     by_sign = []
-    for still in turned(sample).still():
+    for unwound in waves_at_few(sample).without_waves():
         if is_calibrated:
-            still = still.mean((1, 2), keepdim=True)
-        totals = still.new_zeros(len(counts), *still.shape[1:])
-        totals = totals.index_add(0, sample.receivers, still)  # (r, e, s)
-        # n |mean|^2, which is 1 by chance.
+            unwound = unwound.mean((1, 2), keepdim=True)
+        totals = unwound.new_zeros(len(counts), *unwound.shape[1:])
+        totals = totals.index_add(0, sample.receivers, unwound)  # (r, e, s)
+        # n |mean|^2 over n links, which is 1 by chance.
         powers = totals.abs().square().mean((1, 2)) / counts.clamp_min(1)
         by_sign.append((powers - 1) / (counts - 1).clamp_min(1) * (counts > 1))
     return torch.stack(by_sign)
@@ -97,25 +102,27 @@ def likeness(sample: Sample) -> float:
     Each element and subcarrier may have a phase of its own, the same in all links.
     """
     by_sign = []
-    for still in turned(sample).still():
+    for unwound in waves_at_few(sample).without_waves():
         power = 0.0
         for receiver in sample.receivers.unique():
-            links = still[sample.receivers == receiver].flatten(1)  # (k, m)
+            links = unwound[sample.receivers == receiver].flatten(1)  # (k, m)
+            # The pattern of phases common to all links is the first right singular vector, by the
+            # power method.
             common = torch.ones_like(links[0])
-            for _ in range(3):  # the power method for the first singular vector
+            for _ in range(3):
                 common = links.mH @ (links @ common)
             size = common.abs().square().sum().clamp_min(1e-300)
             power += ((links @ common).abs().square().sum() / size).item()
-        by_sign.append(power / still.numel())
+        by_sign.append(power / unwound.numel())
     return max(by_sign)
 
 
 def aligned_likeness(sample: Sample) -> float:
     """Share of power that the direct wave explains after each link's best phase and delay."""
-    parts = turned(sample, subcarriers=16)
+    few = waves_at_few(sample, subcarriers=16)
     by_sign = []
-    for still in parts.still():
-        aligned = still * alignment(still, torch.ones_like(still), parts.frequencies)
+    for unwound in few.without_waves():
+        aligned = unwound * alignment(unwound, torch.ones_like(unwound), few.frequencies)
         by_sign.append(aligned.mean((1, 2)).abs().square().mean().item())
     return max(by_sign)
 

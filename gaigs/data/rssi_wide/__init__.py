@@ -148,7 +148,11 @@ def _to_links(
     positions: Sequence[Sequence[float] | None],
     frequency: float | None,
 ) -> Links:
-    """Links of the gateways that have a reading, with their positions [m]; None if unknown."""
+    """Links of the gateways ``names``, in the order of their columns with a reading.
+
+    Args:
+        positions: Position of each gateway [m]; None if unknown.
+    """
     rows, columns = survey.counts.nonzero()
     receivers = np.unique(columns, return_inverse=True)[1]
     nowhere = [0.0, 0.0, 0.0]  # until the training links estimate it
@@ -227,11 +231,11 @@ def _remarks_on_gateways(
 
 
 class World(NamedTuple):
-    """Places and gateways in the world frame [m], the frame's place on a map, and a remark."""
+    """Points in the world frame, and where it lies."""
 
-    points: Float[ndarray, "n 3"]
-    frame: Frame | None
-    remark: str
+    points: Float[ndarray, "n 3"]  # places, then gateways [m]
+    frame: Frame | None  # the frame's place on a map; None if unknown
+    remark: str  # on the origin; empty if points stay as they are
 
 
 def _to_world(
@@ -242,7 +246,15 @@ def _to_world(
     epsg: int | None,
     gateways: str,
 ) -> World:
-    """Places (the first ``count``) and gateways in the world frame."""
+    """Points in the world frame, near its origin.
+
+    Degrees are converted to UTM. The origin moves to the lowest place if coordinates are of a map
+    or too large. A ``ValueError`` for coordinates that seem to be degrees, or far apart.
+
+    Args:
+        points: Coordinates of ``count`` places, then of gateways, which are changed in place.
+        gateways: Name of the gateways' file, for messages.
+    """
     largest = np.abs(points[:count]).max(0)
     x, y = table.names[axes.x], table.names[axes.y]
     if epsg is None and axes.is_global and largest[0] <= 180:

@@ -45,22 +45,25 @@ class Columns(NamedTuple):
 
 
 class Axes(NamedTuple):
-    """Columns of x, of y and of the height or the floor; a column of -1 is not there."""
+    """Numbers of the columns that hold coordinates."""
 
     x: int
     y: int
-    z: int
-    is_floor: bool
-    is_global: bool
+    z: int  # column of the height or the floor; -1 without one
+    is_floor: bool  # True if z numbers floors
+    is_global: bool  # True if x and y are longitude and latitude
 
     @property
     def columns(self) -> list[int]:
-        """The columns that are there."""
+        """Columns of x, y and, if there is one, z."""
         return [column for column in self[:3] if column >= 0]
 
 
 def plain_name(name: str) -> tuple[str, float | None]:
-    """Name of a column in small letters and digits, and its unit [m]; None if it has no unit."""
+    """A heading's name, in small letters and digits, and its unit in metres: ("x", 0.01) of X [cm].
+
+    The unit is None if there is none, or if it is no length.
+    """
     metres = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048}
     unit = r"[\s_]*[\[(]?\s*(mm|cm|km|m|ft|feet|deg|°)?\s*[\])]?"
     match = re.fullmatch(rf"(?s)(.*?){unit}", name.strip().lower())
@@ -68,7 +71,11 @@ def plain_name(name: str) -> tuple[str, float | None]:
 
 
 def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
-    """Factors of x, y and z to metres, or of x and y to the unit of the system, by headings."""
+    """Factors from the units in the headings of x, y and z to metres.
+
+    If the system ``epsg`` does not count in metres, x and y stay in its unit. A ``ValueError`` if
+    a heading then has another unit.
+    """
     columns = [axes.x, axes.y, axes.z if axes.z >= 0 else axes.x]
     units = [plain_name(table.names[column])[1] for column in columns]
     metres = 1.0 if epsg is None else metres_of(epsg)
@@ -89,7 +96,11 @@ def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
 
 
 def find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) -> Axes:
-    """The columns of coordinates, by the names given or by usual ones."""
+    """The columns of coordinates: the ``coordinates`` named, else those with usual names.
+
+    Raises:
+        ValueError: Columns are missing or ambiguous, or the latitude comes first.
+    """
     plain = [plain_name(name)[0] for name in table.names]
     has_unit = [plain_name(name)[1] is not None for name in table.names]
     longitudes, latitudes = PAIRS[2]
@@ -151,7 +162,11 @@ def find_gateways(
     ignore: Sequence[str],
     not_heard: float | list[float] | None,
 ) -> Columns:
-    """The columns of gateways, and the marks of "not heard" in them."""
+    """The columns of gateways, and the marks of "not heard" in them.
+
+    A gateway is a column named in ``placed`` or one of mostly low levels. A column without a level
+    is left out. A ``ValueError`` if there is no gateway, or if one of its cells is no level.
+    """
     reserved = {axes.x, axes.y, axes.z, *(table.column(name) for name in ignore)}
     free = [k for k in range(len(table.names)) if k not in reserved]
     likely = [k for k in free if table.names[k] in placed or _is_weak(table, k)]
@@ -198,11 +213,12 @@ def find_gateways(
     for k in others:
         name = table.names[k]
         ignored.append(f"{name} (powers in W or mW?)" if name in powers else name)
+    # A column without a name, such as of pandas's index, is not worth a remark.
     return Columns(gateways, marks, [*filter(None, silent)], [*filter(None, ignored)])
 
 
 def _is_weak(table: tables.Table, column: int) -> bool:
-    """True if a column has no coordinate's name, and half of its numbers are low levels."""
+    """True if half of a column's distinct numbers are low levels, and its name is no coordinate."""
     if plain_name(table.names[column])[0] in HEIGHTS.union(*PAIRS[0], *PAIRS[1], *PAIRS[2]):
         return False
     numbers = table.numbers[:, column]
@@ -214,11 +230,14 @@ def _is_weak(table: tables.Table, column: int) -> bool:
 def _refuse_lists(table: tables.Table, columns: Sequence[int]) -> None:
     """Raises a ``ValueError`` if a cell of these columns holds several levels."""
     for k in columns:
-        for row in np.flatnonzero(np.isinf(table.numbers[:, k]))[:1].tolist():
-            levels = tables.numbers_in(table.text(row, k))
-            if levels and QUIETEST <= min(levels) <= max(levels) <= WEAK:
-                got = f"{table.cell(row, k)}, or set data.ignore"
-                table.refuse({row: got}, "one level [dBm] a cell")
+        texts = np.flatnonzero(np.isinf(table.numbers[:, k]))  # rows whose cell is no number
+        if not len(texts):
+            continue
+        row = int(texts[0])
+        levels = tables.numbers_in(table.text(row, k))
+        if levels and QUIETEST <= min(levels) <= max(levels) <= WEAK:
+            got = f"{table.cell(row, k)}, or set data.ignore"
+            table.refuse({row: got}, "one level [dBm] a cell")
 
 
 def _are_powers(column: Float[ndarray, " n"]) -> bool:

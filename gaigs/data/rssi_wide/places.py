@@ -21,7 +21,7 @@ from gaigs.io.yaml import read_mapping, to_vector
 
 
 def name_of_gateways(gateways: str | Path | Mapping | tables.Table | None) -> str:
-    """The gateways' file for messages, or the option of gateways in memory."""
+    """Word for the gateways' origin in messages: their file, or ``receivers`` in memory."""
     return Path(gateways).name if isinstance(gateways, str | Path) else "receivers"
 
 
@@ -51,7 +51,11 @@ def read_gateways(
     storey: float,
     epsg: int | None,
 ) -> tuple[dict[str, list[float]], list[str]]:
-    """Coordinates of a file's gateways by the table's names, and its gateways without a column."""
+    """Coordinates of gateways by the table's columns, and the names of gateways without a column.
+
+    Raises:
+        ValueError: No gateway has a column, or the file or mapping has a defect.
+    """
     if given is None:
         return {}, []
     file: Path = Path(name_of_gateways(given))

@@ -14,15 +14,20 @@ from gaigs.io import tables
 
 
 class Pivoted(NamedTuple):
-    """A table with a place a row: coordinates first, then a gateway a column."""
+    """A table of readings, rearranged to a place a row and a gateway a column."""
 
-    table: tables.Table  # the table; a place with repeated readings of a gateway has several rows
+    table: tables.Table  # coordinates first; a place with repeated readings has several rows
     axes: Axes  # its columns of coordinates
     ignored: list[str]  # names of other columns of the table with a reading a row
 
 
 def pivoted(table: tables.Table, axes: Axes, receiver: str | None, level: str | None) -> Pivoted:
-    """A table with a gateway a column, of one with a reading a row."""
+    """Rearranges a table with a reading a row into one with a place a row and a gateway a column.
+
+    Args:
+        receiver: Column of the gateways' names.
+        level: Column of the readings.
+    """
     if receiver is None or level is None:
         missing = "data.receiver" if receiver is None else "data.level"
         raise ValueError(
@@ -44,8 +49,8 @@ def pivoted(table: tables.Table, axes: Axes, receiver: str | None, level: str | 
     places = tables.number_places(points.tolist())[1].numpy()
     names, gateways = np.unique(texts, return_inverse=True)
 
-    # Repeated readings of a gateway at a place go to rows of their own: the k-th to row k.
-    pairs = places * len(names) + gateways
+    # The k-th reading of a gateway at a place goes to the place's k-th row.
+    pairs = places * len(names) + gateways  # number of each pair of place and gateway
     order = np.argsort(pairs, kind="stable")
     starts = np.searchsorted(pairs[order], pairs[order])
     repeats = np.empty(count, int)
@@ -79,7 +84,10 @@ def pivoted(table: tables.Table, axes: Axes, receiver: str | None, level: str | 
 
 
 def refuse_readings(table: tables.Table, columns: Columns) -> None:
-    """Raises a ``ValueError`` if the only level of each row seems to be of the gateway it names."""
+    """Raises a ``ValueError`` if the table seems to have a reading a row.
+
+    It then has a single column of levels, and another that names the gateway of each.
+    """
     if len(columns.gateways) > 1:
         return
     level = table.names[columns.gateways[0]]

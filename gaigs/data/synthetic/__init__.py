@@ -93,7 +93,11 @@ def furnished_room(
 
 
 def default_room(order: int, receivers: int | None = None) -> SimulatedRoom:
-    """The default room with paths of at most ``order`` reflections; None: its own receivers."""
+    """The default room, with paths of at most ``order`` reflections.
+
+    Args:
+        receivers: Number of receivers along the walls; None: the array and gateways of the room.
+    """
     poses: tuple[Pose, ...] = (POSE,)
     gateways = [gateway(name, position) for name, position in GATEWAYS.items()]
     if receivers is not None:
@@ -126,13 +130,13 @@ def wall_poses(room: Room, count: int) -> tuple[Pose, ...]:
     middle = torch.cat((size[:2] / 2, torch.ones(1, dtype=torch.float64)))
     poses = []
     for number in range(count):
-        share = (number + 0.5) / count
+        share = (number + 0.5) / count  # of the way around the room
         height = 1.2 + 1.4 * (0.618034 * number % 1)
         while True:  # furniture moves a receiver along its wall
             along = share % 1 * ends[-1]
             side = int(torch.searchsorted(ends, along))
-            part = 1 - (ends[side] - along) / sides[side]
-            place = torch.lerp(corners[side], corners[(side + 1) % 4], part)
+            along_side = 1 - (ends[side] - along) / sides[side]
+            place = torch.lerp(corners[side], corners[(side + 1) % 4], along_side)
             position = torch.cat((place, place.new_tensor([height])))
             if is_free(room, position[None]).all():
                 break

@@ -80,9 +80,9 @@ def conductivity(material: str, frequency: float) -> float:
 
 
 def cells(order: int) -> Int[Tensor, "p 3"]:
-    """Mirrored copies of the room: i along x, j along y, k along z.
+    """Numbers i along x, j along y and k along z of the mirrored copies of the room.
 
-    They take |i| + |j| + |k| reflections, at most ``order``; copies with fewer come first.
+    A path to a copy has |i| + |j| + |k| reflections, at most ``order``; fewer ones come first.
     """
 
     def reflections(cell: tuple[int, ...]) -> int:
@@ -116,8 +116,8 @@ def passes(
     first = (lower - start) / ray
     second = (upper - start) / ray
     entry = torch.minimum(first, second).amax(-1).clamp(min=0)
-    leave = torch.maximum(first, second).amin(-1).clamp(max=1)
-    return entry < leave
+    exit_ = torch.maximum(first, second).amin(-1).clamp(max=1)
+    return entry < exit_
 
 
 @dataclass(frozen=True)
@@ -187,8 +187,8 @@ def bounces(
 ) -> Float[Tensor, "b p order 3"]:
     """Points at which paths are reflected, from the receiver on [m]; NaN after the last one.
 
-    A straight line to an image crosses a plane of the lattice at each reflection; folded back, all
-    are in the room.
+    The walls of all mirrored copies are planes of a lattice. A straight line to an image crosses
+    one at each reflection; the crossings are folded back into the room.
     """
     start = receiver.to(images)
     size = images.new_tensor(room.size)

@@ -37,7 +37,8 @@ class ArrayResponse(Model):
         pitch: Distance between neighbouring elements [wavelengths].
         octaves: Lowest and highest octave k of the Fourier features, 2^k cycles a metre; None takes
             those that the training transmitters can teach, as the ``euclidean`` tokenizer does.
-        width, layers: Of the network's hidden layers.
+        width: Width of the network's hidden layers.
+        layers: Number of hidden layers.
 
     Raises:
         ValueError: The labels are no spectra or of several carriers, or an option is out of range.
@@ -86,34 +87,40 @@ class ArrayResponse(Model):
         self.network = nn.Sequential(*hidden, nn.Linear(widths[-1], math.prod(self.fields)))
 
     def forward(self, batch: Batch) -> Prediction:
-        query, directions = batch.query, batch.directions or self.scene.task.directions
+        query = batch.query
+        directions = batch.directions or self.scene.task.directions
         features = fourier_features(query.transmitters - self.middle, self.frequencies)
-        fields = self.network(features).unflatten(-1, self.fields)
-        fields = fields[torch.arange(len(fields), device=fields.device), query.receivers]
-        # A minimum's gradient is that of one pixel: where it lies is searched without the gradients
-        # of all the others.
+        fields = self.network(features).unflatten(-1, self.fields)  # (b, receivers, 2 elements)
+        rows = torch.arange(len(fields), device=fields.device)
+        fields = fields[rows, query.receivers]  # (b, 2 elements)
+        # An extreme's gradient is that of its pixel alone: the pixel is found without gradients.
         with torch.no_grad():
             powers = torch.einsum("bf,fcp->bcp", fields, self.steering).square().sum(1)
-            extremes = torch.stack((powers.argmin(1), powers.argmax(1)), 1)
-        low, high = magnitudes(
-            torch.einsum("bf,fcbp->bcp", fields, self.steering[..., extremes])
-        ).split(1, 1)
+            extremes = torch.stack((powers.argmin(1), powers.argmax(1)), 1)  # (b, 2)
+        sums = torch.einsum("bf,fcbp->bcp", fields, self.steering[..., extremes])
+        low, high = magnitudes(sums).split(1, 1)  # (b, 1) each
         spectra = magnitudes(torch.einsum("bf,fcp->bcp", fields, self.steer(directions)))
-        return Prediction(((spectra - low) / (high - low)).unflatten(1, directions.shape), {})
+        scaled = (spectra - low) / (high - low)  # (b, pixels)
+        return Prediction(scaled.unflatten(1, directions.shape), {})
 
     def steer(self, directions: Directions) -> Float[Tensor, "fields 2 pixels"]:
-        """Matrix from the fields, all real parts before all imaginary ones, to those of the sum."""
+        """The matrix from fields to the real and imaginary part of their sum in each direction.
+
+        Fields are the real parts at all elements, then the imaginary ones.
+        """
         vectors = directions.to(self.elements).flatten().vectors()
-        phases = 2 * math.pi * self.elements @ vectors[:, :2].T
-        cos, sin = phases.cos(), phases.sin()
+        phases = 2 * math.pi * self.elements @ vectors[:, :2].T  # (elements, pixels)
+        cos = phases.cos()
+        sin = phases.sin()
+        # (x + j y) exp(-j p) = x cos p + y sin p + j (y cos p - x sin p)
         return torch.cat((torch.stack((cos, -sin), 1), torch.stack((sin, cos), 1)))
 
 
 def magnitudes(parts: Float[Tensor, "b 2 pixels"]) -> Float[Tensor, "b pixels"]:
-    """Magnitudes of real and imaginary parts, with the gradient 0 at 0.
+    """Magnitudes of complex numbers, given by their parts; the gradient at 0 is 0.
 
     ``norm(dim=1)`` takes ten times as long on a CPU.
     """
-    # Of bfloat16, as trainer.precision=bf16-mixed has it, torch makes no complex numbers.
+    # torch has no complex numbers of bfloat16 (trainer.precision=bf16-mixed).
     parts = parts.to(torch.promote_types(parts.dtype, torch.float32))
     return geometry.magnitudes(torch.complex(*parts.unbind(1)))

@@ -34,21 +34,21 @@ def read_channels(
 ) -> Links:
     """Channels from users to the base stations of a scenario; by reciprocity the users transmit.
 
-    Channels are those of DeepMIMO's generator without its factor of 1 / sqrt(subcarriers):
-    isotropic antennas, plane waves over the array, time dependence exp(+j omega t). The links of
+    DeepMIMO's generator gives the same channels times 1 / sqrt(subcarriers): isotropic antennas,
+    plane waves over the array, time dependence exp(+j omega t). The links of
     one user share a row. Users without a path and paths between base stations are left out. There
     is no official split.
 
     Args:
-        root: Folder with ``params.json`` and a file of each matrix for each base station and set of
-            users, such as ``power_t001_tx000_r000.npz`` (or .mat, .npy). Of a dynamic scenario it
-            is the folder of one scene.
+        root: Folder with ``params.json`` and a file for each matrix, base station and set of users,
+            such as ``power_t001_tx000_r000.npz`` (or .mat, .npy). A dynamic scenario has such a
+            folder for each scene.
         elements: Rows and columns of the stations' arrays, half a wavelength of the carrier apart.
         bandwidth: From the lowest subcarrier to the highest, about the scenario's carrier [Hz].
-        subcarriers: Evenly over the band; a single one is the carrier.
+        subcarriers: Number of subcarriers, evenly over the band; a single one is the carrier.
         transmitters: Number of random users to take; None for all.
         seed: Seed of the choice of users.
-        phase: Of ``gaigs.core.task.csi.Csi``.
+        phase: See ``gaigs.core.task.csi.Csi``.
         band_train, band_test: Subcarriers to train and to test on, as for
             ``gaigs.data.bands.hold_out_band`` [Hz].
 
@@ -80,6 +80,7 @@ def read_channels(
     )
 
     def channels(station: StationPaths, users: np.ndarray) -> Tensor:
+        """Channels of users, rows of ``station.users``, at a station (n, e, s)."""
         gains = station.fields[users, None]  # (n, 1, p)
         if station.departures is not None:
             # A plane wave towards u reaches an element at x by exp(2 j pi u . x / wavelength).
@@ -101,7 +102,7 @@ def read_strengths(
 ) -> Links:
     """Signal strength of users of 0 dBm at the base stations of a scenario.
 
-    Antennas are isotropic. Files, errors and other options are those of ``deepmimo``.
+    Antennas are isotropic. For files, errors and other options see ``deepmimo``.
 
     Args:
         bandwidth: Width of the band about the scenario's carrier over which power is averaged [Hz].

@@ -61,10 +61,10 @@ class StationPaths:
 
     Attributes:
         name: Transmitter set and number as in file names, such as ``t001_tx000``.
-        position: Of the base station [m].
-        users: Positions [m].
+        position: Position of the base station [m].
+        users: Positions of the users [m].
         fields: Gain of each path at the carrier, with its phase; 0 for no path.
-        delays: Of each path [s].
+        delays: Delay of each path [s].
         departures: Directions in which paths leave the station; None if not read.
         is_direct: True for lines of sight.
     """
@@ -79,10 +79,10 @@ class StationPaths:
 
 
 class Scenario(NamedTuple):
-    """A scenario: its carrier [Hz], the paths of each base station, and remarks on them."""
+    """The traced paths of a scenario."""
 
-    frequency: float
-    stations: list[StationPaths]
+    frequency: float  # carrier [Hz]
+    stations: list[StationPaths]  # one for each base station and set of users
     remarks: list[str]
 
 
@@ -105,7 +105,7 @@ class ChosenUsers(NamedTuple):
 def choose_users(
     stations: Sequence[StationPaths], transmitters: int | None, seed: int
 ) -> ChosenUsers:
-    """Users that have a path to a station: all, or a number of random ones."""
+    """Users with a path to a station: all, or so many random ``transmitters`` of them."""
     of_station = [np.flatnonzero(station.fields.any(1)) for station in stations]
     places = np.concatenate(
         [station.users[rows] for station, rows in zip(stations, of_station, strict=True)]
@@ -164,7 +164,10 @@ def to_links(
 
 
 def read_scenario(root: str | Path, with_angles: bool) -> Scenario:
-    """The carrier of a scenario, and its paths of each base station and set of users."""
+    """The carrier and the paths of a scenario, with angles of departure if asked for.
+
+    Phases without the carrier's turn over the delay, as of Sionna RT, get it.
+    """
     root = find_folder(root)
     _refuse_old_formats(root)
     parameters = _read_parameters(root)
@@ -179,11 +182,11 @@ def read_scenario(root: str | Path, with_angles: bool) -> Scenario:
     remarks = []
     is_sionna = parameters.tracer.startswith("Sionna")
     if lacks_carrier(fields, delays, frequency, otherwise=is_sionna):
-        turned = []
+        with_carrier = []
         for station in stations:
-            turn = np.exp(-2j * np.pi * frequency * station.delays)
-            turned.append(replace(station, fields=station.fields * turn))
-        stations = turned
+            waves = np.exp(-2j * np.pi * frequency * station.delays)
+            with_carrier.append(replace(station, fields=station.fields * waves))
+        stations = with_carrier
         remarks.append(
             "phases lack the carrier's over the delay, as those of Sionna RT; it is added"
         )
@@ -209,7 +212,7 @@ class Parameters(NamedTuple):
     Attributes:
         frequency: Carrier [Hz].
         tracer: Name of the ray tracer.
-        both_ends: Numbers of the sets that transmit, and may receive, too.
+        both_ends: Numbers of the sets of base stations, which may receive, too.
     """
 
     frequency: float
@@ -218,9 +221,10 @@ class Parameters(NamedTuple):
 
 
 def _read_parameters(root: Path) -> Parameters:
+    """Entries of ``params.json``, which a dynamic scenario has one folder above its scenes."""
     file = root / "params.json"
     if not has_file(file) and has_file(root.parent / file.name):
-        file = root.parent / file.name  # of a dynamic scenario, one folder a scene
+        file = root.parent / file.name
     try:
         params = json.loads(file.read_text(encoding="utf-8"))
         traced = params["rt_params"]
@@ -278,8 +282,8 @@ def _read_station(root: Path, code: str, with_angles: bool) -> StationPaths:
     if with_angles:
         azimuths = np.deg2rad(arrays["aod_az"])
         zeniths = np.deg2rad(arrays["aod_el"])
-        level = np.sin(zeniths)
-        directions = (level * np.cos(azimuths), level * np.sin(azimuths), np.cos(zeniths))
+        horizontal = np.sin(zeniths)
+        directions = (horizontal * np.cos(azimuths), horizontal * np.sin(azimuths), np.cos(zeniths))
         departures = np.stack(directions, -1)  # (n, p, 3)
     fields = exists * 10 ** (arrays["power"] / 20) * np.exp(1j * np.deg2rad(arrays["phase"]))
     return StationPaths(
@@ -294,7 +298,7 @@ def _read_station(root: Path, code: str, with_angles: bool) -> StationPaths:
 
 
 def _check_range(file: Path, key: str, array: np.ndarray, counts: bool | np.ndarray) -> None:
-    """Raises a ``ValueError`` for a value that counts and is out of range."""
+    """Raises a ``ValueError`` for a value out of range, where ``counts`` is true."""
     low, high, expected = RANGES[key]
     wrong = np.argwhere(~((low <= array) & (array <= high)) & counts)
     if len(wrong):

@@ -35,9 +35,8 @@ class Gsrf(Model):
         scene: Receivers and task.
         pooling: Configuration of the pooling of the complex map; None if the task has no pooling.
         degree: L of the radiance's Fourier-Legendre series.
-        radius: Of the sphere on which footprints are measured [m].
-        count, pitch, margin, opacity, signal: Of the Gaussians at the start, see
-            ``ComplexGaussians``.
+        radius: Radius of the sphere on which footprints are measured [m].
+        count, pitch, margin, opacity, signal: Gaussians at the start, see ``ComplexGaussians``.
 
     Raises:
         ValueError: The links have several carriers; the pooling does not give the task's labels
@@ -73,19 +72,18 @@ class Gsrf(Model):
                 f"model 'gsrf' has no pooling for labels of task {scene.task.name!r}; use another "
                 "model"
             )
-        self.pooling, self.radius = registry("pooling").build(pooling, scene=scene), radius
+        self.radius = radius
+        self.pooling = registry("pooling").build(pooling, scene=scene)
         if self.pooling.channels % 2:
             raise ValueError(
                 f"model 'gsrf' renders complex maps, and pooling {pooling['name']!r} takes "
-                f"{self.pooling.channels} "
-                "real channel; take one that takes two"
+                f"{self.pooling.channels} real channel; take one that takes two"
             )
         grid = self.pooling.grid or scene.task.directions
         if grid is None:
             raise ValueError(
                 f"labels of task {scene.task.name!r} have no directions, so the pooling must have "
-                "a grid of its own, "
-                f"and {pooling['name']} has none; take the task's own pooling"
+                f"a grid of its own, and {pooling['name']} has none; take the task's own pooling"
             )
         zone = self.pooling.zone
         if self.pooling.grid is None:
@@ -110,21 +108,21 @@ class Gsrf(Model):
     def forward(self, batch: Batch) -> Prediction:
         places, which = batch.query.unique(with_receivers=False)
         radiance = self.gaussians.radiance(places.transmitters)
-        links, values = [], []
-        for receiver in batch.query.receivers.unique().tolist() or [
-            0
-        ]:  # no links have a label's shape too
-            links.append((batch.query.receivers == receiver).nonzero()[:, 0])
-            query = batch.query[links[-1]]
-            value = self.pooling(
-                self._map(radiance[which[links[-1]]], receiver, batch), query, batch.directions
-            )
+        by_receiver = []
+        values = []
+        # Without links the first receiver gives an empty value of a label's shape.
+        for receiver in batch.query.receivers.unique().tolist() or [0]:
+            links = (batch.query.receivers == receiver).nonzero()[:, 0]
+            query = batch.query[links]
+            image = self._map(radiance[which[links]], receiver, batch)
+            value = self.pooling(image, query, batch.directions)
             if self.pooling.grid is None and batch.directions is not None:
-                value = value.reshape(
-                    len(query), *batch.directions.shape
-                )  # a list of rays was rendered as one row
+                # A list of rays was rendered as one row.
+                value = value.reshape(len(query), *batch.directions.shape)
+            by_receiver.append(links)
             values.append(value)
-        return Prediction(torch.cat(values)[torch.cat(links).argsort()], {})
+        order = torch.cat(by_receiver).argsort()
+        return Prediction(torch.cat(values)[order], {})
 
     def _map(
         self, radiance: Complex[Tensor, "b n s"], receiver: int, batch: Batch
@@ -132,9 +130,8 @@ class Gsrf(Model):
         """The receiver's map: the real parts of all complex channels, then the imaginary ones."""
         directions = self.pooling.grid or batch.directions or self.scene.task.directions
         vectors = directions.flatten().to(self.gaussians.means).vectors()
-        waves = render(
-            self.gaussians, radiance, self.scene.receivers[receiver].pose, vectors, self.radius
-        )
+        pose = self.scene.receivers[receiver].pose
+        waves = render(self.gaussians, radiance, pose, vectors, self.radius)  # (b, s, rays)
         shape = directions.shape if len(directions.shape) == 2 else (1, *directions.shape)
         return torch.cat((waves.real, waves.imag), 1).unflatten(2, shape)
 
@@ -159,6 +156,5 @@ class Gsrf(Model):
         """``gaussians.ply`` for 3-D splatting viewers, with the constant term of the series."""
         values = dict(self.gaussians.named_parameters())
         values["signal"] = values["signal"][..., :1]
-        write_ply(
-            folder / "gaussians.ply", values, f"gaigs: {self.pooling.channels} signal channels"
-        )
+        comment = f"gaigs: {self.pooling.channels} signal channels"
+        write_ply(folder / "gaussians.ply", values, comment)

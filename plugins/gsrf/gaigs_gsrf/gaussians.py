@@ -24,23 +24,23 @@ class ComplexGaussians(Gaussians):
     Args:
         scene: Its receivers and transmitters say where to put the Gaussians, its carrier how
             densely.
-        zone: Lowest and highest elevation that anything is heard from, in the receivers' frames
+        zone: Lowest and highest elevation from which anything is received, in the receivers' frames
             [rad].
-        channels: Real channels: all real parts of the complex ones before all imaginary parts.
+        channels: Number of real channels: all real parts of complex ones, then all imaginary parts.
         degree: L of the series.
-        radius: Of the sphere of footprints [m].
-        count: Points of the grid at most; where there would be more, its pitch is wider.
-        pitch: Of the grid [wavelengths]; where the carrier is unknown, ``count`` decides.
-        margin: As a share of the box's longest edge.
-        opacity: At the start, in (0, 1).
+        radius: Radius of the sphere of footprints [m].
+        count: Largest number of points of the grid, whose pitch grows to keep it.
+        pitch: Pitch of the grid [wavelengths]; where the carrier is unknown, ``count`` decides.
+        margin: Margin around the box, as a share of its longest edge.
+        opacity: Opacity at the start, in (0, 1).
         signal: Standard deviation of the coefficients' random start.
 
     Attributes:
         signal: Coefficients c_lm at number l² + l + m, (n, channels, (L + 1)²).
-        phases: By which a wave turns that passes through a Gaussian's middle (n,) [rad].
+        phases: Phase that a wave through a Gaussian's middle gains (n,) [rad].
 
     Raises:
-        ValueError: An option is out of range, or nothing of the grid is heard.
+        ValueError: An option is out of range, or no receiver sees a point of the grid.
 
     Source: GSRF (NeurIPS 2025), "Fourier-Legendre radiance field".
     """
@@ -75,16 +75,14 @@ class ComplexGaussians(Gaussians):
         if not zone[0] < zone[1]:
             raise ValueError(
                 f"model 'gsrf' needs labels of two elevations or more, got them from {zone[0]:.6g} "
-                f"to {zone[1]:.6g} "
-                "rad; take another model"
+                f"to {zone[1]:.6g} rad; take another model"
             )
         means = heard(cubic_grid(scene, count, pitch, margin), scene, zone)
         if len(means) < len(scene.receivers):
             raise ValueError(
                 f"the grid of Gaussians must have a point for each of the {len(scene.receivers)} "
-                "receivers, got "
-                f"{len(means)} that are heard; raise model.count, or lower model.pitch or "
-                "model.margin"
+                f"receivers, got {len(means)} that are heard; raise model.count, or lower "
+                "model.pitch or model.margin"
             )
         options = {
             "near": 1.0,
@@ -103,12 +101,12 @@ class ComplexGaussians(Gaussians):
         self.phases = nn.Parameter(torch.zeros(len(means)))
 
     def radiance(self, transmitters: Float[Tensor, "b 3"]) -> Complex[Tensor, "b n s"]:
-        """Radiance of each towards the transmitters, on s complex channels.
+        """Radiance of each Gaussian towards the transmitters, on s complex channels.
 
         psi_i = sum_{l <= L, |m| <= l} c_ilm Y_lm at the direction from the Gaussian to the
         transmitter.
         """
-        offsets = transmitters[:, None] - self.means
+        offsets = transmitters[:, None] - self.means  # (b, n, 3)
         lengths = offsets.norm(dim=-1, keepdim=True)
         # A transmitter within a Gaussian's centre has no direction; upwards is used.
         upwards = offsets.new_tensor([0.0, 0.0, 1.0])
@@ -123,9 +121,9 @@ def fourier_legendre(
     """Y_lm = N_lm P_l^|m|(cos theta) exp(j m az), times (-1)^|m| for m < 0, in the order of l and
     m.
 
-    N_lm = sqrt((2l + 1) / 4 pi (l - |m|)! / (l + |m|)!). Made of the real harmonics, whose
-    recurrence has no factorials and no pole; sqrt(2) N P cos(m az) and sqrt(2) N P sin(m az) are
-    two of them.
+    N_lm = sqrt((2l + 1) / 4 pi (l - |m|)! / (l + |m|)!). They come from the real harmonics, whose
+    recurrence has no factorials and no pole: these are sqrt(2) N P cos(m az) for m > 0 and
+    sqrt(2) N P sin(|m| az) for m < 0.
 
     Args:
         vectors: Unit vectors.
@@ -134,11 +132,15 @@ def fourier_legendre(
     Source: GSRF (NeurIPS 2025).
     """
     harmonics = spherical_harmonics(vectors, degree)
-    middles = torch.tensor(
-        [n**2 + n for n in range(degree + 1) for _ in range(2 * n + 1)], device=vectors.device
-    )
-    orders = torch.arange(len(middles), device=vectors.device) - middles
-    real, imaginary = (harmonics[..., middles + sign * orders.abs()] for sign in (1, -1))
+    # Number of the harmonic with m = 0 of the same l, for each harmonic (k,).
+    middles = []
+    for n in range(degree + 1):
+        middles += [n**2 + n] * (2 * n + 1)
+    middle = torch.tensor(middles, device=vectors.device)
+    orders = torch.arange(len(middle), device=vectors.device) - middle  # m
+    real = harmonics[..., middle + orders.abs()]
+    imaginary = harmonics[..., middle - orders.abs()]
+    # 1 for m = 0, else sqrt(1/2), with the sign of (-1)^|m| for m < 0.
     size = vectors.new_tensor([1.0, math.sqrt(0.5), -math.sqrt(0.5)])
     size = size[torch.where((orders < 0) & (orders % 2 == 1), 2, orders.sign().abs())]
     return torch.complex(size * real, size * orders.sign() * imaginary)
@@ -150,9 +152,9 @@ def cubic_grid(scene: Scene, count: int, pitch: float, margin: float) -> Float[T
 
     Args:
         scene: Box, receivers and carrier.
-        count: Most points.
-        pitch: In wavelengths, where these are known.
-        margin: As a share of the box's longest edge.
+        count: Largest number of points; the pitch grows to keep it.
+        pitch: Least distance of points [wavelengths]; 0 where the carrier is unknown.
+        margin: Margin as a share of the box's longest edge.
     """
     lower, upper = (corner.double() for corner in scene.box)
     edges = (upper - lower) + 2 * margin * (upper - lower).max()
@@ -165,17 +167,16 @@ def cubic_grid(scene: Scene, count: int, pitch: float, margin: float) -> Float[T
     while (steps + 1).prod() > count:
         step = 1.02 * step
         steps = (edges / step).floor()
-    axes = (
-        middle + step * (torch.arange(size + 1) - size / 2)
-        for middle, size in zip((lower + upper) / 2, steps.tolist(), strict=True)
-    )
+    axes = []
+    for middle, size in zip((lower + upper) / 2, steps.tolist(), strict=True):
+        axes.append(middle + step * (torch.arange(size + 1) - size / 2))
     return torch.cartesian_prod(*axes).float()
 
 
 def heard(
     points: Float[Tensor, "n 3"], scene: Scene, zone: tuple[float, float]
 ) -> Float[Tensor, "k 3"]:
-    """Those of some points that a receiver sees between two elevations."""
+    """The points that a receiver sees between two elevations of its frame [rad]."""
     seen = torch.zeros(len(points), dtype=torch.bool)
     for receiver in scene.receivers:
         _, elevations, _ = to_spherical(receiver.pose.local(points))

@@ -17,13 +17,12 @@ L1, SSIM, FOURIER = 0.44, 0.37, 0.19
 class GsrfLoss:
     """Spectra: 0.44 L1 + 0.37 (1 - SSIM) + 0.19 Fourier. Levels: squared error of amplitudes.
 
-    The SSIM window spans 11 pixels of the label's own grid; its weights are uniform, as those of
-    ``l1_ssim``. The Fourier term is the mean squared difference of the two-dimensional discrete
-    Fourier transforms, in the form that keeps energies. By Parseval's theorem that is the mean
-    squared error, and so it is computed.
+    The SSIM window spans 11 pixels of the label's own grid; its weights are uniform, as in
+    ``l1_ssim``. The Fourier term is the mean squared difference of unitary two-dimensional discrete
+    Fourier transforms; by Parseval's theorem it is computed as the mean squared error.
 
     Args:
-        task: Whose labels are compared.
+        task: Task of the labels.
 
     Raises:
         ValueError: The labels are complex: a loss of channels is not published.
@@ -43,8 +42,8 @@ class GsrfLoss:
         """The loss, and its terms; see ``gaigs.splatting.loss.Loss``.
 
         Raises:
-            ValueError: The batch asks for a list of directions, which has no windows, or for fewer
-                than 3 x 3.
+            ValueError: The batch has a list of directions, which has no windows, or fewer than
+                3 x 3 of them.
         """
         errors = values - batch.labels
         if self.directions is None:

@@ -30,17 +30,16 @@ class MeanAmplitude(Pooling):
         self.grid = sphere("pooling.grid", grid)
 
     def fit(self, links: Links) -> None:
-        """Sees to it that the training labels can be predicted.
+        """Checks that the training labels can be predicted.
 
         Raises:
-            ValueError: One is at -100 dBm or below, where no amplitude is.
+            ValueError: A label is at -100 dBm or below, where no amplitude is.
         """
         least = links.labels[links.split.train].min().item()
         if least <= -RANGE:
             raise ValueError(
                 "pooling 'mean_amplitude' gives levels above -100 dBm, and a training label is "
-                f"{least:.6g} dBm; leave "
-                "such readings out, or take another pooling"
+                f"{least:.6g} dBm; leave such readings out, or take another pooling"
             )
 
     def forward(
@@ -49,8 +48,7 @@ class MeanAmplitude(Pooling):
         query: Query,
         directions: Directions | None = None,
     ) -> Float[Tensor, " b"]:
-        """Level [dBm], float32 where the map is of half precision; where the map is 0, so is its
-        gradient.
-        """
+        """Levels [dBm], in single precision at least; the gradient of a pixel of 0 is 0."""
         image = image.to(torch.promote_types(image.dtype, torch.float32))
-        return RANGE * (magnitudes(torch.complex(*image.unbind(1))).mean((1, 2)) - 1)
+        amplitudes = magnitudes(torch.complex(*image.unbind(1)))  # (b, rows, columns)
+        return RANGE * (amplitudes.mean((1, 2)) - 1)

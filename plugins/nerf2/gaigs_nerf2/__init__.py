@@ -17,8 +17,8 @@ __all__ = ["Nerf2", "RayMarching", "Samples", "amplitudes_and_phases", "render"]
 
 
 class Nerf2(RayMarching):
-    """Place -> attenuation and a feature; feature, direction and transmitter -> the field sent
-    along the ray.
+    """Two networks: place -> attenuation and a feature; feature, direction and transmitter -> the
+    field sent along the ray.
 
     The first network's input joins its layers again halfway. The second has a layer of ``width``
     and one of half of it.
@@ -26,8 +26,9 @@ class Nerf2(RayMarching):
     Args:
         scene: Receivers, task, carrier.
         samples, far, rays, frequency: See ``RayMarching``.
-        octaves: Of the features sin 2^k x and cos 2^k x of positions [m] and directions, k from 0.
-        width, layers: Of the first network.
+        octaves: Number of the features sin 2^k x and cos 2^k x of positions [m] and directions, k
+            from 0.
+        width, layers: Width and number of the first network's layers.
 
     Raises:
         ValueError: See ``RayMarching``.
@@ -35,9 +36,8 @@ class Nerf2(RayMarching):
     Source: NeRF², 2023.
     """
 
-    learning_rates: Mapping[str, float] = {
-        "network": 2e-3
-    }  # published: 8e-4, falling as a cosine over 30,000 steps
+    # Published: 8e-4, falling as a cosine over 30,000 steps.
+    learning_rates: Mapping[str, float] = {"network": 2e-3}
 
     def __init__(
         self,
@@ -61,7 +61,8 @@ class Nerf2(RayMarching):
         inputs = [features, *[width] * (layers - 1)]
         inputs[self.joint] += features
         self.layers = nn.ModuleList(nn.Linear(size, width) for size in inputs)
-        self.attenuate, self.feature = nn.Linear(width, 2), nn.Linear(width, width)
+        self.attenuate = nn.Linear(width, 2)
+        self.feature = nn.Linear(width, width)
         self.parts = width, features, features  # inputs of the second network's first layer
         self.join = nn.Linear(sum(self.parts), width)
         self.send = nn.Sequential(
@@ -76,20 +77,18 @@ class Nerf2(RayMarching):
         places = fourier_features(points, self.frequencies)
         hidden = places
         for number, layer in enumerate(self.layers):
-            hidden = relu(
-                layer(torch.cat((places, hidden), -1) if number == self.joint else hidden)
-            )
-        attenuations, turns = amplitudes_and_phases(self.attenuate(hidden))
-        # All links share the layer's output for the ray: it is summed part by part.
-        ray, view, transmitter = self.join.weight.split(self.parts, 1)
-        ray = linear(self.feature(hidden), ray, self.join.bias)
-        ray = ray + linear(fourier_features(views, self.frequencies), view)[:, None]
-        transmitter = linear(
-            fourier_features(query.transmitters - self.middle, self.frequencies), transmitter
-        )
-        amplitudes, phases = amplitudes_and_phases(
-            self.send((ray + transmitter[:, None, None]).relu_())
-        )
+            if number == self.joint:
+                hidden = torch.cat((places, hidden), -1)
+            hidden = relu(layer(hidden))
+        attenuations, turns = amplitudes_and_phases(self.attenuate(hidden))  # (r, i, 1) each
+        # All links share the first layer's output for the ray: the layer is summed part by part.
+        of_feature, of_view, of_transmitter = self.join.weight.split(self.parts, 1)
+        ray = linear(self.feature(hidden), of_feature, self.join.bias)  # (r, i, width)
+        ray = ray + linear(fourier_features(views, self.frequencies), of_view)[:, None]
+        positions = fourier_features(query.transmitters - self.middle, self.frequencies)
+        transmitter = linear(positions, of_transmitter)[:, None, None]  # (b, 1, 1, width)
+        sent = self.send((ray + transmitter).relu_())
+        amplitudes, phases = amplitudes_and_phases(sent)  # (b, r, i, c) each
         return Samples(attenuations[..., 0], turns[..., 0], amplitudes, phases)
 
 

@@ -25,11 +25,11 @@ class Samples(NamedTuple):
     """Properties of the samples i along each ray r, counted from the receiver.
 
     Attributes:
-        attenuations: a, decay of a passing wave's amplitude (r, i) [1/m].
-        turns: p, rate of its phase (r, i) [rad/m].
-        amplitudes: s, of the wave that a sample sends towards the receiver for each link (b, r, i,
-            c).
-        phases: phi, of the same (b, r, i, c) [rad].
+        attenuations: Decay a of a passing wave's amplitude (r, i) [1/m].
+        turns: Rate p of a passing wave's phase (r, i) [rad/m].
+        amplitudes: Amplitude s of the wave that a sample sends to the receiver, for each link (b,
+            r, i, c).
+        phases: Phase phi of this wave (b, r, i, c) [rad].
     """
 
     attenuations: Float[Tensor, "r i"]
@@ -41,35 +41,34 @@ class Samples(NamedTuple):
 def render(
     samples: Samples, step: float, gains: Float[Tensor, " i"], shifts: Float[Tensor, "i c"]
 ) -> Complex[Tensor, "b r c"]:
-    """S = sum_i g_i s_i exp(j (phi_i + x_i)) prod_{j<i} (1 - alpha_j) exp(j p_j d), alpha_j = 1 -
-    exp(-a_j d).
+    """Field along each ray, the sum of its samples' waves.
 
-    As 1 - alpha_j is exp(-a_j d), the products are exponentials of sums: none is rounded to 0
-    within, nor to 1.
+        S = sum_i g_i s_i exp(j (phi_i + x_i)) prod_{j<i} (1 - alpha_j) exp(j p_j d)
+
+    with 1 - alpha_j = exp(-a_j d). Products are computed as exponentials of sums, since factors of
+    almost 0 or 1 would be rounded.
 
     Args:
-        samples: Along each ray.
-        step: d, from one sample to the next [m].
-        gains: g, factor of the distance.
-        shifts: x, phase of the distance [rad].
+        samples: Samples along each ray.
+        step: Distance d from one sample to the next [m].
+        gains: Factor g of each distance.
+        shifts: Phase x of each distance [rad].
 
     Source: NeRF², 2023, with its 0.025 / t_i of spectra as gains and its 2 pi t_i / lambda of RSSI
     as shifts.
     """
-    passed, turned = (
-        step * (values.cumsum(1) - values) for values in (samples.attenuations, samples.turns)
-    )
-    strengths = (gains * (-passed).exp())[None, ..., None] * samples.amplitudes
-    phases = samples.phases + (turned[..., None] + shifts)
-    return torch.complex((strengths * phases.cos()).sum(2), (strengths * phases.sin()).sum(2))
+    # Loss and phase of a wave on its way from a sample to the receiver (r, i).
+    losses = step * (samples.attenuations.cumsum(1) - samples.attenuations)
+    turns = step * (samples.turns.cumsum(1) - samples.turns)
+    strengths = (gains * (-losses).exp())[None, ..., None] * samples.amplitudes
+    phases = samples.phases + (turns[..., None] + shifts)  # (b, r, i, c)
+    real = (strengths * phases.cos()).sum(2)
+    imaginary = (strengths * phases.sin()).sum(2)
+    return torch.complex(real, imaginary)
 
 
 def check_octaves(octaves: int) -> None:
-    """Sees to it that float32 holds the features sin 2^k x for all k below ``octaves``.
-
-    Raises:
-        ValueError: It does not.
-    """
+    """Raises a ``ValueError`` unless float32 resolves the features sin 2^k x of k < ``octaves``."""
     if not 0 <= octaves <= MAX_OCTAVE:
         raise ValueError(
             f"model.octaves must be at least 0 and at most {MAX_OCTAVE}, got {octaves}"
@@ -77,8 +76,7 @@ def check_octaves(octaves: int) -> None:
 
 
 class RayMarching(Model):
-    """A model of values at samples along rays from the receivers; a subclass defines them in
-    ``sample``.
+    """A model that sums samples along rays from the receivers; a subclass has ``sample``.
 
     Samples stand in the middles of equal steps. ``gaigs_nerf2.readings`` turns the sums along the
     rays into spectra, RSSI and channels. The unit of strength is such that the untrained model
@@ -86,14 +84,14 @@ class RayMarching(Model):
 
     Args:
         scene: Receivers, task, carrier.
-        samples: Along a ray.
-        far: Where rays end [m]; None: at the corner farthest from any receiver of the box that
-            holds the training transmitters and the receivers.
+        samples: Number of samples along a ray.
+        far: Length of the rays [m]; None: the largest distance from a receiver to a corner of the
+            box that holds the training transmitters and the receivers.
         rays: Rows and columns of the rays over the sphere, where labels have no directions.
-        frequency: Carrier of RSSI whose data say none [Hz].
+        frequency: Carrier of RSSI where the data have none [Hz].
 
     Attributes:
-        grid: Rays that are marched whatever directions are asked for; None: those asked for.
+        grid: Rays for all labels; None: rays in the directions of each label.
 
     Raises:
         ValueError: The labels are no spectra, RSSI or channels, or of several carriers; an option
@@ -121,23 +119,23 @@ class RayMarching(Model):
         self.register_buffer("unit", torch.ones(()))
 
     def _divide(self, far: float) -> None:
-        """Puts samples evenly along the rays, up to a distance [m]."""
+        """Divides rays of length ``far`` [m] into steps, each with a sample in its middle.
+
+        It sets the step, and the distances of the samples with their gains and phases. It is called
+        at the start, and when a state with another length is loaded.
+        """
         self.register_buffer("far", torch.tensor(far, dtype=torch.float64))
         self.step = far / self.samples
         distances = self.step * (torch.arange(self.samples, dtype=torch.float64) + 0.5)
-        shifts = self.reading.shifts(distances).remainder(
-            2 * math.pi
-        )  # which float32 then resolves
-        for name, values in (
-            ("distances", distances),
-            ("gains", self.reading.gains(distances)),
-            ("shifts", shifts),
-        ):
-            self.register_buffer(name, values.float(), persistent=False)
+        gains = self.reading.gains(distances)
+        # Phases of many turns would lose their digits in float32.
+        shifts = self.reading.shifts(distances).remainder(2 * math.pi)
+        self.register_buffer("distances", distances.float(), persistent=False)
+        self.register_buffer("gains", gains.float(), persistent=False)
+        self.register_buffer("shifts", shifts.float(), persistent=False)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        # Of a copy at other receivers the rays are as long as they were; checkpoints of before
-        # have no length.
+        # A copy for other receivers keeps the length of the rays; old checkpoints have none.
         far = state_dict.setdefault(f"{prefix}far", self.far)
         if far != self.far:
             self._divide(far.item())
@@ -147,23 +145,22 @@ class RayMarching(Model):
     def sample(
         self, query: Query, points: Float[Tensor, "r i 3"], views: Float[Tensor, "r 3"]
     ) -> Samples:
-        """Properties of points, for links to one receiver.
+        """Properties of the samples for links to one receiver.
 
         Args:
             query: The links.
-            points: Relative to the middle of the transmitters' box, ``middle`` [m].
-            views: Unit vectors along which the rays go, world frame.
+            points: Samples relative to ``middle``, the middle of the transmitters' box [m].
+            views: Unit vectors of the rays, world frame.
         """
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Takes the unit of strength from some training links, and of channels the sign of their
-        phases.
-        """
+        """Fits the reading, and the unit of strength by a few training links."""
         self.reading.fit(links)
-        train, (count, most) = links.split.train, CALIBRATION
-        some = train[torch.linspace(0, len(train) - 1, min(count, len(train))).long()]
-        batch = links.batch(some).to(self.unit.device)
+        train = links.split.train
+        count, most = CALIBRATION
+        chosen = train[torch.linspace(0, len(train) - 1, min(count, len(train))).long()]
+        batch = links.batch(chosen).to(self.unit.device)
         if batch.directions is not None:
             stride = -(-batch.labels[0].numel() // most)
             batch = replace(
@@ -172,32 +169,34 @@ class RayMarching(Model):
                 labels=batch.labels.flatten(1)[:, ::stride],
             )
         self.unit.fill_(1.0)
-        wanted, given = (
-            self.reading.amplitudes(values, batch.query)
-            for values in (batch.labels, self(batch).value)
-        )
+        wanted = self.reading.amplitudes(batch.labels, batch.query)
+        given = self.reading.amplitudes(self(batch).value, batch.query)
         if batch.labels.is_complex():  # each link has a vote, however weak or loud it is
             wanted = self.reading.amplitudes(links.labels[train], links.query[train])
-            wanted, given = (part.flatten(1).mean(1).quantile(0.5) for part in (wanted, given))
+            wanted = wanted.flatten(1).mean(1).quantile(0.5)
+            given = given.flatten(1).mean(1).quantile(0.5)
         self.unit.copy_(wanted.mean() / given.mean())
 
     def forward(self, batch: Batch) -> Prediction:
         directions = (self.grid or batch.directions or self.scene.task.directions).to(self.middle)
-        query, rays = batch.query, directions.flatten()
-        links, values = [], []
-        for receiver in query.receivers.unique().tolist() or [
-            0
-        ]:  # no links have a label's shape too
-            links.append((query.receivers == receiver).nonzero()[:, 0])
-            own = query[links[-1]]
-            values.append(self.reading(self.march(own, receiver, rays), own, directions))
-        return Prediction(torch.cat(values)[torch.cat(links).argsort()], {})
+        query = batch.query
+        rays = directions.flatten()
+        by_receiver = []
+        values = []
+        # Without links the first receiver gives an empty value of a label's shape.
+        for receiver in query.receivers.unique().tolist() or [0]:
+            links = (query.receivers == receiver).nonzero()[:, 0]
+            fields = self.march(query[links], receiver, rays)
+            values.append(self.reading(fields, query[links], directions))
+            by_receiver.append(links)
+        order = torch.cat(by_receiver).argsort()
+        return Prediction(torch.cat(values)[order], {})
 
     def march(self, query: Query, receiver: int, rays: Rays) -> Complex[Tensor, "b r c"]:
         """Fields along rays at one receiver, for links to it.
 
-        Without gradients at most ``chunk`` pairs of a link and a ray at a time. All links share the
-        attenuation and phase along a ray, so rays are parted, not links.
+        Without gradients, at most ``chunk`` pairs of a link and a ray are computed at a time. All
+        links share the attenuation and phase along a ray, so rays are split, not links.
         """
         if torch.is_grad_enabled() or not len(query):
             return self.march_at_once(query, receiver, rays)
@@ -206,13 +205,12 @@ class RayMarching(Model):
         return torch.cat([self.march_at_once(query, receiver, part) for part in parts], 1)
 
     def march_at_once(self, query: Query, receiver: int, rays: Rays) -> Complex[Tensor, "b r c"]:
-        """``march`` for all pairs of a link and a ray together."""
+        """Fields as ``march`` gives them, for all pairs of a link and a ray together."""
         pose = self.scene.receivers[receiver].pose.to(self.middle)
-        views = rays.vectors() @ pose.rotation.mT
-        points = pose.position - self.middle + self.distances[:, None] * views[:, None]
-        return self.unit * render(
-            self.sample(query, points, views), self.step, self.gains, self.shifts
-        )
+        views = rays.vectors() @ pose.rotation.mT  # (r, 3)
+        points = pose.position - self.middle + self.distances[:, None] * views[:, None]  # (r, i, 3)
+        samples = self.sample(query, points, views)
+        return self.unit * render(samples, self.step, self.gains, self.shifts)
 
     @torch.no_grad()
     def evaluate(self, batch: Batch) -> Tensor:
@@ -222,9 +220,7 @@ class RayMarching(Model):
 
 
 def farthest(scene: Scene) -> float:
-    """From any receiver to the farthest corner of the box that holds the training transmitters and
-    receivers [m].
-    """
+    """Largest distance from a receiver to a corner of the box of transmitters and receivers [m]."""
     places = scene.positions(scene.lower)
     lower, upper = scene.box
     return torch.maximum(places - lower, upper - places).norm(dim=1).max().item()

@@ -19,12 +19,13 @@ pi) at about 920 MHz."""
 
 
 class Reading(nn.Module):
-    """Label from S, the sums along rays.
+    """How labels follow from S, the fields along rays.
 
     Attributes:
-        channels: Numbers that a sample has an amplitude and a phase of.
-        grid: The rays, where labels have no directions; None where they have.
-        carriers: Whose phase turns along the rays (channels,) [Hz]; None where the phase is learnt.
+        channels: Number of waves that a sample sends, each with an amplitude and a phase.
+        grid: Rays for labels without directions; None for labels with directions.
+        carriers: Carriers whose phase turns along the rays (channels,) [Hz]; None where the phase
+            is learnt.
     """
 
     channels = 1
@@ -39,13 +40,13 @@ class Reading(nn.Module):
         return torch.ones_like(distances)
 
     def shifts(self, distances: Float[Tensor, " i"]) -> Float[Tensor, "i c"]:
-        """How far the phase turns on the way 2 pi t / lambda [rad]."""
+        """Phase 2 pi t / lambda over a distance t [rad]; 0 where the phase is learnt."""
         if self.carriers is None:
             return torch.zeros_like(distances[:, None])
         return 2 * math.pi / speed_of_light * distances[:, None] * self.carriers.to(distances)
 
     def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
-        """Magnitudes of S, or of the sum of the rays, that would give these labels."""
+        """Magnitudes of S, or of its sum over the rays, that would give these labels."""
         raise NotImplementedError
 
     def forward(
@@ -74,26 +75,26 @@ class Level(Reading):
     """100 (|sum_u S(u)| - 1) [dBm]: the sum's magnitude is 0 for -100 dBm and 1 for 0 dBm.
 
     Args:
-        grid: Of the rays.
-        frequency: Of the carrier [Hz].
+        grid: Directions of the rays.
+        frequency: Carrier [Hz].
     """
 
     def __init__(self, grid: Grid, frequency: float):
         super().__init__()
-        self.grid, self.carriers = grid, torch.tensor([frequency], dtype=torch.float64)
+        self.grid = grid
+        self.carriers = torch.tensor([frequency], dtype=torch.float64)
 
     def fit(self, links: Links) -> None:
-        """Sees to it that the training labels can be predicted.
+        """Checks that the training labels can be predicted.
 
         Raises:
-            ValueError: One is at -100 dBm or below, where no amplitude is.
+            ValueError: A label is at -100 dBm or below, where no amplitude is.
         """
         least = links.labels[links.split.train].min().item()
         if least <= -100:
             raise ValueError(
                 "a radiance field gives levels above -100 dBm, and a training label is "
-                f"{least:.6g} dBm; leave such "
-                "readings out, or take another model"
+                f"{least:.6g} dBm; leave such readings out, or take another model"
             )
 
     def amplitudes(self, labels: Tensor, query: Query) -> Tensor:
@@ -110,11 +111,11 @@ class Channel(Reading):
 
     a is the elements' pattern and x_e an element's place. F is the wave of free space over the
     direct distance. Where the training channels' phases fall with the distance, as for the time
-    dependence exp(+j omega t), the sum is the complex conjugate. Where they follow it with neither
-    sign, F is its amplitude alone.
+    dependence exp(+j omega t), the sum over u is conjugated. Where they follow the distance with
+    neither sign, F is an amplitude without a phase.
 
     Args:
-        grid: Of the rays.
+        grid: Directions of the rays.
         scene: Its task has the subcarriers, its receivers the elements.
 
     Raises:
@@ -124,7 +125,9 @@ class Channel(Reading):
     def __init__(self, grid: Grid, scene: Scene):
         super().__init__()
         check_elements("marching along rays", scene)
-        self.scene, self.grid, self.carriers = scene, grid, scene.task.frequencies
+        self.scene = scene
+        self.grid = grid
+        self.carriers = scene.task.frequencies
         self.channels = len(self.carriers)
         self.register_buffer("sign", torch.tensor(-1))  # of F; 0: its amplitude alone
         self.register_buffer("array_sign", torch.tensor(-1))
@@ -132,7 +135,8 @@ class Channel(Reading):
     def fit(self, links: Links) -> None:
         """Takes the signs of phases from the training channels."""
         train = links.split.train
-        labels, query = links.labels[train].to(torch.complex128), links.query[train]
+        labels = links.labels[train].to(torch.complex128)
+        query = links.query[train]
         waves = direct_waves(self.scene, query, self.carriers)
         self.sign.fill_(self.scene.task.phase_sign(labels, waves, query.receivers))
         self.array_sign.copy_(self.sign if self.sign else torch.tensor(array_sign(labels, waves)))
@@ -144,22 +148,20 @@ class Channel(Reading):
         self, sums: Complex[Tensor, "b r c"], query: Query, directions: Directions
     ) -> Tensor:
         receiver = int(query.receivers[0]) if len(query) else 0
-        array, directions = (
-            self.scene.receivers[receiver].array,
-            directions.flatten().vectors().double(),
-        )
+        array = self.scene.receivers[receiver].array
+        vectors = directions.flatten().vectors().double()  # (r, 3)
         # A wave from the direction u reaches an element at x earlier by x . u / c than the middle.
-        delays = directions @ array.elements.to(directions).T / speed_of_light
-        phases = -2 * math.pi * self.carriers.to(directions)[:, None, None] * delays
-        steering = torch.polar(array.gain(directions)[:, None].expand_as(phases), phases).to(
-            sums
-        )  # (c, r, e)
-        heard = (sums.permute(2, 0, 1) @ steering).permute(1, 2, 0)
+        delays = vectors @ array.elements.to(vectors).T / speed_of_light  # (r, e)
+        phases = -2 * math.pi * self.carriers.to(vectors)[:, None, None] * delays  # (c, r, e)
+        gains = array.gain(vectors)[:, None].expand_as(phases)
+        steering = torch.polar(gains, phases).to(sums)
+        received = (sums.permute(2, 0, 1) @ steering).permute(1, 2, 0)  # (b, e, c)
         if self.array_sign < 0:
-            heard = heard.conj()
-        return heard * self._direct(query).to(sums)
+            received = received.conj()
+        return received * self._direct(query).to(sums)
 
     def _direct(self, query: Query) -> Complex[Tensor, "b 1 c"]:
+        """The wave F of free space at the middle of the receiver's array."""
         return direct_waves(self.scene, query, self.carriers, int(self.sign), at_elements=False)
 
 
@@ -192,6 +194,5 @@ def make_reading(scene: Scene, rays: list[int], frequency: float) -> Reading:
             return Channel(Grid.sphere(*rays), scene)
     raise ValueError(
         "a radiance field is marched for spectrum, rssi and csi, and these labels are of task "
-        f"{task.name!r}; take "
-        "another model"
+        f"{task.name!r}; take another model"
     )

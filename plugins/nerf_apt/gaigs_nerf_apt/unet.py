@@ -10,15 +10,14 @@ DIVISOR = 4
 
 
 class Convolution(nn.Conv2d):
-    """3 x 3 over rays and samples: the rays close a circle, and there is nothing before the first
-    and last sample.
-    """
+    """A 3 x 3 convolution over rays, which close a circle, and samples, which are padded with 0."""
 
     def __init__(self, inputs: int, outputs: int):
         super().__init__(inputs, outputs, 3)
 
     def forward(self, image: Float[Tensor, "n c rays samples"]) -> Tensor:
-        return super().forward(pad(pad(image, (0, 0, 1, 1), mode="circular"), (1, 1, 0, 0)))
+        around = pad(image, (0, 0, 1, 1), mode="circular")
+        return super().forward(pad(around, (1, 1, 0, 0)))
 
 
 class Double(nn.Sequential):
@@ -36,7 +35,7 @@ def after(width: int) -> tuple[nn.Module, nn.Module]:
 
 
 class Pyramid(nn.Module):
-    """Means over the whole image and over its quarters join every place."""
+    """Adds to every place the means over the whole image and over its quarters."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -44,15 +43,15 @@ class Pyramid(nn.Module):
         self.join = nn.Conv2d(width + 2 * (width // 2), width, 1)
 
     def forward(self, image: Float[Tensor, "n c rays samples"]) -> Tensor:
-        means = [
-            interpolate(level(adaptive_avg_pool2d(image, cells)), image.shape[2:], mode="bilinear")
-            for cells, level in zip((1, 2), self.levels, strict=True)
-        ]
+        means = []
+        for cells, level in zip((1, 2), self.levels, strict=True):
+            small = level(adaptive_avg_pool2d(image, cells))  # (n, c / 2, cells, cells)
+            means.append(interpolate(small, image.shape[2:], mode="bilinear"))
         return self.join(torch.cat((image, *means), 1))
 
 
 class Gate(nn.Module):
-    """How much of the encoder's features passes at each place, as the decoder's ask for it."""
+    """An attention gate: the decoder's features decide how much of the encoder's passes."""
 
     def __init__(self, width: int):
         super().__init__()
@@ -64,16 +63,16 @@ class Gate(nn.Module):
         )
 
     def forward(
-        self, asked: Float[Tensor, "n c rays samples"], offered: Float[Tensor, "n c rays samples"]
+        self, decoded: Float[Tensor, "n c rays samples"], encoded: Float[Tensor, "n c rays samples"]
     ) -> Tensor:
-        return offered * self.weigh(self.ask(asked) + self.offer(offered))
+        return encoded * self.weigh(self.ask(decoded) + self.offer(encoded))
 
 
 class UNet(nn.Module):
-    """Features of rays x samples -> as many numbers at each, seen in context.
+    """A network from features at rays x samples to numbers at them, with their context.
 
     Args:
-        inputs, outputs: Numbers at each sample.
+        inputs, outputs: Count of numbers at each sample.
         widths: Channels at full, half and quarter resolution.
 
     Source: NeRF-APT, 2025; Oktay et al., Attention U-Net, 2018; Zhao et al., Pyramid Scene Parsing
@@ -85,17 +84,15 @@ class UNet(nn.Module):
         full, half, quarter = widths
         self.first = Convolution(inputs, full)
         self.rest = nn.Sequential(*after(full), Convolution(full, full), *after(full))
-        self.down, self.bottom, self.pyramid = (
-            Double(full, half),
-            Double(half, quarter),
-            Pyramid(quarter),
-        )
-        self.to_half, self.to_full = (
-            nn.ConvTranspose2d(quarter, half, 2, 2),
-            nn.ConvTranspose2d(half, full, 2, 2),
-        )
-        self.gate_half, self.gate_full = Gate(half), Gate(full)
-        self.up_half, self.up_full = Double(2 * half, half), Double(2 * full, full)
+        self.down = Double(full, half)
+        self.bottom = Double(half, quarter)
+        self.pyramid = Pyramid(quarter)
+        self.to_half = nn.ConvTranspose2d(quarter, half, 2, 2)
+        self.to_full = nn.ConvTranspose2d(half, full, 2, 2)
+        self.gate_half = Gate(half)
+        self.gate_full = Gate(full)
+        self.up_half = Double(2 * half, half)
+        self.up_full = Double(2 * full, full)
         self.last = nn.Conv2d(full, outputs, 1)
 
     def forward(
@@ -103,13 +100,12 @@ class UNet(nn.Module):
         image: Float[Tensor, "n c rays samples"],
         shifts: Float[Tensor, "b full"] | None = None,
     ) -> Float[Tensor, "bn outputs rays samples"]:
-        """One image after another.
+        """The outputs of all images.
 
         Args:
-            image: Features, of one image or several.
-            shifts: Part of the first convolution's output by inputs that are constant over an image
-                and differ between links b. Each image is then seen b times, those of a link one
-                after another.
+            image: Features of n images.
+            shifts: Part of the first convolution's output that is constant over an image and
+                differs between b links. The output then has b times n images, link by link.
         """
         full = self.first(image)
         if shifts is not None:
@@ -117,7 +113,8 @@ class UNet(nn.Module):
         full = self.rest(full)
         half = self.down(max_pool2d(full, 2))
         quarter = self.pyramid(self.bottom(max_pool2d(half, 2)))
-        asked = self.to_half(quarter)
-        half = self.up_half(torch.cat((asked, self.gate_half(asked, half)), 1))
-        asked = self.to_full(half)
-        return self.last(self.up_full(torch.cat((asked, self.gate_full(asked, full)), 1)))
+        decoded = self.to_half(quarter)
+        half = self.up_half(torch.cat((decoded, self.gate_half(decoded, half)), 1))
+        decoded = self.to_full(half)
+        full = self.up_full(torch.cat((decoded, self.gate_full(decoded, full)), 1))
+        return self.last(full)

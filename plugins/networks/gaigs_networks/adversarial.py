@@ -17,14 +17,15 @@ DISCRIMINATOR = "discriminator"
 
 
 class Adversarial(Descent):
-    """A step of the discriminator, then a step of all other parameters; both count as one step.
+    """Training in turns: a step of the discriminator, then a step of all other parameters.
 
-    The model has a method ``discriminate(batch, values)``, which gives a logit for each link (b,),
-    large where it takes the values for labels, and a parameter group ``discriminator``.
+    Both count as one step. The model has a method ``discriminate(batch, values)``, which gives a
+    logit for each link (b,), large where it takes the values for labels, and a parameter group
+    ``discriminator``.
 
     Args:
         weight: Weight of the adversarial term beside the loss.
-        **options: As of ``gaigs.training.descent.Descent``.
+        **options: Options of ``gaigs.training.descent.Descent``.
 
     Raises:
         ValueError: An option is out of range, or the model has no discriminator.
@@ -47,12 +48,14 @@ class Adversarial(Descent):
 
     def configure_optimizers(self):
         groups = self.model.parameter_groups()
-        judged = {DISCRIMINATOR: groups.pop(DISCRIMINATOR)}
+        of_discriminator = {DISCRIMINATOR: groups.pop(DISCRIMINATOR)}
         optimizers = [
-            make_optimizer(self.optimizer, part, self.learning_rates) for part in (groups, judged)
+            make_optimizer(self.optimizer, part, self.learning_rates)
+            for part in (groups, of_discriminator)
         ]
         done = share_done(self.trainer)
-        return optimizers, [make_schedule(self.schedule, each, done) for each in optimizers]
+        schedules = [make_schedule(self.schedule, optimizer, done) for optimizer in optimizers]
+        return optimizers, schedules
 
     def on_fit_start(self) -> None:
         if self.trainer.world_size > 1:
@@ -65,26 +68,29 @@ class Adversarial(Descent):
 
     def training_step(self, batch: Batch, _: int) -> Tensor:
         batch = self.prepare(batch)
-        own, judge = self.optimizers()
+        generator, discriminator = self.optimizers()
         value, penalties = self.model(batch)
 
-        judge.zero_grad()
+        # The discriminator learns to give labels a large logit and predictions a small one.
+        discriminator.zero_grad()
         real = self.model.discriminate(batch, batch.labels)
         fake = self.model.discriminate(batch, value.detach())
-        judged = cross_entropy(real, torch.ones_like(real)) + cross_entropy(
-            fake, torch.zeros_like(fake)
-        )
-        self.manual_backward(judged)
-        judge.optimizer.step()  # past Lightning, which would count it as a step of the training
+        of_real = cross_entropy(real, torch.ones_like(real))
+        of_fake = cross_entropy(fake, torch.zeros_like(fake))
+        judgement = of_real + of_fake
+        self.manual_backward(judgement)
+        # Past Lightning, which would count it as a step of the training.
+        discriminator.optimizer.step()
 
-        own.zero_grad()
+        # The model learns predictions with a large logit.
+        generator.zero_grad()
         loss, terms = self.loss(value, batch)
         fooled = self.model.discriminate(batch, value)
         deceit = cross_entropy(fooled, torch.ones_like(fooled))
-        terms = terms | {"discriminator": judged, "deceit": deceit}
+        terms = terms | {"discriminator": judgement, "deceit": deceit}
         total = self.add_up(loss + self.weight * deceit, terms, penalties, batch)
         self.manual_backward(total)
-        own.step()
+        generator.step()
         for schedule in self.lr_schedulers():
             schedule.step()
         return total.detach()

@@ -17,13 +17,13 @@ LAYERS = 4
 
 
 class Dcgan(Network):
-    """Noise and a link's numbers -> a small image of many channels -> twice as large in each of
-    four layers -> label.
+    """A generator: noise and a link's features -> a small image of many channels -> twice as large
+    in each of four layers -> label.
 
     An axis that is shorter than 16 pixels doubles in the last layers alone, so that one number a
     link is drawn by fully connected layers. Pixels beyond the label's last row and column are cut
-    off. The discriminator goes the same way back, and is shown the link's numbers in every pixel. A
-    prediction takes the noise's mean, 0.
+    off. The discriminator has the same layers in reverse, and gets the link's features in every
+    pixel. A prediction takes the mean of the noise, 0.
 
     Args:
         scene: Receivers, task, box of the training transmitters.
@@ -31,7 +31,7 @@ class Dcgan(Network):
         noise: Count of standard normal numbers that the generator gets beside the link's.
         octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a
             metre; None: those that the training transmitters can teach.
-        pixel: Of the images that spectra are drawn in [deg].
+        pixel: Pixel of the images in which spectra are drawn [deg].
 
     Raises:
         ValueError: An option is out of range.
@@ -53,21 +53,22 @@ class Dcgan(Network):
         channels, *sizes = self.label.shape
         doublings = [min(LAYERS, (size - 1).bit_length()) for size in sizes]
         widths = [width * 2**k for k in reversed(range(LAYERS))]
-        small = (
-            widths[0],
-            *(-(-size // 2**count) for size, count in zip(sizes, doublings, strict=True)),
-        )
+        # The first image, rounded up: halved as often as the axis doubles.
+        small = [widths[0]]
+        for size, count in zip(sizes, doublings, strict=True):
+            small.append(-(-size // 2**count))
         features = self.question.width
-        drawing = [nn.Linear(noise + features, math.prod(small)), nn.Unflatten(1, small)]
-        judging = []
+        generator = [nn.Linear(noise + features, math.prod(small)), nn.Unflatten(1, tuple(small))]
+        discriminator = []
         for layer, (inner, outer) in enumerate(pairwise([*widths, channels])):
             strides = [2 if layer >= LAYERS - count else 1 for count in doublings]
-            drawing += [BatchNorm(inner), nn.ReLU(), transposed(inner, outer, strides, sizes)]
-            seen = outer if layer < LAYERS - 1 else outer + features
-            judging = [convolution(seen, inner, strides, sizes), nn.LeakyReLU(0.2), *judging]
-        self.generator = nn.Sequential(*drawing)
-        verdict = (nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(widths[0], 1))
-        self.discriminator = nn.Sequential(*judging, *verdict)
+            generator += [BatchNorm(inner), nn.ReLU(), transposed(inner, outer, strides, sizes)]
+            inputs = outer if layer < LAYERS - 1 else outer + features
+            reverse = convolution(inputs, inner, strides, sizes)
+            discriminator = [reverse, nn.LeakyReLU(0.2), *discriminator]
+        self.generator = nn.Sequential(*generator)
+        logit = (nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(widths[0], 1))
+        self.discriminator = nn.Sequential(*discriminator, *logit)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Generator and discriminator."""
@@ -87,7 +88,7 @@ class Dcgan(Network):
         """A logit for each link, large where the discriminator takes the values for labels.
 
         Raises:
-            ValueError: The values are those of single directions.
+            ValueError: The values are for single directions, which make no image.
         """
         images = self.label.images(values, batch.directions)
         features = self.question(batch.query)[..., None, None].expand(-1, -1, *images.shape[2:])
@@ -95,19 +96,22 @@ class Dcgan(Network):
 
 
 def transposed(inner: int, outer: int, strides: list[int], sizes: list[int]) -> nn.ConvTranspose2d:
-    """A layer that multiplies the sides of an image by the strides."""
-    kernels = [
-        4 if stride == 2 else min(size, 3) // 2 * 2 + 1
-        for stride, size in zip(strides, sizes, strict=True)
-    ]
-    return nn.ConvTranspose2d(
-        inner, outer, kernels, strides, [(kernel - 1) // 2 for kernel in kernels]
-    )
+    """A layer from ``inner`` to ``outer`` channels that multiplies an image's sides by the strides.
+
+    Args:
+        sizes: Sides of the label, which bound the kernel.
+    """
+    kernels = []
+    for stride, size in zip(strides, sizes, strict=True):
+        kernels.append(4 if stride == 2 else min(size, 3) // 2 * 2 + 1)
+    paddings = [(kernel - 1) // 2 for kernel in kernels]
+    return nn.ConvTranspose2d(inner, outer, kernels, strides, paddings)
 
 
 def convolution(outer: int, inner: int, strides: list[int], sizes: list[int]) -> nn.Conv2d:
-    """A layer that divides them, rounded up: thinned labels have fewer pixels, though never less
-    than one.
+    """The reverse of ``transposed``: a layer that divides an image's sides by the strides.
+
+    Sides are rounded up, as thinned labels may have a single pixel.
     """
     kernels = [min(size, 3) // 2 * 2 + 1 for size in sizes]
     return nn.Conv2d(outer, inner, kernels, strides, [kernel // 2 for kernel in kernels])

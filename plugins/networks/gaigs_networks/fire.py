@@ -14,29 +14,30 @@ from gaigs_networks.network import Network, check_widths, linear_layers
 
 
 class Fire(Network):
-    """In training an encoder maps the label to a latent code, and a decoder draws the label from
-    the code.
+    """A conditional variational auto-encoder: an encoder maps the label to a latent code, and a
+    decoder draws the label from the code.
 
-    With y the label's image and c the link's numbers, a step draws z ~ N(mu(y, c), exp(lambda(y,
-    c))), predicts the decoder's image of (z, c), and adds a penalty on the information in z,
+    With y the label's image and c the link's features, a training step draws z ~ N(mu(y, c),
+    exp(lambda(y, c))), predicts the decoder's image of (z, c), and adds a penalty on the
+    information in z,
 
         KL = sum_i (mu_i² + exp(lambda_i) - lambda_i - 1) / 2   [nat]
 
-    A prediction has no label to look at, and takes the mean of the prior, z = 0.
+    A prediction has no label, and takes the mean of the prior, z = 0.
 
-    The penalty ``kl`` is KL over the count of numbers in an image, in the unit of a mean squared
-    error: times the variance of the labels; of complex ones times 1, as their loss has no unit.
-    With the weight 2 s, it is the bound on the likelihood of labels with independent noise of s
-    times their variance.
+    The penalty ``kl`` is KL over the count of numbers in an image, times the variance of the
+    labels, so that it has the unit of a mean squared error; for complex labels times 1, as their
+    loss has no unit. With the weight 2 s, loss and penalty bound the likelihood of labels with
+    independent noise of s times their variance.
 
     Args:
         scene: Receivers, task, box of the training transmitters.
-        widths: Of the encoder's layers; those of the decoder are the same in reverse, before its
-            last one.
+        widths: Widths of the encoder's layers; the decoder has them in reverse before its last
+            layer.
         latent: Length of z.
         octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a
             metre; None: those that the training transmitters can teach.
-        pixel: Of the images that spectra are drawn in [deg].
+        pixel: Pixel of the images in which spectra are drawn [deg].
 
     Raises:
         ValueError: An option is out of range.
@@ -46,9 +47,8 @@ class Fire(Network):
     """
 
     learning_rates: Mapping[str, float] = {"network": 1e-3}
-    penalty_weights: Mapping[str, float] = {
-        "kl": 0.2
-    }  # twice the share of the labels' variance taken for noise
+    # Twice the share of the labels' variance that counts as noise.
+    penalty_weights: Mapping[str, float] = {"kl": 0.2}
 
     def __init__(
         self,
@@ -60,7 +60,8 @@ class Fire(Network):
     ):
         super().__init__(scene, octaves, pixel)
         check_widths(widths=widths, latent=latent)
-        numbers, features = math.prod(self.label.shape), self.question.width
+        numbers = math.prod(self.label.shape)
+        features = self.question.width
         self.latent = latent
         self.encoder = linear_layers([numbers + features, *widths], nn.LeakyReLU())
         self.posterior = nn.Linear(widths[-1], 2 * latent)
@@ -71,7 +72,8 @@ class Fire(Network):
 
     def forward(self, batch: Batch) -> Prediction:
         features = self.question(batch.query)
-        z, penalties = features.new_zeros(len(features), self.latent), {}
+        z = features.new_zeros(len(features), self.latent)
+        penalties = {}
         if self.training and batch.labels is not None:
             z, kl = self.encode(self.label.own_images(batch.labels, batch.directions), features)
             unit = 1.0 if batch.labels.is_complex() else self.label.scale.square()
@@ -82,8 +84,9 @@ class Fire(Network):
     def encode(
         self, images: Float[Tensor, "b channels rows columns"], features: Float[Tensor, "b width"]
     ) -> tuple[Float[Tensor, "b latent"], Float[Tensor, " b"]]:
-        """A random z of each label, and how much it tells [nat]."""
-        seen = self.encoder(torch.cat((images.flatten(1), features), 1))
-        mean, log_variance = self.posterior(seen).chunk(2, 1)
+        """A random code z of each label, and the information KL in it [nat]."""
+        hidden = self.encoder(torch.cat((images.flatten(1), features), 1))
+        mean, log_variance = self.posterior(hidden).chunk(2, 1)
         kl = (mean.square() + log_variance.exp() - log_variance - 1).sum(1) / 2
-        return mean + (log_variance / 2).exp() * torch.randn_like(mean), kl
+        z = mean + (log_variance / 2).exp() * torch.randn_like(mean)
+        return z, kl

@@ -30,18 +30,18 @@ class LabelImage(nn.Module):
     | complex channel | elements | subcarriers | 2: real and imaginary part |
 
     A spectrum's image has every k-th row and column of the label, and is interpolated linearly
-    between them. Complex labels are scaled by the amplitude that free space has at the median link,
-    times their ``strength`` over free space, which no single link rules. They are not shifted: 0
-    means the same at every phase.
+    between them. Complex labels are scaled by the amplitude of free space at the median link, times
+    their ``strength`` over free space, which no single link decides. They are not shifted, as 0 has
+    no phase.
 
     Args:
-        scene: Whose labels.
-        pixel: Of a spectrum's image: from one row or column to the next, at most [deg]; never less
-            than the label's.
+        scene: Receivers and task of the labels.
+        pixel: Largest distance from one row or column of a spectrum's image to the next [deg]; the
+            label's own if that is larger.
 
     Attributes:
         shape: Channels, rows, columns.
-        grid: Directions of the pixels; None where a label has none.
+        grid: Directions of the pixels; None for labels without directions.
 
     Raises:
         ValueError: ``pixel`` is not positive, or larger than ``LARGEST``.
@@ -53,14 +53,15 @@ class LabelImage(nn.Module):
             raise ValueError(
                 f"model.pixel must be above 0 and at most {LARGEST:g} [deg], got {pixel}"
             )
-        self.scene, self.task, self.grid = scene, scene.task, None
+        self.scene = scene
+        self.task = scene.task
+        self.grid = None
         shape = scene.task.shape
-        rows, columns = (
-            (shape[0], math.prod(shape[1:])) if len(shape) > 1 else (1, math.prod(shape))
-        )
+        rows = shape[0] if len(shape) > 1 else 1
+        columns = math.prod(shape) // rows
         if scene.task.directions is not None:
-            own = scene.task.directions
-            self.grid = own.thin(every(own.elevations, pixel), every(own.azimuths, pixel))
+            grid = scene.task.directions
+            self.grid = grid.thin(every(grid.elevations, pixel), every(grid.azimuths, pixel))
             rows, columns = self.grid.shape
         self.shape = (2 if scene.task.dtype.is_complex else 1, rows, columns)
         self.register_buffer("mean", torch.tensor(0.0))
@@ -69,10 +70,10 @@ class LabelImage(nn.Module):
     def fit(self, links: Links) -> None:
         """Takes mean and scale from the training links."""
         if self.task.dtype.is_complex:
-            labels, query = links.labels[links.split.train], links.query[links.split.train]
-            waves = direct_waves(
-                self.scene, query, self.task.frequencies, at_elements=False
-            ).expand_as(labels)
+            labels = links.labels[links.split.train]
+            query = links.query[links.split.train]
+            waves = direct_waves(self.scene, query, self.task.frequencies, at_elements=False)
+            waves = waves.expand_as(labels)
             usual = waves.abs().square().mean((1, 2)).sqrt().quantile(0.5).item()
             self.scale.fill_(usual * strength(labels, waves, query.receivers))
             return
@@ -91,13 +92,14 @@ class LabelImage(nn.Module):
     def values(
         self, images: Float[Tensor, "b channels rows columns"], directions: Directions | None
     ) -> Tensor:
-        """The labels that images stand for (b, *shape), of spectra in the directions asked for;
-        None: the label's.
+        """The labels of images (b, *shape).
+
+        Args:
+            directions: Directions of spectra; None: all of the label.
         """
-        # Of bfloat16, as trainer.precision=bf16-mixed has it, torch makes no complex numbers.
-        images = (
-            images.to(torch.promote_types(images.dtype, torch.float32)) * self.scale + self.mean
-        )
+        # torch has no complex numbers of bfloat16 (trainer.precision=bf16-mixed).
+        images = images.to(torch.promote_types(images.dtype, torch.float32))
+        images = images * self.scale + self.mean
         if self.grid is not None:
             return interpolate(images[:, 0], self.grid, directions or self.task.directions)
         numbers = torch.complex(*images.unbind(1)) if self.task.dtype.is_complex else images
@@ -106,8 +108,7 @@ class LabelImage(nn.Module):
     def images(
         self, labels: Tensor, directions: Directions | None
     ) -> Float[Tensor, "b channels rows columns"]:
-        """The images of labels, those of spectra with a pixel for each of the directions that the
-        labels have.
+        """The images of labels. Images of spectra have a pixel for each direction of the labels.
 
         Raises:
             ValueError: The labels are of single directions, which make no image.
@@ -115,27 +116,25 @@ class LabelImage(nn.Module):
         if self.grid is not None and not isinstance(directions, Grid):
             raise ValueError(
                 "a network that looks at labels needs rows and columns, and training.thinning.rays "
-                "draws single "
-                "directions; set training.thinning.rays=null"
+                "draws single directions; set training.thinning.rays=null"
             )
         channels, rows, columns = self.shape if self.grid is None else (1, *directions.shape)
         numbers = torch.view_as_real(labels).movedim(-1, 1) if labels.is_complex() else labels
-        return ((numbers - self.mean) / self.scale).reshape(len(labels), channels, rows, columns)
+        scaled = (numbers - self.mean) / self.scale
+        return scaled.reshape(len(labels), channels, rows, columns)
 
     def own_images(
         self, labels: Tensor, directions: Directions | None
     ) -> Float[Tensor, "b channels rows columns"]:
-        """The same in the pixels that images have here, whichever directions the labels have."""
+        """The images of labels, of spectra interpolated to the pixels of ``grid``."""
         images = self.images(labels, directions)
-        return (
-            images
-            if self.grid is None
-            else interpolate(images[:, 0], directions, self.grid)[:, None]
-        )
+        if self.grid is None:
+            return images
+        return interpolate(images[:, 0], directions, self.grid)[:, None]
 
 
 def every(angles: Float[Tensor, " n"], pixel: float) -> slice:
-    """Those of a label's rows or columns that are not more than a pixel apart [rad, deg]."""
+    """Slice of every k-th of even ``angles`` [rad], at most a ``pixel`` [deg] apart."""
     pitch = (angles.max() - angles.min()).item() / max(len(angles) - 1, 1)
     # A hundredth more: four rows of a degree in float32 may be more than 4 degrees apart.
     return slice(None, None, max(1, int(1.01 * math.radians(pixel) / pitch)) if pitch else 1)
@@ -144,10 +143,10 @@ def every(angles: Float[Tensor, " n"], pixel: float) -> slice:
 def interpolate(
     values: Float[Tensor, "b rows columns"], grid: Grid, directions: Directions
 ) -> Float[Tensor, "b ..."]:
-    """Values between a grid's pixels, linearly; beyond its first and last row they are those of
-    that row.
+    """Values of a grid, interpolated linearly in some directions.
 
-    Azimuths go round: between the last column and the first one lie pixels like any others.
+    Directions beyond the first or last row get the values of that row. Azimuths go round: the last
+    column is beside the first one.
     """
     rows = shares(grid.elevations, directions.elevations).to(values)
     columns = shares(grid.azimuths, directions.azimuths, period=2 * math.pi).to(values)
@@ -157,21 +156,26 @@ def interpolate(
 
 
 def shares(
-    known: Float[Tensor, " n"], asked: Float[Tensor, " k"], period: float | None = None
+    known: Float[Tensor, " n"], angles: Float[Tensor, " k"], period: float | None = None
 ) -> Float[Tensor, "k n"]:
-    """Weights of known angles in the value at an angle asked for [rad], float64."""
+    """Weights of values at known angles in the interpolated value at each angle [rad], float64.
+
+    Args:
+        period: Period of the angles [rad]; None: angles beyond the known ones count as the last.
+    """
     count = len(known)
     known, order = known.double().sort()
-    asked = asked.to(known)
+    angles = angles.to(known)
     if period is None:
-        asked = asked.clamp(known[0], known[-1])
+        angles = angles.clamp(known[0], known[-1])
     else:
-        asked = known[0] + (asked - known[0]).remainder(period)
-        known, order = torch.cat((known, known[:1] + period)), torch.cat((order, order[:1]))
+        angles = known[0] + (angles - known[0]).remainder(period)
+        known = torch.cat((known, known[:1] + period))
+        order = torch.cat((order, order[:1]))
     if len(known) == 1:
-        return torch.ones_like(asked)[:, None]
-    above = torch.searchsorted(known, asked, right=True).clamp(max=len(known) - 1)
-    share = (asked - known[above - 1]) / (known[above] - known[above - 1])
-    found = asked.new_zeros(len(asked), count)
-    found.scatter_add_(1, order[above - 1][:, None], 1 - share[:, None])
-    return found.scatter_add_(1, order[above][:, None], share[:, None])
+        return torch.ones_like(angles)[:, None]
+    above = torch.searchsorted(known, angles, right=True).clamp(max=len(known) - 1)
+    share = (angles - known[above - 1]) / (known[above] - known[above - 1])
+    weights = angles.new_zeros(len(angles), count)
+    weights.scatter_add_(1, order[above - 1][:, None], 1 - share[:, None])
+    return weights.scatter_add_(1, order[above][:, None], share[:, None])

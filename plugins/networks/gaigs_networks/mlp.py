@@ -12,16 +12,15 @@ from gaigs_networks.network import BatchNorm, Network, check_widths
 
 
 class Mlp(Network):
-    """Hidden layers, each linear, normalised over the batch, leaky rectified and thinned out; then
-    a linear head.
+    """Hidden layers (linear, batch normalisation, leaky ReLU, dropout), then a linear head.
 
     Args:
         scene: Receivers, task, box of the training transmitters.
-        widths: Of the hidden layers.
+        widths: Widths of the hidden layers.
         dropout: Share of each hidden layer's numbers that a training step leaves out.
         octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a
             metre; None: those that the training transmitters can teach.
-        pixel: Of the images that spectra are drawn in [deg].
+        pixel: Pixel of the images in which spectra are drawn [deg].
 
     Raises:
         ValueError: An option is out of range.

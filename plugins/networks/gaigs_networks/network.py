@@ -20,8 +20,8 @@ class Network(Model):
 
     Args:
         scene: Receivers, task, box of the training transmitters.
-        octaves: As ``Question`` takes them.
-        pixel: As ``LabelImage`` takes it [deg].
+        octaves: See ``Question``.
+        pixel: See ``LabelImage`` [deg].
 
     Raises:
         ValueError: An option is out of range.
@@ -46,10 +46,10 @@ class Network(Model):
 
 
 class BatchNorm(nn.BatchNorm1d):
-    """Batch normalisation of vectors and images; where a channel has one number in all, by the
-    running statistics.
+    """Batch normalisation of vectors and images.
 
-    A single number has no spread, and the last batch of a pass may hold a single link.
+    A channel with a single number has no spread, as in a batch of one link: it is normalised by the
+    running statistics.
 
     Source: Ioffe and Szegedy, Batch Normalization, 2015.
     """
@@ -66,17 +66,14 @@ class BatchNorm(nn.BatchNorm1d):
 
 def linear_layers(widths: Sequence[int], activation: nn.Module) -> nn.Sequential:
     """Linear layers from each width to the next one, an activation behind each."""
-    return nn.Sequential(
-        *(part for pair in pairwise(widths) for part in (nn.Linear(*pair), activation))
-    )
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(widths):
+        layers += [nn.Linear(inputs, outputs), activation]
+    return nn.Sequential(*layers)
 
 
 def check_widths(**options: int | Sequence[int]) -> None:
-    """Sees to it that widths are whole numbers from 1 on.
-
-    Raises:
-        ValueError: One is not; or a list of them is empty.
-    """
+    """Raises a ``ValueError`` unless options are whole numbers from 1 on, or lists of such."""
     for option, given in options.items():
         widths = given if isinstance(given, Sequence) else [given]
         if not widths or not all(isinstance(width, int) and width >= 1 for width in widths):

@@ -16,11 +16,11 @@ from gaigs.splatting.tokenizer.euclidean import octaves as angular_frequencies
 
 
 class Question(nn.Module):
-    """Numbers about 1 that tell links apart: where the transmitter stands, who hears, in a band at
-    which carrier.
+    """Features of a link, of size 1 or so: the transmitter's place, the receiver and, in data of
+    several carriers, the carrier.
 
-    The place is [x, sin(w x), cos(w x)], x from the middle of the training transmitters' box; x
-    itself is in halves of the box's longest edge. All edges are scaled alike, as a box may be flat.
+    The place gives [x, sin(w x), cos(w x)], with x counted from the middle of the training
+    transmitters' box in halves of its longest edge, along all axes, as a box may be flat.
 
     Args:
         scene: Receivers, carriers and the box.
@@ -29,7 +29,7 @@ class Question(nn.Module):
             does.
 
     Attributes:
-        width: How many numbers a link has.
+        width: Count of features.
 
     Raises:
         ValueError: The range of octaves is empty.
@@ -52,7 +52,7 @@ class Question(nn.Module):
             self.width += 1 + 2 * len(BAND_FREQUENCIES)
 
     def forward(self, query: Query) -> Float[Tensor, "b width"]:
-        """The numbers of each link.
+        """The features of each link.
 
         Raises:
             ValueError: The training links have several carriers, and the query says none.

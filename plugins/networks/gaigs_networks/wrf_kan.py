@@ -17,15 +17,15 @@ DEGREE = 3
 
 
 class WrfKan(Network):
-    """Kolmogorov-Arnold layers from a link's numbers to its label's image.
+    """Kolmogorov-Arnold layers from a link's features to its label's image.
 
     Args:
         scene: Receivers, task, box of the training transmitters.
-        widths: Between the layers.
-        intervals: Of each edge's spline.
+        widths: Widths between the layers.
+        intervals: Number of intervals of each edge's spline.
         octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a
             metre; None: those that the training transmitters can teach.
-        pixel: Of the images that spectra are drawn in [deg].
+        pixel: Pixel of the images in which spectra are drawn [deg].
 
     Raises:
         ValueError: An option is out of range.
@@ -54,15 +54,16 @@ class WrfKan(Network):
 
 
 class KanLayer(nn.Module):
-    """y_o = b_o + sum_i ( w_oi silu(x_i) + sum_k c_oik B_k(x_i) ), B_k the cubic B-splines over
-    [-1, 1].
+    """A layer with a learnt function on each edge, from input i to output o:
 
-    The knots are evenly spaced and go on beyond both ends, so that the splines add up to 1 within.
-    Far outside, the base branch, silu, stands alone.
+        y_o = b_o + sum_i ( w_oi silu(x_i) + sum_k c_oik B_k(x_i) )
+
+    B_k are cubic B-splines with even knots, some beyond [-1, 1], so that they add up to 1 within.
+    Far outside there is the base branch, silu, alone.
 
     Args:
         inputs, outputs: Widths.
-        intervals: From knot to knot over [-1, 1]; there are ``intervals`` + 3 splines.
+        intervals: Intervals between knots over [-1, 1]; there are ``intervals`` + 3 splines.
 
     Source: Liu et al., KAN: Kolmogorov-Arnold Networks, 2024, section 2.
     """
@@ -74,17 +75,19 @@ class KanLayer(nn.Module):
         self.register_buffer("centres", centres, persistent=False)
         self.base = nn.Linear(inputs, outputs)
         self.splines = nn.Parameter(torch.empty(outputs, inputs * len(centres)))
-        nn.init.normal_(
-            self.splines, std=0.1 / math.sqrt(inputs)
-        )  # a small part of the base branch, at first
+        # Small beside the base branch, at first.
+        nn.init.normal_(self.splines, std=0.1 / math.sqrt(inputs))
 
     def forward(self, x: Float[Tensor, "b inputs"]) -> Float[Tensor, "b outputs"]:
         return self.base(silu(x)) + linear(self.basis(x).flatten(1), self.splines)
 
     def basis(self, x: Float[Tensor, "b inputs"]) -> Float[Tensor, "b inputs splines"]:
-        """The value of every B-spline: of width 4 knots, a cubic of the distance to its centre on
-        each of them.
+        """The value of every cubic B-spline.
+
+        At the distance d from its centre [steps] it is (2 - d)³ / 6 - 2 (1 - d)³ / 3, where
+        negative differences count as 0.
         """
         distances = ((x[..., None] - self.centres) / self.step).abs()
-        outer, inner = (2 - distances).clamp_min(0), (1 - distances).clamp_min(0)
+        outer = (2 - distances).clamp_min(0)
+        inner = (1 - distances).clamp_min(0)
         return outer.pow(3) / 6 - inner.pow(3) * (2 / 3)

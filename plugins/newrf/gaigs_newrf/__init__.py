@@ -42,33 +42,35 @@ def render(
     frequencies: Float[Tensor, " s"],
     sign: int = -1,
 ) -> Complex[Tensor, "b e s"]:
-    """sum_k sum_i F_i c / (4 pi f z_i) alpha_i prod_{j<i} (1 - alpha_j) exp(-j 2 pi f z_i / c).
+    """Channels, the sums of the waves from all samples i along all rays k:
 
-    alpha = 1 - exp(-depth). The phase is that of the whole way: the steps Delta_j up to the sample
-    add up to its distance z_i.
+        sum_k sum_i F_i c / (4 pi f z_i) alpha_i prod_{j<i} (1 - alpha_j) exp(-j 2 pi f z_i / c)
+
+    with alpha = 1 - exp(-depth). The phase is that of the whole distance z_i.
 
     Args:
-        fields: Field that a sample i along a ray k sends towards the antenna.
-        depths: Optical depth of each sample's step; of a ray's last one it may be infinite.
-        distances: z, from the antenna [m].
-        frequencies: Of the subcarriers [Hz].
-        sign: Of phases.
+        fields: Field F that a sample sends towards the antenna.
+        depths: Optical depth of each sample's step; a ray's last one may be infinite.
+        distances: Distance z from the antenna [m].
+        frequencies: Subcarriers f [Hz].
+        sign: Sign of phases.
 
     Source: NeWRF, 2024.
     """
-    weights = -torch.expm1(-depths) * torch.exp(-pad(depths[..., :-1].cumsum(-1), (1, 0)))
+    passed = torch.exp(-pad(depths[..., :-1].cumsum(-1), (1, 0)))
+    weights = -torch.expm1(-depths) * passed  # (b, k, i)
     waves = free_space(distances[..., None], frequencies.to(distances.device), sign).to(fields)
-    return (weights[..., None] * fields).flatten(1, 2).mT @ waves.flatten(1, 2)
+    sent = (weights[..., None] * fields).flatten(1, 2)  # (b, k i, e)
+    return sent.mT @ waves.flatten(1, 2)
 
 
 class Field(nn.Module):
-    """Place and direction -> density, and the field sent from there in that direction to each
-    element.
+    """A network from place and direction to density, and to the field sent in that direction.
 
     Args:
         features: Widths of the features of place and direction.
-        width, layers: Of the network; its input joins it again behind the fourth layer.
-        elements: Numbers to give.
+        width, layers: Width and number of layers; the input joins again behind the fourth layer.
+        elements: Number of elements, each with a field.
     """
 
     def __init__(self, features: tuple[int, int], width: int, layers: int, elements: int):
@@ -88,16 +90,16 @@ class Field(nn.Module):
     def forward(
         self, places: Float[Tensor, "*batch features"], views: Float[Tensor, "*batch features"]
     ) -> tuple[Float[Tensor, "*batch"], Complex[Tensor, "*batch e"]]:
-        """Density, of a sample's usual step, and tanh re + j tanh im."""
+        """Density, as optical depth of a usual step; and fields, parts within -1..1 by tanh."""
         hidden = places
         for number, layer in enumerate(self.layers):
-            joined = number == self.joint
-            hidden = layer(torch.cat((places, hidden), -1) if joined else hidden).relu()
+            if number == self.joint:
+                hidden = torch.cat((places, hidden), -1)
+            hidden = layer(hidden).relu()
         sent = self.send(torch.cat((hidden, views), -1))
-        # Of bfloat16, as trainer.precision=bf16-mixed has it, torch makes no complex numbers.
-        real, imaginary = (
-            sent.to(torch.promote_types(sent.dtype, torch.float32)).tanh().chunk(2, -1)
-        )
+        # torch has no complex numbers of bfloat16 (trainer.precision=bf16-mixed).
+        sent = sent.to(torch.promote_types(sent.dtype, torch.float32)).tanh()
+        real, imaginary = sent.chunk(2, -1)
         return softplus(self.density(hidden)[..., 0]), torch.complex(real, imaginary)
 
 
@@ -115,15 +117,15 @@ class NeWrf(Model):
 
     Args:
         scene: Receivers and task.
-        arrivals: Rays from each place.
-        samples: Along a ray.
-        octaves: Of the features sin 2^k x and cos 2^k x of positions [m], k from 0.
-        view_octaves: The same of directions.
-        width, layers: Of the network.
+        arrivals: Number of rays from each place.
+        samples: Number of samples along a ray.
+        octaves: Number of the features sin 2^k x and cos 2^k x of positions [m], k from 0.
+        view_octaves: Number of such features of directions.
+        width, layers: Width and number of the network's layers.
 
     Raises:
-        ValueError: The labels are no channels, or of one subcarrier, or of several carriers; an
-            array has another number of elements than they; an option is out of range.
+        ValueError: The labels are no channels, or have one subcarrier or several carriers; an array
+            has another number of elements than the labels; an option is out of range.
 
     Source: NeWRF, 2024.
     """
@@ -146,31 +148,27 @@ class NeWrf(Model):
         if len(scene.task.frequencies) < 2:
             raise ValueError(
                 "model 'newrf' estimates arrivals from delays, which a single subcarrier does not "
-                "tell; take another "
-                "model"
+                "tell; take another model"
             )
         check_one_carrier("model 'newrf'", scene)
-        least = {
-            "arrivals": 1,
-            "samples": 2,
-            "octaves": 0,
-            "view_octaves": 0,
-            "width": 1,
-            "layers": 1,
-        }
-        given = arrivals, samples, octaves, view_octaves, width, layers
-        for (option, low), value in zip(least.items(), given, strict=True):
-            if value < low:
-                raise ValueError(f"model.{option} must be at least {low}, got {value}")
+        for option, value, least in (
+            ("arrivals", arrivals, 1),
+            ("samples", samples, 2),
+            ("octaves", octaves, 0),
+            ("view_octaves", view_octaves, 0),
+            ("width", width, 1),
+            ("layers", layers, 1),
+        ):
+            if value < least:
+                raise ValueError(f"model.{option} must be at least {least}, got {value}")
             if option.endswith("octaves") and value > MAX_OCTAVE:
                 raise ValueError(f"model.{option} must be at most {MAX_OCTAVE}, got {value}")
         lower, upper = scene.lower, scene.upper
         self.register_buffer("middle", (lower + upper) / 2)
         self.register_buffer("steps", (torch.arange(samples) + 1) / samples, persistent=False)
         self.register_buffer("place_frequencies", 2.0 ** torch.arange(octaves), persistent=False)
-        self.register_buffer(
-            "view_frequencies", 2.0 ** torch.arange(view_octaves), persistent=False
-        )
+        view_frequencies = 2.0 ** torch.arange(view_octaves)
+        self.register_buffer("view_frequencies", view_frequencies, persistent=False)
         origins = scene.positions(lower)[:, None].expand(-1, arrivals, -1)
         self.register_buffer("origins", origins.clone())
         self.register_buffer("unit", torch.ones(()))
@@ -184,59 +182,61 @@ class NeWrf(Model):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Takes sign, unit of strength and the points that waves arrive from, from the training
+        """Takes the sign of phases, the unit of strength and the origins of waves from the training
         channels.
         """
-        train, frequencies = links.split.train, self.scene.task.frequencies
-        labels, query = links.labels[train].to(torch.complex128), links.query[train]
+        train = links.split.train
+        frequencies = self.scene.task.frequencies
+        labels = links.labels[train].to(torch.complex128)
+        query = links.query[train]
         waves = direct_waves(self.scene, query, frequencies)
         sign = self.scene.task.phase_sign(labels, waves, query.receivers)
         self.sign.fill_(sign or array_sign(labels, waves))
         ratios = (labels.abs().square().sum((1, 2)) / waves.abs().square().sum((1, 2))).sqrt()
         self.unit.copy_(ratios.quantile(LOUD))
-        falling = labels if self.sign < 0 else labels.conj()
+        falling = labels if self.sign < 0 else labels.conj()  # phases fall with the distance
         for receiver, antenna in enumerate(self.scene.receivers):
-            own = (query.receivers == receiver).nonzero()[:, 0]
-            if not len(own):
+            rows = (query.receivers == receiver).nonzero()[:, 0]
+            if not len(rows):
                 continue
-            own = own[torch.linspace(0, len(own) - 1, min(MOST_LINKS, len(own))).long()]
-            places, first = query.transmitters[own].double(), antenna.pose.position.double()
+            rows = rows[torch.linspace(0, len(rows) - 1, min(MOST_LINKS, len(rows))).long()]
+            places = query.transmitters[rows].double()
+            first = antenna.pose.position.double()
             lower = torch.minimum(self.scene.lower.double(), first)
             upper = torch.maximum(self.scene.upper.double(), first)
             beyond = upper - lower + MARGIN * (upper - lower).max()
             region = torch.stack((lower - beyond, upper + beyond))
-            found = find_origins(
-                falling[own], places, frequencies, first, region, self.origins.shape[1]
-            )
-            self.origins[receiver] = found.to(self.origins)
+            count = self.origins.shape[1]
+            origins = find_origins(falling[rows], places, frequencies, first, region, count)
+            self.origins[receiver] = origins.to(self.origins)
 
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query
-        links, values = [], []
-        for receiver in query.receivers.unique().tolist() or [
-            0
-        ]:  # no links have a label's shape too
-            links.append((query.receivers == receiver).nonzero()[:, 0])
-            values.append(self._march(query.transmitters[links[-1]], receiver))
+        by_receiver = []
+        values = []
+        # Without links the first receiver gives an empty value of a label's shape.
+        for receiver in query.receivers.unique().tolist() or [0]:
+            links = (query.receivers == receiver).nonzero()[:, 0]
+            values.append(self._march(query.transmitters[links], receiver))
+            by_receiver.append(links)
         # Several processes train together, and each must have a gradient of all fields.
         idle = sum(0 * parameter.sum() for parameter in self.parameters()) if self.training else 0
-        return Prediction(torch.cat(values)[torch.cat(links).argsort()] + idle, {})
+        order = torch.cat(by_receiver).argsort()
+        return Prediction(torch.cat(values)[order] + idle, {})
 
     def _march(self, places: Float[Tensor, "b 3"], receiver: int) -> Complex[Tensor, "b e s"]:
         """Channels between places and one receiver."""
-        ways = self.origins[receiver] - places[:, None]
+        ways = self.origins[receiver] - places[:, None]  # (b, k, 3)
         lengths = ways.double().norm(dim=-1)
         points = places[:, None, None] - self.middle + ways[:, :, None] * self.steps[:, None]
-        # On the very point no direction is seen, and that of length 0 stands for it.
+        # At the very origin there is no direction: the vector 0 stands for it.
         views = fourier_features(normalize(ways, dim=-1), self.view_frequencies)
-        views = views[:, :, None].expand(-1, -1, len(self.steps), -1)
-        densities, fields = self.fields[receiver](
-            fourier_features(points, self.place_frequencies), views
-        )
+        views = views[:, :, None].expand(-1, -1, len(self.steps), -1)  # (b, k, i, features)
+        features = fourier_features(points, self.place_frequencies)
+        densities, fields = self.fields[receiver](features, views)
         steps = (lengths / len(self.steps)).to(densities)
         depths = self.density * steps[..., None] * densities[..., :-1]
-        depths = pad(depths, (0, 1), value=torch.inf)
+        depths = pad(depths, (0, 1), value=torch.inf)  # the last sample lets nothing through
         distances = lengths[..., None] * self.steps.double()
-        return self.unit * render(
-            fields, depths, distances, self.scene.task.frequencies, int(self.sign)
-        )
+        frequencies = self.scene.task.frequencies
+        return self.unit * render(fields, depths, distances, frequencies, int(self.sign))

@@ -42,16 +42,16 @@ class NGrf(Model):
 
     Args:
         scene: Receivers and task.
-        count: Gaussians of each receiver.
-        margin: Of the box in which Gaussians start, around transmitters and receivers, as a share
-            of its longest edge.
+        count: Number of Gaussians of each receiver.
+        margin: Margin of the box in which Gaussians start, around transmitters and receivers, as a
+            share of the longest edge.
         scale: Standard deviation of the Gaussians at the start, as a share of the scene's extent.
-        strength: Standard deviation of s at the start, over that of the first Gaussian, which is 1.
-        width, layers: Of the network.
+        strength: Standard deviation of s at the start; the first Gaussian has s = 1.
+        width, layers: Width and number of the network's layers.
 
     Raises:
         ValueError: The labels are not channels, or of several carriers; an array has another number
-            of elements than they; an option is out of range.
+            of elements than the labels; an option is out of range.
 
     Source: nGRF (Umer et al., arXiv 2508.11668); the README says which parts are ours.
     """
@@ -86,66 +86,70 @@ class NGrf(Model):
         means[:, 0] = receivers
         strengths = strength * math.sqrt(0.5) * torch.randn(len(receivers), count, 2)
         strengths[:, 0] = torch.tensor([1.0, 0.0])
-        self.means, self.strengths = nn.Parameter(means), nn.Parameter(strengths)
-        self.quats = nn.Parameter(
-            torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(receivers), count, 1)
-        )
-        self.log_scales = nn.Parameter(
-            torch.full((len(receivers), count, 3), math.log(scale * scene.extent))
-        )
+        log_scales = torch.full((len(receivers), count, 3), math.log(scale * scene.extent))
+        upright = torch.tensor([1.0, 0.0, 0.0, 0.0])
+        self.means = nn.Parameter(means)
+        self.strengths = nn.Parameter(strengths)
+        self.quats = nn.Parameter(upright.repeat(len(receivers), count, 1))
+        self.log_scales = nn.Parameter(log_scales)
         self.register_buffer("middle", (scene.lower + scene.upper) / 2)
-        self.register_buffer(
-            "frequencies", octaves("octaves", *learnable_octaves(scene)), persistent=False
-        )
-        elements = [
-            r.array.elements @ r.pose.rotation.mT.to(r.array.elements) for r in scene.receivers
-        ]
-        self.register_buffer(
-            "elements", torch.stack(elements).to(means), persistent=False
-        )  # (r, e, 3), world axes
+        frequencies = octaves("octaves", *learnable_octaves(scene))
+        self.register_buffer("frequencies", frequencies, persistent=False)
+        elements = []
+        for receiver in scene.receivers:
+            offsets = receiver.array.elements
+            elements.append(offsets @ receiver.pose.rotation.mT.to(offsets))
+        # Elements along the world's axes (r, e, 3) [m].
+        self.register_buffer("elements", torch.stack(elements).to(means), persistent=False)
         self.register_buffer("gains", torch.ones(len(receivers), dtype=torch.complex64))
         self.register_buffer("sign", torch.tensor(-1))
         sizes = [6 * (1 + 2 * len(self.frequencies)), *[width] * layers]
-        hidden = [
-            part for pair in itertools.pairwise(sizes) for part in (nn.Linear(*pair), nn.ReLU())
-        ]
+        hidden: list[nn.Module] = []
+        for inputs, outputs in itertools.pairwise(sizes):
+            hidden += [nn.Linear(inputs, outputs), nn.ReLU()]
         self.network = nn.Sequential(*hidden, nn.Linear(width, 3))
         nn.init.zeros_(self.network[-1].weight)
         nn.init.zeros_(self.network[-1].bias)
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits the sign of phases, and the gain g of each receiver over free space, to the training
+        """Fits the sign of phases, and each receiver's gain g over free space, to the training
         channels.
         """
         train = links.split.train
-        labels, query = links.labels[train].to(torch.complex128), links.query[train]
+        labels = links.labels[train].to(torch.complex128)
+        query = links.query[train]
         waves = direct_waves(self.scene, query, self.scene.task.frequencies)
         sign = self.scene.task.phase_sign(labels, waves, query.receivers)
         self.sign.fill_(sign or array_sign(labels, waves))
         waves = waves if self.sign < 0 else waves.conj()
         for receiver in query.receivers.unique().tolist():
-            own = query.receivers == receiver
-            self.gains[receiver] = fit_gain(labels[own], waves[own]).to(self.gains)
+            rows = query.receivers == receiver
+            self.gains[receiver] = fit_gain(labels[rows], waves[rows]).to(self.gains)
 
     def forward(self, batch: Batch) -> Prediction:
-        query, which = batch.query, batch.query.receivers
-        means, turns = self.means[which], quaternions_to_rotations(self.quats)[which]
+        query = batch.query
+        which = query.receivers
+        means = self.means[which]  # (b, n, 3)
+        rotations = quaternions_to_rotations(self.quats)[which]  # (b, n, 3, 3)
         offsets = query.transmitters[:, None] - means
-        whitened = (offsets[..., None, :] @ turns)[..., 0, :] / self.log_scales[which].exp()
-        weights = (-0.5 * whitened.square().sum(-1)).exp()
+        whitened = (offsets[..., None, :] @ rotations)[..., 0, :] / self.log_scales[which].exp()
+        weights = (-0.5 * whitened.square().sum(-1)).exp()  # w (b, n)
         strengths = torch.view_as_complex(self.strengths)[which]
         sources = self._excited(means, query.transmitters, offsets) * weights * strengths
-        places = offsets.double()[:, :, None] - (self.elements[which][:, None] @ turns.mT).double()
-        frequencies, lengths = (
-            self.scene.task.frequencies.to(places),
-            offsets.double().norm(dim=-1, keepdim=True),
-        )
-        middle, sign = frequencies.mean(), int(self.sign)
-        band = free_space(lengths, frequencies, sign).to(sources)
-        elements = free_space(places.norm(dim=-1), middle, sign) / free_space(lengths, middle, sign)
-        heard = (sources * self.gains[which, None])[:, None] * elements.mT.to(sources) @ band
-        return Prediction(heard, {})
+        # From each element's image to the transmitter (b, n, e, 3).
+        elements = (self.elements[which][:, None] @ rotations.mT).double()
+        ways = offsets.double()[:, :, None] - elements
+        lengths = offsets.double().norm(dim=-1, keepdim=True)  # d (b, n, 1)
+        frequencies = self.scene.task.frequencies.to(ways)
+        middle = frequencies.mean()
+        sign = int(self.sign)
+        band = free_space(lengths, frequencies, sign).to(sources)  # (b, n, s)
+        # From element to element, waves differ as at the middle of the band (b, n, e).
+        ratios = free_space(ways.norm(dim=-1), middle, sign) / free_space(lengths, middle, sign)
+        scaled = sources * self.gains[which, None]
+        channels = scaled[:, None] * ratios.mT.to(sources) @ band  # (b, e, s)
+        return Prediction(channels, {})
 
     def _excited(
         self,
@@ -153,21 +157,21 @@ class NGrf(Model):
         places: Float[Tensor, "b 3"],
         offsets: Float[Tensor, "b n 3"],
     ) -> Complex[Tensor, "b n"]:
-        """2 sigmoid(a) exp(j phi - alpha d), from the network."""
+        """Factors 2 sigmoid(a) exp(j phi - alpha d) of the Gaussians, from the network."""
         features = fourier_features(means.detach() - self.middle, self.frequencies)
-        moving = fourier_features(places - self.middle, self.frequencies)[:, None].expand_as(
-            features
-        )
+        moving = fourier_features(places - self.middle, self.frequencies)
+        moving = moving[:, None].expand_as(features)  # (b, n, features)
         values = self.network(torch.cat((features, moving), -1))
-        amplitudes, phases, attenuations = values.to(
-            torch.promote_types(values.dtype, torch.float32)
-        ).unbind(-1)
+        # torch has no complex numbers of bfloat16 (trainer.precision=bf16-mixed).
+        values = values.to(torch.promote_types(values.dtype, torch.float32))
+        amplitudes, phases, attenuations = values.unbind(-1)
         passed = (-softplus(attenuations + ATTENUATION) * offsets.norm(dim=-1)).exp()
         return polar(2 * amplitudes.sigmoid() * passed, phases)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        own = {name: [getattr(self, name)] for name in self.learning_rates if name != "network"}
-        return own | {"network": list(self.network.parameters())}
+        names = [name for name in self.learning_rates if name != "network"]
+        groups = {name: [getattr(self, name)] for name in names}
+        return groups | {"network": list(self.network.parameters())}
 
     def facts(self) -> dict[str, object]:
         """Number of Gaussians of all receivers together."""

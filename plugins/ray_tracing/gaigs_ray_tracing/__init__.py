@@ -58,12 +58,12 @@ class RayTracing(Model):
         room: ``built_in``, or a room of the data set ``sionna``.
         mesh: File of one's own room instead (.obj, .ply, .xml) [m]; None for the room of that name.
             It is read in ``fit``, and is in the state dict.
-        materials: Which tabulated material a material of the mesh is like, by its name there.
+        materials: Tabulated material for each material of the mesh, by its name there.
         calibrate: True to train materials and gains. Else materials are as tabulated, and nothing
             is trained.
-        frequency: Carrier of links whose data say none [Hz]; None where they do.
+        frequency: Carrier of links where the data have none [Hz]; None where they have.
         depth: Largest number of reflections, passages through surfaces and diffractions of a path.
-        rays: That leave each transmitter.
+        rays: Number of rays from each transmitter.
 
     Raises:
         ValueError: The room is unknown, an option is out of range, or the labels are neither
@@ -96,8 +96,12 @@ class RayTracing(Model):
             raise ValueError(f"model.depth must be in 1..8, got {depth}")
         if rays < 1:
             raise ValueError(f"model.rays must be at least 1, got {rays}")
-        self.room, self.mesh, self.materials = room, mesh, materials
-        self.frequency, self.depth, self.rays = frequency, depth, rays
+        self.room = room
+        self.mesh = mesh
+        self.materials = materials
+        self.frequency = frequency
+        self.depth = depth
+        self.rays = rays
         self.beamformer = _beamformer(scene)
         learnt = {"log_permittivities": torch.zeros(0), "log_conductivities": torch.zeros(0)}
         if self.beamformer is None:
@@ -114,8 +118,12 @@ class RayTracing(Model):
     # --- the room ---
 
     def _furnish(self, text: str) -> None:
-        """Takes the room's surfaces from the text of an OBJ file."""
-        self.text, meshes = text, read_obj(text, "the room")
+        """Sets the room's surfaces and materials, from the text of an OBJ file.
+
+        ``fit`` calls it, and the loading of a state.
+        """
+        self.text = text
+        meshes = read_obj(text, "the room")
         self.known = known_materials(meshes, self.materials)
         self.offsets = torch.zeros(1)
         band = self.scene.bandwidth
@@ -142,9 +150,8 @@ class RayTracing(Model):
             ValueError: The mesh is damaged or of unknown materials.
         """
         text = wavefront_obj(find_meshes(self.room, self.mesh))
-        self.surfaces = torch.tensor(
-            list(text.encode()), dtype=torch.uint8, device=self.surfaces.device
-        )
+        device = self.surfaces.device
+        self.surfaces = torch.tensor(list(text.encode()), dtype=torch.uint8, device=device)
         self._furnish(text)  # as written, so that a checkpoint has the same
         frequencies = self._carriers(links.query)
         for carrier in frequencies.unique().tolist():
@@ -154,8 +161,13 @@ class RayTracing(Model):
 
     @torch.no_grad()
     def _fit_gains(self, links: Links) -> None:
+        """Fits each receiver's gain to the training links, and for channels the sign of phases.
+
+        A receiver without training links gets the median amplitude of the others.
+        """
         train = links.split.train
-        labels, query = links.labels[train], links.query[train]
+        labels = links.labels[train]
+        query = links.query[train]
         is_complex = labels.is_complex()
         if is_complex:
             waves = direct_waves(self.scene, query, self.scene.task.frequencies)
@@ -164,77 +176,74 @@ class RayTracing(Model):
         self.log_gains.zero_()
         values = torch.cat([self(Batch(part)).value for part in query.parts(BATCH)])
         for receiver in query.receivers.unique().tolist():
-            own = query.receivers == receiver
+            rows = query.receivers == receiver
             if is_complex:
-                gain = fit_gain(labels[own], values[own])
+                gain = fit_gain(labels[rows], values[rows])
                 if gain != 0:
-                    self.log_gains[receiver] = torch.stack(
-                        (gain.abs().log(), -int(self.sign) * gain.angle())
-                    )
+                    phase = -int(self.sign) * gain.angle()
+                    self.log_gains[receiver] = torch.stack((gain.abs().log(), phase))
             else:
-                self.log_gains[receiver, 0] = (labels[own] - values[own]).median() / NEPER
+                self.log_gains[receiver, 0] = (labels[rows] - values[rows]).median() / NEPER
         trained = query.receivers.unique()
-        unheard = torch.ones(len(self.log_gains), dtype=torch.bool).index_fill(0, trained, False)
-        if len(trained):  # of amplitudes alone: nothing tells their phases
-            self.log_gains[unheard, 0] = self.log_gains[trained, 0].median()
+        untrained = torch.ones(len(self.log_gains), dtype=torch.bool).index_fill(0, trained, False)
+        if len(trained):
+            self.log_gains[untrained, 0] = self.log_gains[trained, 0].median()
 
     @property
     def predicts_untrained(self) -> bool:
         return True
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Those of the materials, and the receivers' gains; empty without calibration."""
-        groups = {"materials": ["log_permittivities", "log_conductivities"], "gains": ["log_gains"]}
+        """Parameters of the materials, and the receivers' gains; empty without calibration."""
         parameters = dict(self.named_parameters())
-        return {
-            key: [parameters[name] for name in names if name in parameters]
-            for key, names in groups.items()
-        }
+        names = ("log_permittivities", "log_conductivities")
+        materials = [parameters[name] for name in names if name in parameters]
+        gains = [parameters["log_gains"]] if "log_gains" in parameters else []
+        return {"materials": materials, "gains": gains}
 
     def facts(self) -> dict[str, object]:
         """Materials of the surfaces at the lowest carrier, and the time to trace a place."""
-        carrier = self._carriers(
-            Query(self.scene.lower[None], torch.tensor([0]), self._lowest())
-        ).item()
-        slabs = self.slabs(carrier)
+        lowest = self.scene.frequencies[:1] if len(self.scene.frequencies) else None
+        query = Query(self.scene.lower[None], torch.tensor([0]), lowest)
+        carrier = self._carriers(query).item()
+        permittivities = self.slabs(carrier).permittivities.detach()
+        materials = {}
+        for name, value in zip(self.known, permittivities, strict=True):
+            materials[name] = {
+                "permittivity": value.real.item(),
+                "conductivity": -value.imag.item() * 2 * math.pi * carrier * epsilon_0,
+            }
         tracer = self._tracer(carrier)
-        return {
-            "materials": {
-                name: {
-                    "permittivity": value.real.item(),
-                    "conductivity": -value.imag.item() * 2 * math.pi * carrier * epsilon_0,
-                }
-                for name, value in zip(self.known, slabs.permittivities.detach(), strict=True)
-            },
-            "tracing_ms": 1e3 * tracer.seconds / tracer.places if tracer.places else None,
-        }
+        milliseconds = 1e3 * tracer.seconds / tracer.places if tracer.places else None
+        return {"materials": materials, "tracing_ms": milliseconds}
 
     # --- prediction ---
 
     def forward(self, batch: Batch) -> Prediction:
         query = batch.query.to("cpu")
         frequencies = self._carriers(query)
-        task, dtype = self.scene.task, query.transmitters.dtype
-        shape = (
-            task.shape if self.beamformer is None else (batch.directions or task.directions).shape
-        )
-        value = torch.zeros(
-            len(query), *shape, dtype=dtype.to_complex() if task.dtype.is_complex else dtype
-        )
+        task = self.scene.task
+        shape = task.shape
+        if self.beamformer is not None:
+            shape = (batch.directions or task.directions).shape
+        dtype = query.transmitters.dtype
+        dtype = dtype.to_complex() if task.dtype.is_complex else dtype
+        value = torch.zeros(len(query), *shape, dtype=dtype)
         for carrier in frequencies.unique().tolist():
             for receiver in query.receivers.unique().tolist():
-                own = ((frequencies == carrier) & (query.receivers == receiver)).nonzero()[:, 0]
-                if len(own):
-                    part = self._report(query[own], receiver, carrier, batch)
-                    value = value.index_add(0, own, part.to(value.dtype))
+                is_part = (frequencies == carrier) & (query.receivers == receiver)
+                links = is_part.nonzero()[:, 0]
+                if len(links):
+                    part = self._report(query[links], receiver, carrier, batch)
+                    value = value.index_add(0, links, part.to(value.dtype))
         return Prediction(value.to(batch.query.transmitters.device), {})
 
     def _report(self, query: Query, receiver: int, carrier: float, batch: Batch) -> Tensor:
-        """Labels of links to one receiver."""
-        antenna, task = self.scene.receivers[receiver], self.scene.task
-        traced = padded(
-            self._tracer(carrier).find(query.transmitters, receiver), antenna.pose.position
-        )
+        """Labels of links to one receiver at one carrier [Hz]."""
+        antenna = self.scene.receivers[receiver]
+        task = self.scene.task
+        links = self._tracer(carrier).find(query.transmitters, receiver)
+        traced = padded(links, antenna.pose.position)
         paths = Paths(traced.images, gains(traced, self.slabs(carrier)))
         if task.dtype.is_complex:
             amplitude, phase = self.log_gains[receiver].cpu().double()
@@ -247,48 +256,38 @@ class RayTracing(Model):
             return self.beamformer(lags.to(torch.complex64), query, batch.directions)
         if self.scene.bandwidth is None:
             distances = (paths.images - antenna.pose.position.double()).norm(dim=-1)
-            powers = (
-                (paths.gains.abs() * free_space(distances, torch.tensor(carrier), 0).real)
-                .square()
-                .sum(1)
-            )
+            spreading = free_space(distances, torch.tensor(carrier), 0).real
+            powers = (paths.gains.abs() * spreading).square().sum(1)
         else:
             powers = respond(paths, antenna, carrier, self.offsets).abs().square().mean((1, 2))
         return 10 * (powers + SILENT).log10() + NEPER * self.log_gains[receiver, 0].cpu().double()
 
     def slabs(self, carrier: float) -> Slabs:
-        """Materials of the surfaces at a carrier [Hz]."""
-        real, c, d = torch.tensor(
-            [MATERIALS[kind] for kind in self.known.values()], dtype=torch.float64
-        ).T
+        """Materials of the surfaces at a carrier [Hz], with the learnt factors."""
+        kinds = [*self.known.values()]
+        tabulated = torch.tensor([MATERIALS[kind] for kind in kinds], dtype=torch.float64)
+        real, c, d = tabulated.T
+        # ITU-R P.2040-3: conductivity c (f / GHz)^d, permittivity real - j conductivity / (w e0).
         conductivities = c * (carrier / 1e9) ** d * self.log_conductivities.cpu().double().exp()
         permittivities = torch.complex(
             1 + (real - 1) * self.log_permittivities.cpu().double().exp(),
             -conductivities / (2 * math.pi * epsilon_0 * carrier),
         )
-        thicknesses = torch.tensor(
-            [THICKNESS[kind] for kind in self.known.values()], dtype=torch.float64
-        )
+        thicknesses = torch.tensor([THICKNESS[kind] for kind in kinds], dtype=torch.float64)
         return Slabs(permittivities, thicknesses, carrier)
 
     def _tracer(self, carrier: float) -> Tracer:
+        """The tracer of the room at a carrier [Hz]; models of one room share it."""
         receivers = tuple(
             tuple(receiver.pose.position.double().tolist()) for receiver in self.scene.receivers
         )
-        return find_tracer(
-            self.text, tuple(self.known.items()), receivers, carrier, self.depth, self.rays
-        )
-
-    def _lowest(self) -> Float[Tensor, "1"] | None:
-        return self.scene.frequencies[:1] if len(self.scene.frequencies) else None
+        known = tuple(self.known.items())
+        return find_tracer(self.text, known, receivers, carrier, self.depth, self.rays)
 
     def _carriers(self, query: Query) -> Float[Tensor, " b"]:
         """The frequency of each link [Hz]."""
-        if (
-            self.frequency is not None
-            and query.frequencies is None
-            and not self.scene.task.dtype.is_complex
-        ):
+        has_carrier = query.frequencies is not None or self.scene.task.dtype.is_complex
+        if self.frequency is not None and not has_carrier:
             return torch.full((len(query),), float(self.frequency))
         return carriers(self.scene, query)
 

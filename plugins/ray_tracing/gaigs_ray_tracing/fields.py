@@ -29,13 +29,13 @@ class Traced(NamedTuple):
 
     Attributes:
         images: Where the transmitter seems to stand (p, 3) [m].
-        strengths: 1; of a diffracted path its whole gain, which does not change with the materials
+        strengths: 1; for a diffracted path its whole gain, which does not change with the materials
             (p,).
         kinds: Interaction, 0, ``REFLECTED`` or ``PASSED`` (p, d).
         surfaces: Number of the surface's material (p, d).
-        cosines: Of the angles of incidence (p, d).
-        turns: From the components that a field has after one of them to those before the next (p, d
-            + 1, 2, 2).
+        cosines: Cosines of the angles of incidence (p, d).
+        turns: Matrices from a field's components after one interaction to its components before the
+            next (p, d + 1, 2, 2).
     """
 
     images: Float[Tensor, "*p 3"]
@@ -47,17 +47,15 @@ class Traced(NamedTuple):
 
 
 def padded(links: Sequence[Traced], receiver: Float[Tensor, "3"]) -> Traced:
-    """The paths of several links (b, p), float64; those that a link has fewer of have the strength
-    0.
+    """The paths of several links (b, p), float64; missing paths have the strength 0.
 
     Args:
-        links: At least one.
-        receiver: Position [m].
+        links: Paths of each link, of one link or more.
+        receiver: Position of the receiver [m].
     """
-    images, strengths, kinds, surfaces, cosines, turns = (
-        pad_sequence(list(parts), batch_first=True) for parts in zip(*links, strict=True)
-    )
-    # Not at the receiver, from where no direction would lead to them.
+    fields = [pad_sequence(list(parts), batch_first=True) for parts in zip(*links, strict=True)]
+    images, strengths, kinds, surfaces, cosines, turns = fields
+    # Missing images stand away from the receiver, so that they have a direction.
     images = torch.where((strengths != 0)[..., None], images.double(), receiver.double() + 1)
     return Traced(
         images,
@@ -73,9 +71,10 @@ class Slabs(NamedTuple):
     """The surfaces' materials at one frequency.
 
     Attributes:
-        permittivities: Complex and relative, for the time dependence exp(+j omega t) (m,).
-        thicknesses: [m] (m,).
-        frequency: [Hz].
+        permittivities: Complex relative permittivities, for the time dependence exp(+j omega t)
+            (m,).
+        thicknesses: Thickness of each slab [m] (m,).
+        frequency: Carrier [Hz].
     """
 
     permittivities: Complex[Tensor, " m"]
@@ -89,22 +88,24 @@ class Slabs(NamedTuple):
 
         Args:
             surfaces: Numbers of materials.
-            cosines: Of the angles of incidence.
+            cosines: Cosines of the angles of incidence.
 
         Source: ITU-R P.2040-3, section 2.2.2.2, a slab in air.
         """
         permittivities = self.permittivities[surfaces]
-        single = torch.stack(fresnel(permittivities, cosines))
+        single = torch.stack(fresnel(permittivities, cosines))  # r of one face (2, *p)
         root = torch.sqrt(permittivities - (1 - cosines.square()))
-        once = torch.exp(
-            -2j * math.pi * self.frequency / speed_of_light * self.thicknesses[surfaces] * root
-        )
-        several = 1 - single.square() * once.square()  # between the slab's faces
-        return single * (1 - once.square()) / several, (1 - single.square()) * once / several
+        wavenumber = -2j * math.pi * self.frequency / speed_of_light
+        once = torch.exp(wavenumber * self.thicknesses[surfaces] * root)  # q, one way through
+        # All reflections between the faces: R = r (1 - q²) / (1 - r² q²), T = (1 - r²) q / (...).
+        several = 1 - single.square() * once.square()
+        reflected = single * (1 - once.square()) / several
+        passed = (1 - single.square()) * once / several
+        return reflected, passed
 
 
 def gains(paths: Traced, slabs: Slabs) -> Complex[Tensor, "b p"]:
-    """Of the vertical field along each path, without the spreading of free space; that has 1."""
+    """Gain of the vertical field along each path over free space of the same length."""
     field = paths.turns[..., 0, :, 1].to(torch.complex128)
     for step in range(paths.kinds.shape[-1]):
         kind = paths.kinds[..., step]

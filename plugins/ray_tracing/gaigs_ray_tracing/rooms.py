@@ -37,8 +37,7 @@ def check_room(room: str) -> None:
     if room not in BUILT_IN and room not in ROOMS:
         raise ValueError(
             f"model 'ray_tracing' must know the room: one of built_in, {', '.join(ROOMS)}, got "
-            f"{room!r}; set "
-            "model.room, or model.mesh to a file of its surfaces"
+            f"{room!r}; set model.room, or model.mesh to a file of its surfaces"
         )
 
 
@@ -65,34 +64,34 @@ def find_meshes(room: str, mesh: str | None) -> list[Mesh]:
 
 
 def known_materials(meshes: Sequence[Mesh], chosen: Mapping[str, str]) -> dict[str, str]:
-    """Which tabulated material each material of a mesh starts as, by names in ascending order.
+    """The tabulated material of each material of a mesh, by names in ascending order.
 
     Args:
         meshes: Surfaces.
-        chosen: The user's choice for some.
+        chosen: The user's choice for some materials.
 
     Raises:
-        ValueError: A name is unknown, or is said of a material that there is not.
+        ValueError: A tabulated material is unknown, or a choice is for none of the materials.
     """
-    there = sorted({mesh.material for mesh in meshes})
-    if unused := sorted(set(chosen) - set(there)):
+    names = sorted({mesh.material for mesh in meshes})
+    if unused := sorted(set(chosen) - set(names)):
         raise ValueError(
-            f"model.materials has {', '.join(unused)}, and the materials are {', '.join(there)}"
+            f"model.materials has {', '.join(unused)}, and the materials are {', '.join(names)}"
         )
-    found = {}
-    for name in there:
+    tabulated = {}
+    for name in names:
         plain = name.removeprefix("mat-").removeprefix("itu_").removeprefix("itu-")
-        found[name] = chosen.get(name, FURNITURE.get(name, plain))
-        if found[name] not in THICKNESS:
+        tabulated[name] = chosen.get(name, FURNITURE.get(name, plain))
+        if tabulated[name] not in THICKNESS:
             raise ValueError(
-                f"material {name!r} must be one of {', '.join(THICKNESS)}, got {found[name]!r}; "
-                "say which it is like: "
-                f"+model.materials.{name}=concrete"
+                f"material {name!r} must be one of {', '.join(THICKNESS)}, got "
+                f"{tabulated[name]!r}; say which it is like: +model.materials.{name}=concrete"
             )
-    return found
+    return tabulated
 
 
 def _read(file: Path) -> list[Mesh]:
+    """The surfaces of a file of any kind; a ``ValueError`` if there are none."""
     if file.suffix not in SUFFIXES:
         raise ValueError(f"model.mesh must be a file {', '.join(SUFFIXES)}, got {file.name}")
     if not file.is_file():
@@ -121,22 +120,21 @@ def read_obj(text: str, source: str) -> list[Mesh]:
         source: Its name in errors.
 
     Raises:
-        ValueError: A line holds no numbers where it must, or a face takes vertices that there are
-            not.
+        ValueError: A line has no numbers where they must be, or a face has unknown vertices.
     """
-    vertices, groups = parse_obj(text.splitlines(), source)
-    return [
-        _mesh(name, material, vertices.tolist(), faces)
-        for (name, material), faces in groups.items()
-    ]
+    points, groups = parse_obj(text.splitlines(), source)
+    vertices = points.tolist()
+    return [_mesh(*names, vertices, faces) for names, faces in groups.items()]
 
 
 def _read_ply(file: Path) -> list[Mesh]:
+    """The surface of a PLY file as one mesh without a material's name; none without faces."""
     vertices, faces = read_ply(file)
     return [_mesh(file.stem, NO_NAME[1], positions(vertices).tolist(), faces)] if faces else []
 
 
 def _read_scene(file: Path) -> list[Mesh]:
+    """The surfaces of a scene of Mitsuba, as Sionna RT loads it."""
     rt = tracing.find_sionna()
     import mitsuba
 
@@ -153,9 +151,7 @@ def _read_scene(file: Path) -> list[Mesh]:
     meshes = []
     for name, shape in scene.objects.items():
         parameters = mitsuba.traverse(shape.mi_mesh)
-        if (
-            "vertex_positions" not in parameters
-        ):  # as of a rectangle, which has no vertices of its own
+        if "vertex_positions" not in parameters:  # such as a rectangle of Mitsuba
             raise ValueError(
                 f"{file}, shape {name!r}, must be a mesh of type ply or obj; export it as one, as "
                 "Blender does"
@@ -168,9 +164,8 @@ def _read_scene(file: Path) -> list[Mesh]:
 
 
 def _mesh(name: str, material: str, vertices: Sequence, faces: Sequence[tuple[int, ...]]) -> Mesh:
-    """A mesh of those vertices alone that its faces have."""
+    """A mesh with the vertices that its faces have, in the order of the faces."""
     numbers = {corner: k for k, corner in enumerate(dict.fromkeys(itertools.chain(*faces)))}
     corners = tuple(tuple(vertices[corner]) for corner in numbers)
-    return Mesh(
-        name, material, corners, tuple(tuple(numbers[corner] for corner in face) for face in faces)
-    )
+    renumbered = tuple(tuple(map(numbers.__getitem__, face)) for face in faces)
+    return Mesh(name, material, corners, renumbered)

@@ -3,6 +3,7 @@ once.
 """
 
 import functools
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,17 +41,16 @@ between them.
 class Tracer:
     """The paths of one carrier in a room.
 
-    By tracing, a path is a chain of reflections, passages through surfaces and at most one
-    diffraction, whose points are Sionna RT's. Which paths there are is decided with the materials
-    as tabulated.
+    Sionna RT finds each path as a chain of reflections, passages through surfaces and at most one
+    diffraction, for the materials as tabulated.
 
     Args:
         surfaces: Text of an OBJ file; its materials are names of ``known``.
-        known: Which tabulated material each of them is.
-        receivers: Positions [m].
-        frequency: Of the carrier [Hz].
-        depth: Largest number of things that happen to a path.
-        rays: That leave each transmitter.
+        known: Tabulated material of each material.
+        receivers: Positions of the receivers [m].
+        frequency: Carrier [Hz].
+        depth: Largest number of interactions of a path.
+        rays: Number of rays from each transmitter.
     """
 
     def __init__(
@@ -64,24 +64,27 @@ class Tracer:
     ):
         meshes = read_obj(surfaces, "the room")
         self.meshes = [replace(mesh, material=known[mesh.material]) for mesh in meshes]
-        self.receivers, self.frequency, self.depth, self.rays = receivers, frequency, depth, rays
+        self.receivers = receivers
+        self.frequency = frequency
+        self.depth = depth
+        self.rays = rays
         names = sorted(known)
         self.numbers = np.array([names.index(mesh.material) for mesh in meshes])
         self.normals = np.concatenate([_normals(mesh) for mesh in meshes])
-        self.first = np.cumsum(
-            [0, *(len(mesh.triangles()) for mesh in meshes)]
-        )  # triangle of each mesh
+        # Number of the first triangle of each mesh.
+        self.first = np.cumsum([0, *(len(mesh.triangles()) for mesh in meshes)])
+        materials = {}
+        for name in names:
+            materials[name] = [known[name], MATERIALS[known[name]], THICKNESS[known[name]]]
         self.key = {
             "of": "ray_tracing",
             "surfaces": surfaces,
-            "materials": {
-                name: [known[name], MATERIALS[known[name]], THICKNESS[known[name]]]
-                for name in names
-            },
+            "materials": materials,
             "receivers": receivers.tolist(),
             "frequency": frequency,
             "settings": [depth, rays, CHUNK, CANDIDATES, tracing.WEAKEST],
         }
+        # Paths to all receivers by place: of places to remember, and of others.
         self.data: dict[tuple[float, ...], list[Traced]] = {}
         self.others: dict[tuple[float, ...], list[Traced]] = {}
         self.seconds = 0.0
@@ -90,19 +93,19 @@ class Tracer:
         """Places traced in that time."""
 
     def remember(self, places: Float[Tensor, "b 3"]) -> None:
-        """Traces places that will be asked for time and again, or reads their paths from disk."""
+        """Traces places that are needed again and again, or reads their paths from disk."""
         places = places.double().unique(dim=0)
         missing = [place for place in map(tuple, places.tolist()) if place not in self.data]
         if not missing:
             return
 
         def trace() -> dict[str, ndarray]:
-            links = [link for place in self._trace(missing) for link in place]
-            arrays = {
-                name: torch.cat([getattr(link, name) for link in links]).numpy()
-                for name in Traced._fields
-            }
-            return arrays | {"counts": np.array([len(link.strengths) for link in links])}
+            """The paths of all links, one after another, and the number of each link's paths."""
+            links = [*itertools.chain.from_iterable(self._trace(missing))]
+            arrays = {"counts": np.array([len(link.strengths) for link in links])}
+            for name in Traced._fields:
+                arrays[name] = torch.cat([getattr(link, name) for link in links]).numpy()
+            return arrays
 
         title = (
             f"tracing the paths of {len(missing)} transmitters to {len(self.receivers)} receivers"
@@ -115,22 +118,20 @@ class Tracer:
         self.data |= {place: links[k * count : (k + 1) * count] for k, place in enumerate(missing)}
 
     def find(self, places: Float[Tensor, "b 3"], receiver: int) -> list[Traced]:
-        """The paths of links to one of the receivers."""
-        asked = list(map(tuple, places.double().tolist()))
-        missing = [
-            place
-            for place in dict.fromkeys(asked)
-            if place not in self.data and place not in self.others
-        ]
+        """The paths from places [m] to one of the receivers, traced where they are unknown."""
+        keys = list(map(tuple, places.double().tolist()))
+        distinct = dict.fromkeys(keys)
+        missing = [key for key in distinct if key not in self.data and key not in self.others]
         if missing:
+            # The memory is bounded: where it is full, places that are not requested now go.
             if (len(self.others) + len(missing)) * len(self.receivers) > MOST:
-                self.others = {place: self.others[place] for place in asked if place in self.others}
+                self.others = {key: self.others[key] for key in keys if key in self.others}
             self.others |= zip(missing, self._trace(missing), strict=True)
-        return [(self.data.get(place) or self.others[place])[receiver] for place in asked]
+        return [(self.data.get(key) or self.others[key])[receiver] for key in keys]
 
     @functools.cached_property
     def scene(self):
-        """Sionna RT's, with the receivers."""
+        """The scene of Sionna RT, with the receivers."""
         scene = tracing.make_scene(self.meshes, self.frequency)
         from sionna import rt
 
@@ -144,11 +145,10 @@ class Tracer:
         from sionna import rt
 
         start = time.perf_counter()
-        # Which of two chains stays that share a cell of a table would else be up to the processor's
-        # threads.
+        # Two chains may share a cell of a table: threads must not decide which one stays.
         solver = rt.PathSolver(deterministic=True)
         identities = {scene.objects[f"mesh {k}"].object_id: k for k in range(len(self.meshes))}
-        found: list[list[Traced]] = []
+        by_place: list[list[Traced]] = []
         for first in range(0, len(places), CHUNK):
             chunk = places[first : first + CHUNK]
             names = [f"transmitter {k}" for k in range(len(chunk))]
@@ -161,43 +161,49 @@ class Tracer:
                 max_num_paths_per_src=CANDIDATES,
                 diffraction=True,
             )
-            found += self._links(paths, np.array(chunk), identities)
+            by_place += self._links(paths, np.array(chunk), identities)
             scene.remove(names)
         self.seconds += time.perf_counter() - start
         self.places += len(places)
-        return found
+        return by_place
 
     def _links(
         self, paths, places: Float[ndarray, "b 3"], identities: dict[int, int]
     ) -> list[list[Traced]]:
-        """Paths of Sionna RT, by place and receiver."""
-        fields = (paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex))[:, 0, :, 0]
+        """Paths of Sionna RT by place and receiver, without the weakest.
+
+        Args:
+            identities: Number of each mesh by Sionna RT's number of the object.
+        """
+        fields = paths.a[0].numpy() + 1j * paths.a[1].numpy().astype(complex)
+        fields = fields[:, 0, :, 0]  # (receivers, places, paths)
         valid = paths.valid.numpy()
-        there = np.zeros_like(valid)
+        is_kept = np.zeros_like(valid)
         for receiver, place in np.ndindex(*valid.shape[:2]):
-            there[
-                receiver,
-                place,
-                tracing.without_weakest(fields[receiver, place] * valid[receiver, place]),
-            ] = True
-        receivers, transmitters, _ = there.nonzero()
+            kept = tracing.without_weakest(fields[receiver, place] * valid[receiver, place])
+            is_kept[receiver, place, kept] = True
+        receivers, transmitters, _ = is_kept.nonzero()
 
-        def pick(tensor):
-            return np.moveaxis(tensor.numpy(), 0, 3)[there]
+        def pick(tensor) -> ndarray:
+            """Values (p, d, ...) of the kept paths."""
+            return np.moveaxis(tensor.numpy(), 0, 3)[is_kept]
 
-        types, objects, faces, points = map(
-            pick, (paths.interactions, paths.objects, paths.primitives, paths.vertices)
-        )
-        meshes = np.vectorize(identities.get, otypes=[int])(objects, -1)
-        ends = places[transmitters], self.receivers[receivers]
         traced = self._paths(
-            *ends, fields[there], types, meshes, faces.astype(int), points.astype(float)
+            starts=places[transmitters],
+            ends=self.receivers[receivers],
+            fields=fields[is_kept],
+            types=pick(paths.interactions),
+            meshes=np.vectorize(identities.get, otypes=[int])(pick(paths.objects), -1),
+            faces=pick(paths.primitives).astype(int),
+            points=pick(paths.vertices).astype(float),
         )
-        links = [[Traced(*(part[:0] for part in traced))] * len(self.receivers) for _ in places]
-        for place, own in enumerate(links):
+        links = []
+        for place in range(len(places)):
+            to_receivers = []
             for receiver in range(len(self.receivers)):
                 chosen = torch.from_numpy((transmitters == place) & (receivers == receiver))
-                own[receiver] = Traced(*(part[chosen] for part in traced))
+                to_receivers.append(Traced(*(part[chosen] for part in traced)))
+            links.append(to_receivers)
         return links
 
     def _paths(
@@ -210,17 +216,26 @@ class Tracer:
         faces: Int[ndarray, "p d"],
         points: Float[ndarray, "p d 3"],
     ) -> Traced:
-        """Directions, angles and planes of incidence of paths."""
+        """Paths in the form of ``Traced``, from the points and surfaces of p paths.
+
+        Args:
+            starts, ends: Positions of transmitters and receivers [m].
+            fields: Gain of each path.
+            types: Interactions of Sionna RT; 0 for none.
+            meshes, faces: Number of the mesh and of its triangle at each interaction.
+            points: Places of the interactions [m].
+        """
         from sionna.rt import InteractionType
 
         points = np.where((types > 0)[..., None], points, ends[:, None])
         steps = np.diff(np.concatenate((starts[:, None], points, ends[:, None]), 1), axis=1)
-        lengths = np.linalg.norm(steps, axis=-1)
+        lengths = np.linalg.norm(steps, axis=-1)  # (p, d + 1)
         total = lengths.sum(1)
         directions = steps / np.where(lengths > 0, lengths, 1)[..., None]
-        for step in range(1, directions.shape[1]):  # behind the last point it goes on as before
-            gone = lengths[:, step] == 0
-            directions[gone, step] = directions[gone, step - 1]
+        # Behind the last interaction steps have no length: the direction stays.
+        for step in range(1, directions.shape[1]):
+            is_over = lengths[:, step] == 0
+            directions[is_over, step] = directions[is_over, step - 1]
         strengths = np.ones(len(types), complex)
         diffracted = (types == InteractionType.DIFFRACTION).any(1)
         spreading = speed_of_light / self.frequency / (4 * np.pi * total)
@@ -248,26 +263,34 @@ class Tracer:
         meshes: Int[ndarray, "p d"],
         faces: Int[ndarray, "p d"],
     ) -> tuple[Float[ndarray, "p d"], Float[ndarray, "p d1 2 2"]]:
-        """Cosines of incidence, and the content of ``Traced.turns``."""
+        """Cosines of the angles of incidence, and ``Traced.turns``.
+
+        The components of a field are along two unit vectors. At a surface these are across the
+        plane of incidence (TE) and in it (TM).
+        """
         count, depth = kinds.shape
-        before = _vertical(directions[:, 0])
-        cosines, turns = np.ones((count, depth)), np.zeros((count, depth + 1, 2, 2))
+        before = _vertical(directions[:, 0])  # unit vectors (p, 2, 3) up to the next surface
+        cosines = np.ones((count, depth))
+        turns = np.zeros((count, depth + 1, 2, 2))
         for step in range(depth):
-            happens = kinds[:, step] > 0
-            normals = self.normals[
-                np.where(happens, self.first[meshes[:, step]] + faces[:, step], 0)
-            ]
-            here, after = directions[:, step], directions[:, step + 1]
-            cosines[:, step] = np.abs((here * normals).sum(-1))
-            across = np.cross(here, normals)
+            is_surface = kinds[:, step] > 0
+            triangles = np.where(is_surface, self.first[meshes[:, step]] + faces[:, step], 0)
+            normals = self.normals[triangles]
+            arriving = directions[:, step]
+            leaving = directions[:, step + 1]
+            cosines[:, step] = np.abs((arriving * normals).sum(-1))
+            across = np.cross(arriving, normals)
             sines = np.linalg.norm(across, axis=-1, keepdims=True)
+            # Along the normal there is no plane of incidence: the vector before stays.
             across = np.where(
                 sines > UPRIGHT, across / np.where(sines > UPRIGHT, sines, 1), before[:, 0]
             )
-            happens = happens[:, None, None]
-            own = np.where(happens, np.stack((across, np.cross(across, here)), 1), before)
-            turns[:, step] = own @ before.swapaxes(1, 2)
-            before = np.where(happens, np.stack((across, np.cross(across, after)), 1), before)
+            is_surface = is_surface[:, None, None]
+            at_arrival = np.stack((across, np.cross(across, arriving)), 1)
+            at_arrival = np.where(is_surface, at_arrival, before)
+            turns[:, step] = at_arrival @ before.swapaxes(1, 2)
+            behind = np.stack((across, np.cross(across, leaving)), 1)
+            before = np.where(is_surface, behind, before)
         turns[:, depth] = _vertical(directions[:, -1]) @ before.swapaxes(1, 2)
         return cosines, turns
 
@@ -281,12 +304,12 @@ def find_tracer(
     depth: int,
     rays: int,
 ) -> Tracer:
-    """The tracer of a room and a carrier; all who ask for the same share one."""
+    """The tracer of a room at a carrier, made once for equal arguments."""
     return Tracer(surfaces, dict(known), np.array(receivers), frequency, depth, rays)
 
 
 def _normals(mesh: Mesh) -> Float[ndarray, "f 3"]:
-    """Unit normal of each triangle; one without an area has none, and no ray meets it."""
+    """Unit normal of each triangle; 0 for a triangle without an area, which no ray meets."""
     corners = np.array(mesh.vertices)[np.array(mesh.triangles())]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     lengths = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -294,8 +317,7 @@ def _normals(mesh: Mesh) -> Float[ndarray, "f 3"]:
 
 
 def _vertical(directions: Float[ndarray, "p 3"]) -> Float[ndarray, "p 2 3"]:
-    """Unit vectors across directions, along the horizontal and down the meridian."""
+    """Two unit vectors across each direction: along the horizontal and down the meridian."""
     azimuths = np.arctan2(directions[:, 1], directions[:, 0])
-    cos, sin, none = np.cos(azimuths), np.sin(azimuths), np.zeros_like(azimuths)
-    horizontal = np.stack((-sin, cos, none), -1)
+    horizontal = np.stack((-np.sin(azimuths), np.cos(azimuths), np.zeros_like(azimuths)), -1)
     return np.stack((horizontal, np.cross(horizontal, directions)), 1)

@@ -26,20 +26,18 @@ GEOMETRY = ("means", "quats", "log_scales")
 class Rf3dgs(GaussianSplatting):
     """The splatting pipeline, trained in two stages.
 
-    1. Geometry. Without a file everything is trained, and each Gaussian sends alike for all
-    transmitters, as a
-       photograph does not depend on the transmitter: it learns the common part of the training
-       spectra. With a file there is no training: Gaussians stand at its points.
-    2. Radio. Centres, orientations and scales are frozen and the signal is reset. Trained are
-    opacities and spherical
-       harmonics over the direction in which a transmitter sees a Gaussian.
+    1. Geometry. With a file, Gaussians stand at its points, and nothing is trained. Without a file
+       everything is trained, and each Gaussian sends alike for all transmitters: it learns what the
+       training spectra have in common.
+    2. Radio. Centres, orientations and scales are frozen and the signal is reset. Opacities are
+       trained, and spherical harmonics over the direction from which a transmitter sees a Gaussian.
 
     Args:
         scene: Receivers and task.
         geometry: File with the room's points, mesh or splats, see ``gaigs_rf_3dgs.geometry``; None
             for none.
         first_stage: Share of the training that the first stage takes without a file.
-        **options: As ``GaussianSplatting`` has them.
+        **options: Options of ``GaussianSplatting``.
 
     Raises:
         ValueError: The labels are no spectra, or an option is out of range.
@@ -58,13 +56,15 @@ class Rf3dgs(GaussianSplatting):
         if not 0 < first_stage < 1:
             raise ValueError(f"model.first_stage must lie between 0 and 1, got {first_stage}")
         call(f"model {self.name!r}", super().__init__, options, scene=scene)
-        self.geometry, self.first_stage, self.degree = geometry, first_stage, self.gaussians.degree
+        self.geometry = geometry
+        self.first_stage = first_stage
+        self.degree = self.gaussians.degree
         self.register_buffer("stage", torch.tensor(1))
         self.register_load_state_dict_post_hook(lambda module, _: module._enter())
         self._enter()
 
     def forward(self, batch: Batch) -> Prediction:
-        """As the pipeline's.
+        """Predicts as ``GaussianSplatting``.
 
         Raises:
             ValueError: Several processes train, which cannot freeze shared parameters.
@@ -72,23 +72,23 @@ class Rf3dgs(GaussianSplatting):
         if self.training and distributed.is_available() and distributed.is_initialized():
             raise ValueError(
                 "model 'rf_3dgs' freezes its geometry within the training, which one process can "
-                "do, not "
-                f"{distributed.get_world_size()}; set trainer.devices=1"
+                f"do, not {distributed.get_world_size()}; set trainer.devices=1"
             )
         return super().forward(batch)
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """As the pipeline's; and puts the Gaussians where the file has them."""
+        """Fits as ``GaussianSplatting``, and moves the Gaussians to the points of the file."""
         super().fit(links)
         if self.geometry is None:
             return
-        gaussians, logit = self.gaussians, self.gaussians.opacity_logits[0].clone()
-        found = read_geometry(Path(self.geometry), len(gaussians))
-        gaussians.resize(len(found.means))
+        gaussians = self.gaussians
+        logit = gaussians.opacity_logits[0].clone()
+        geometry = read_geometry(Path(self.geometry), len(gaussians))
+        gaussians.resize(len(geometry.means))
         gaussians.opacity_logits.fill_(logit)
         self._reset()
-        for name, values in found._asdict().items():
+        for name, values in geometry._asdict().items():
             if values is not None:
                 getattr(gaussians, name).copy_(values)
 
@@ -109,12 +109,12 @@ class Rf3dgs(GaussianSplatting):
         )
 
     def facts(self) -> dict[str, object]:
-        """Beside the rasterizer: the stage that the model is of, and where its geometry is from."""
+        """Facts of ``GaussianSplatting``, the stage of the model, and the file of its geometry."""
         source = "training spectra" if self.geometry is None else Path(self.geometry).name
         return super().facts() | {"stage": int(self.stage), "geometry": source}
 
     def _enter(self) -> None:
-        """Sets the harmonics that count, and the trained parameters, by the stage."""
+        """Sets the degree of the harmonics and the trained parameters, by the stage."""
         is_radio = int(self.stage) == 2
         self.gaussians.degree = self.degree if is_radio else 0
         for name in GEOMETRY:
@@ -122,5 +122,6 @@ class Rf3dgs(GaussianSplatting):
 
     @torch.no_grad()
     def _reset(self) -> None:
+        """Sets the signal to ``GREY`` in all directions."""
         nn.init.zeros_(self.gaussians.signal)
         self.gaussians.signal[..., 0] = GREY / SH_DC

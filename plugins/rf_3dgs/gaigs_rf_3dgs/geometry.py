@@ -15,12 +15,12 @@ from gaigs.io.meshes import read_obj, read_ply, triangles
 from gaigs.io.tables import read_points
 
 NEIGHBOURS = 3
-"""A Gaussian at a bare point is as wide as these are away, in root mean square, as 3-D Gaussian
-splatting starts.
+"""Nearest points whose root mean square distance is the width of a Gaussian at a point, as in 3-D
+Gaussian splatting.
 """
 
 NEAREST = 1e-3
-"""They count as at least so far away [m]: points that are there twice have no distance."""
+"""Smallest width of a Gaussian at a point [m]: a repeated point has no distance."""
 
 SPLATS = {
     "log_scales": [f"scale_{i}" for i in range(3)],
@@ -31,13 +31,13 @@ SPLATS = {
 
 
 class Geometry(NamedTuple):
-    """Gaussians as a file has them, raw as those of ``gaigs.splatting.gaussians.Gaussians``.
+    """Gaussians of a file, as raw parameters of ``gaigs.splatting.gaussians.Gaussians``.
 
     Attributes:
         means: Centres, world frame (n, 3) [m].
-        log_scales: (n, 3).
-        quats: (w, x, y, z), of any length.
-        opacity_logits: (n,), of splats; else None.
+        log_scales: Logarithms of standard deviations (n, 3).
+        quats: Quaternions (w, x, y, z) of any length.
+        opacity_logits: Logits of opacities (n,); None unless the file has splats.
     """
 
     means: Float[Tensor, "n 3"]
@@ -47,13 +47,13 @@ class Geometry(NamedTuple):
 
 
 def read_geometry(file: Path, most: int) -> Geometry:
-    """Gaussians at a room's points; a mesh is sampled at as many as allowed, evenly over its area.
+    """Gaussians at a room's points, or at random points of a mesh.
 
     Args:
-        file: World frame [m]. ``.csv`` with points x,y,z, a heading or not; ``.obj`` with vertices,
-            and faces or not; ``.ply`` with vertices, and faces or not, or with splats, which keep
-            their scales, rotations and opacities.
-        most: No more than so many Gaussians; of more points, so many are drawn.
+        file: Geometry in the world frame [m]. ``.csv`` with points x,y,z, with a heading or
+            without; ``.obj`` with vertices, with faces or without; or ``.ply`` with the same, or
+            with splats, which keep their scales, rotations and opacities.
+        most: Largest number of Gaussians; more points are thinned at random.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -84,26 +84,29 @@ def read_geometry(file: Path, most: int) -> Geometry:
     chosen = torch.randperm(len(points))[:most]
     means = torch.from_numpy(points)[chosen].float()
     if splats:
-        own = {name: torch.from_numpy(values)[chosen].float() for name, values in splats.items()}
-        return Geometry(means, own["log_scales"], own["quats"], own["opacity_logits"][:, 0])
+        stored = {name: torch.from_numpy(values)[chosen].float() for name, values in splats.items()}
+        logits = stored["opacity_logits"][:, 0]
+        return Geometry(means, stored["log_scales"], stored["quats"], logits)
     distances, _ = cKDTree(means.numpy()).query(means.numpy(), k=NEIGHBOURS + 1)
     widths = torch.from_numpy(distances[:, 1:]).square().mean(1).sqrt().clamp(min=NEAREST).float()
     return Geometry(means, widths.log()[:, None].expand(-1, 3), torch.randn(len(means), 4))
 
 
 def _sample(corners: np.ndarray, count: int) -> np.ndarray:
-    """Points spread at random over triangles (f, 3, 3), each as likely as its area is large."""
+    """Random points, uniform over the area of triangles (f, 3, 3); none without an area."""
     corners = torch.from_numpy(corners)
-    sides = corners[:, 1:] - corners[:, :1]
+    sides = corners[:, 1:] - corners[:, :1]  # (f, 2, 3)
     areas = torch.linalg.cross(sides[:, 0], sides[:, 1]).norm(dim=1)
     if not areas.sum() > 0:
         return np.zeros((0, 3))
-    of = torch.multinomial(areas, count, replacement=True)
+    triangle = torch.multinomial(areas, count, replacement=True)
     along = torch.rand(count, 2, dtype=corners.dtype)
-    along = torch.where(
-        along.sum(1, keepdim=True) > 1, 1 - along, along
-    )  # folded back into the triangle
-    return (corners[of, 0] + (along[..., None] * sides[of]).sum(1)).numpy()
+    # The other half of the parallelogram is folded back into the triangle.
+    along = torch.where(along.sum(1, keepdim=True) > 1, 1 - along, along)
+    return (corners[triangle, 0] + (along[..., None] * sides[triangle]).sum(1)).numpy()
+
+
+# Readers give points (n, 3) [m], triangles (f, 3) as numbers of points, and raw columns of splats.
 
 
 def _read_csv(file: Path) -> tuple[np.ndarray, np.ndarray, dict]:
@@ -122,8 +125,9 @@ def _read_ply(file: Path) -> tuple[np.ndarray, np.ndarray, dict]:
     def columns(names):
         return np.stack([vertices[name] for name in names], -1)
 
-    if all(column in vertices.dtype.names for own in SPLATS.values() for column in own):
-        return columns("xyz"), _triangles(()), {name: columns(own) for name, own in SPLATS.items()}
+    if {*itertools.chain(*SPLATS.values())} <= {*vertices.dtype.names}:
+        splats = {name: columns(names) for name, names in SPLATS.items()}
+        return columns("xyz"), _triangles(()), splats
     return columns("xyz"), _triangles(faces), {}
 
 

@@ -35,14 +35,13 @@ def find_paths(
     diffraction: bool = True,
 ) -> Paths:
     """The paths in a room: traced the first time, afterwards read from a file by ``keep``."""
-    surfaces: dict[str, object] = (
-        {"scene": room.digest}
-        if isinstance(room, SceneFile)
-        else {
-            "meshes": [(mesh.material, mesh.vertices, mesh.faces) for mesh in room.meshes()],
-            "thickness": THICKNESS,
-        }
-    )
+    surfaces: dict[str, object] = {}
+    if isinstance(room, SceneFile):
+        surfaces["scene"] = room.digest
+    else:
+        meshes = room.meshes()
+        surfaces["meshes"] = [(mesh.material, mesh.vertices, mesh.faces) for mesh in meshes]
+        surfaces["thickness"] = THICKNESS
     key = {
         **surfaces,
         "receiver": receiver.tolist(),
@@ -82,10 +81,15 @@ def find_paths(
 def keep(
     key: Mapping[str, object], make: Callable[[], dict[str, np.ndarray]], task: str
 ) -> dict[str, np.ndarray]:
-    """Arrays by name from a file in ``$XDG_CACHE_HOME/gaigs/sionna``, which is made the first time.
+    """Arrays from a file in ``$XDG_CACHE_HOME/gaigs/sionna``, which is made the first time.
 
-    The key has all that the arrays depend on beside the packages, as JSON; ``task`` names the
-    computation in the log. A damaged file is a ``ValueError``.
+    Args:
+        key: All that the arrays depend on, beside the packages, as JSON can hold it.
+        make: Computes the arrays by name.
+        task: Name of the computation in the log.
+
+    Raises:
+        ValueError: The file is damaged.
     """
     key = {"version": VERSION, "packages": tracing.find_packages(), **key}
     folder = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser() / "gaigs" / "sionna"

@@ -80,13 +80,13 @@ class MeshRoom:
 
     Attributes:
         floor: Corners (x, y) of the floor, counterclockwise [m].
-        ceiling: Corners of the ceiling, each above that of the floor [m]; where they differ walls
-            lean.
+        ceiling: Corners (x, y) of the ceiling, one for each of the floor's; walls lean between
+            different ones [m].
         height: Height of the ceiling [m].
         convex: Corners of the convex parts of floor and ceiling.
         walls: Material of each wall, from a corner to the next.
         slabs: Materials of floor and ceiling.
-        antenna: Position of the array [m], the point that it faces [m], and its rotation about its
+        antenna: Position of the array [m], the point that it faces [m], and its rotation about the
             normal [deg].
         gateways: Positions of the receivers with a single antenna, by name [m].
     """

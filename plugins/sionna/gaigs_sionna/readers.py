@@ -66,8 +66,13 @@ def traced_room_csi(
 ) -> Links:
     """Channels of transmitters at random places in a room, at each element of its 4 x 4 array.
 
-    A wideband receiver estimates them. Rooms, scenes, places, array, diffraction and errors are
-    those of ``sionna``, channels and other options those of ``synthetic_csi``.
+    A wideband receiver estimates them.
+
+    Args:
+        room, transmitters, scene, receiver, facing, heights, diffraction: See ``sionna``, which
+            raises the same errors.
+        frequency, bandwidth, subcarriers, seed, phase, band_train, band_test: See
+            ``synthetic_csi``.
     """
     receivers = None if receiver is None else [receiver]
     simulated = find_room(room, scene, "receiver", receivers, facing, heights, diffraction)
@@ -90,10 +95,12 @@ def traced_room_rssi(
 ) -> Links:
     """Signal strength of transmitters of 0 dBm at random places in a room, at four gateways.
 
-    Bluetooth gateways on its walls report it. Rooms, scenes, places, diffraction and errors are
-    those of ``sionna``, readings and other options those of ``synthetic_rssi``.
+    Bluetooth gateways on the walls report it.
 
     Args:
+        room, transmitters, scene, heights, diffraction: See ``sionna``, which raises the same
+            errors.
+        noise, sensitivity, seed: See ``synthetic_rssi``.
         receivers: Positions of the gateways in the scene [m].
     """
     simulated = find_room(room, scene, "receivers", receivers, None, heights, diffraction)

@@ -149,7 +149,7 @@ class FreeSpace:
         floor: Height of the lowest surface [m].
         lower, upper: Corners of the grid, which has all surfaces and receivers [m].
         pitch: Edge of a cell [m].
-        centres: Of the cells (c, 3) [m].
+        centres: Middles of the cells (c, 3) [m].
         reached: True for cells that can be reached (c,).
     """
 
@@ -171,12 +171,15 @@ class FreeSpace:
         for axis in range(3):
             near = np.moveaxis(number, axis, 0)
             pairs.append(np.stack((near[:-1].ravel(), near[1:].ravel()), -1))
+        # Neighbouring cells are joined if no surface lies between their centres.
         joined = np.concatenate(pairs)
         joined = joined[self.is_open(self.centres[joined[:, 0]], self.centres[joined[:, 1]])]
         graph = coo_matrix(
             (np.ones(len(joined), bool), tuple(joined.T)), (number.size, number.size)
         )
         part = connected_components(graph, directed=False)[1]
+        # A receiver is in the parts of the cells around it that it sees: its own cell's centre may
+        # lie behind the wall on which it hangs.
         around = np.indices((3, 3, 3)).reshape(3, -1).T - 1
         cells = self.cells(receivers)[:, None] + around
         cells = np.clip(cells, 0, self.counts - 1).reshape(-1, 3)
@@ -210,9 +213,8 @@ class FreeSpace:
         around = around[np.abs(around).any(1)]
         around *= margin / np.linalg.norm(around, axis=1, keepdims=True)
         ends = places[:, None] + around
-        clear = self.is_open(places.repeat(len(around), 0), ends.reshape(-1, 3)).reshape(
-            len(places), -1
-        )
+        clear = self.is_open(places.repeat(len(around), 0), ends.reshape(-1, 3))
+        clear = clear.reshape(len(places), -1)  # (k, 26)
         return torch.from_numpy(free & clear.all(1))
 
 

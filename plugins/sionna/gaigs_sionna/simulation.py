@@ -68,7 +68,7 @@ def _find_scene(
     heights: Sequence[float] | None,
     diffraction: bool,
 ) -> SimulatedRoom:
-    """The room of a scene file; options are those of ``find_room``."""
+    """The room of a scene file; for the options see ``find_room``."""
     positions = check_points(f"data.{option}", receivers)
     if heights is not None and not (len(heights) == 2 and heights[0] < heights[1]):
         raise ValueError(f"data.heights must be the lowest and the highest z [m], got {[*heights]}")

@@ -71,11 +71,12 @@ def find_llvm() -> str:
         "/usr/local/lib",
     )
     names = "libLLVM.so*", "libLLVM-[0-9]*.so*", "libLLVM.dylib"
-    files = (
-        [chosen]
-        if chosen
-        else [file for folder in folders for name in names for file in glob(f"{folder}/{name}")]
-    )
+    files: list[str] = []
+    if chosen:
+        files.append(chosen)
+    else:
+        for folder, name in itertools.product(folders, names):
+            files += glob(f"{folder}/{name}")
     versions = {file: llvm_version(file) for file in dict.fromkeys(map(os.path.realpath, files))}
     newest = max(versions, key=versions.__getitem__, default="")
     if versions.get(newest, 0) < oldest:
@@ -91,8 +92,9 @@ def find_llvm() -> str:
 
 
 def llvm_version(file: str) -> int:
-    """Major version of a libLLVM, 0 before 16 and if loading fails; an old one aborts the process
-    that loads it.
+    """Major version of a libLLVM; 0 before 16, or if it cannot be loaded.
+
+    A process of its own loads it, since an old one aborts the process.
     """
     code = (
         "import ctypes, sys; number = ctypes.c_uint(); "
@@ -112,15 +114,18 @@ def trace(
     frequency: float,
     reflections: int | None = None,
 ) -> Paths:
-    """The paths at a carrier [Hz] from transmitters to a receiver point [m], strongest first; gains
-    are padded with 0.
+    """The paths at a carrier [Hz] from transmitters to a receiver point [m], strongest first.
 
-    By reciprocity the rays leave the single receiver. Both ends have an isotropic, vertically
-    polarised antenna: its field runs along the meridians about the vertical. A path that is
-    reflected and passes through surfaces equals a straight one from an image of the transmitter, at
-    the path's length in the direction of arrival. Length and direction of a diffracted path are
-    exact at the receiver point, and its wave is more curved than that of its image. With a largest
-    number of reflections there are no diffractions, as in ``trace_scene``.
+    Transmitters with fewer paths than others have further ones with a gain of 0. By reciprocity the
+    rays leave the single receiver. Both ends have an isotropic, vertically polarised antenna: its
+    field runs along the meridians about the vertical. A path that is reflected and passes through
+    surfaces equals a straight one from an image of the transmitter, at the path's length in the
+    direction of arrival. Length and direction of a diffracted path are exact at the receiver point,
+    and its wave is more curved than the wave of the image.
+
+    Args:
+        reflections: Largest number of reflections of a path, then without diffractions, as in
+            ``trace_scene``; None: ``DEPTH`` interactions of any kind.
 
     Raises:
         ImportError: Sionna RT is not installed.
@@ -146,10 +151,12 @@ def trace_scene(
     depth: int = DEPTH,
     reflections: int | None = None,
 ) -> Paths:
-    """As ``trace``, in a scene that is ``set_up``; without a path all gains are 0.
+    """The paths of ``trace``, in a scene that is ``set_up``; without a path all gains are 0.
 
-    With a largest number of reflections there are no diffractions: each triangle of a curved
-    surface has edges.
+    Args:
+        depth: Largest number of interactions of a path.
+        reflections: Largest number of reflections of a path, then without diffractions, as each
+            triangle of a curved surface has edges; None: any.
     """
     images: list[Tensor] = []
     gains: list[Tensor] = []
@@ -197,7 +204,7 @@ def solve(
 
 
 def find_sionna() -> Any:
-    """The module ``sionna.rt``, set to compute on the processor; errors as for ``trace``."""
+    """The module ``sionna.rt``, set to compute on the processor; it raises errors as ``trace``."""
     find_packages()
     os.environ["DRJIT_LIBLLVM_PATH"] = find_llvm()  # read once, when the first kernel is compiled
     import mitsuba

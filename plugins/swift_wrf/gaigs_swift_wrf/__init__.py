@@ -33,22 +33,22 @@ MiB an array.
 
 
 class SwiftWrf(Model):
-    """Transmitter position -> 2-D Gaussians in the plane of azimuth and elevation -> their plain
-    sum.
+    """Spectra as sums of 2-D Gaussians in the plane of azimuth and elevation, which a network
+    deforms for each transmitter:
 
         s(u) = sum_i a_i exp(-(u - m_i)' C_i^-1 (u - m_i) / 2)    C_i = L_i L_i' + pixel variance
 
     without opacity, depth or order. Each receiver has Gaussians of its own: means m, lower
     triangular factors L and amplitudes a. A network adds to all three for each transmitter: [PE(m),
-    PE(transmitter), receiver] -> layers of one width with ReLU -> a linear head each; those of
+    PE(transmitter), receiver] -> layers of one width with ReLU -> a linear head each. The heads of
     means and factors start at 0. Gaussians start on a Fibonacci lattice over the label's
     directions, each as wide as its neighbours are away, and silent.
 
     Args:
         scene: Receivers and task; positions are taken relative to the middle of the transmitters'
             box.
-        count: Gaussians of each receiver.
-        width, layers: Of the network.
+        count: Number of Gaussians of each receiver.
+        width, layers: Width and number of the network's layers.
         octaves: Lowest and highest octave k of the transmitter's Fourier features, 2^k cycles a
             metre; None takes those that the training transmitters can teach, as the ``euclidean``
             tokenizer does.
@@ -72,14 +72,12 @@ class SwiftWrf(Model):
         if grid is None:
             raise ValueError(
                 "model 'swift_wrf' lays its Gaussians in the plane of a spectrum, and labels of "
-                "task "
-                f"{scene.task.name!r} have no directions; take another model"
+                f"task {scene.task.name!r} have no directions; take another model"
             )
         if not grid.pitch > 0:
             raise ValueError(
                 "model 'swift_wrf' needs labels of two elevations or more, got "
-                f"{tuple(grid.shape)} directions; take "
-                "another model"
+                f"{tuple(grid.shape)} directions; take another model"
             )
         for option, number in (("count", count), ("width", width), ("layers", layers)):
             if number < 1:
@@ -106,12 +104,8 @@ class SwiftWrf(Model):
             features += 1 + 2 * len(BAND_FREQUENCIES)
         self.first = TokenLinear((receivers, 2 * (1 + 2 * len(PLANE_FREQUENCIES)), features), width)
         self.rest = nn.ModuleList(nn.Linear(width, width) for _ in range(layers - 1))
-        self.heads = nn.ModuleDict(
-            {
-                name: nn.Linear(width, size)
-                for name, size in (("means", 2), ("factors", 3), ("amplitudes", 1))
-            }
-        )
+        sizes = {"means": 2, "factors": 3, "amplitudes": 1}
+        self.heads = nn.ModuleDict({name: nn.Linear(width, size) for name, size in sizes.items()})
         for name in ("means", "factors"):
             nn.init.zeros_(self.heads[name].weight)
             nn.init.zeros_(self.heads[name].bias)
@@ -119,30 +113,29 @@ class SwiftWrf(Model):
     def forward(self, batch: Batch) -> Prediction:
         directions = batch.directions or self.scene.task.directions
         gaussians = self.deform(batch.query)
-        return Prediction(
-            add_up(gaussians, directions.to(gaussians.means), self.pixel_variance), {}
-        )
+        values = add_up(gaussians, directions.to(gaussians.means), self.pixel_variance)
+        return Prediction(values, {})
 
     def deform(self, query: Query) -> PlaneGaussians:
-        """The Gaussians of each link."""
-        own = PlaneGaussians(self.means, self.factors, self.amplitudes)
-        own = PlaneGaussians(*(values[query.receivers] for values in own))
+        """The Gaussians of each link, with the network's changes."""
+        means = self.means[query.receivers]  # (b, n, 2)
+        factors = self.factors[query.receivers]  # (b, n, 3)
+        amplitudes = self.amplitudes[query.receivers]  # (b, n)
         receivers = one_hot(query.receivers, len(self.scene.receivers)).to(self.middle)
         transmitters = fourier_features(query.transmitters - self.middle, self.frequencies)
         if self.scene.has_band:
-            band = fourier_features(
-                self.scene.band_positions(query)[:, None], BAND_FREQUENCIES.to(transmitters)
-            )
+            positions = self.scene.band_positions(query)[:, None]
+            band = fourier_features(positions, BAND_FREQUENCIES.to(transmitters))
             transmitters = torch.cat((transmitters, band), 1)
-        # The network says how a place responds to a transmitter; where the Gaussians go is learnt
-        # from the image alone.
-        places = fourier_features(own.means.detach(), PLANE_FREQUENCIES.to(transmitters))
+        # Detached: the image alone moves the Gaussians, and not the network's use of their places.
+        places = fourier_features(means.detach(), PLANE_FREQUENCIES.to(transmitters))
         hidden = relu(self.first(Tokens(receivers, places, transmitters)))
         for layer in self.rest:
             hidden = relu(layer(hidden))
-        means, factors, amplitudes = (head(hidden) for head in self.heads.values())
         return PlaneGaussians(
-            own.means + means, own.factors + factors, own.amplitudes + amplitudes[..., 0]
+            means + self.heads["means"](hidden),
+            factors + self.heads["factors"](hidden),
+            amplitudes + self.heads["amplitudes"](hidden)[..., 0],
         )
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
@@ -152,12 +145,12 @@ class SwiftWrf(Model):
         }
 
     def facts(self) -> dict[str, object]:
-        """How many Gaussians there are, of all receivers together."""
+        """Number of Gaussians of all receivers together."""
         count = self.amplitudes.numel()
         return {"num_gaussians": count, "num_gaussians_start": count}
 
     def rendering(self, batch: Batch) -> Callable[[], Tensor]:
-        """The sum alone."""
+        """A function that sums the Gaussians up, without the network."""
         with torch.no_grad():
             gaussians = self.deform(batch.query)
         directions = (batch.directions or self.scene.task.directions).to(gaussians.means)

@@ -10,9 +10,9 @@ from gaigs.splatting.pooling.spectrum import SpectrumPooling
 
 
 class _Clamp(torch.autograd.Function):
-    """Values within 0..1; beyond, a gradient counts where a step down it leads back.
+    """Clamps values to 0..1. Beyond, it passes gradients that lead back into the range.
 
-    With none beyond, a map that starts below 0 everywhere would be 0 for good.
+    Without these, a map that starts below 0 everywhere would stay 0 for good.
     """
 
     @staticmethod
@@ -28,12 +28,12 @@ class _Clamp(torch.autograd.Function):
 
 
 class Clamped(SpectrumPooling):
-    """C_0, or |C_0 + j C_1|, clamped to 0..1; beyond, gradients that lead back count.
+    """Spectra C_0, or |C_0 + j C_1|, clamped to 0..1; beyond, gradients that lead back count.
 
     Args:
-        channels: 1 (real) or 2 (complex).
+        channels: Number of channels C: 1 (real) or 2 (complex).
 
-    Source: WRF-GS (INFOCOM 2025), which renders one.
+    Source: WRF-GS (INFOCOM 2025), which renders one channel.
     """
 
     def forward(

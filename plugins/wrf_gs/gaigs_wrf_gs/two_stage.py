@@ -23,19 +23,19 @@ from gaigs.splatting.tokenizer.euclidean import MAX_OCTAVE, fourier_features
 class TwoStage(Deformation):
     """Attenuation and signal of every Gaussian, for a transmitter and a receiver.
 
-    Attenuation network: E(P_x) -> layers of one width with ReLU, E(P_x) is fed into the middle one
-    again. From its end h the attenuation delta and a feature, both linear; delta through a sigmoid,
-    at first ``INITIAL_ATTENUATION``. Signal network: [feature, E(P_TX), CLS, PE(view)] -> width ->
-    half of it, with ReLU -> the signal of each channel. The view is the unit vector from the
-    receiver to the Gaussian. So matter is the same for all links, and its signal depends on
-    transmitter and receiver.
+    The attenuation network has layers of one width with ReLU; its input E(P_x) joins its middle
+    layer again. Two linear heads follow: the attenuation delta through a sigmoid, which starts as
+    ``INITIAL_ATTENUATION``, and a feature. The signal network maps [feature, E(P_TX), CLS,
+    PE(view)] -> width -> half of it, with ReLU -> the signal of each channel. The view is the unit
+    vector from the receiver to the Gaussian. So attenuations are the same for all links, and
+    signals depend on transmitter and receiver.
 
     Args:
-        scene: Where the receivers stand.
-        channels: Signal channels of a Gaussian.
+        scene: Scene with the receivers' positions.
+        channels: Number of signal channels of a Gaussian.
         tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens.
-        width: Of the attenuation network, and of the signal network's first layer.
-        layers: Of the attenuation network.
+        width: Width of the attenuation network, and of the signal network's first layer.
+        layers: Number of the attenuation network's layers.
         view_octaves: L of PE(view), which has the angular frequencies 2^k for k = 0..L-1.
 
     Raises:
@@ -70,32 +70,29 @@ class TwoStage(Deformation):
         self.scene = scene
         links, gaussians, transmitters = tokenizer_widths
         matter = 0, gaussians, 0
-        self.first, self.again = (
-            TokenLinear(matter, width),
-            TokenLinear(matter, width, hidden=width),
-        )
+        self.first = TokenLinear(matter, width)
+        self.again = TokenLinear(matter, width, hidden=width)
         self.before = nn.ModuleList(nn.Linear(width, width) for _ in range(layers // 2 - 1))
         self.behind = nn.ModuleList(
             nn.Linear(width, width) for _ in range(layers - layers // 2 - 1)
         )
-        self.attenuation, self.feature = nn.Linear(width, 1), nn.Linear(width, width)
+        self.attenuation = nn.Linear(width, 1)
+        self.feature = nn.Linear(width, width)
         self.register_buffer("view_frequencies", 2.0 ** torch.arange(view_octaves))
         view = 3 * (1 + 2 * view_octaves)
         self.signal_first = TokenLinear((links, width, transmitters), width, hidden=view)
-        self.signal_second, self.signal = (
-            nn.Linear(width, width // 2),
-            nn.Linear(width // 2, channels),
-        )
+        self.signal_second = nn.Linear(width, width // 2)
+        self.signal = nn.Linear(width // 2, channels)
         nn.init.zeros_(self.attenuation.weight)
-        nn.init.constant_(
-            self.attenuation.bias, math.log(INITIAL_ATTENUATION / (1 - INITIAL_ATTENUATION))
-        )
+        logit = math.log(INITIAL_ATTENUATION / (1 - INITIAL_ATTENUATION))
+        nn.init.constant_(self.attenuation.bias, logit)
 
     def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
-        """Signal (b, n, channels, 1), attenuations (b, n)."""
-        b, n = len(query), placed.means.shape[1]
-        # One row, where Gaussians stand still: the part that depends on matter alone is computed
-        # once for all queries.
+        """Signal (b, n, channels, 1) and attenuations (b, n)."""
+        b = len(query)
+        n = placed.means.shape[1]
+        # Gaussians that stand still have one row: attenuations are then computed once for all
+        # queries.
         nobody = tokens.scene.new_zeros(1 if tokens.gaussians.ndim == 2 else b, 0)
         matter = Tokens(nobody, tokens.gaussians, nobody)
         hidden = relu(self.first(matter))
@@ -104,17 +101,17 @@ class TwoStage(Deformation):
         hidden = relu(self.again(matter, hidden))
         for layer in self.behind:
             hidden = relu(layer(hidden))
-        attenuations = (
-            LEAST_ATTENUATION + (1 - LEAST_ATTENUATION) * self.attenuation(hidden)[..., 0].sigmoid()
-        )
+        shares = self.attenuation(hidden)[..., 0].sigmoid()
+        attenuations = LEAST_ATTENUATION + (1 - LEAST_ATTENUATION) * shares
         excited = tokens._replace(gaussians=self.feature(hidden))
         signal = relu(self.signal_first(excited, self.view(placed, query)))
         signal = self.signal(relu(self.signal_second(signal)))
         return Residuals(delta_signal=signal[..., None], attenuations=attenuations.expand(b, n))
 
     def view(self, placed: Placed, query: Query) -> Float[Tensor, "b n features"]:
-        """PE of the unit vectors from each query's receiver to the Gaussians, 0 where one sits on
-        the receiver.
+        """PE of the unit vectors from each query's receiver to the Gaussians.
+
+        A Gaussian on the receiver has the vector 0.
         """
         offsets = placed.means - self.scene.positions(placed.means)[query.receivers][:, None]
         directions = offsets / offsets.norm(dim=-1, keepdim=True).clamp(min=NEAR)

@@ -11,21 +11,20 @@ from gaigs.splatting.gaussians import Placed, Tokens
 
 
 class AmplitudePhase(Deformation):
-    """Change by a transmitter of every Gaussian's rotation, scale and signal.
+    """Changes of every Gaussian's rotation, scale and signal for a transmitter.
 
-    Network: u = [E(P_x), E(P_TX), CLS] -> layers of one width with ReLU, u is fed into the middle
-    one again. Linear heads from its end: rotation and scale, 0 at the start; amplitude a and phase
-    phi of each wave. A wave is a pair of channels, real and imaginary part, and its residual a
-    exp(j phi); of a map with an odd number of channels, which are real, the real part of each wave
-    counts.
+    The network's input u = [E(P_x), E(P_TX), CLS] goes through layers of one width with ReLU, and
+    joins the middle one again. Linear heads give rotation and scale, 0 at the start, and amplitude
+    a and phase phi of each wave, whose residual is a exp(j phi). A wave is a pair of channels, real
+    and imaginary part. An odd number of channels are real ones: they get the real parts.
 
     Published is |a exp(j phi)|, in which the phase cancels.
 
     Args:
-        channels: Signal channels of a Gaussian: all real parts before all imaginary ones.
+        channels: Number of signal channels of a Gaussian: all real parts, then all imaginary ones.
         tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens.
-        width: Of the layers.
-        layers: Their number.
+        width: Width of the layers.
+        layers: Number of layers.
 
     Raises:
         ValueError: A size is out of range.
@@ -48,8 +47,10 @@ class AmplitudePhase(Deformation):
         self.behind = nn.ModuleList(
             nn.Linear(width, width) for _ in range(layers - layers // 2 - 1)
         )
-        self.rotation, self.scale = nn.Linear(width, 4), nn.Linear(width, 3)
-        self.amplitude, self.phase = nn.Linear(width, waves), nn.Linear(width, waves)
+        self.rotation = nn.Linear(width, 4)
+        self.scale = nn.Linear(width, 3)
+        self.amplitude = nn.Linear(width, waves)
+        self.phase = nn.Linear(width, waves)
         for head in (self.rotation, self.scale):
             nn.init.zeros_(head.weight)
             nn.init.zeros_(head.bias)
@@ -66,6 +67,9 @@ class AmplitudePhase(Deformation):
 
     def signal(self, hidden: Tensor) -> Tensor:
         """The waves' residuals (b, n, channels)."""
-        amplitudes, phases = self.amplitude(hidden), self.phase(hidden)
+        amplitudes = self.amplitude(hidden)
+        phases = self.phase(hidden)
         real = amplitudes * phases.cos()
-        return torch.cat((real, amplitudes * phases.sin()), -1) if self.is_complex else real
+        if not self.is_complex:
+            return real
+        return torch.cat((real, amplitudes * phases.sin()), -1)
