@@ -160,6 +160,8 @@ class BoxSearch:
         """The box with each face, place and the loss changed in turn while the error falls."""
         least = self._error(depths, [box])
         for _ in range(rounds):
+            if stages.is_up():
+                break
             before = least
             for part in range(10):
                 for other in self._changed(box, part, steps):

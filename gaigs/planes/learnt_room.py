@@ -48,11 +48,13 @@ class LearntPlane(NamedTuple):
 
 
 class Matter(NamedTuple):
-    """Obstacles."""
+    """Obstacles: Gaussians, and boxes with sharp edges."""
 
     centres: Float[ndarray, "k 3"]  # [m]
     widths: Float[ndarray, "k 3"]  # standard deviations along the world's axes [m]
     densities: Float[ndarray, " k"]  # densities at the centres [dB/m]
+    boxes: Float[ndarray, "m 8 3"]  # corners [m]
+    losses: Float[ndarray, " m"]  # losses by the boxes, however long the way inside [dB]
 
 
 class LearntRoom(NamedTuple):
@@ -82,7 +84,9 @@ def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
     matter = None
     if placement.obstacles is not None:
         blobs = placement.obstacles
-        columns = (blobs.centres + placement.middle, blobs.widths, NEPER * blobs.densities)
+        columns = [blobs.centres + placement.middle, blobs.widths, NEPER * blobs.densities]
+        losses = NEPER * blobs.box_depths[blobs.used].clamp_min(0)
+        columns += [blobs.box_corners + placement.middle, losses]
         matter = Matter(*(column.cpu().double().numpy() for column in columns))
     paths: list[LearntPath] = []
     if links is not None:

@@ -94,8 +94,23 @@ class Obstacles(nn.Module):
         """Attenuation at the centres [Np/m]."""
         return self.log_densities.exp()
 
+    @property
+    def used(self) -> Bool[Tensor, " k"]:
+        """True for the boxes that a search has found."""
+        return self.boxes[:, 1, 0] > self.boxes[:, 0, 0]
+
+    @property
+    def box_corners(self) -> Float[Tensor, "k 8 3"]:
+        """Corners of the used boxes, from the middle of the room [m]."""
+        side = torch.cartesian_prod(*[torch.arange(2, device=self.boxes.device)] * 3)  # (8, 3)
+        along = self.boxes[self.used][:, side, torch.arange(3)]  # (k, 8, 3)
+        return along @ self.box_axes.T
+
     def forward(
-        self, start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]
+        self,
+        start: Float[Tensor, "*batch 3"],
+        end: Float[Tensor, "*batch 3"],
+        has_boxes: bool = True,
     ) -> Inexact[Tensor, "*batch"]:
         """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad]."""
         starts = start.reshape(-1, 3)
@@ -112,14 +127,21 @@ class Obstacles(nn.Module):
             for legs in zip(starts.split(size), ends.split(size), strict=True)
         ]
         depths = torch.cat(parts)  # (segments, 1 or 2)
-        used = self.boxes[:, 1, 0] > self.boxes[:, 0, 0]
-        hits = starts.new_zeros(len(starts), int(used.sum()))
-        for number, box in enumerate(self.boxes[used]):
-            hits[:, number] = passes_box(starts @ self.box_axes, ends @ self.box_axes, box)
-        solid = hits @ self.box_depths[used].clamp_min(0)
-        depths = torch.cat((depths[:, :1] + solid[:, None], depths[:, 1:]), 1)
+        if has_boxes and self.used.any():
+            solid = self._box_depths(starts, ends)  # (segments, 1)
+            depths = torch.cat((depths[:, :1] + solid, depths[:, 1:]), 1)
         depths = depths[:, 0] if self.turns is None else torch.view_as_complex(depths)
         return depths.view(start.shape[:-1])
+
+    def _box_depths(
+        self, start: Float[Tensor, "s 3"], end: Float[Tensor, "s 3"]
+    ) -> Float[Tensor, "s 1"]:
+        """Depths of segments through boxes [Np]."""
+        start = start @ self.box_axes
+        end = end @ self.box_axes
+        hits = [passes_box(start, end, box) for box in self.boxes[self.used]]
+        depths = self.box_depths[self.used].clamp_min(0)
+        return (torch.stack(hits, 1).to(depths) @ depths)[:, None]
 
 
 def passes_box(
