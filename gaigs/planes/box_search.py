@@ -1,6 +1,6 @@
 """Search for boxes that explain shadows: tomography with few, sharp obstacles."""
 
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Complex, Float
@@ -24,7 +24,10 @@ class ChannelErrors(NamedTuple):
     floor: float = 1e-3  # 30 dB: better links pull less and less
 
     @classmethod
-    def of(cls, fields: Complex[Tensor, "b n e s"], channels: Complex[Tensor, "b e s"]) -> Self:
+    def of(
+        cls, fields: Complex[Tensor, "b n e s"], channels: Complex[Tensor, "b e s"]
+    ) -> "ChannelErrors":
+        """Errors of channels, from the field of each path without obstacles."""
         fields = fields.flatten(2)
         channels = channels.flatten(1)[..., None]  # (b, numbers, 1)
         power = channels.abs().square().sum((1, 2))[:, None].clamp_min(FAINTEST)

@@ -53,8 +53,9 @@ class Matter(NamedTuple):
     centres: Float[ndarray, "k 3"]  # [m]
     widths: Float[ndarray, "k 3"]  # standard deviations along the world's axes [m]
     densities: Float[ndarray, " k"]  # densities at the centres [dB/m]
-    boxes: Float[ndarray, "m 8 3"]  # corners [m]
-    losses: Float[ndarray, " m"]  # losses by the boxes, however long the way inside [dB]
+    boxes: Float[ndarray, "m 8 3"] = np.zeros((0, 8, 3))  # corners [m]
+    # Losses by the boxes, however long the way inside [dB].
+    losses: Float[ndarray, " m"] = np.zeros(0)
 
 
 class LearntRoom(NamedTuple):

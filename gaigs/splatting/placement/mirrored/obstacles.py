@@ -127,7 +127,7 @@ class Obstacles(nn.Module):
             for legs in zip(starts.split(size), ends.split(size), strict=True)
         ]
         depths = torch.cat(parts)  # (segments, 1 or 2)
-        if has_boxes and self.used.any():
+        if has_boxes:
             solid = self._box_depths(starts, ends)  # (segments, 1)
             depths = torch.cat((depths[:, :1] + solid, depths[:, 1:]), 1)
         depths = depths[:, 0] if self.turns is None else torch.view_as_complex(depths)
@@ -139,9 +139,11 @@ class Obstacles(nn.Module):
         """Depths of segments through boxes [Np]."""
         start = start @ self.box_axes
         end = end @ self.box_axes
-        hits = [passes_box(start, end, box) for box in self.boxes[self.used]]
         depths = self.box_depths[self.used].clamp_min(0)
-        return (torch.stack(hits, 1).to(depths) @ depths)[:, None]
+        hits = depths.new_zeros(len(start), len(depths))
+        for number, box in enumerate(self.boxes[self.used]):
+            hits[:, number] = passes_box(start, end, box)
+        return (hits @ depths)[:, None]
 
 
 def passes_box(
