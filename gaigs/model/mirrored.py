@@ -190,7 +190,8 @@ class MirroredSplatting(GaussianSplatting):
             start,
         ).run()
         self._plan(planes, slabs)
-        if is_known:
+        # One receiver or two do not tell how far behind a box its shadow began.
+        if is_known and self.scene.radios >= 3:
             rows = train[:: math.ceil(len(train) / 1200)]  # with which a search takes some seconds
             self.shadowed = Batch(links.query[rows], labels=received[rows])
         placement.step.mul_(0.1)  # the search is exact to millimetres
