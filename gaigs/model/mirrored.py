@@ -18,6 +18,7 @@ from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
+from gaigs.planes.box_search import BoxSearch, ChannelErrors
 from gaigs.planes.channel_search import ChannelSearch
 from gaigs.planes.field_search import FieldSearch
 from gaigs.planes.lag_search import LagSearch
@@ -67,6 +68,7 @@ class MirroredSplatting(GaussianSplatting):
 
     places: Query | None = None  # set by fit
     levels: LevelSearch | None = None
+    shadowed: Batch | None = None  # channels in which boxes are searched; set by fit
 
     def __init__(
         self,
@@ -158,6 +160,7 @@ class MirroredSplatting(GaussianSplatting):
         a common phase. Without one, the faces of the box stay.
         """
         placement = self.placement
+        received = links.labels
         links = replace(links, labels=self.scene.equalised(links.query, links.labels))
         train = links.split.train
         sign = int(pooling.sign)
@@ -187,6 +190,10 @@ class MirroredSplatting(GaussianSplatting):
             start,
         ).run()
         self._plan(planes, slabs)
+        # One receiver or two do not tell how far behind a box its shadow began.
+        if is_known and self.scene.radios >= 3:
+            rows = train[:: math.ceil(len(train) / 1200)]  # with which a search takes some seconds
+            self.shadowed = Batch(links.query[rows], labels=received[rows])
         placement.step.mul_(0.1)  # the search is exact to millimetres
 
     def _search_field(
@@ -263,7 +270,9 @@ class MirroredSplatting(GaussianSplatting):
             placement.enable_reflections()
         # Early, too, if a search has found the planes: each path costs time in every step.
         if number == len(self.revisions) - 1 or (number == 1 and placement.found):
-            return prune(placement, [train] if validation is None else [train, validation], loss)
+            batches = [train] if validation is None else [train, validation]
+            dropped = prune(placement, batches, loss)
+            return dropped + (self._place_boxes() if number == 1 else "")
         if number < 2 and not adds_waves:
             return "planes stay where they are"
         if self.is_wide or (self.scene.one_radio and not adds_waves):
@@ -287,6 +296,33 @@ class MirroredSplatting(GaussianSplatting):
         least = 0.03 * placement.diagonal if number == (0 if adds_waves else 2) else 0.0
         moves = ", ".join(f"{move:+.3f}" for move in move_planes(self, train, wavelength, least))
         return f"phases count; planes moved by {moves} m; loss {before:.4f} -> {loss(train):.4f}"
+
+    def _place_boxes(self) -> str:
+        """Puts boxes that explain the shadows at all receivers in place of learnt obstacles."""
+        placement = self.placement
+        if self.shadowed is None or placement.obstacles is None:
+            return ""
+        query = self.shadowed.query.to(self.device)
+        rows = torch.arange(len(query), device=self.device)
+        products, matches = [], []
+        for link, channel in zip(rows.split(1), self.shadowed.labels.split(1), strict=True):
+            asked = query[link]
+            folded = placement.folded(asked)
+            strengths = placement.strengths(asked, folded.paths, blocked=False)
+            fields = self._separate(asked, strengths * placement.patterns(asked, folded.ways))
+            errors = ChannelErrors.of(fields, channel.to(fields))
+            products.append(errors.products)
+            matches.append(errors.matches)
+        axes = placement.room_axes
+        links = placement.folded(query)
+        paths = links.paths._replace(start=links.paths.start @ axes, end=links.paths.end @ axes)
+        ends = torch.cat((links.seen[0][:, 0], links.receivers)).unique(dim=0) @ axes
+        boxes = BoxSearch(paths, ChannelErrors(torch.cat(products), torch.cat(matches)), ends).run()
+        if boxes:
+            depths = ends.new_tensor([box.loss for box in boxes])
+            corners = torch.stack([box.corners for box in boxes])
+            placement.obstacles.place_boxes(axes, corners, depths)
+        return f"; {len(boxes)} boxes found"
 
     def _start(self) -> Float[Tensor, "w 4"]:
         """Planes from which a search starts, in the world's frame.
@@ -313,8 +349,12 @@ class MirroredSplatting(GaussianSplatting):
 
         All links are to one receiver.
         """
+        return self._separate(query, self.placement.margins(query))
+
+    def _separate(self, query: Query, strengths: Complex[Tensor, "b n"]) -> Tensor:
+        """Channels by each path of links to one receiver, with these strengths (b, n, e, s)."""
         with self.placement.holding():
-            self.placement.held = self.placement.margins(query)
+            self.placement.held = strengths
             which = torch.arange(len(query), device=query.transmitters.device)
             paths = self.paths(self.excite(query), which, int(query.receivers[0]), query)
         count, n = paths.amplitudes.shape

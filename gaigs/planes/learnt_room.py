@@ -48,11 +48,14 @@ class LearntPlane(NamedTuple):
 
 
 class Matter(NamedTuple):
-    """Obstacles."""
+    """Obstacles: Gaussians, and boxes with sharp edges."""
 
     centres: Float[ndarray, "k 3"]  # [m]
     widths: Float[ndarray, "k 3"]  # standard deviations along the world's axes [m]
     densities: Float[ndarray, " k"]  # densities at the centres [dB/m]
+    boxes: Float[ndarray, "m 8 3"] = np.zeros((0, 8, 3))  # corners [m]
+    # Losses by the boxes, however long the way inside [dB].
+    losses: Float[ndarray, " m"] = np.zeros(0)
 
 
 class LearntRoom(NamedTuple):
@@ -82,7 +85,9 @@ def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
     matter = None
     if placement.obstacles is not None:
         blobs = placement.obstacles
-        columns = (blobs.centres + placement.middle, blobs.widths, NEPER * blobs.densities)
+        columns = [blobs.centres + placement.middle, blobs.widths, NEPER * blobs.densities]
+        losses = NEPER * blobs.box_depths[blobs.used].clamp_min(0)
+        columns += [blobs.box_corners + placement.middle, losses]
         matter = Matter(*(column.cpu().double().numpy() for column in columns))
     paths: list[LearntPath] = []
     if links is not None:

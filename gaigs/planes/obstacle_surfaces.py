@@ -193,6 +193,21 @@ def find_crossings(
     )
 
 
+def sheets_of_boxes(obstacles: Obstacles, middle: Float[ndarray, "3"]) -> list[Sheet]:
+    """Boxes as sheets: a path crosses two faces, and each takes half of the loss."""
+    import trimesh.creation  # slow to import
+
+    axes = obstacles.box_axes.cpu().double().numpy()
+    bounds = obstacles.boxes[obstacles.used].cpu().double().numpy()
+    depths = obstacles.box_depths[obstacles.used].clamp_min(0).tolist()
+    sheets = []
+    for corners, depth in zip(bounds, depths, strict=True):
+        mesh = trimesh.creation.box(bounds=corners)
+        conductance = 2 * math.expm1(depth / 2)  # 1 / (1 + conductance / 2)² = exp(-depth)
+        sheets.append(Sheet(conductance, mesh.vertices @ axes.T + middle, mesh.faces))
+    return sheets
+
+
 def attenuate_paths(
     placement: Mirrored, obstacles: Obstacles, query: Query, options: SurfaceOptions
 ) -> AttenuatedPaths:
@@ -211,7 +226,7 @@ def attenuate_paths(
     paths = link * len(sequences) + folded.path[leg]
     start = folded.start[link, leg].double()
     along = folded.end[link, leg].double() - start
-    depths = obstacles(start.float(), (start + along).float()).real.double()
+    depths = obstacles(start.float(), (start + along).float(), has_boxes=False).real.double()
     depths = fields.new_zeros(fields.numel()).index_add(0, paths, depths)  # (b n,), of each path
     steps = torch.linspace(0, 1, options.samples).to(along)[:, None]  # (k, 1)
     samples = [
@@ -340,11 +355,12 @@ def fit_sheets(
     obstacles = placement.obstacles
     if obstacles is None:
         return [], 0.0
+    middle = placement.middle.cpu().numpy()
+    boxes = sheets_of_boxes(obstacles, middle)
     paths = attenuate_paths(placement, obstacles, query, options)
     candidates = choose_densities(paths, options.candidates)
     if not candidates:
-        return [], 0.0
-    middle = placement.middle.cpu().numpy()
+        return boxes, 0.0
     matter = sample_matter(obstacles, lower - middle, upper - middle, options.voxels)
     crossings = [find_crossings(obstacles, matter, density, paths.legs) for density in candidates]
     fit = SheetFit(paths, crossings)
@@ -359,7 +375,7 @@ def fit_sheets(
     sizes = [crossings[number].surface_count for number in chosen]
     spread = [log.expand(size) for log, size in zip(values[:-1], sizes, strict=True)]
     _, values = fit.fit(chosen, sizes, torch.cat([*spread, values[-1:]]))
-    sheets = []
+    sheets = boxes
     for number, logs in zip(chosen, values[:-1].split(sizes), strict=True):
         for surface, conductance in enumerate(logs.exp().tolist(), 1):
             if conductance < options.least_conductance:

@@ -12,8 +12,10 @@ from matplotlib.collections import EllipseCollection, LineCollection, PolyCollec
 from matplotlib.colors import ListedColormap, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
+from matplotlib.path import Path
 from matplotlib.patheffects import Normal, Stroke
 from numpy import ndarray
+from scipy.spatial import ConvexHull
 
 from gaigs.data import Links
 from gaigs.planes.learnt_room import LearntPlane, LearntRoom, Matter
@@ -384,6 +386,11 @@ def _draw_matter(view: _View, matter: Matter) -> AxesImage:
     upwards = _bells(y, matter, view.up)
     extent = (left, left + len(x) * pixel, bottom, bottom + len(y) * pixel)
     losses = (upwards * columns) @ across.T  # (y, x)
+    pixels = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+    for corners, loss in zip(matter.boxes, matter.losses, strict=True):
+        outline = view.project(corners)
+        hull = Path(outline[ConvexHull(outline).vertices])
+        losses += loss * hull.contains_points(pixels).reshape(losses.shape)
     return view.ax.imshow(losses, origin="lower", extent=extent, cmap="Purples", alpha=0.8)
 
 

@@ -3,6 +3,7 @@
 import math
 
 import numpy as np
+import pytest
 import torch
 
 import gaigs
@@ -90,3 +91,20 @@ def test_clear_rooms_have_no_sheets():
     clear = placement_of([((0.0, 0.0, 0.0), 0.01, 1e-9)])
     found, _ = surfaces.fit_sheets(clear, query, *CORNERS, options)
     assert found == []
+
+
+@torch.no_grad()
+def test_sheets_of_a_box_take_its_loss():
+    placement = placement_of([((0.0, 0.0, 0.0), 0.5, 2.0)])
+    corners = torch.tensor([[[1.0, -0.5, -0.5], [1.5, 0.5, 0.5]]])
+    turned = torch.tensor([[0.6, -0.8, 0.0], [0.8, 0.6, 0.0], [0.0, 0.0, 1.0]])
+    placement.obstacles.place_boxes(turned, corners, torch.tensor([1.2]))
+    middle = np.array([3.5, 2.5, 1.5])
+    (sheet,) = surfaces.sheets_of_boxes(placement.obstacles, middle)
+    passed = (1 + sheet.conductance / 2) ** -2  # of a path through two faces
+    assert -math.log(passed) == pytest.approx(1.2)
+    expected = placement.obstacles.box_corners[0].double().numpy() + middle
+    assert {*map(tuple, sheet.vertices.round(6))} == {*map(tuple, expected.round(6))}
+    # Faces look outwards: the volume that they enclose is positive.
+    a, b, c = (sheet.vertices[sheet.faces[:, corner]] - middle for corner in range(3))
+    assert (np.cross(a, b) * c).sum() / 6 == pytest.approx(0.5, rel=1e-5)

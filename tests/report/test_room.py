@@ -205,6 +205,19 @@ def test_obstacles_are_shown_by_what_they_take_along_the_line_of_sight(walls, rn
         assert image.get_clim()[0] == 0
 
 
+def test_boxes_take_their_loss_wherever_the_line_of_sight_meets_them(walls):
+    corners = np.array([[x, y, z] for x in (1.0, 2.0) for y in (1.0, 3.0) for z in (0.0, 1.5)])
+    gaussians = np.full((1, 3), 2.0), np.full((1, 3), 0.5), np.zeros(1)
+    matter = Matter(*gaussians, corners[None], np.array([6.0]))
+    plan, side, _ = room(links(POINT), learnt=LearntRoom(walls, matter, [])).axes
+    for ax, area in ((plan, 2.0), (side, 1.5)):
+        (image,) = ax.images
+        losses, (left, right, bottom, top) = image.get_array(), image.get_extent()
+        pixel = (right - left) * (top - bottom) / losses.size
+        assert {*np.unique(losses)} == {0.0, 6.0}
+        assert (losses == 6).sum() * pixel == pytest.approx(area, rel=0.05)
+
+
 def test_obstacles_that_take_next_to_nothing_stay_pale(walls):
     matter = Matter(np.full((1, 3), 2.0), np.full((1, 3), 0.5), np.array([0.01]))
     plan, *_ = room(links(POINT), learnt=LearntRoom(walls, matter, [])).axes

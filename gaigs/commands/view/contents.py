@@ -318,9 +318,15 @@ def gaussian_splats(gaussians: Gaussians, most: int = 3000) -> dict:
 
 def obstacle_splats(matter: Matter) -> dict:
     """Obstacles as the page draws them: the opacity is the power that a central path loses."""
-    centres, widths, densities = matter
-    losses = densities * math.sqrt(2 * math.pi) * np.exp(np.log(widths).mean(1))  # [dB]
+    widths = matter.widths
+    losses = matter.densities * math.sqrt(2 * math.pi) * np.exp(np.log(widths).mean(1))  # [dB]
     covariances = widths[:, :, None] ** 2 * np.eye(3)
+    # A box as the Gaussian with its mean and covariance.
+    middles = matter.boxes.mean(1)
+    sides = matter.boxes - middles[:, None]  # (m, 8, 3), half an edge along each axis
+    covariances = np.concatenate((covariances, np.einsum("mci,mcj->mij", sides, sides) / 24))
+    losses = np.concatenate((losses, matter.losses))
+    centres = np.concatenate((matter.centres, middles))
     return splats(centres, covariances, 1 - 10 ** (-losses / 10), losses)
 
 

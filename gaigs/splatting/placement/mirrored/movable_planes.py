@@ -195,6 +195,16 @@ class MovablePlanes(Placement):
         self.origin[number] = seen_from(plane.double(), self.middle)
         self.shifts[number] = 0
 
+    @property
+    def room_axes(self) -> Float[Tensor, "3 3"]:
+        """Axes of an upright room in the columns, the first square to its first upright plane."""
+        normals = self.normals[self.used]
+        upright = normals[normals[:, 2].abs() < 0.1]
+        first = upright[0] if len(upright) else normals.new_tensor([1.0, 0.0, 0.0])
+        up = first.new_tensor([0.0, 0.0, 1.0])
+        across = functional.normalize(torch.linalg.cross(up, first), dim=0)
+        return torch.stack((torch.linalg.cross(across, up), across, up), 1)
+
     @torch.no_grad()
     def move_by_wavelengths(self, wavelength: float) -> None:
         """Lets planes move in fractions of the wavelength [m]."""

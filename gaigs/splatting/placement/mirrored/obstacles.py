@@ -4,7 +4,7 @@ import math
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Inexact
+from jaxtyping import Bool, Float, Inexact
 from torch import Tensor, nn
 
 
@@ -18,6 +18,9 @@ class Obstacles(nn.Module):
         depth = rho length sqrt(pi / (2 A)) exp(-(C - B²/A) / 2) (erf((A + B) / sqrt(2 A)) - erf(B /
         sqrt(2 A)))
 
+    Boxes have sharp edges: each adds one depth to all segments through it, of any length, and is
+    learnt by a search (``place_boxes``); descent learns its depth alone.
+
     Matter also slows waves. With ``has_phases`` each obstacle has a learnt ratio of phase lag to
     attenuation, its turn at all frequencies, and the depth is complex. ``lower`` and ``upper`` are
     corners of the box around transmitters and receivers [m].
@@ -27,8 +30,12 @@ class Obstacles(nn.Module):
 
     pairs = 2**16
     """Segments times obstacles at a time: a CPU keeps them in its cache, without fresh memory."""
+    most_boxes = 20
+    """Boxes that a checkpoint has room for."""
     origin: Tensor
     unit: Tensor
+    boxes: Tensor
+    box_axes: Tensor
 
     def __init__(
         self,
@@ -49,6 +56,25 @@ class Obstacles(nn.Module):
         self.log_widths = nn.Parameter(torch.full((count, 3), math.log(0.05 * diagonal)))
         self.log_densities = nn.Parameter(torch.full((count,), math.log(0.8 / diagonal)))
         self.turns = nn.Parameter(torch.zeros(count)) if has_phases else None
+        # Least and largest coordinates of boxes along the axes in the columns [m]; 0 for no box.
+        self.register_buffer("boxes", torch.zeros(self.most_boxes, 2, 3))
+        self.register_buffer("box_axes", torch.eye(3))
+        self.box_depths = nn.Parameter(torch.zeros(self.most_boxes))  # [Np]
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        for name in ("boxes", "box_axes", "box_depths"):  # which older checkpoints lack
+            state_dict.setdefault(prefix + name, getattr(self, name).detach())
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+    @torch.no_grad()
+    def place_boxes(
+        self, axes: Float[Tensor, "3 3"], boxes: Float[Tensor, "k 2 3"], depths: Float[Tensor, " k"]
+    ) -> None:
+        """Puts boxes with their depths [Np]; Gaussians are as faint as at the start again."""
+        self.box_axes.copy_(axes)
+        self.boxes[: len(boxes)] = boxes
+        self.box_depths[: len(boxes)] = depths
+        self.log_densities.fill_(math.log(0.096 / float(self.unit)))
 
     def __len__(self) -> int:
         return len(self.places)
@@ -68,8 +94,23 @@ class Obstacles(nn.Module):
         """Attenuation at the centres [Np/m]."""
         return self.log_densities.exp()
 
+    @property
+    def used(self) -> Bool[Tensor, " k"]:
+        """True for the boxes that a search has found."""
+        return self.boxes[:, 1, 0] > self.boxes[:, 0, 0]
+
+    @property
+    def box_corners(self) -> Float[Tensor, "k 8 3"]:
+        """Corners of the used boxes, from the middle of the room [m]."""
+        side = torch.cartesian_prod(*[torch.arange(2, device=self.boxes.device)] * 3)  # (8, 3)
+        along = self.boxes[self.used][:, side, torch.arange(3)]  # (k, 8, 3)
+        return along @ self.box_axes.T
+
     def forward(
-        self, start: Float[Tensor, "*batch 3"], end: Float[Tensor, "*batch 3"]
+        self,
+        start: Float[Tensor, "*batch 3"],
+        end: Float[Tensor, "*batch 3"],
+        has_boxes: bool = True,
     ) -> Inexact[Tensor, "*batch"]:
         """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad]."""
         starts = start.reshape(-1, 3)
@@ -86,8 +127,35 @@ class Obstacles(nn.Module):
             for legs in zip(starts.split(size), ends.split(size), strict=True)
         ]
         depths = torch.cat(parts)  # (segments, 1 or 2)
+        if has_boxes:
+            solid = self._box_depths(starts, ends)  # (segments, 1)
+            depths = torch.cat((depths[:, :1] + solid, depths[:, 1:]), 1)
         depths = depths[:, 0] if self.turns is None else torch.view_as_complex(depths)
         return depths.view(start.shape[:-1])
+
+    def _box_depths(
+        self, start: Float[Tensor, "s 3"], end: Float[Tensor, "s 3"]
+    ) -> Float[Tensor, "s 1"]:
+        """Depths of segments through boxes [Np]."""
+        start = start @ self.box_axes
+        end = end @ self.box_axes
+        depths = self.box_depths[self.used].clamp_min(0)
+        hits = depths.new_zeros(len(start), len(depths))
+        for number, box in enumerate(self.boxes[self.used]):
+            hits[:, number] = passes_box(start, end, box)
+        return (hits @ depths)[:, None]
+
+
+def passes_box(
+    start: Float[Tensor, "s 3"], end: Float[Tensor, "s 3"], corners: Float[Tensor, "2 3"]
+) -> Bool[Tensor, " s"]:
+    """True for segments through a box along the axes: the last entry lies before the first exit."""
+    ray = end - start
+    inverse = 1 / torch.where(ray.abs() < 1e-9, 1e-9, ray)
+    first = (corners[0] - start) * inverse  # (s, 3)
+    second = (corners[1] - start) * inverse
+    entry = torch.minimum(first, second).amax(1).clamp_min(0)
+    return entry < torch.maximum(first, second).amin(1).clamp_max(1)
 
 
 _FAINTEST = -80.0

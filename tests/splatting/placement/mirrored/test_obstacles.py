@@ -161,3 +161,24 @@ def test_initial_obstacles_are_faint_and_all_over_the_room():
     one = Obstacles(1, LOWER, UPPER)
     ray = torch.tensor([10.0, 0, 0])
     assert 0 < one(one.centres[0] - ray, one.centres[0] + ray) < 0.12  # a decibel is 0.115 Np
+
+
+def test_boxes_dim_whatever_the_way_inside(obstacles):
+    start = torch.tensor([[-2.0, 0, 0], [-2.0, 0.4, 0], [-2.0, -2, 0]]).double()
+    end = torch.tensor([[2.0, 0, 0], [2.0, 0.4, 0], [2.0, -2, 0]]).double()
+    before = obstacles(start, end)
+    corners = torch.tensor([[[-0.1, -0.5, -0.5], [0.1, 0.5, 0.5]]]).double()
+    obstacles.place_boxes(torch.eye(3).double(), corners, torch.tensor([1.5]).double())
+    obstacles.log_densities.data.fill_(-80)
+    added = obstacles(start, end)
+    torch.testing.assert_close(added.real, torch.tensor([1.5, 1.5, 0.0]).double())
+    assert not torch.allclose(before.real, added.real)
+    (gradient,) = torch.autograd.grad(added.real.sum(), obstacles.box_depths)
+    assert gradient[0] == 2
+
+
+def test_checkpoint_without_boxes_loads(obstacles):
+    state = obstacles.state_dict()
+    for name in ("boxes", "box_axes", "box_depths"):
+        del state[name]
+    obstacles.load_state_dict(state)

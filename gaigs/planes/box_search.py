@@ -1,0 +1,224 @@
+"""Search for boxes that explain shadows: tomography with few, sharp obstacles."""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Complex, Float
+from torch import Tensor
+
+from gaigs.core import stages
+from gaigs.core.geometry import FAINTEST
+from gaigs.splatting.placement.mirrored.obstacles import passes_box
+from gaigs.splatting.placement.mirrored.reflections import Folded
+
+
+class ChannelErrors(NamedTuple):
+    """Logarithms of the relative errors of channels h whose paths are dimmed by depths.
+
+    With the paths' fields F and a = exp(-depths), |h - F a|² = |h|² - 2 a . Re(F^H h) + a .
+    Re(F^H F) a.
+    """
+
+    products: Float[Tensor, "b n n"]  # Re(F^H F) / |h|²
+    matches: Float[Tensor, "b n"]  # Re(F^H h) / |h|²
+    floor: float = 1e-3  # 30 dB: better links pull less and less
+
+    @classmethod
+    def of(
+        cls, fields: Complex[Tensor, "b n e s"], channels: Complex[Tensor, "b e s"]
+    ) -> "ChannelErrors":
+        """Errors of channels, from the field of each path without obstacles."""
+        fields = fields.flatten(2)
+        channels = channels.flatten(1)[..., None]  # (b, numbers, 1)
+        power = channels.abs().square().sum((1, 2))[:, None].clamp_min(FAINTEST)
+        products = (fields.conj() @ fields.mT).real / power[..., None]
+        return cls(products, (fields.conj() @ channels)[..., 0].real / power)
+
+    def __call__(self, depths: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+        passed = (-depths).exp()
+        terms = (self.products @ passed[..., None])[..., 0] - 2 * self.matches
+        errors = (1 + (passed * terms).sum(1)).clamp_min(0)
+        return (errors / self.floor).log1p() - (errors * self.floor).log1p()
+
+
+class Cuboid(NamedTuple):
+    """A cuboid that dims the field of each path through it, however long the way inside."""
+
+    corners: Float[Tensor, "2 3"]  # least and largest coordinates [m]
+    loss: float  # [Np]
+
+
+class BoxSearch:
+    """Boxes, each shared by all paths of all receivers, that lower the errors of links.
+
+    A box starts in one of the cells in which paths are most too strong, and its faces move to the
+    least mean error. It holds no transmitter and no receiver, since these stand in the open. The
+    best box whose fall of the error is clear stays, all take turns, and a gap is cut through boxes
+    that cover two things.
+
+    Attributes:
+        most: Boxes after which the search ends; cuts at most double them.
+        seeds: Cells from which each box is tried.
+        steps: Moves of a face, and the shortest edge [cells].
+        losses: Least and largest loss [Np]: below 3 dB materials and gains may be wrong as well.
+        clear: Least fall of the mean error [standard errors].
+        price: Least fall of the mean error by a box or a cut.
+
+    Args:
+        folded: Paths of the links.
+        errors: Errors of the links by depths.
+        places: Transmitters and receivers, in the paths' frame [m].
+
+    Source: ours; for the idea Wilson and Patwari, Radio Tomographic Imaging, 2010.
+    """
+
+    most = 10
+    seeds = 6
+    steps = (1.0, 0.5, 0.25)
+    losses = (0.35, 6.0)
+    clear = 3.0
+    price = 0.004
+
+    def __init__(self, folded: Folded, errors: ChannelErrors, places: Float[Tensor, "k 3"]):
+        self.errors = errors
+        self.places = places
+        count, n = folded.exists.shape
+        path = folded.path + n * torch.arange(count, device=folded.path.device)[:, None]  # (b, s)
+        exists = folded.exists[:, folded.path].flatten().nonzero()[:, 0]
+        self.path = path.flatten()[exists]
+        self.start = folded.start.flatten(0, 1)[exists]
+        self.end = folded.end.flatten(0, 1)[exists]
+        lower, upper = places.amin(0), places.amax(0)
+        self.cell = float((upper - lower).norm()) / 45  # 0.2 m in a room of 7 by 5 m
+        self.lower = lower - 2 * self.cell
+        self.upper = upper + 2 * self.cell
+        self.common = 0.0  # depth of all paths, while gains are not yet right [Np]
+        self.boxes: list[Cuboid] = []
+
+    @torch.no_grad()
+    def run(self) -> list[Cuboid]:
+        """The boxes; none if no box is clear."""
+        while len(self.boxes) < self.most and not stages.is_up():
+            depths = self._depths(self.boxes)
+            before = self.errors(depths)
+            best = None
+            least = before.mean() - self.price
+            for seed in self._seeds(depths):
+                box = self._grown(depths, seed, self.steps[:2], 30)
+                fall = before - self.errors(depths + self._depth(box))
+                is_clear = fall.mean() > self.clear * fall.std() / len(fall) ** 0.5
+                if is_clear and before.mean() - fall.mean() < least:
+                    best, least = box, before.mean() - fall.mean()
+            if best is None:
+                break
+            self.boxes.append(best)
+            self._take_turns(self.steps[1:], 1)
+            for box in [*self.boxes]:
+                self._cut(box)
+        self._take_turns((*self.steps, 0.1), 5)
+        return self.boxes
+
+    def _depth(self, box: Cuboid) -> Float[Tensor, "b n"]:
+        """Depths of all paths by a box [Np]."""
+        hit = passes_box(self.start, self.end, box.corners).nonzero()[:, 0]
+        depths = torch.zeros_like(self.errors.matches)
+        losses = depths.new_full((len(hit),), box.loss)
+        return depths.flatten().index_add(0, self.path[hit], losses).view_as(depths)
+
+    def _depths(self, boxes: list[Cuboid]) -> Float[Tensor, "b n"]:
+        """Depths of all paths by boxes and in common [Np]."""
+        depths = torch.full_like(self.errors.matches, self.common)
+        return sum((self._depth(box) for box in boxes), start=depths)
+
+    def _error(self, depths: Float[Tensor, "b n"], boxes: list[Cuboid]) -> float:
+        """Mean error with boxes added."""
+        return self.errors(depths + self._depths(boxes) - self.common).mean().item()
+
+    def _seeds(self, depths: Float[Tensor, "b n"]) -> list[Cuboid]:
+        """Cells, two apart, that lower the errors most clearly."""
+        before = self.errors(depths)
+        axes = [
+            torch.arange(*ends, 2 * self.cell) for ends in zip(self.lower, self.upper, strict=True)
+        ]
+        rated = []
+        for corner in torch.cartesian_prod(*axes).to(depths):
+            box = Cuboid(torch.stack((corner, corner + self.cell)), 1.5)
+            if self._is_free(box):
+                fall = before - self.errors(depths + self._depth(box))
+                rated.append((fall.mean() / (fall.std() + FAINTEST), box))
+        rated.sort(key=lambda pair: -pair[0])
+        return [box for _, box in rated[: self.seeds]]
+
+    def _is_free(self, box: Cuboid) -> bool:
+        """True for a box of some size, in the room, that holds no place."""
+        low, high = box.corners
+        inside = ((self.places > low) & (self.places < high)).all(1)
+        is_large = (high - low >= self.steps[-1] * self.cell).all()
+        within = (low >= self.lower).all() & (high <= self.upper).all()
+        return bool(is_large & within & ~inside.any())
+
+    def _grown(
+        self, depths: Float[Tensor, "b n"], box: Cuboid, steps: tuple[float, ...], rounds: int
+    ) -> Cuboid:
+        """The box with each face, place and the loss changed in turn while the error falls."""
+        least = self._error(depths, [box])
+        for _ in range(rounds):
+            if stages.is_up():
+                break
+            before = least
+            for part in range(10):
+                for other in self._changed(box, part, steps):
+                    error = self._error(depths, [other])
+                    if error < least - 1e-5:
+                        box, least = other, error
+            if before - least < 1e-4:
+                break
+        return box
+
+    def _changed(self, box: Cuboid, part: int, steps: tuple[float, ...]) -> list[Cuboid]:
+        """Free boxes with face 0 to 5, then the place along axis 0 to 2, then the loss changed."""
+        if part == 9:
+            losses = box.loss * torch.tensor([0.5, 0.7, 0.85, 1.2, 1.4, 2.0])
+            return [Cuboid(box.corners, loss) for loss in losses.clamp(*self.losses).tolist()]
+        sides = [part // 3] if part < 6 else [0, 1]
+        changed = []
+        for step in (*steps, *(-step for step in steps)):
+            corners = box.corners.clone()
+            corners[sides, part % 3] += step * self.cell
+            changed.append(Cuboid(corners, box.loss))
+        return [other for other in changed if self._is_free(other)]
+
+    def _take_turns(self, steps: tuple[float, ...], rounds: int) -> None:
+        """Changes each box beside the others, then the common depth."""
+        for number, box in enumerate(self.boxes):
+            others = self._depths(self.boxes[:number] + self.boxes[number + 1 :])
+            self.boxes[number] = self._grown(others, box, steps, rounds)
+        depths = self._depths(self.boxes)
+        changes = torch.linspace(-0.1, 0.1, 9).tolist()  # within 1 dB
+        self.common += min(changes, key=lambda change: self._error(depths + change, []))
+
+    def _cut(self, box: Cuboid) -> None:
+        """Drops a box that no longer helps, or cuts a gap through it if that does."""
+        others = [other for other in self.boxes if other is not box]
+        depths = self._depths(others)
+        parts: list[Cuboid] = []
+        least = self._error(depths, [])
+        for trial in [[box], *self._halves(box)]:
+            error = self._error(depths, trial)
+            if error < least - self.price:
+                parts, least = trial, error
+        self.boxes = others + parts
+
+    def _halves(self, box: Cuboid) -> list[list[Cuboid]]:
+        """Pairs of boxes that a gap along an axis leaves."""
+        pairs = []
+        for axis in range(3):
+            low, high = box.corners[:, axis].tolist()
+            cuts = torch.linspace(low, high, min(20, int((high - low) / self.cell * 2) + 1))
+            for begin, end in torch.combinations(cuts[1:-1]).tolist():
+                pair = [Cuboid(box.corners.clone(), box.loss) for _ in range(2)]
+                pair[0].corners[1, axis] = begin
+                pair[1].corners[0, axis] = end
+                if all(map(self._is_free, pair)):
+                    pairs.append(pair)
+        return pairs
