@@ -361,10 +361,10 @@ class Batch:
     """A query with directions and labels.
 
     Attributes:
-        directions: Directions to predict, the same for all links; None for a label without.
+        directions: Directions to predict, the same for all links; None if labels have none.
         labels: Measured values (b, ...), of the task's shape; None when predicting.
-        shares: Weights of this batch in means over all processes that train together: of means over
-            links, and of means over places. A single process has 1.
+        shares: Weights of this batch's mean over links, and of its mean over places. The mean of
+            all processes that train together is then the mean over all their links, or places.
     """
 
     query: Query

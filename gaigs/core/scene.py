@@ -270,7 +270,7 @@ def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
 
 
 def check_elements(owner: str, scene: Scene, pads: bool = False) -> Task:
-    """The task of channels with as many elements as each receiver's array.
+    """The scene's task; a ``ValueError`` unless it has channels with each array's elements.
 
     ``owner`` names a component in errors. One that ``pads`` takes smaller arrays too, and predicts
     0 at the elements that they lack.

@@ -205,7 +205,8 @@ def median_spacing(places: Float[Tensor, "n 3"]) -> float:
 def floors_of(places: Float[Tensor, "n 3"]) -> Float[Tensor, " k"]:
     """Heights of separate floors [m], most places first; empty if there is one floor.
 
-    A floor has 5 places or more. Floors are 2 m apart, and twice the range of a floor's heights.
+    A floor has 5 places or more. The gap between floors is more than 2 m, and at least twice the
+    range of heights on any floor.
     """
     heights = places[:, 2].sort().values
     gaps = heights.diff()

@@ -29,12 +29,14 @@ def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiv
 def are_one_radio(places: int, links: int, sent: int, given: bool | None = None) -> bool:
     """True if the receivers are places of one radio that moves, or of radios alike.
 
+    One radio has 12 places or more, with less than 12 links each on average. Its transmitters have
+    less than two links each on average, or are few beacons: four or more places to each. In a
+    survey of access points a transmitter's place has several links: one to each access point heard.
+
     Args:
-        places: Number of places of receivers: 12 or more for one radio, of less than 12 links each.
+        places: Number of places of receivers.
         links: Number of links.
-        sent: Number of places of transmitters. For one radio each has less than two links; or they
-            are few beacons, at most a quarter of ``places``. In a survey of access points a place
-            has several links.
+        sent: Number of places of transmitters.
         given: The user's answer, which counts; None without one.
     """
     if given is not None:

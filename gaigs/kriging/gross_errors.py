@@ -58,8 +58,10 @@ def are_alone(
     most: Float[Tensor, ""],
     neighbours: int = 5,
 ) -> Bool[Tensor, " k"]:
-    """True for errors above ``most`` that are as far from the errors of the nearest places; all
-    False if more than one in twenty are.
+    """True for errors above ``most`` that differ by more than ``most`` from all errors nearby.
+
+    These are at the nearest ``neighbours`` places. All are False if more than one in twenty would
+    be True: what so many have is a part of the room.
     """
     is_alone = torch.zeros_like(errors, dtype=torch.bool)
     far = (errors.abs() > most).nonzero()[:, 0]

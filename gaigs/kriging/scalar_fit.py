@@ -30,18 +30,19 @@ class ScalarOptions:
 
     Attributes:
         neighbours: Readings around a held-out one while a process is fitted.
-        around: Readings around a place whose variance is asked of many, and around each of more
-            than ``large`` whose noise has Student's t: those behind them lower a deviation by a
-            hundredth.
-        local: Readings around a place whose mean is asked of a process that is not solved.
-        few: Known readings to each place asked at once, above which such a process stays so.
-        large: Known readings of which a fold keeps the hyperparameters of all: ten times as many as
-            a fit holds out.
-        many: Readings of a receiver that all enter a variance; of more the nearest, which then take
-            less time.
-        together: Readings of a receiver that enter one covariance matrix; of more see ``Tiles``.
-        scatter: Scatter between receivers of the logarithms of length, signal and noise: the prior
-            of each receiver's.
+        around: Nearest readings that enter a variance, if a receiver has more than ``many``; and
+            the noise of a reading with Student's t, if more than ``large`` are known. Farther
+            readings lower a deviation by a hundredth alone.
+        local: Nearest readings that enter the mean at a place while a process is not solved.
+        few: Known readings for each place asked at once. With more, an unsolved process answers by
+            ``local`` readings and stays unsolved; with fewer it is solved first.
+        large: Known readings above which a fold keeps the hyperparameters of all: ten times as many
+            as a fit holds out.
+        many: Largest number of a receiver's readings that all enter a variance. Of more the nearest
+            ``around`` do, which takes less time.
+        together: Most readings of a receiver in one covariance matrix; ``Tiles`` divide more.
+        scatter: Scatter between receivers of the logarithms of length, signal and noise, as the
+            prior has it.
         degrees: Degrees of freedom of Student's t: of the scatter, and of the noise where it is not
             normal.
         rounds: Repetitions of expectation and maximisation for the variances of single readings.
@@ -52,11 +53,11 @@ class ScalarOptions:
         edges: Longest correlation length, in longest edges of the box of places: beyond it the
             kernel is a line in the box.
         widest: Largest deviation of the signal over the residuals' root mean square. Readings
-            millimetres apart show its ratio to a power of the length alone: beside them a larger
-            one would give levels that no receiver hears.
-        largest: Largest deviation of the noise over the residuals' root mean square, and the
-            inverse of the least one of both: the noise keeps matrices regular where a place is
-            measured twice.
+            millimetres apart show only the deviation's ratio to a power of the length. Without a
+            bound it could grow until it gives levels that no receiver hears.
+        largest: Largest deviation of the noise over the residuals' root mean square. Its inverse is
+            the least deviation of signal and noise. The noise keeps matrices regular where a place
+            is measured twice.
     """
 
     neighbours: int = 32

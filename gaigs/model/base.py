@@ -189,7 +189,7 @@ class Model(Movable):
         frequencies: object = None,
         interval: float | None = None,
     ) -> Tensor | Estimate | dict:
-        """Values for transmitters anywhere: a query, or a point, a list of points, or a grid.
+        """Values for transmitters at a point, a list or a grid of points, or for a query.
 
         Args:
             transmitters: Positions (..., 3), world frame [m], anything that becomes a float tensor;
@@ -199,8 +199,8 @@ class Model(Movable):
                 without measurements, see ``at_receivers``.
             frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the
                 training links' only carrier.
-            batch_size: Links computed at a time, of all receivers at least those of one position;
-                None: as many as have 2^17 numbers together.
+            batch_size: Largest number of links computed at a time, but at least all links of one
+                position; None: as many as have 2^17 numbers together.
             directions: Directions to predict; None: the label's own, if it has directions.
             frequencies: Subcarriers of channels to predict (s,) [Hz], also ones that no label had;
                 None: the label's own. A model without ``any_frequency``, such as ``knn``, gives the
@@ -218,10 +218,10 @@ class Model(Movable):
             channels of a named receiver have the elements of its array.
 
         Warns:
-            ExtrapolationWarning: A position is farther from the training transmitters' box than the
-                diagonal of this box and the receivers, or a frequency is outside the training
-                links' band, or subcarriers are farther from the band of the labels than it is wide,
-                or the values are those of other subcarriers. Not for a query.
+            ExtrapolationWarning: A position is outside the training transmitters' box by more than
+                the diagonal of transmitters and receivers together; or a frequency is outside the
+                training links' band; or subcarriers are farther from the labels' band than it is
+                wide; or the values belong to other subcarriers. A query gives no warning.
 
         Raises:
             ValueError: The batch size is less than 1, or a position, receiver, frequency or

@@ -159,7 +159,7 @@ class GaussianSplatting(Model):
         projection: str | Mapping | Projection | None,
         rasterizer: str | Mapping | Rasterizer | None,
     ) -> Directions:
-        """Builds projection and rasterizer, and gives the directions of the map."""
+        """Builds projection and rasterizer; returns the directions of the map's pixels."""
         if projection is None or rasterizer is None:
             raise ValueError(
                 f"pooling {name_of(self.pooling)!r} takes a map, which needs a projection and a "
@@ -172,6 +172,7 @@ class GaussianSplatting(Model):
             raise ValueError(
                 f"labels of task {task.name!r} have no directions; take the task's own pooling"
             )
+        # What the pooling makes of an empty map shows the shape of its labels.
         self._check_gives(torch.zeros(1, self.pooling.channels, *grid.shape))
         self.projection = registry("projection").build(projection, pixel=grid.pitch)
         self.rasterizer = registry("rasterizer").build(rasterizer)

@@ -212,16 +212,20 @@ class Kriging(Wrapper):
         return int(min(most, max(100, stages.left() / 9 / link_time / self.scene.radios)))
 
     def _krige_labels(self, links: Links, values: Tensor | None, is_final: bool) -> "Kriging":
-        """``krige`` of labels; ``values`` are the trend's predictions of known links, if known."""
+        """``krige`` of labels, where the trend may lose its weight to a law of distance.
+
+        ``values`` are the trend's predictions of the known links, validation links last. They are
+        None for labels of one number, and computed if the trend may have weight.
+        """
         self._make_posterior(False)
         split, is_scalar = links.split, self.scene.task.is_scalar
         held = drawn(split.validation) if is_scalar else split.validation
         is_unlearnt = False
         if len(held) and any(self.weights):
-            known = predicted(self.trend, links, held) if values is None else values[-len(held) :]
-            trend = validation_scores(links, known, held)
-            fallback = self.law_scores(links, held)
-            is_unlearnt = is_surely_better(fallback, trend)
+            at_held = predicted(self.trend, links, held) if values is None else values[-len(held) :]
+            trend_scores = validation_scores(links, at_held, held)
+            law_scores = self.law_scores(links, held)
+            is_unlearnt = is_surely_better(law_scores, trend_scores)
         # A law of distance that is surely better than the learnt room: levels show no room.
         weights = (0.0,) if is_unlearnt and is_scalar else self.weights
         if values is None and any(weights):
@@ -235,6 +239,7 @@ class Kriging(Wrapper):
             score = validation_scores(links, predicted(model, links, held)).mean()
             if validation_scores(links, predicted(without, links, held)).mean() > score:
                 model = without
+            # The second fit has replaced this model's choices: take the better model's.
             self._copy_choices(model)
         if is_final:
             self._solve(links, values)
@@ -243,10 +248,11 @@ class Kriging(Wrapper):
                     "the room was not learnt: %s on validation links is %.3g, that of %s %.3g\n"
                     "the prediction falls back on kriging of %s, with %.0f %% of the trained model",
                     links.task.monitor,
-                    trend.mean().abs(),
+                    trend_scores.mean().abs(),
                     name_of(self.laws[0]),
-                    fallback.mean().abs(),
+                    law_scores.mean().abs(),
                     self.fallback_options["name"],
+                    # The trend's share in the blend of the class's first line.
                     100 * (1 - self.weight * (1 - self.trend_weight)),
                 )
             self._log()
@@ -425,9 +431,10 @@ class Kriging(Wrapper):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """``_alone`` at other receivers, of which no residuals are known.
+        """The trend, or the fallback if the trend has no weight, at other receivers.
 
-        The process stays where the receivers are places of one radio.
+        Nothing is kriged there, as no residuals are known. Where receivers are places of one radio,
+        labels are kriged over these places, too: then the whole model moves with its process.
         """
         if self.scene.one_radio and not self.by_paths:
             return super().at_receivers(receivers)

@@ -195,9 +195,10 @@ class LagScore(Score[LagRoom]):
         return waves
 
     def refine(self, room: LagRoom) -> LagRoom:
-        """The room after a descent with all planes, if that lowers the error certainly.
+        """The room after a descent with all planes, if that certainly lowers the error.
 
-        The direct path is open where that lowers a link's error.
+        Before it the direct path is blocked at links whose error falls by more than
+        ``LagOptions.blocked`` without it. ``errors`` stay as the last move has left them.
         """
         with_direct = self.errors(room.planes, room.opened(0, True))
         without = self.errors(room.planes, room.opened(0, False))
@@ -205,9 +206,10 @@ class LagScore(Score[LagRoom]):
         sequences = self.paths.sequences(room.planes)
 
         def loss(planes: Float[Tensor, "w 4"]) -> Float[Tensor, ""]:
+            # Half the links take half the time; all of them judge the result below.
             return self.errors(planes, room.open, sequences, every=2).mean()
 
-        planes = descend(loss, self.paths.receivers, room.planes, [], 40, 3e-3)[0]
+        (planes,) = descend(loss, self.paths.receivers, room.planes, others=[], steps=40, rate=3e-3)
         gains = self.errors(room.planes, room.open) - self.errors(planes, room.open)
         return room._replace(planes=planes) if self._is_certain(gains) else room
 

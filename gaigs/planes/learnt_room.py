@@ -72,10 +72,10 @@ class LearntRoom(NamedTuple):
 
 @torch.no_grad()
 def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
-    """The room as paths of links show it.
+    """The learnt room as paths of links show it.
 
-    Planes are those of the training links, paths those of the first test transmitter. Without links
-    planes are those of ``spread_links``, and there are no paths.
+    Paths of some training links outline the planes; without links paths of ``spread_links`` do.
+    The room's own paths lead from the first test transmitter; without links it has none.
     """
     if links is None:
         query = spread_links(placement.scene)

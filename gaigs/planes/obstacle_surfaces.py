@@ -153,7 +153,10 @@ def measure_densities(obstacles: Obstacles, points: Float[Tensor, "k 3"]) -> Flo
 def sample_matter(
     obstacles: Obstacles, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], voxels: int
 ) -> MatterGrid:
-    """Matter in a box, whose corners are from the middle of the room [m]."""
+    """Samples matter at about ``voxels`` points of a box, and two points beyond on each side.
+
+    The corners ``lower`` and ``upper`` are relative to the middle of the room [m].
+    """
     pitch = float((np.prod(upper - lower) / voxels) ** (1 / 3))
     corner = lower - 2 * pitch
     shape = np.ceil((upper - corner) / pitch).astype(int) + 3
@@ -240,8 +243,8 @@ def attenuate_paths(
 def choose_densities(paths: AttenuatedPaths, count: int) -> list[float]:
     """Densities of matter [Np/m] at which paths lose their fields; empty if they lose nothing.
 
-    They are evenly spaced logarithms between the densities below which paths lose a tenth and nine
-    tenths.
+    Their logarithms are evenly spaced. A tenth of the loss happens in matter thinner than the first
+    one, and a tenth in matter denser than the last.
     """
     densities = paths.legs.densities
     # Each leg's loss, spread over its matter.

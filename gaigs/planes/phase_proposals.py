@@ -86,6 +86,8 @@ def propose_by_phases(
 def _grids(data: ChannelData, reach: float, tilt: float) -> list[Float[Tensor, " k"]]:
     """Grids of the periodogram: offsets [m], and tilts [rad] towards two axes."""
     wavelength = data.wavelength
+    # A step changes a path's length by an eighth or a fifth of a wavelength at most, so no lobe is
+    # missed: bounces are within half a diagonal of the middle. Four steps on a side at least.
     offset_step = min(wavelength / 16, reach / 4)
     tilt_step = min(wavelength / 5 / data.frame.diagonal, tilt / 4)
     offsets = min(round(reach / offset_step), data.options.offset_cells)

@@ -146,7 +146,7 @@ def _correct(overrides: dict[str, str], config: dict) -> list[str]:
             configured = configured.get("name", absent)
             accepted = [text, *(OmegaConf.load(file).get("name") for file in files_of(key, text))]
         elif "${" in text or isinstance(configured, list):
-            accepted = [configured]
+            accepted = [configured]  # text of a reference or a list has no value to compare
         else:
             accepted = [_parsed(text)]
         if configured is not absent and configured not in accepted:

@@ -66,9 +66,9 @@ def find_systems(
 
 
 def _system(group: Sequence[Run], shared: Mapping, names: Mapping) -> System:
-    """The row of runs that differ in the seed alone."""
+    """The row of runs that differ in the seed alone; its name leaves out ``shared`` settings."""
     overrides = group[0].overrides
-    # A seed that was run twice, in two multiruns, counts once.
+    # Of a seed that was run twice, in two multiruns, the first run counts: it is stored last.
     ended = {run.metrics["seed"]: run for run in reversed(group) if run.metrics is not None}
     runs = [ended[seed] for seed in sorted(ended)]
     model = overrides.get("model")
@@ -78,7 +78,7 @@ def _system(group: Sequence[Run], shared: Mapping, names: Mapping) -> System:
     varied = [f"{key}={value}" for key, value in overrides.items() if key not in usual]
     values: dict[str, list[float]] = {}
     for run in runs:
-        scores = next(iter(run.metrics["models"].values()))
+        scores = next(iter(run.metrics["models"].values()))  # the run's model, before baselines
         for key, value in (scores | _costs(run.metrics)).items():
             if value is not None:
                 values.setdefault(key, []).append(value)
@@ -89,7 +89,7 @@ def _system(group: Sequence[Run], shared: Mapping, names: Mapping) -> System:
             cause = run.failure or "unfinished"
             failures.append(f"seed {seed}: {cause}" if seed else cause)
     name = " ".join([names.get(model, model), *varied])
-    return System(model, name, runs, values, failures, bool(varied))
+    return System(model, name, runs, values, failures, is_varied=bool(varied))
 
 
 def _costs(metrics: Mapping) -> dict[str, float | None]:

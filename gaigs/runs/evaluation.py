@@ -75,8 +75,10 @@ def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> 
 def fitted(
     look_up: Model, links: Links, before: Model | None = None, many: int = ScalarOptions.large
 ) -> Model:
-    """A copy of a model without a training, fitted to the known links; to more than ``many`` with
-    the choices of a fit ``before`` to most of these.
+    """A copy of a model without a training, fitted to the known links.
+
+    If these are more than ``many``, it keeps the choices of ``before``: the same model, fitted to
+    most of them.
     """
     if before is not None and len(links.split.known) > many:
         return before.refitted(links)

@@ -22,27 +22,31 @@ ANOTHER = "choose another folder (hydra.run.dir)"
 
 
 def claim(folder: Path, config: dict) -> None:
-    """Writes the configuration into a run folder, unless this run or another one is there."""
+    """Writes the configuration into a run folder, or checks that the run there has this one.
+
+    Other files there, or another run to resume, are a ``ValueError``.
+    """
     file = folder / "config.yaml"
-    ours = "config.yaml software.json best.ckpt log predictions.npz gaussians.ply radio_map.npz"
-    names = [*ours.split(), "figures", "last.ckpt", "metrics.json"]
+    files = "config.yaml software.json best.ckpt log predictions.npz gaussians.ply radio_map.npz"
+    names = [*files.split(), "figures", "last.ckpt", "metrics.json"]
     there = [name for name in names if (folder / name).exists()]
     if there and not is_configuration(file):
         raise ValueError(f"{folder} holds {', '.join(there)} of something else\n{ANOTHER}")
     for place in (folder, folder / "figures", *folder.glob("members/*")):
-        remove_parts(place)
+        remove_parts(place)  # a killed run leaves temporary files
+    # Without a checkpoint or scores there is nothing to resume: the run starts anew.
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
         store(config, folder)
         return
     check_software(folder, config)
     try:
-        there = OmegaConf.to_container(OmegaConf.load(file))
+        earlier = OmegaConf.to_container(OmegaConf.load(file))
     except Exception as error:  # any error of YAML or OmegaConf
         raise ValueError(f"cannot parse {file}: {' '.join(str(error).split())}") from error
     from gaigs.configuration import differences  # with Hydra, which loading does without
 
     differing = []
-    values = differences(there, config)
+    values = differences(earlier, config)
     for key, (was, value) in values.items():
         # The configuration of a model repeats the configurations of its parts.
         if not (key.startswith("model.") and key.removeprefix("model.") in values):

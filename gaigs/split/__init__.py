@@ -20,9 +20,9 @@ def rows_of(links: Links) -> Int[Tensor, " n"]:
 
 
 def places_of(links: Links) -> Int[Tensor, " n"]:
-    """The group of each link: all links of a place, and of a row, are in one group.
+    """Number of each link's group: links at one place, or of one row, are in one group.
 
-    A group is named by its first row.
+    A row is one transmission. A group has the number of its first row.
     """
     rows = rows_of(links)
     last = rows.new_full((len(rows),), int(rows.max()))

@@ -203,7 +203,7 @@ class Task(ABC):
     def fingerprint(self, values: Tensor) -> Tensor:
         """Real numbers (k, m) of labels or predictions that change steadily with the place.
 
-        By default they are at most 512 numbers of their own, evenly spread: arrays resolve fewer.
+        By default at most 512 of a label's own numbers, evenly spread: arrays resolve fewer.
         """
         return thin_labels(values, 512).float()
 

@@ -51,6 +51,7 @@ class Spectrum(Task):
             torch.as_tensor(elevations, dtype=torch.float32),
             torch.as_tensor(azimuths, dtype=torch.float32),
         )
+        # Checks the angles. The second grid says that labels of this task have directions.
         self.directions: Grid = as_directions(grid, grid, self.name)
         self.normalisation = normalisation
 

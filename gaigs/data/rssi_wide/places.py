@@ -89,12 +89,16 @@ def _mapped_gateways(
     height: float,
     storey: float,
 ) -> dict[str, list[float]]:
-    """Coordinates of gateways by their names, from lists of x, y and optionally z."""
+    """Coordinates of gateways by their names, from lists of x, y and optionally z.
+
+    Gateways without z, or on floor 0, have ``height`` [m]; floors are a ``storey`` apart [m].
+    """
     places = {}
     for name, value in given.items():
+        # The error of any other value asks for x, y and z.
         count = 2 if isinstance(value, list) and len(value) == 2 else 3
         vector = to_vector(f"{file}: {name}", value, "xyz"[:count])
-        place = [unit * x for unit, x in zip(units, vector, strict=False)]
+        place = [unit * x for unit, x in zip(units, vector, strict=False)]  # z may be missing
         if axes.is_floor:
             place[2:] = [height + storey * floor for floor in place[2:]]
         places[name] = [*place, height][:3]

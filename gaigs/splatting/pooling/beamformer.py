@@ -174,7 +174,7 @@ class Beamformer:
     ) -> Float[Tensor, "m k"]:
         """``_basis`` in the dtype and on the device of ``parts``, stored for grids.
 
-        Training thins one grid in a few ways; lists of rays hardly come back.
+        A training asks for the same few thinned grids again and again. Lists of rays hardly repeat.
         """
         if not isinstance(directions, Grid):
             return self._basis(carrier, query, directions).to(parts)

@@ -14,7 +14,7 @@ from gaigs.splatting.pooling import Pooling, sphere
 
 @register("pooling", "mean_power")
 class MeanPower(Pooling):
-    """The mean power over the grid's solid angle and the receiver's noise, in dB.
+    """The mean power over all directions plus the power of the receiver's noise, in dB.
 
     The power of a pixel is |C_0|^2, or |C_0|^2 + |C_1|^2, eq. (3). Powers add, so paths do not
     cancel: RSSI is averaged over bandwidth and time. A receiver hears its own noise even where

@@ -139,12 +139,12 @@ class GATokenizer(nn.Module):
         anchors: Float[Tensor, "sets m 3"],
         is_shared: bool,
     ) -> tuple[Float[Tensor, "*b tokens 3"], Float[Tensor, "*b tokens d"]]:
-        """Points and type scalars of [TX, CLS, anchors] of each query.
+        """Points and type scalars of the tokens: transmitter, CLS and anchors, in this order.
 
         Args:
             query: The links.
             transmitters, anchors: Positions relative to the box, of order one.
-            is_shared: True for all transmitters before one CLS and one set of anchors.
+            is_shared: True if links share CLS and anchors: b + 1 + m tokens, else (b, 2 + m).
         """
         b, m = len(query), anchors.shape[1]
         cls, transmitter, anchor = self.types.split(1)  # (1, 2) each
