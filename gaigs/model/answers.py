@@ -1,5 +1,7 @@
 """Predictions, deviations and calibrations of models on some of the links of a data set."""
 
+import math
+import time
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,8 +13,8 @@ from torch import Tensor
 from gaigs.calibration import Calibration
 from gaigs.calibration.conformal import usual_deviations
 from gaigs.calibration.held_out import Answers, calibrate
+from gaigs.core import stages
 from gaigs.core.query import Batch, evenly
-from gaigs.core.stages import timed
 from gaigs.data import Links
 from gaigs.kriging.links import single_readings
 from gaigs.model.base import Model
@@ -72,7 +74,7 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
         batch = Batch(links.query[index[:1]], links.task.directions).to(fold.device)
         return Answers(values, deviations, fold.deviations(batch) is not None)
 
-    with timed("intervals"):
+    with stages.timed("intervals"):
         unseen = model.unseen(links)
         calibration = calibrate(links, name_of(model), model.fold_count, unseen, answer)
         if calibration is None or not model.any_receiver or links.one_radio:
@@ -154,3 +156,20 @@ def random_effects(errors: Sequence[Tensor]) -> Float[Tensor, "2"]:
     means = torch.stack([part.mean() for part in errors])
     between = means.square().mean() - (within / counts).mean()
     return torch.stack((between.clamp_min(0), within))
+
+
+def count_in_time(model: Model, links: Links, most: int) -> int:
+    """The number of known links of a receiver, at most ``most``, that the time left for kriging
+    allows.
+
+    The trained model predicts the links once, and once more for each half of the validation links.
+    These three predictions may take a third of the time that is left.
+    """
+    if math.isinf(stages.left()):
+        return most
+    sample = evenly(links.split.known, 64)
+    predicted(model, links, sample[:1])  # the first prediction compiles and loads
+    began = time.monotonic()
+    predicted(model, links, sample)
+    link_time = max(time.monotonic() - began, 1e-9) / len(sample)  # [s]
+    return int(min(most, max(100, stages.left() / 9 / link_time / links.scene.radios)))

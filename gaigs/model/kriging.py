@@ -2,7 +2,6 @@
 
 import logging
 import math
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,7 +27,7 @@ from gaigs.kriging.paths import PathPosterior
 from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar import ScalarPosterior
 from gaigs.model import LookUp, Model, Prediction, Wrapper
-from gaigs.model.answers import predicted
+from gaigs.model.answers import count_in_time, predicted
 from gaigs.registry import name_of, register, registry
 
 log = logging.getLogger(__name__)
@@ -149,7 +148,7 @@ class Kriging(Wrapper):
         count = len(links.split.known)
         if most is None:
             most = max(1, count) if links.task.is_scalar else LIMIT
-        links = limit_known(links, self._most(links, most))
+        links = limit_known(links, count_in_time(self.trend, links, most))
         if is_final and math.isfinite(stages.left()) and len(links.split.known) < count:
             stages.leave_out(f"kriging has {len(links.split.known)} of {count} known links")
         self.fallback.fit(links)
@@ -159,9 +158,8 @@ class Kriging(Wrapper):
         if by_paths is None and self.trend.has_margins:
             is_few = len(single_readings(links, links.split.validation)) < FEWEST
             return self._krige_better(links, values, is_final, is_few)
-        if by_paths:
-            return self._krige_paths(links, values, is_final)
-        return self._krige_labels(links, values, is_final)
+        krige = self._krige_paths if by_paths else self._krige_labels
+        return krige(links, values, is_final)
 
     def law_scores(self, links: Links, held: Int[Tensor, " h"]) -> Float[Tensor, " h"]:
         """Scores of validation links by the law that may take the trend's place, which is kept."""
@@ -195,21 +193,6 @@ class Kriging(Wrapper):
                 scores.mean(),
             )
         return self._krige_labels(links, values, is_final)
-
-    def _most(self, links: Links, most: int = LIMIT) -> int:
-        """The number of known links of a receiver that time allows, at most ``most``.
-
-        The trained model predicts the links once, and once more for each half of the validation
-        links. These three predictions may take a third of the time that is left.
-        """
-        if math.isinf(stages.left()):
-            return most
-        sample = evenly(links.split.known, 64)
-        predicted(self.trend, links, sample[:1])  # the first prediction compiles and loads
-        began = time.monotonic()
-        predicted(self.trend, links, sample)
-        link_time = max(time.monotonic() - began, 1e-9) / len(sample)  # [s]
-        return int(min(most, max(100, stages.left() / 9 / link_time / self.scene.radios)))
 
     def _krige_labels(self, links: Links, values: Tensor | None, is_final: bool) -> "Kriging":
         """``krige`` of labels, where the trend may lose its weight to a law of distance.

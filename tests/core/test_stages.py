@@ -17,6 +17,7 @@ from gaigs.core import stages
 from gaigs.kriging import scalar_fit
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.kriging.scalar_fit import ScalarOptions
+from gaigs.model.answers import count_in_time
 from gaigs.model.gaussian_process import GaussianProcess
 from gaigs.model.kriging import Kriging
 from gaigs.testing import example_links
@@ -172,10 +173,10 @@ def test_kriging_takes_as_many_links_as_it_has_time_for(clock, monkeypatch):
     model = Kriging(
         links.scene, gaigs.train("gaigs", links, max_steps=1, count=10, enable_progress_bar=False)
     )
-    monkeypatch.setattr("gaigs.model.kriging.time", Clock(64.0))  # a second a link
-    assert model._most(many) == 6000
+    monkeypatch.setattr("gaigs.model.answers.time", Clock(64.0))  # a second a link
+    assert count_in_time(model.trend, many, 6000) == 6000
     with stages.watched(9 * 250.0 * len(links.receivers)):
-        assert model._most(many) in (249, 250)
+        assert count_in_time(model.trend, many, 6000) in (249, 250)
 
 
 SMALL = (
