@@ -43,7 +43,7 @@ class Mirrored(PathFields):
         planes: Largest number of planes; six at the start; the searches of spectra and channels
             find others.
         order: Largest number of reflections of a path; at most 100,000 sequences of planes.
-        obstacles: Number of Gaussians of matter in the room.
+        obstacles: Number of Gaussians of matter in the room; with 0 no boxes are searched either.
         walls: File whose largest planes are the first ones: a floor plan ``.csv`` of consecutive
             vertices x,y [m], or a Wavefront ``.obj`` [m]. None: the box's faces. A checkpoint does
             not need the file.
