@@ -148,7 +148,7 @@ class Ensemble(Wrapper):
             if member.is_trained:
                 of_members.append([*member.unseen(links)])
             else:
-                refitted = member._refitted(training)
+                refitted = member.refitted(training)
                 of_members.append([Unseen(refitted, links.split.validation, links.split.train)])
         for parts in itertools.product(*of_members):
             asked = parts[0].asked
@@ -162,8 +162,8 @@ class Ensemble(Wrapper):
         for mine, theirs in zip(self._members, other._members, strict=True):
             mine.take_hyperparameters(theirs)
 
-    def _refitted(self, links: Links) -> Model:
-        return self._of([member._refitted(links) for member in self._members])
+    def refitted(self, links: Links) -> Model:
+        return self._of([member.refitted(links) for member in self._members])
 
     def _of(self, members: list) -> "Ensemble":
         """The same mean of other members."""

@@ -11,8 +11,9 @@ from jaxtyping import Complex, Float
 from scipy.constants import speed_of_light
 from torch import Tensor, nn
 
+from gaigs.core import stages
 from gaigs.core.propagation import fit_gain
-from gaigs.core.query import Batch, Query
+from gaigs.core.query import Batch, Query, drawn
 from gaigs.core.scene import Scene, carriers, direct_gains, direct_waves
 from gaigs.core.task import Task
 from gaigs.data import Links
@@ -192,7 +193,7 @@ class MirroredSplatting(GaussianSplatting):
         self._plan(planes, slabs)
         # One receiver or two do not tell how far behind a box its shadow began.
         if is_known and self.scene.radios >= 3:
-            rows = train[:: math.ceil(len(train) / 1200)]  # with which a search takes some seconds
+            rows = drawn(train, 1200)  # with which a search takes some seconds
             self.shadowed = Batch(links.query[rows], labels=received[rows])
         placement.step.mul_(0.1)  # the search is exact to millimetres
 
@@ -318,6 +319,8 @@ class MirroredSplatting(GaussianSplatting):
         paths = links.paths._replace(start=links.paths.start @ axes, end=links.paths.end @ axes)
         ends = torch.cat((links.seen[0][:, 0], links.receivers)).unique(dim=0) @ axes
         boxes = BoxSearch(paths, ChannelErrors(torch.cat(products), torch.cat(matches)), ends).run()
+        if stages.is_up():
+            return "; no time for boxes"
         if boxes:
             depths = ends.new_tensor([box.loss for box in boxes])
             corners = torch.stack([box.corners for box in boxes])

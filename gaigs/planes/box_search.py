@@ -98,7 +98,9 @@ class BoxSearch:
     @torch.no_grad()
     def run(self) -> list[Cuboid]:
         """The boxes; none if no box is clear."""
-        while len(self.boxes) < self.most and not stages.is_up():
+        for _ in range(self.most):
+            if stages.is_up() or len(self.boxes) >= self.most:
+                break
             depths = self._depths(self.boxes)
             before = self.errors(depths)
             best = None

@@ -146,7 +146,8 @@ def _try_each(
         with stages.watched(max(1.0, share), shown), limited_threads(config["threads"]):
             try:
                 tried.append(work(label, config, links, place))
-            except ValueError as error:  # such as of a training that diverges
+            # Such as of a training that diverges, or of memory.
+            except (ValueError, RuntimeError) as error:
                 log.warning("auto: %s is left out: %s", label, error)
     return tried
 

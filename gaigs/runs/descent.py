@@ -74,7 +74,7 @@ def descend(
         validation = InOrder(links, links.split.validation, module.batch_size)
     resumed = last if last.is_file() else None
     if resumed is not None:
-        content = resumable(last, best)
+        content = resumable(last, best, module)
         check_same_links(content[checkpoint.KEY], identity, last)
         log.info("going on after step %d", content["global_step"])
         stages.current().began -= content["callbacks"][budget.state_key]["seconds"]
@@ -141,14 +141,18 @@ def _check_processes(trainer: lightning.Trainer, config: dict) -> None:
         )
 
 
-def resumable(last: Path, best: Path) -> dict:
-    """The checkpoint to resume from; a ValueError if it or the best one is damaged."""
+def resumable(last: Path, best: Path, module: lightning.LightningModule) -> dict:
+    """The checkpoint to resume from; a ValueError if it or the best one is damaged or too old."""
     training = ("optimizer_states", "lr_schedulers", "loops", "callbacks", "epoch", "global_step")
     try:
         content = checkpoint.read(last)
         known = content | content[checkpoint.KEY]
         if lacking := [key for key in (*training, "split", "links") if key not in known]:
             raise ValueError(f"{last} lacks {', '.join(lacking)} of a training")
+        # The optimizer knows no parameters of a later version.
+        parameters = [name for name, _ in module.named_parameters()]
+        if lacking := [name for name in parameters if name not in content["state_dict"]]:
+            raise ValueError(f"{last} is of another version of gaigs, without {lacking[0]}")
         if best.is_file():
             checkpoint.read(best)
     except ValueError as error:

@@ -266,10 +266,10 @@ def score(
             continue
         with stages.timed(key):
             model = models[key] if key in models else fitted(look_ups[key], links, earlier.get(key))
-            earlier[key] = model
         if is_baseline and stages.is_up():
             left_out.append(key)
             continue
+        earlier[key] = model
         with stages.timed(key):
             values = predicted(model, links, test.index, frequencies)
         test.add(key, values)

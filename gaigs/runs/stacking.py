@@ -52,6 +52,9 @@ def shares_of(products: Float[Tensor, "k c c"], places: Int[Tensor, " k"]) -> Fl
     matrix = torch.cat((root, draw * one, torch.full_like(one[:1], 1e3)))
     target = torch.cat((0 * first, draw * first, first.new_tensor([1e3])))
     found = torch.from_numpy(nnls(matrix.numpy(), target.numpy())[0])
-    tenths = (10 * found / found.sum()).round() / 10
-    tenths[found.argmax()] += 1 - tenths.sum()
-    return tenths
+    exact = 10 * found / found.sum()
+    tenths = exact.floor()
+    # The largest remainders get what rounding down has left.
+    lacking = int(10 - tenths.sum().round())
+    tenths[(exact - tenths).argsort(descending=True)[:lacking]] += 1
+    return tenths / 10

@@ -10,6 +10,7 @@ from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model import checkpoint
 from gaigs.model.ensemble import Ensemble
 from gaigs.model.gaigs import GaussianSplatting
+from gaigs.registry import registry
 
 FEW = {"max_steps": 2, "count": 20, "enable_progress_bar": False}
 
@@ -130,3 +131,22 @@ def test_deviations_do_not_depend_on_the_asked_directions():
     expected = model.deviations(batch)
     assert (expected > 0).all()
     torch.testing.assert_close(model.deviations(replace(batch, directions=few)), expected)
+
+
+@pytest.mark.parametrize("other", ["path_loss", "gaigs"])
+def test_held_out_predictions_of_a_blend_have_not_seen_their_links(links, other):
+    nearest = registry("model").build({"name": "knn", "k": 1}, scene=links.scene)
+    nearest.fit(links)
+    members = [nearest, gaigs.train(other, links, **(FEW if other == "gaigs" else {}))]
+    blend = Ensemble(links.scene, members, [0.5, 0.5]).eval()
+    blend.fit(links)
+    unseen = [*blend.unseen(links)]
+    assert unseen
+    for part in unseen:
+        query = links.query[part.asked]
+        # The nearest neighbour of a known link is the link itself.
+        torch.testing.assert_close(nearest.predict(query), links.labels[part.asked])
+        held_out, other_one = part.model.members
+        assert not torch.allclose(held_out.predict(query), links.labels[part.asked])
+        expected = (held_out.predict(query) + other_one.predict(query)) / 2
+        torch.testing.assert_close(part.model.predict(query), expected)

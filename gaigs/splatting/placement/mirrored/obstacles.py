@@ -63,7 +63,7 @@ class Obstacles(nn.Module):
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
         for name in ("boxes", "box_axes", "box_depths"):  # which older checkpoints lack
-            state_dict.setdefault(prefix + name, getattr(self, name).detach())
+            state_dict.setdefault(prefix + name, torch.zeros_like(getattr(self, name)))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     @torch.no_grad()
@@ -72,6 +72,7 @@ class Obstacles(nn.Module):
     ) -> None:
         """Puts boxes with their depths [Np]; Gaussians are as faint as at the start again."""
         self.box_axes.copy_(axes)
+        self.boxes.zero_()
         self.boxes[: len(boxes)] = boxes
         self.box_depths[: len(boxes)] = depths
         self.log_densities.fill_(math.log(0.096 / float(self.unit)))
