@@ -15,8 +15,9 @@ from gaigs.splatting.placement.mirrored.reflections import Folded
 class ChannelErrors(NamedTuple):
     """Logarithms of the relative errors of channels h whose paths are dimmed by depths.
 
-    With the paths' fields F and a = exp(-depths), |h - F a|² = |h|² - 2 a . Re(F^H h) + a .
-    Re(F^H F) a.
+    F has the field of each path without obstacles, and a = exp(-depths):
+
+        |h - F a|² = |h|² - 2 a' Re(F^H h) + a' Re(F^H F) a
     """
 
     products: Float[Tensor, "b n n"]  # Re(F^H F) / |h|²
@@ -35,6 +36,7 @@ class ChannelErrors(NamedTuple):
         return cls(products, (fields.conj() @ channels)[..., 0].real / power)
 
     def __call__(self, depths: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+        """Error of each link with its paths dimmed by ``depths`` [Np]."""
         passed = (-depths).exp()
         terms = (self.products @ passed[..., None])[..., 0] - 2 * self.matches
         errors = (1 + (passed * terms).sum(1)).clamp_min(0)
@@ -184,7 +186,8 @@ class BoxSearch:
             return [Cuboid(box.corners, loss) for loss in losses.clamp(*self.losses).tolist()]
         sides = [part // 3] if part < 6 else [0, 1]
         changed = []
-        for step in (*steps, *(-step for step in steps)):
+        inwards = [-step for step in steps]
+        for step in (*steps, *inwards):
             corners = box.corners.clone()
             corners[sides, part % 3] += step * self.cell
             changed.append(Cuboid(corners, box.loss))

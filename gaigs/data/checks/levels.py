@@ -65,7 +65,7 @@ def _linear_unit(sample: Sample | None, text: str, median: float) -> Finding:
     """The finding that levels are volts, watts or mW instead of decibels, with its mend.
 
     Args:
-        sample: Links of receivers at given places; None if there are none.
+        sample: Some links of the receivers whose places are given; None if no place is given.
         text: What was found so far.
         median: 10 log10 of the median level.
     """

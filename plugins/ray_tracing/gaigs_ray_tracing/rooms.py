@@ -91,7 +91,7 @@ def known_materials(meshes: Sequence[Mesh], chosen: Mapping[str, str]) -> dict[s
 
 
 def _read(file: Path) -> list[Mesh]:
-    """The surfaces of a file of any kind; a ``ValueError`` if there are none."""
+    """The surfaces of a mesh or scene file; a ``ValueError`` if it has none."""
     if file.suffix not in SUFFIXES:
         raise ValueError(f"model.mesh must be a file {', '.join(SUFFIXES)}, got {file.name}")
     if not file.is_file():

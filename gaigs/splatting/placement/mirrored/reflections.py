@@ -46,7 +46,7 @@ class Folded(NamedTuple):
     def parts(
         self, values: Inexact[Tensor, "b w *s"]
     ) -> Iterator[tuple[int, Inexact[Tensor, "b k *s"]]]:
-        """Splits values of bounces: those of all last bounces, of the last but one, and so on.
+        """Splits values of bounces: first the last bounce of every path, then the last but one.
 
         Each part comes with the number of its first sequence; it has all sequences from there on.
         """
