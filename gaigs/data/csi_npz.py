@@ -176,7 +176,7 @@ def _to_links(
     """Links of checked arrays, without channels of zeros.
 
     Args:
-        added: Remarks on their making.
+        added: Remarks on how the arrays were made.
         ignored: Names of other arrays in the file.
     """
     numbers = {name: torch.from_numpy(array) for name, array in arrays.items()}
@@ -247,10 +247,10 @@ def write(folder: str | Path, links: Links) -> None:
 def _load(
     file: Path, given: Mapping[str, str | list], axis: str | None
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The arrays by name, and the names of ignored arrays.
+    """The arrays by gaigs's names, and the names of ignored arrays.
 
     Args:
-        given: Other names of arrays in the file.
+        given: Names of arrays in the file where they differ from gaigs's.
         axis: Option ``parts`` of ``read``.
     """
     arrays: dict[str, np.ndarray] = {}

@@ -134,8 +134,8 @@ class Bsdf(NamedTuple):
 def itu_bsdf(material: Material, frequency: float) -> Bsdf:
     """A material of ITU-R P.2040 in Sionna RT.
 
-    Sionna RT gets its name, and computes the constants for the carrier that is set there. Outside
-    1 to 40 GHz, where Sionna RT has no table, it gets extrapolated constants.
+    Sionna RT gets its name, and computes the constants for the carrier that is set there. Outside 1
+    to 40 GHz, where Sionna RT has no table, it gets extrapolated constants.
 
     Args:
         material: Name and thickness.

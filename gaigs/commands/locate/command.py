@@ -120,11 +120,10 @@ def summary(
     """Scores of located test transmitters by the name of the estimate, for ``locate.json``.
 
     There are the median and mean error of each estimate [m]; the mean place goes by the name
-    ``locate``. It also has the share of transmitters inside their regions, and the mean prior
-    probability of a region.
+    ``locate``, with the share of transmitters inside their regions and the mean prior probability
+    of a region.
 
     Args:
-        truth: Places of the transmitters [m].
         errors: Errors by the estimate's name, such as ``median`` or ``knn`` [m].
         level: Probability with which a region holds its transmitter.
     """

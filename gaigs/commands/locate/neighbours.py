@@ -32,7 +32,6 @@ def neighbours(
         values: Fingerprints to locate. Where a receiver has received nothing, the least known level
             stands in, or 0 for labels of several numbers.
         known: Fingerprints at the known ``places`` [m].
-        places: Places of the known transmissions.
         groups: Group of each known fingerprint, such as its place.
         most: Largest number of known transmissions that choose the number of neighbours.
     """
@@ -57,7 +56,6 @@ def weighted_mean(
 
     Args:
         apart: Distance of each of n fingerprints from the fingerprint at each of k places.
-        places: The places [m].
     """
     nearest = apart.topk(min(count, apart.shape[1]), largest=False)
     weights = 1 / nearest.values.clamp_min(1e-6)

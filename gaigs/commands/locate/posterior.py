@@ -116,10 +116,9 @@ def posterior(
     step: float | None,
     level: float,
 ) -> Location:
-    """The location of received fingerprints, by the options of ``locate``.
+    """The location of fingerprints ``values``, by the options of ``locate``.
 
-    Args:
-        values: Fingerprints of n transmissions, m numbers a receiver by ``Task.fingerprint``.
+    Each of n transmissions has m numbers a receiver, by ``Task.fingerprint``.
 
     Raises:
         ValueError: ``level`` or ``step`` is out of range.

@@ -42,13 +42,10 @@ class Coverage:
 
 
 class MeanLevel(Coverage):
-    """Expected reading of the best receiver [dBm].
+    """Expected reading of the best receiver [dBm]; arguments as for ``Coverage``.
 
-    For a level a below all readings it is a + integral from a on of P(best reading > t) dt.
-
-    Args:
-        values, deviations: As of ``Coverage``.
-        steps: Number of levels t.
+    For a level a below all readings it is a + integral from a on of P(best reading > t) dt, over
+    ``steps`` levels t.
     """
 
     def __init__(
