@@ -272,8 +272,8 @@ def stopping(waits: bool = False) -> Iterator[None]:
     """Lets the signals ``STOPPING`` stop a run as Ctrl-C does, and restores the handlers.
 
     Args:
-        waits: True for a process that waits for another run afterwards. It ignores the signals
-            then, as its launcher would wait for it forever.
+        waits: True for a process that waits for another run afterwards. While it waits, signals
+            are noted and stop its next run: if the process ended, its launcher would hang.
     """
     # Other threads may not set handlers.
     if threading.current_thread() is not threading.main_thread():

@@ -154,9 +154,9 @@ def lacking(
     count: int,
     frequencies: Float[Tensor, " s"],
 ) -> Bool[Tensor, "b e s"]:
-    """True for numbers of channels that do not exist at each link's receiver.
+    """True where a number of a channel (b, e, s) does not exist at the link's receiver.
 
-    These are elements, of ``count`` ones, that its array lacks, and subcarriers outside its band.
+    Its array has only the first few of the ``count`` elements, or its band excludes the subcarrier.
     """
     sizes = torch.tensor([len(receiver.array) for receiver in receivers])
     hears = torch.stack([receiver.hears(frequencies.cpu()) for receiver in receivers])  # (r, s)

@@ -51,10 +51,10 @@ def from_arrays(
             ``Spectrum(elevations, azimuths)`` or ``Csi(elements, frequencies)`` of
             ``gaigs.core.task``.
         transmitters: Positions, world frame (n, 3) [m], or (n, 2) of one ``height``.
-        labels: One a link (n, *shape), or one for each transmitter and receiver (n, k, *shape),
-            with the task's ``shape``. Real numbers (n, k) may be a data frame, whose columns name
-            the receivers. Readings of NaN or None and channels of zeros were not received: they are
-            left out, and so are receivers without training links.
+        labels: One a link (n, *task.shape), or one for each transmitter and receiver (n, k,
+            *task.shape). Numbers (n, k) may be a data frame, whose columns name the receivers.
+            Readings of NaN or None and channels of zeros were not received: they are left out, and
+            so are receivers without training links.
         receivers: ``Receiver`` or several; or positions (3,) or (k, 3) [m], or a mapping of names
             to positions. Such receivers are not turned, and all elements of a channel stand at the
             position. For levels [dBm] a position, or all of them, may be None or NaN, and is then
@@ -168,9 +168,7 @@ def split_configuration(
     Args:
         data: Name of the data in errors, in the plural, such as ``arrays``.
         reader: Function that the user calls; errors list its parameters but the last, the options.
-        split: Name or configuration; None: ``official`` with rows, else ``random``.
-        options: Options of the split.
-        test_rows, train_rows: Rows that the user gives, for ``official`` only.
+        test_rows, train_rows: Rows that the user gives, for the split ``official`` only.
     """
     has_rows = test_rows is not None or train_rows is not None
     split = split or ("official" if has_rows else "random")
@@ -210,7 +208,6 @@ class _Ends(NamedTuple):
 
         Args:
             sent: Number of each link's transmitter place.
-            given: The user's answer; None without one.
         """
         if given is not None or not self.is_one_each:
             return bool(given)
@@ -259,14 +256,12 @@ def _find_stands(
     height: float,
     task: Task,
 ) -> _Stands:
-    """Names and positions of the receivers.
+    """Names and positions of the receivers; positions (k, 2) get the ``height`` [m].
 
     Args:
         receivers: Positions; a mapping of them by name; or None for receivers without a position,
             as many as ``index`` or the labels' ``shape`` has.
         columns: Names of the labels' columns; empty without names.
-        index: Receiver of each link; None without.
-        height: Height of positions (k, 2) [m].
     """
     names = [*columns]
     if isinstance(receivers, Mapping):

@@ -134,7 +134,7 @@ def survey(
 ) -> SurveyPlan:
     """The next places to measure: each lowers the mean variance over a region and receivers most.
 
-    A receiver counts at a place as much as it is likely to hear it, by the measured places around.
+    A receiver counts at a place by its probability of reception, from the measured places around.
     Labels do not enter beyond the fitted process, so a plan is made before anything is measured.
     The largest variance would be a poor guide: it is in the corners. Places stand half a
     correlation length apart or more, as long as there is room. The first places of a longer plan

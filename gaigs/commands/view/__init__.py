@@ -77,7 +77,7 @@ class View:
             serving.serve_forever()
 
     def page(self, stored: dict | None = None) -> str:
-        """The HTML page; without stored predictions it asks the server that sent it."""
+        """The HTML page; without stored predictions the page asks its server for them."""
         # Amplitudes and maps, paths, errors, and Gaussians.
         colours = {}
         for name in ("viridis", "plasma_r", "YlOrRd", "Blues"):

@@ -49,7 +49,7 @@ def read(
     Args:
         file: The table. Levels lie in [-150, 30] dBm. Empty cells and NaN were not received.
         gateways: Table of ``name,x,y,z``, or YAML of ``name: [x, y, z]``, in the coordinates of the
-            places. Gateways that it does not have, or all if it is None, get their place from the
+            places. Gateways that the table lacks, or all without a table, get their place from the
             training links.
         coordinates: Columns of x, y and optionally z or floor; longitude and easting come first.
             None: by their names.
