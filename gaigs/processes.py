@@ -148,7 +148,7 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
 
 
 def fault_of_plug_in(error: Exception) -> str:
-    """File and line in a plug-in at which an error arose; empty if its code raised the error.
+    """File and line in a plug-in at which an error arose; empty if the plug-in itself raised it.
 
     Files of gaigs and installed packages are no plug-ins.
     """
@@ -226,9 +226,10 @@ def hang_up(number: int) -> None:
 
 
 class _Repeater:
-    """Handler of a stopping signal, which is sent again if Python ignores its error.
+    """Handler of a stopping signal, whose error stops the run.
 
-    Python ignores errors that are raised while it destroys an object.
+    Python ignores the error if it is raised while an object is destroyed; the signal is then sent
+    again.
     """
 
     def __init__(self, delay: float = 0.05):

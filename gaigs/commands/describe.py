@@ -184,8 +184,8 @@ def figure(links: Links) -> Figure:
 def draw_places(axis: Axes, links: Links, levels: Levels) -> None:
     """Draws places and receivers from above.
 
-    A place has the colour of the number of receivers that receive it. If all places have the same
-    number, it is the level at the first receiver.
+    Colours show how many receivers receive a place. If this number is the same everywhere, they
+    show the level at the first receiver.
     """
     query = links.query
     pairs = torch.cat((query.transmitters, query.receivers[:, None].float()), 1).unique(dim=0)

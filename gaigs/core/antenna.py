@@ -82,9 +82,9 @@ class Array:
 
     @functools.cached_property
     def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"], Float[Tensor, " l"]]:
-        """Distinct vectors between elements [m], each pair's index, and pairs of each; float64.
+        """Distinct vectors between elements [m], each pair's vector by number, and pairs of each.
 
-        A field's covariance depends on these vectors alone; a 4 x 4 array has 49.
+        A field's covariance depends on these vectors alone; a 4 x 4 array has 49. All in float64.
         """
         # Cached tensors of inference mode could not be saved for a later backward pass.
         with torch.inference_mode(False):

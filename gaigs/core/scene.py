@@ -306,7 +306,7 @@ def direct_waves(
     sign: int = -1,
     at_elements: bool = True,
 ) -> Complex[Tensor, "b e s"]:
-    """Free space from each transmitter to its receiver's elements, or to its middle (e = 1).
+    """Free space to the receiver's elements or, without ``at_elements``, to its middle (e = 1).
 
     It is 0 at elements that the receiver's array lacks, and outside the receiver's band.
     ``sign`` is as for ``free_space``.

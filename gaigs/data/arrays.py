@@ -402,7 +402,7 @@ def _one_a_link(labels: Tensor, index: Any, count: int, receivers: int, task: Ta
 
 
 def _received(labels: Tensor, task: Task, remarks: list[str]) -> Bool[Tensor, " m"]:
-    """True for links that were received: their label is not NaN, and no channel of zeros.
+    """True for links that were received: their label is neither NaN nor a channel of zeros.
 
     Raises:
         ValueError: No link was received, or a label is NaN or infinite in part.

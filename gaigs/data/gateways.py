@@ -107,7 +107,8 @@ def _fit_laws(
 ) -> Laws:
     """Laws of each candidate under each correlation, with their log likelihood.
 
-    The likelihood is over all laws and variances; the prior of the slope is one more observation.
+    The likelihood is integrated over all laws and variances; the prior of the slope acts as one
+    more observation.
 
     Args:
         factors: Cholesky factors of c correlations of the shadowing at n places.

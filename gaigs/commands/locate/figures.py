@@ -108,7 +108,7 @@ def error_figure(
         truth: Places of the transmitters [m].
         mean: Estimates of them [m].
         known: Known places [m].
-        errors: Errors by the names of the guesses, with "mean" and "knn" [m].
+        errors: Errors by the names of the estimates, with "mean" and "knn" [m].
         most: Largest number of transmitters from above.
     """
     with rc_context(style.STYLE):

@@ -71,7 +71,7 @@ def mismatch(
     if not unknown_power:
         likely = is_received.float() @ prints.reception_probabilities.log().mT
         unlikely = (~is_received).float() @ (-prints.reception_probabilities).log1p().mT
-        # In a track, a value that no receiver has received may not have been sent.
+        # In a track, a transmission that no receiver has received may not have been sent.
         reception = (likely + unlikely) * (counts > 0)[:, None]
     elif not prints.task.shape:
         counts = counts - 1  # the fitted offset takes one degree of freedom

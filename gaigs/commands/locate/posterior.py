@@ -133,7 +133,7 @@ def posterior(
     drop = conformal_drop(prints, unknown_power, step, level)
     is_calibrated = prints.held_out_count >= fewest(level)
     locations = []
-    # In parts: a value takes 60 bytes a candidate, and its posterior 9. A track is one part.
+    # In parts: a transmission takes 60 bytes a candidate, its posterior 9. A track is one part.
     for part in values.split(64 if step is None else len(values)):
         difference = mismatch(prints, part @ prints.axes, unknown_power)
         candidates = prints.candidates

@@ -195,7 +195,7 @@ class MapMaker:
     def has_whole_transmissions(self) -> bool:
         """True if no transmission of a known link has a link in the test.
 
-        A receiver without a link of a transmission has then not received it.
+        Then a receiver without a known link of a transmission has not received this transmission.
         """
         rows = rows_of(self.links)
         known = rows[at_carrier(self.links, self.frequency, "train", "validation")]

@@ -48,8 +48,8 @@ def track(
     Args:
         logarithms: Log posterior of each transmission alone.
         step, is_received: See ``smoothed``.
-        spread: Number of candidates left over which the posterior of a single transmission spreads;
-            it sets m. Regions of tracks reach far beyond the likeliest candidates.
+        spread: Number of the j candidates over which the posterior of one transmission spreads; it
+            sets m. Regions of tracks reach far beyond the likeliest candidates.
 
     Returns:
         The j candidates, and the logarithms of the track's posterior at them.

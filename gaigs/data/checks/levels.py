@@ -62,10 +62,10 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 
 
 def _linear_unit(sample: Sample | None, text: str, median: float) -> Finding:
-    """The finding that positive levels are volts, watts or mW instead of decibels.
+    """The finding that positive levels are volts, watts, mW or less instead of decibels.
 
-    A slope near 10 dB a decade of distance, in place of 20, tells volts. Else the size of the
-    levels tells watts from mW.
+    By 10 log10, amplitudes fall by 10 dB a decade of distance, and powers by 20: such a slope tells
+    volts. Else the size of the levels tells watts from mW.
 
     Args:
         sample: Links of the receivers whose places are given, for the slope; None: no place is.

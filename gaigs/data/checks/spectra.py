@@ -26,7 +26,7 @@ from gaigs.data.checks.places import scale_of
 
 
 def check_extremes(links: Any) -> Iterator[Finding]:
-    """Counts of constant spectra, and of min-max spectra without a pixel of 0 or of 1.
+    """Findings that count constant spectra, and min-max scaled ones without a pixel of 0 or of 1.
 
     A ``ValueError`` if all spectra are constant, or too small for SSIM.
     """
