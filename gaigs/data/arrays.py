@@ -134,7 +134,7 @@ def _warn_of_untrained(receivers: Sequence[Receiver], trained: Sequence[Receiver
     untrained = [receiver.name for receiver in receivers if receiver.name not in names]
     if untrained:
         log.warning(
-            "receivers without a training link are left out: %s\nname the others by name",
+            "receivers without a training link are left out: %s\nuse names: indices shift",
             shortened(untrained),
         )
 

@@ -210,7 +210,7 @@ def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator
 
 
 def changing(name: str, parts: Sequence[str], move: Move, mend: str) -> Hypothesis:
-    """A convention that moves the fields ``parts`` of a ``Sample``."""
+    """A convention that changes the fields ``parts`` of a ``Sample`` by ``move``."""
     return Hypothesis(name, partial(_changed, parts=parts, move=move), mend)
 
 
@@ -230,7 +230,7 @@ def _scaled(ends: Sequence[str], unit: str, factor: float) -> Hypothesis:
 
 
 def _changed(sample: Sample, parts: Sequence[str], move: Move) -> Sample:
-    """The sample with ``move`` of the fields ``parts``, or of each array in a tuple of arrays."""
+    """The sample with ``move`` applied to the fields ``parts``, or to each array in a tuple."""
     moved = {}
     for name in parts:
         value = getattr(sample, name)

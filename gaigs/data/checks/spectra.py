@@ -191,7 +191,7 @@ def best_directions(
 
 
 def near_likeness(sample: Sample) -> float:
-    """Mean correlation of each spectrum with the nearest other place's, less the mean spectrum."""
+    """Mean correlation of each spectrum with that of the nearest place, both less the mean."""
     pixels = sample.labels.flatten(1)
     likeness = torch.corrcoef(pixels - pixels.mean(0))  # (n, n)
     apart = torch.cdist(sample.transmitters, sample.transmitters).fill_diagonal_(math.inf)
