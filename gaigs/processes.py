@@ -148,7 +148,7 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
 
 
 def fault_of_plug_in(error: Exception) -> str:
-    """File and line in a plug-in at which an error arose; empty if its code raised the error.
+    """File and line in a plug-in at which an error arose; empty if the plug-in itself raised it.
 
     Files of gaigs and installed packages are no plug-ins.
     """
@@ -226,9 +226,10 @@ def hang_up(number: int) -> None:
 
 
 class _Repeater:
-    """Handler of a stopping signal, which is sent again if Python ignores its error.
+    """Handler of a stopping signal, whose error stops the run.
 
-    Python ignores errors that are raised while it destroys an object.
+    Python ignores the error if it is raised while an object is destroyed; the signal is then sent
+    again.
     """
 
     def __init__(self, delay: float = 0.05):
@@ -272,8 +273,8 @@ def stopping(waits: bool = False) -> Iterator[None]:
     """Lets the signals ``STOPPING`` stop a run as Ctrl-C does, and restores the handlers.
 
     Args:
-        waits: True for a process that waits for another run afterwards. It ignores the signals
-            then, as its launcher would wait for it forever.
+        waits: True for a process that waits for another run afterwards. While it waits, signals
+            are noted and stop its next run: if the process ended, its launcher would hang.
     """
     # Other threads may not set handlers.
     if threading.current_thread() is not threading.main_thread():

@@ -37,9 +37,9 @@ class Job(NamedTuple):
 def run(config: DictConfig) -> float | None:
     """One job: ``gaigs.run`` in Hydra's run folder; returns the validation score for sweepers.
 
-    An error that a user can mend becomes one message; ``hydra.verbose=true`` prints the traceback
-    first. A signal ends the process with 128 and the signal's number, as in shells. Without a
-    result there is no folder.
+    An error that a user can correct becomes one message; ``hydra.verbose=true`` prints the
+    traceback first. A signal ends the process with 128 and the signal's number, as in shells.
+    Without a result there is no folder.
     """
     settings = HydraConfig.get()
     job = describe_job(settings, config.get("command"))

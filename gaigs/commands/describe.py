@@ -28,8 +28,8 @@ class Description:
     """What ``describe`` finds; its text is one screen.
 
     Attributes:
-        read: Sentences on the links, places, labels and receivers, and what the reader left out.
-        findings: What is probably wrong, and what mends it.
+        read: Sentences on the links, places, labels and receivers, and on readings left out.
+        findings: What is probably wrong, and how to correct it.
 
     Example:
         >>> print(gaigs.describe(gaigs.links("synthetic_rssi", transmitters=60)))
@@ -184,8 +184,8 @@ def figure(links: Links) -> Figure:
 def draw_places(axis: Axes, links: Links, levels: Levels) -> None:
     """Draws places and receivers from above.
 
-    Colours are the number of receivers that receive a place, or the level at the first one if all
-    numbers are equal.
+    Colours show how many receivers receive a place. If this number is the same everywhere, they
+    show the level at the first receiver.
     """
     query = links.query
     pairs = torch.cat((query.transmitters, query.receivers[:, None].float()), 1).unique(dim=0)

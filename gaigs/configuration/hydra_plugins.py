@@ -34,8 +34,9 @@ class PluginConfigurations(SearchPathPlugin):
 class Constructors(ConfigSource):
     """The configuration of a component: ``name``, and its constructor's options with defaults.
 
-    For a reader it also chooses the task and the split that ``gaigs.register`` notes. A file of the
-    same name takes the options from the group ``constructors/<kind>``.
+    For a data reader it also chooses the task and the split that ``gaigs.register`` notes. A YAML
+    file of the same name replaces it; such a file includes the options from
+    ``constructors/<kind>/<name>``.
     """
 
     def __init__(self, provider: str, path: str):

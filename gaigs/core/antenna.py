@@ -82,9 +82,9 @@ class Array:
 
     @functools.cached_property
     def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"], Float[Tensor, " l"]]:
-        """Distinct vectors between elements [m], each pair's index, and pairs of each; float64.
+        """Distinct vectors between elements [m], each pair's vector by number, and pairs of each.
 
-        A field's covariance depends on these vectors alone; a 4 x 4 array has 49.
+        A field's covariance depends on these vectors alone; a 4 x 4 array has 49. All in float64.
         """
         # Cached tensors of inference mode could not be saved for a later backward pass.
         with torch.inference_mode(False):
@@ -154,9 +154,9 @@ def lacking(
     count: int,
     frequencies: Float[Tensor, " s"],
 ) -> Bool[Tensor, "b e s"]:
-    """True for numbers of channels that do not exist at each link's receiver.
+    """True where a number of a channel (b, e, s) does not exist at the link's receiver.
 
-    These are elements, of ``count`` ones, that its array lacks, and subcarriers outside its band.
+    Its array has only the first few of the ``count`` elements, or its band excludes the subcarrier.
     """
     sizes = torch.tensor([len(receiver.array) for receiver in receivers])
     hears = torch.stack([receiver.hears(frequencies.cpu()) for receiver in receivers])  # (r, s)

@@ -228,9 +228,9 @@ class FrontEndFit:
 
 
 def _polynomials(frequencies: Float[Tensor, " s"], count: int) -> Float[Tensor, "s k"]:
-    """Orthonormal polynomials over the band, of degrees below ``count``.
+    """Orthonormal polynomials over the band, k = ``count`` of degrees from 0.
 
-    They come from Chebyshev's polynomials, cos(k arccos x).
+    They come from Chebyshev's polynomials, cos(n arccos x).
     """
     middle = (frequencies.min() + frequencies.max()) / 2
     half = (frequencies.max() - middle).clamp_min(1)

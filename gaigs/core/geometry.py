@@ -25,8 +25,8 @@ class Frame:
     """Place of the world frame on a map: its origin (x, y) [m] in a projected system (EPSG code).
 
     Raises:
-        ValueError: There is no such system, it has other units than metres, or the origin is not
-            within it. Without pyproj systems other than UTM are not checked.
+        ValueError: There is no such system, its unit is not the metre, or the origin is outside of
+            the system. Without pyproj systems other than UTM are not checked.
 
     Example:
         >>> places = [[10.0, 20.0, 1.5], [30.0, 5.0, 1.5], [0.0, 9.0, 1.5]]

@@ -89,7 +89,7 @@ class RadioMap:
     def save(self, path: str | Path) -> None:
         """Writes ``.npz`` with ``values_<unit>``, e.g. ``values_dbm``, and the other attributes.
 
-        The values are ``values`` if the unit has other signs than letters.
+        The name is ``values`` alone if the unit is not all letters.
         """
         arrays = {_key(self.unit): self.values, "x": self.x, "y": self.y, "height": self.height}
         arrays |= {"receivers": self.receivers, "quantity": self.quantity, "unit": self.unit}

@@ -63,7 +63,7 @@ def obstruct(
     """Obstruction of the direct paths from ``starts`` to ``ends`` [m] by roofs.
 
     Paths are sampled about once a cell. Samples within 1.5 cells of an end do not count: an antenna
-    at a wall may be in the building's cell.
+    at a wall may be in the building's cell. The knife-edge loss depends on the ``wavelength`` [m].
 
     Returns:
         Four numbers of each path: 1 if a roof is above it, else 0; its length inside buildings [m];

@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 class FlatAxis(NamedTuple):
     """A world axis on which all transmitters share a coordinate, and all receivers share one.
 
-    A plane across it at h reflects paths of the same lengths as a plane at transmitters + receivers
-    - h, so labels do not show which of the two there is.
+    A plane across it at the coordinate h reflects paths of the same lengths as one at transmitters
+    + receivers - h, so labels do not show which of the two there is.
     """
 
     axis: int  # 0 to 2
@@ -58,10 +58,10 @@ class Scene:
         frame: Place of the world frame on a map; None if unknown.
         places: Number of training places; 0 if unknown.
         floors: Heights of separate floors of training transmitters, that with most places first
-            (k,) [m]; empty of one.
+            (k,) [m]; empty for one floor.
         responses: Factors of channels by each receiver's front end; None where none is learnt.
-        room: Corners of the box of training transmitters and training receivers (2, 3) [m], if the
-            receivers are others; None: they are the training's.
+        room: Corners of the box of training transmitters and training receivers (2, 3) [m]; None
+            if ``receivers`` are those of the training.
         one_radio: True if the receivers are places of one radio that moves, or of equal radios.
             They share one gain, and a model learns from all their links together.
 
@@ -272,8 +272,8 @@ def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
 def check_elements(owner: str, scene: Scene, pads: bool = False) -> Task:
     """The scene's task; a ``ValueError`` unless it has channels with each array's elements.
 
-    ``owner`` names a component in errors. One that ``pads`` takes smaller arrays too, and predicts
-    0 at the elements that they lack.
+    ``owner`` names a component in errors. A component that ``pads`` takes smaller arrays too, and
+    predicts 0 at missing elements.
     """
     task = scene.task
     if not task.is_channel:
@@ -306,9 +306,9 @@ def direct_waves(
     sign: int = -1,
     at_elements: bool = True,
 ) -> Complex[Tensor, "b e s"]:
-    """Free space from each transmitter to its receiver's elements, or to its middle (e = 1).
+    """Free space to the receiver's elements or, without ``at_elements``, to its middle (e = 1).
 
-    It is 0 at elements that other receivers' arrays have alone, and outside a receiver's band.
+    It is 0 at elements that the receiver's array lacks, and outside the receiver's band.
     ``sign`` is as for ``free_space``.
     """
     # Some metres from the origin float32 would round an element's place by 1e-6 m, at 6 GHz by

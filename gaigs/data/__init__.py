@@ -36,9 +36,9 @@ Parts = tuple[Int[Tensor, " train"], Int[Tensor, " test"]]
 class Split:
     """Links to train, validate and test on; ``name`` is the protocol with its numbers.
 
-    ``groups`` has the group of each link of the data, a row, a run or a cube: each is held out
-    whole. None: places are. ``by_receivers`` is true if whole receivers are held out: models then
-    predict for receivers without training links.
+    ``groups`` has the group of each of the n links, such as its row, run or cube. A group is never
+    divided, in cross-validation either; None: the groups are the places. ``by_receivers`` is true
+    if whole receivers are held out: models then predict for receivers without training links.
     """
 
     name: str
@@ -94,8 +94,8 @@ class Links:
         uncertainties: Standard deviation of each receiver's place (r,) [m]: 0 if given, infinite
             until ``divide`` estimates it from the training links. None: all are given, and
             receivers without training links stay.
-        noises: Standard deviation of each label by the scatter of repeated readings, less the more
-            of them it is the mean of (n,), in the label's unit; None without repetitions.
+        noises: Standard deviation of each label (n,), in its unit, by the scatter of repeated
+            readings; lower for a mean of several. None without repetitions.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
         one_radio: True if the receivers are places of one radio that moves, or of radios alike,
             with one gain; otherwise each has its own.
@@ -243,12 +243,15 @@ def load(data: Mapping, split: Mapping, task: str | None = None, is_checked: boo
 
 
 def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
-    """Links with their split, by its configuration; remarks name doubts, such as random phases.
+    """Links with the split of a configuration, learnt front ends and estimated places.
 
-    With ``is_checked`` remarks name what ``data.checks`` finds, too.
+    Channels lose constant subcarriers. In links with ``uncertainties``, receivers without a
+    training link are left out, and receivers without a place get an estimate of it from the
+    training links. The remarks say so.
 
-    In links with ``uncertainties``, receivers without a training link are left out, and receivers
-    without a place get an estimate of it from the training links.
+    Args:
+        split: Configuration of the split.
+        is_checked: True to search faults such as random phases by ``data.checks``, for the remarks.
     """
     if links.task.is_channel and isinstance(links.labels, Tensor):
         check_elements(links)
@@ -329,9 +332,10 @@ def check_elements(links: Links) -> None:
 
 
 def without_constant(links: Links) -> Links:
-    """Channels without constant subcarriers, and then without silent links; remarks count them.
+    """Channels without constant subcarriers, which are guards or nulls; remarks count them.
 
-    Links at held-out subcarriers lose theirs, too. Links of constant subcarriers alone stay.
+    Links at held-out subcarriers lose theirs, too. Links that are 0 at all other subcarriers are
+    left out. If all subcarriers are constant, the links stay as they are.
     """
     both = []  # the links, and the same links at held-out subcarriers
     remarks = [links.remarks]

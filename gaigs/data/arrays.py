@@ -20,7 +20,7 @@ from gaigs.core.query import Query, as_numbers, as_positions, as_tensor, check_c
 from gaigs.core.task import Task, check_range
 from gaigs.data import Links, divide
 from gaigs.data.parts import check_parts
-from gaigs.data.readings import are_one_radio, loud_remark, marks_of
+from gaigs.data.readings import are_one_radio, marks_of, remark_on_zeros
 from gaigs.io.frames import is_frame, read_frame
 from gaigs.io.tables import number_places, shortened
 from gaigs.registry import check_instance, registry, suggest
@@ -51,13 +51,13 @@ def from_arrays(
             ``Spectrum(elevations, azimuths)`` or ``Csi(elements, frequencies)`` of
             ``gaigs.core.task``.
         transmitters: Positions, world frame (n, 3) [m], or (n, 2) of one ``height``.
-        labels: One a link, (n, ...) of the task's shape; or one for each transmitter and receiver,
-            (n, k, ...), of numbers also a data frame, whose columns name the receivers. Readings of
-            NaN or None and channels of zeros were not received: they are left out, and so are
-            receivers without training links.
-        receivers: ``Receiver`` or several, or positions (3,) or (k, 3) [m] of antennas that look
-            along the axes; all elements of a channel then stand there. A mapping has names for
-            them. For levels [dBm] a position may be None or NaN, and so may all of them: it is
+        labels: One a link (n, *task.shape), or one for each transmitter and receiver (n, k,
+            *task.shape). Numbers (n, k) may be a data frame, whose columns name the receivers.
+            Readings of NaN or None and channels of zeros were not received: they are left out, and
+            so are receivers without training links.
+        receivers: ``Receiver`` or several; or positions (3,) or (k, 3) [m], or a mapping of names
+            to positions. Such receivers are not turned, and all elements of a channel stand at the
+            position. For levels [dBm] a position, or all of them, may be None or NaN, and is then
             estimated from the training links.
         index: Receiver of each link (n,), or of all, from 0; not needed with one receiver, n
             positions, or labels (n, k, ...).
@@ -134,7 +134,7 @@ def _warn_of_untrained(receivers: Sequence[Receiver], trained: Sequence[Receiver
     untrained = [receiver.name for receiver in receivers if receiver.name not in names]
     if untrained:
         log.warning(
-            "receivers without a training link are left out: %s\nname the others by name",
+            "receivers without a training link are left out: %s\nuse names: indices shift",
             shortened(untrained),
         )
 
@@ -166,8 +166,9 @@ def split_configuration(
     """The configuration of the split of data in memory, with the options of its constructor.
 
     Args:
-        data: Word for the data in messages, in the plural.
-        reader: Function that the user calls; messages list its parameters but the last.
+        data: Name of the data in errors, in the plural, such as ``arrays``.
+        reader: Function that the user calls; errors list its parameters but the last, the options.
+        test_rows, train_rows: Rows that the user gives, for the split ``official`` only.
     """
     has_rows = test_rows is not None or train_rows is not None
     split = split or ("official" if has_rows else "random")
@@ -203,7 +204,7 @@ class _Ends(NamedTuple):
     ) -> bool:
         """True if the receivers are places of one radio: as ``given``, or by ``are_one_radio``.
 
-        A remark is added where nothing was given.
+        A remark is added if it is true and the user has not said so.
 
         Args:
             sent: Number of each link's transmitter place.
@@ -255,11 +256,11 @@ def _find_stands(
     height: float,
     task: Task,
 ) -> _Stands:
-    """Names and positions of the receivers.
+    """Names and positions of the receivers; positions (k, 2) get the ``height`` [m].
 
     Args:
-        receivers: Positions; a mapping of them by name; or None for as many receivers without a
-            position as ``index`` or the labels' ``shape`` tells.
+        receivers: Positions; a mapping of them by name; or None for receivers without a position,
+            as many as ``index`` or the labels' ``shape`` has.
         columns: Names of the labels' columns; empty without names.
     """
     names = [*columns]
@@ -401,7 +402,7 @@ def _one_a_link(labels: Tensor, index: Any, count: int, receivers: int, task: Ta
 
 
 def _received(labels: Tensor, task: Task, remarks: list[str]) -> Bool[Tensor, " m"]:
-    """True for links that were received: their label is not NaN, and no channel of zeros.
+    """True for links that were received: their label is neither NaN nor a channel of zeros.
 
     Raises:
         ValueError: No link was received, or a label is NaN or infinite in part.
@@ -424,7 +425,7 @@ def _received(labels: Tensor, task: Task, remarks: list[str]) -> Bool[Tensor, " 
 
 def _doubt_levels(labels: Tensor, received: Tensor, remarks: list[str]) -> None:
     """Remarks, with a warning, about levels that may mean "not heard"."""
-    doubts = [loud_remark(labels[received].tolist()).removeprefix("; ")]
+    doubts = [remark_on_zeros(labels[received].tolist()).removeprefix("; ")]
     for mark in marks_of(labels[:, None].numpy()):
         readings = int((labels == mark).sum())
         doubts.append(f"{readings} readings of {mark:g} dBm are taken for levels")

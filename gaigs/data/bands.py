@@ -59,11 +59,12 @@ def hold_out_band(
 def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
     """Channels of several bands, in which each receiver counts as one radio for each band.
 
-    Bands end where a frequency is more than ``gap`` times the one below, but not within four or
-    more evenly spaced ones of a part. Links of one place share a row.
+    A band ends where a frequency is more than ``gap`` times the one below. The evenly spaced
+    subcarriers of a part, four or more, are never cut. Links of one place share a row.
 
     Args:
         parts: Channels of one site, such as of one band each; receivers at one place are the same.
+        gap: Largest ratio of neighbouring frequencies within a band.
 
     Raises:
         ValueError: Parts have different phases, or other subcarriers or arrays in one band.

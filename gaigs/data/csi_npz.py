@@ -91,8 +91,8 @@ def read(
             receiver; ``frequencies`` (s,), subcarriers [Hz]; ``h`` (n, e, s), complex channels,
             linear amplitude; optionally ``elements`` (e, 3), offsets of an array's elements from
             its receiver's position along the world's axes [m], by default 0. With (k, e, 3) each
-            receiver has its own, and NaN for those that it lacks, where ``h`` is 0. The remarks
-            name other arrays. In place of ``h`` and ``rx_index`` the file may have impulse
+            receiver has its own, and a missing element is NaN, and 0 in ``h``. The remarks name
+            other arrays. In place of ``h`` and ``rx_index`` the file may have impulse
             responses, see ``gaigs.data.impulse_responses.from_sionna``.
         arrays: Names of these arrays in the file where they differ, such as ``{"h": "CSI"}``; two
             names are for real and imaginary part.
@@ -176,7 +176,7 @@ def _to_links(
     """Links of checked arrays, without channels of zeros.
 
     Args:
-        added: Remarks on their making.
+        added: Remarks on how the arrays were made.
         ignored: Names of other arrays in the file.
     """
     numbers = {name: torch.from_numpy(array) for name, array in arrays.items()}
@@ -247,10 +247,10 @@ def write(folder: str | Path, links: Links) -> None:
 def _load(
     file: Path, given: Mapping[str, str | list], axis: str | None
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """The arrays by name, and the names of ignored arrays.
+    """The arrays by gaigs's names, and the names of ignored arrays.
 
     Args:
-        given: Other names of arrays in the file.
+        given: Names of arrays in the file where they differ from gaigs's.
         axis: Option ``parts`` of ``read``.
     """
     arrays: dict[str, np.ndarray] = {}

@@ -38,10 +38,10 @@ def from_frame(
 
     The frame is of pandas, polars, pyarrow, or of another library with the PyCapsule or the
     interchange protocol; or a mapping of columns. It has a place a row and a receiver a column; or,
-    with ``receiver`` and ``level``, a reading a row. Where both ends move, ``receiver`` lists the
-    columns of its place; the names of ``rssi_csv`` do so, too. Other columns and cells are
-    understood, checked and remarked on as by ``gaigs.data.rssi_wide.read``. NaN and None were not
-    received.
+    with ``receiver`` and ``level``, a reading a row. Where both ends move, each row has both
+    places: ``receiver`` lists the columns of the receiver's, or columns have the names of
+    ``rssi_csv``. Other columns and cells are understood, checked and remarked on as by
+    ``gaigs.data.rssi_wide.read``. NaN and None were not received.
 
     Args:
         frame: The data frame.

@@ -23,9 +23,10 @@ class FrontEnds(NamedTuple):
 
 
 def learn_responses(links: Any, options: FrontEndOptions | None = None) -> FrontEnds | None:
-    """Responses of the receivers' front ends, by the training links; None where none gains.
+    """Responses of the receivers' front ends, learnt from the training links.
 
-    Each receiver decides by the score of free space at training places that are left out.
+    A receiver gets a response if it improves the score of free space at training places that are
+    left out of the fit. None if no receiver gets one.
     """
     options = options or FrontEndOptions()
     task = links.task

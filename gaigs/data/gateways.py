@@ -48,10 +48,11 @@ def estimate_place(
 ) -> tuple[Float[Tensor, "3"], float]:
     """Place of a gateway [m] from the levels [dBm] that it reads, and its expected error [m].
 
-    Levels follow a + b log10(distance) with shadowing, whose correlation makes many readings at one
-    spot count as few. Places within half the extent of the readings around them are equally likely
-    before any reading, and the result is the mean after all. Readings over three deviations from
-    the law at the best place are pulled in to it. Places that do not hear the gateway do not enter.
+    The transmitters of these readings are at ``places``. Levels follow a + b log10(distance) with
+    shadowing, whose correlation makes many readings at one spot count as few. Before any reading,
+    all places in the readings' box, widened by half its extent, are equally likely; the result is
+    the mean of the posterior. Readings over three deviations from the law at the best place are
+    moved to three. Places that do not hear the gateway are not used.
 
     Source: Gudmundson, Correlation model for shadow fading in mobile radio systems, 1991; the
     marginal likelihood is that of Rasmussen and Williams, Gaussian Processes for Machine Learning,
@@ -106,7 +107,13 @@ def _fit_laws(
 ) -> Laws:
     """Laws of each candidate under each correlation, with their log likelihood.
 
-    The likelihood is over all laws and variances; the prior of the slope is one more observation.
+    The likelihood is integrated over all laws and variances; the prior of the slope acts as one
+    more observation.
+
+    Args:
+        factors: Cholesky factors of c correlations of the shadowing at n places.
+        decades: Decimal logarithms of the distances from these places to g candidates.
+        levels: Readings at the places [dBm].
     """
     columns = torch.cat((torch.ones_like(levels)[:, None], levels[:, None], decades), 1)
     columns = columns.expand(len(factors), -1, -1)  # (c, n, 2 + g)

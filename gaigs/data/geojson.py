@@ -22,7 +22,8 @@ def read_polygons(file: Path, frame: Frame | None, mend: str) -> list[tuple[Ring
     """The polygons of a file, positions (k, 3) in the world frame [m], with their properties.
 
     Positions are longitude and latitude, or easting and northing, if there is a frame; else metres
-    of the world frame. A height that the file does not give is NaN.
+    of the world frame. A height that the file does not give is NaN. ``mend`` says in errors what to
+    do, such as "draw buildings".
 
     Source: RFC 7946.
     """
@@ -46,7 +47,8 @@ def read_buildings(
 ) -> list[Building]:
     """Buildings of a file, each polygon with its property ``height`` [m].
 
-    Roofs stand ``height`` above the property ``ground`` [m], or above 0 of the world frame.
+    A roof is its height above the polygon's property ``ground`` [m] or, without one, above 0 of the
+    world frame.
 
     Args:
         height: Height of buildings without one [m].

@@ -50,10 +50,10 @@ def lacks_carrier(
     frequency: float,
     otherwise: bool = False,
 ) -> bool:
-    """True if gains of lines of sight are without the phase of their delay at the carrier.
+    """True if the gains ``fields`` of lines of sight lack the phase of their delay at the carrier.
 
-    Some ray tracers give such gains; all phases are then alike. With fewer than ten lines of sight
-    the answer is ``otherwise``.
+    Some ray tracers give such gains, and all phases are then alike. With fewer than ten lines of
+    sight the answer is ``otherwise``.
     """
     if len(fields) < 10:
         return otherwise
@@ -81,9 +81,9 @@ def from_sionna(
     """Arrays of ``gaigs.data.csi_npz`` from impulse responses of Sionna RT, and remarks.
 
     ``sionna.rt.Paths.cir`` gives them. Gains of ``sionna.rt.Paths.a`` lack the carrier's phase over
-    the delay, and get it: first paths whose delay is the distance over the speed of light (lines of
-    sight) show which gains these are. A channel is the same both ways, so the end with fewer places
-    becomes the fixed one, in a tie the receivers.
+    the delay, which is then added; ``lacks_carrier`` recognises them by the links in line of sight,
+    whose first delay is the distance over the speed of light. A channel is the same both ways, so
+    the end with fewer places becomes the fixed one, in a tie the receivers.
 
     Args:
         arrays: ``a`` (k, e, n, m, p, 1) and ``tau`` (k, n, p) or (k, e, n, m, p), of k receivers

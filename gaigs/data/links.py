@@ -1,4 +1,4 @@
-"""Links of a registered reader, or of data in memory: a data frame, traced paths, arrays."""
+"""Links of a registered data reader, or of data in memory: a data frame, traced paths, arrays."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -14,10 +14,10 @@ from gaigs.registry import check_type
 
 
 def links(source: Any = None, /, **options: Any) -> Links:
-    """Links of a registered reader, or of data in memory, with their split.
+    """Links of a registered data reader, or of data in memory, with their split.
 
     Args:
-        source: Name of a registered reader, e.g. ``"synthetic"``, ``"nerf2_spectrum"``,
+        source: Name of a data reader, e.g. ``"synthetic"``, ``"nerf2_spectrum"``,
             ``"rssi_csv"``; a data frame of levels [dBm], or a mapping of its columns; ``Paths`` or
             a ``RadioMap`` of Sionna RT; None for arrays.
         options: Options of reader and split by their names, and ``split``, the name of a registered

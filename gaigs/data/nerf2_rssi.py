@@ -13,7 +13,14 @@ from torch import Tensor
 from gaigs.core.query import Query
 from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links, Parts
-from gaigs.data.readings import carriers_of, gateway, loud_remark, match_names, suggested, to_dbm
+from gaigs.data.readings import (
+    carriers_of,
+    gateway,
+    match_names,
+    remark_on_zeros,
+    suggested,
+    to_dbm,
+)
 from gaigs.io import tables
 from gaigs.io.yaml import read_mapping, to_position
 from gaigs.registry import register
@@ -70,7 +77,7 @@ def read(root: str | Path, frequency: float | None = None) -> Links:
     silent = [name for k, name in enumerate(names) if k not in present]
     if silent:
         remarks += f", and so are the gateways that heard nothing: {', '.join(silent)}"
-    remarks += loud_remark(dbm[received].tolist())
+    remarks += remark_on_zeros(dbm[received].tolist())
     return Links(
         query=Query(torch.tensor(positions)[rows], receivers, carriers_of(frequency, len(rows))),
         receivers=tuple(gateway(names[k], gateways[names[k]]) for k in present.tolist()),

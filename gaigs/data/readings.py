@@ -54,9 +54,10 @@ def to_dbm(
     not_heard: Sequence[float],
     mend: str,
 ) -> list[list[float]]:
-    """Cells of a table as readings [dBm], each ``not_heard`` or in range.
+    """Cells of a table as readings [dBm], each ``not_heard`` or from ``lowest`` on.
 
-    ``mend`` says in the error what to do with other marks of "not heard".
+    A ``ValueError`` for any other cell; ``mend`` says in it what to do with other values that mean
+    "not heard".
     """
     cells = {}
     for line, texts in rows.items():
@@ -120,7 +121,8 @@ def and_list(numbers: Iterable[float]) -> str:
 def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     """Values among readings [dBm] that mean "not heard", a gateway a column; NaN for an empty cell.
 
-    Out of bounds they are repeated or usual values. Within bounds they are
+    Values outside the range of levels are such marks if they are repeated or usual, as 100. Values
+    within the range are
 
     - 0 and repeated values from -1 up, three at most, more than 10 dB above all others;
     - of columns with two values or more, a usual value from -105 down, 5 dB below all others, or 10
@@ -185,7 +187,7 @@ def _lowest_marks(levels: Float[ndarray, "n k"], marks: Sequence[float]) -> list
     return lowest
 
 
-def loud_remark(levels: Iterable[float]) -> str:
+def remark_on_zeros(levels: Iterable[float]) -> str:
     """The remark that counts levels of 0 dBm or more: many tables mean "not heard" by 0."""
     count = sum(level >= 0 for level in levels)
     return f"; {count} readings of 0 dBm or more are taken for levels" if count else ""

@@ -14,8 +14,8 @@ from gaigs.data.readings import (
     are_one_radio,
     carriers_of,
     gateway,
-    loud_remark,
     marks_given,
+    remark_on_zeros,
     to_dbm,
 )
 from gaigs.io import tables
@@ -102,7 +102,7 @@ def read(
     below = sum(value < min(marks) < 0 for value in dbm)
     if below:
         remarks += f"; {below} readings below {min(marks):g} dBm are taken for levels"
-    remarks += loud_remark(value for value in dbm if value not in marks)
+    remarks += remark_on_zeros(value for value in dbm if value not in marks)
     if ignored:
         remarks += f"; columns ignored: {', '.join(ignored)}"
     return Links(

@@ -109,8 +109,8 @@ def _elements(
 ) -> Float[ndarray, "r a 3"]:
     """Offsets of the antennas from their device [m], at the end of the links with fewer devices.
 
-    Without a synthetic array, paths are traced to each antenna, whose place is then known. Else
-    all devices have the antennas of the scene's array.
+    Without a synthetic array, paths are traced to each antenna, and ``rx`` and ``tx`` are the
+    traced places. Else all devices have the antennas of the scene's array.
     """
     fixed, array = (rx, source.rx_array) if len(rx) <= len(tx) else (tx, source.tx_array)
     if not source.synthetic_array:

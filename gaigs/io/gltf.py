@@ -12,7 +12,7 @@ def write_gltf(file: Path, meshes: Sequence[Mesh], extras: Sequence[Mapping[str,
     """Writes meshes as ``.glb``, or as ``.gltf`` with its buffers within: a node each, with extras.
 
     Args:
-        extras: Numbers of each node by name.
+        extras: Numbers of each node by name, such as ``loss_db``.
     """
     import trimesh  # slow to import
     from trimesh.exchange import gltf

@@ -141,7 +141,7 @@ SEPARATORS = {"\t": "tabs", ";": "semicolons", "|": "bars", ",": "commas", " ": 
 
 
 def find_delimiter(lines: Sequence[str]) -> str:
-    """The mark that cuts the first three lines into equally many cells, or else a comma."""
+    """The character that cuts the first three lines into equally many cells, or else a comma."""
     for mark in SEPARATORS:
         counts = {len(split_cells(line, mark)) for line in lines[:3]}
         if len(counts) == 1 and counts != {1}:
@@ -169,7 +169,7 @@ def split_rows(
 ) -> dict[int, list[str]]:
     """Cells of each line after the first ``skip``; a ``ValueError`` unless a line has one a name.
 
-    Where another mark separates the cells, commas are decimal ones.
+    Where another character separates the cells, commas are decimal points.
     """
     rows: dict[int, list[str]] = {}
     wrong: dict[int, str] = {}

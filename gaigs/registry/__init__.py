@@ -145,7 +145,7 @@ class Registry:
             check_known(f"{self.kind} {name!r}", self.get(name), sorted(options), given)
 
     def choices(self, name: str) -> dict[str, str]:
-        """The task and the split that a reader's registration chooses; no module is imported."""
+        """The task and the split that a data reader's registration chooses, without an import."""
         if name in self._choices:
             return self._choices[name]
         holders, _ = find_holders(self.kind, name)
@@ -253,13 +253,13 @@ def register(
     Args:
         kind: The kind, one of the keys of ``gaigs.registries``.
         name: The name on the command line and in configurations.
-        task: Task of a reader's labels, which ``data=<name>`` chooses, too.
-        split: Split of a reader's links, which ``data=<name>`` chooses, too.
+        task: Task of a data reader's labels, which ``data=<name>`` chooses, too.
+        split: Split of a data reader's links, which ``data=<name>`` chooses, too.
 
     Raises:
         TypeError: The component is not callable.
         ValueError: The kind is unknown, or another component has the name; or a component that is
-            no reader chooses task or split.
+            no data reader chooses task or split.
 
     Example:
         >>> @gaigs.register("split", "every_third")

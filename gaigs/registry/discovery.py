@@ -69,7 +69,7 @@ class Holder:
     def digest(self) -> str:
         """SHA-256 of the sources: the component's own, and those in ./plugins that it imports.
 
-        Its own are all files of its package, or its file if it is in no package.
+        Its own sources are the files of its package or, outside of packages, its file.
         """
         place = self.file or self.folder
         if self.file is not None and self.root is not None:

@@ -40,8 +40,8 @@ def configuration_of(component: object) -> dict:
 def storable(value: Any, where: str) -> Any:
     """A value in plain dictionaries, lists, numbers and strings.
 
-    It holds these, registered components, estimators of scikit-learn, paths, and numbers of numpy
-    or torch; another type is a ``ValueError``.
+    The value may hold these, registered components, estimators of scikit-learn, paths, and numbers
+    of numpy or torch; another type is a ``ValueError``.
     """
     if isinstance(value, Mapping):
         return {key: storable(entry, f"{where}, {key}") for key, entry in value.items()}

@@ -41,7 +41,7 @@ def paired(
         places: A number for the place of each link (k,).
         resamples: Number of resamples; no probability is below 2 / (resamples + 1).
         seed: Seed of the resamples.
-        most: About the most links of a resample; with more a part of the places is drawn from.
+        most: Number of links, about, above which resamples are of a random part of the places.
 
     Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapters 8 and 16.
     """

@@ -24,7 +24,7 @@ def own_scores(file: Path, kind: str) -> dict[str, ndarray]:
 def scores_of_systems(files: Mapping[str, Path], kind: str) -> dict[str, ndarray]:
     """The arrays ``<kind>_<model>`` of each system's model, then of the first system's baselines.
 
-    A baseline with the scores of a system of its name is left out.
+    A baseline is left out if a system of the same name has the same scores.
     """
     systems: dict[str, ndarray] = {}
     baselines: dict[str, ndarray] = {}

@@ -1,4 +1,4 @@
-"""Published figures of systems, and the names of models for readers."""
+"""Published figures of systems, and the shown names of models."""
 
 from pathlib import Path
 

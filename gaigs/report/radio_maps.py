@@ -100,6 +100,7 @@ class _Drawing(NamedTuple):
             dots[name] = rows[:: ceil(len(rows) / 100) or 1]
         shown = np.concatenate([dot[:, 2] for dot in dots.values()])
         scale = _scale(radio_map.values, shown, _error_unit(radio_map.unit))
+        # The edges on the floor are the plan of the walls.
         is_low = (edges[..., 2] == edges[..., 2].min(initial=np.inf)).all(1)
         return cls(radio_map, gateways, dots, edges[is_low][..., :2], scale)
 

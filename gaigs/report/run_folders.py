@@ -175,10 +175,11 @@ def _has_unread_tokenizer(config: Mapping) -> bool:
 
 
 def _add_differing_options(runs: list[Run]) -> None:
-    """Adds options to ``overrides`` in which runs of one group differ.
+    """Adds options in which runs of a group differ to their ``overrides``.
 
-    A group has the same overrides except the seed, so that such options come from ``config.yaml``
-    alone. Runs with another value than most of the group get a doubt.
+    The runs of a group have the same overrides except the seed, so that such options come from
+    ``config.yaml`` alone. A run with another value than most of the group gets a note in
+    ``doubts``.
     """
     for group in by_seed(runs):
         configs = {run.folder: _compared(run.config) for run in group}

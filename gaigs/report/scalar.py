@@ -141,7 +141,7 @@ def _cells(
     receiver: Int[ndarray, " t"],
     error_unit: str,
 ) -> _Cells:
-    """Cells of a round width, which hold all labels.
+    """Readings counted in cells of label and prediction, of a round width, that hold all labels.
 
     A prediction more than 20 cells outside the range of the labels counts as at that limit.
     """

@@ -102,9 +102,9 @@ def new_figure(width: float, height: float, layout: str = "constrained") -> Figu
 
 
 def ask(figure: Figure, question: str, note: str = "") -> None:
-    """Gives a figure the question that it answers as its title, and a note at its foot.
+    """Gives a figure a title, the question that it answers, and a note at its foot.
 
-    The note goes into the figure's legend if there is one, which would cover it elsewhere.
+    If the figure has a legend, the note goes into it, since the legend would cover it elsewhere.
     """
     figure.suptitle(question, size=8, weight="bold")
     if note and figure.legends:

@@ -29,7 +29,7 @@ class System(NamedTuple):
     """A row of the table."""
 
     model: str  # registered name
-    name: str  # name for a reader
+    name: str  # name in tables and figures
     runs: Sequence[Run]  # runs that ended, one a seed; empty for a baseline
     values: dict[str, list[float]]  # values of each metric and cost, one a run
     failures: Sequence[str] = ()  # seed and cause of each run that has not ended

@@ -17,8 +17,8 @@ from gaigs.testing.checks import PRECISION, require, require_close, require_same
 def check_placement(placement: nn.Module, scene: Scene, device: torch.device | str = "cpu") -> None:
     """Checks a placement: shapes, dtype, gradients, independence of the batch.
 
-    It is built for the scene and 2 channels. A placement with Gaussians of its own is also called
-    without free ones. The contract is in ``gaigs.splatting.placement.Placement``.
+    It is built for the scene and 2 channels. A placement that makes Gaussians itself is also called
+    without any others. The contract is in ``gaigs.splatting.placement.Placement``.
     """
     generator = torch.Generator().manual_seed(0)
     cases = [(40, 3, torch.float32), (40, 3, torch.float64)]

@@ -34,11 +34,11 @@ def check_pooling(
 ) -> None:
     """Checks a pooling: values, finite gradients, independence of the batch.
 
-    It is fitted to links of its task, and its twin has the same state. Silent maps and paths are
-    among the inputs. A pooling of maps without a grid is given maps over the label's directions and
-    over a list of some of them; any other is called with such a list. A pooling of maps to one real
-    number must also take maps that are constant, span 12 decades or are of half precision.
-    The contract is in ``gaigs.splatting.pooling.Pooling``.
+    The pooling is fitted to the links, and a second one is given its state. Silent maps and paths
+    are among the inputs. A pooling of maps without a grid is given maps over the label's directions
+    and over a list of some of them; any other is called with such a list. A pooling of maps to one
+    real number must also take maps that are constant, span 12 decades or are of half precision. The
+    contract is in ``gaigs.splatting.pooling.Pooling``.
 
     Args:
         build: Makes the pooling for a scene.

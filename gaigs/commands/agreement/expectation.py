@@ -25,9 +25,14 @@ def on_split(
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
     """Expected metrics on the split's test links and the baselines' metrics, by row; and remarks.
 
-    Each test link is looked up in the cell of its nearest known link of the same receiver and
-    carrier, and stands for the pairs compared there. The rows are empty if no test link can be
-    looked up. Baselines are fitted if labels have at most ``looked_up`` numbers.
+    Each test link and its nearest known link, of the same receiver and carrier, fall into a cell of
+    ``agreement``. The scores of pairs compared in these cells are the expected ones. There are none
+    if no such cell has a pair.
+
+    Args:
+        random: Draws the pairs.
+        baselines: Configurations of the baselines to fit.
+        looked_up: Largest number of numbers in all labels together with which baselines are fitted.
     """
     rows: dict[str, dict[str, float]] = {}
     remarks = []
@@ -102,11 +107,12 @@ def drawn_scores(
     random: np.random.Generator,
     fewest: int = 20_000,
 ) -> dict[str, Tensor]:
-    """Scores of ``fewest`` random pairs, or one a test link if these are more.
+    """Scores of random pairs by name: ``fewest`` of them, or one a test link if these are more.
 
     Args:
         cells: Cell of each test link; cells are drawn from them with replacement.
         score: Name of the score by which pairs were compared.
+        random: Draws the cells, and then a pair of each.
     """
     numbers, counts = np.unique(random.choice(cells, max(fewest, len(cells))), return_counts=True)
     by_cell = []

@@ -65,7 +65,7 @@ def write(
 
 
 def table_of_cells(cells: Sequence[Cell], score: str) -> list[list[str]]:
-    """Rows of a table with its heading: distances down, separations across."""
+    """Rows of a table with its heading: distances of places down, separations across."""
     texts = {(cell.distance, cell.separation): cell.text(score) for cell in cells}
     columns = sorted({cell.separation for cell in cells})
     lines = [["distance [m]", *map(_separation, columns)]]
@@ -76,7 +76,7 @@ def table_of_cells(cells: Sequence[Cell], score: str) -> list[list[str]]:
 
 
 def figure(score: str, cells: Sequence[Cell]) -> Figure:
-    """Median and 10th to 90th percentile against distance, one line for each separation."""
+    """Median and 10th to 90th percentile against distance, a line for each range of separations."""
     distances = list(dict.fromkeys(cell.distance for cell in cells))
     columns = sorted({cell.separation for cell in cells})
     with rc_context(STYLE):

@@ -20,7 +20,10 @@ from gaigs.split import rows_of
 
 @dataclass(frozen=True)
 class Agreement:
-    """Scores of pairs of labels, in cells of distance (rows) and separation (columns)."""
+    """Scores of pairs of labels, in cells of distance (rows) and separation (columns).
+
+    The separation of a pair is the number of measurements from one of its labels to the other.
+    """
 
     # Upper edges of the rows [m]; the first row holds pairs at one place, its edge is next to 0.
     distances: ndarray
@@ -97,11 +100,11 @@ def measure(
     Args:
         links: All links in the order of the files, which counts as the order of measurement.
         random: Draws the pairs.
-        counted: Largest number of computed distances; of more pairs, the pairs of random links with
-            all others count.
+        counted: Largest number of computed distances. If there are more pairs, links are drawn at
+            random, and only their pairs with all other links are counted.
         block: Number of distances in memory at a time.
-        most: Largest number of pairs of a cell whose labels are compared; at least 30 of large
-            labels.
+        most: Largest number of pairs of a cell whose labels are compared; large labels take less,
+            at least 30.
     """
     places = links.query.transmitters.double().numpy()
     groups = groups_of(links)
@@ -179,6 +182,7 @@ class Reservoir:
 
     Args:
         cells: Number of cells. Pairs of a further cell are never kept.
+        most: Largest number of pairs that a cell keeps.
     """
 
     def __init__(self, cells: int, most: int):
@@ -219,6 +223,11 @@ def draw(
     random: np.random.Generator,
 ) -> tuple[Int[ndarray, " cells"], dict[int, Int[ndarray, "k 2"]]]:
     """Counts the pairs of each cell, and draws up to ``most`` of them.
+
+    Args:
+        agreement: Edges of the cells, and the share of links whose pairs are counted.
+        places: Transmitter of each link [m].
+        most, block, random: As for ``measure``.
 
     Returns:
         The number of pairs in each cell; and the drawn pairs by cell, as earlier and later link.

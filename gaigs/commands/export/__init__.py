@@ -120,6 +120,7 @@ def run(config: dict, folder: Path) -> None:
         raise ValueError(f"command=export needs export.format, one of {forms}")
     suffix = check_suffix(Path(f"export.{form}"))
     model = load(config["folder"], config["trust"])
+    # A ``.nc`` is a radio map without places, and predictions with them.
     takes_places = suffix in OTHER_FILES["predictions"] + OTHER_FILES["scenario"]
     has_map = suffix in MAP_FILES and model.scene.task.is_scalar
     if places is None and takes_places and not has_map:

@@ -128,10 +128,12 @@ def query_of(kind: str, scene: Scene, places: object, frequency: float | None) -
 def tabulate(
     query: Query, scene: Scene, task: Task, estimate: Estimate, measured: Tensor | None
 ) -> dict[str, Variable]:
-    """The variables of a file of predictions.
+    """The variables of a file of predictions, by name.
 
-    They are columns of links (n,); axes of labels, each by its own name; and values, deviations,
-    bounds, radii and labels by links and axes, complex ones as ``_real`` and ``_imag``.
+    Places, receivers and carriers have a number for each link (n,). Each axis of the labels is a
+    variable of its own, such as ``subcarrier``. Values, deviations, bounds of intervals, radii of
+    complex intervals, and ``measured`` labels have the links and these axes; complex ones are two
+    variables, ``_real`` and ``_imag``.
     """
     axes = {}
     for name, axis in task.axes().items():

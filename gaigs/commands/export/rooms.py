@@ -102,7 +102,8 @@ def traced_gains(model: MirroredSplatting, rest: float) -> Complex[Tensor, " rec
     """Factor of each receiver by which traced channels of Sionna RT become the model's channels.
 
     Args:
-        rest: Loss of obstacles outside all sheets, from ``fit_sheets`` [Np].
+        rest: Gain [Np] that ``fit_sheets`` leaves to all paths beside the sheets, the thin
+            absorbers that stand for obstacles.
     """
     placement = model.placement
     nepers = placement.receiver_gains + placement.path_gains[..., 0].mean() + rest
@@ -133,8 +134,8 @@ class Bsdf(NamedTuple):
 def itu_bsdf(material: Material, frequency: float) -> Bsdf:
     """A material of ITU-R P.2040 in Sionna RT.
 
-    It is given by name, so that Sionna RT computes it for the carrier that is set there. Outside
-    1 to 40 GHz, where Sionna RT has no table, it is given by extrapolated constants.
+    Sionna RT gets its name, and computes the constants for the carrier that is set there. Outside 1
+    to 40 GHz, where Sionna RT has no table, it gets extrapolated constants.
 
     Args:
         material: Name and thickness.
@@ -150,9 +151,10 @@ def itu_bsdf(material: Material, frequency: float) -> Bsdf:
 
 
 def sheet_bsdf(sheet: Sheet) -> Bsdf:
-    """The material of a sheet of obstacles: it transmits, and scatters the rest.
+    """The material of a sheet, a thin absorber that stands for obstacles.
 
-    Sionna RT leaves scattered power out by default, so that a sheet only dims waves.
+    It transmits, and scatters the rest. Sionna RT leaves scattered power out by default, so that a
+    sheet only dims waves.
     """
     thickness = 1e-5  # [m]; thin against the wavelength, so that only the conductance counts
     impedance = 376.73  # of free space [ohm]

@@ -58,11 +58,12 @@ class PlaceDensity:
         width: float,
         folds: Int[Tensor, " g"] | None = None,
     ) -> Float[Tensor, " g"]:
-        """Logarithm of the density at places.
+        """Logarithm of the prior density at places.
 
         Args:
             width: Standard deviation of the normal density about each known place [m].
-            folds: Fold of each place; known places of the same fold do not count. None: all count.
+            folds: Fold of each of ``places``, if they are known ones: the known places of the same
+                fold do not count. None: all count.
         """
         axes = self.has_extent
         squares = distances(places[:, axes], self.places[:, axes]).square_()  # (g, k)
@@ -79,7 +80,7 @@ class PlaceDensity:
         return torch.logaddexp(near, (self.elsewhere / volume).log())
 
     def likeliest_width(self, spacing: float, most: int = 1000, tried: int = 24) -> float:
-        """The width [m] that makes the known places of each fold likeliest, given the other folds.
+        """The width [m] under which known places have the highest density, given the other folds.
 
         Args:
             spacing: Median distance from a known place to the next [m].
@@ -109,6 +110,9 @@ def near_candidates(
     """Candidates of the prior ``PlaceDensity``: a quarter on a grid, the others near known places.
 
     Args:
+        box: Corners of the box of the grid [m].
+        points: Number of candidates.
+        floors: Heights of separate floors [m]; empty for one.
         known: Known links, whose transmitters are the known places.
     """
     places, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)

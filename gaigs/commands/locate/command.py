@@ -25,7 +25,7 @@ from gaigs.runs import links_of, load
 
 
 def run(config: dict, folder: Path) -> None:
-    """Locates the transmitters of received values, or of a finished run's test.
+    """Locates the transmitters of a file of received values, or of a finished run's test.
 
     Writes ``locate.csv``, ``locate.png`` and, for a test, ``locate.json`` into a folder.
     """
@@ -117,9 +117,15 @@ def summary(
     errors: Mapping[str, Float[Tensor, " n"]],
     level: float,
 ) -> dict[str, Any]:
-    """Median and mean error of each guess [m], by its name; the mean place is called ``locate``.
+    """Scores of located test transmitters by the name of the estimate, for ``locate.json``.
 
-    It also has the share of transmitters in their regions, and the regions' mean size.
+    There are the median and mean error of each estimate [m]; the mean place goes by the name
+    ``locate``, with the share of transmitters inside their regions and the mean prior probability
+    of a region.
+
+    Args:
+        errors: Errors by the estimate's name, such as ``median`` or ``knn`` [m].
+        level: Probability with which a region holds its transmitter.
     """
     numbers: dict[str, Any] = {"locate": {}}
     for name, error in errors.items():

@@ -62,7 +62,7 @@ def posterior_figure(location: Location, level: float | None = None) -> Figure:
 
 
 def draw_posterior(axis: Axes, location: Location, label: str) -> None:
-    """Draws the probability of cells, and the region of a single value with its ``label``."""
+    """Draws the probability of cells; a single transmission also gets its region with ``label``."""
     cells = Cells.around(location.places[:, :2].double().numpy())
     # Smooth over neighbouring cells: they hold different numbers of candidates.
     chances = gaussian_filter(cells.sums(location.probabilities.mean(0).double().numpy()), 1)
@@ -86,7 +86,7 @@ def plot_location(result: Location, ax: Any = None) -> Any:
 
 
 def outline(axis: Axes, cells: Cells, location: Location, label: str) -> None:
-    """Draws the region of a single value."""
+    """Draws the region of a single transmission."""
     counts = cells.sums(location.region[0].double().numpy())
     inside = gaussian_filter((counts > 0).astype(float), 1)
     x = (cells.x[1:] + cells.x[:-1]) / 2
@@ -108,7 +108,7 @@ def error_figure(
         truth: Places of the transmitters [m].
         mean: Estimates of them [m].
         known: Known places [m].
-        errors: Errors by the names of the guesses, with "mean" and "knn" [m].
+        errors: Errors by the names of the estimates, with "mean" and "knn" [m].
         most: Largest number of transmitters from above.
     """
     with rc_context(style.STYLE):

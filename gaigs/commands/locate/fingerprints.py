@@ -1,4 +1,4 @@
-"""Fingerprints: the values of all receivers by which places are compared."""
+"""Fingerprints: what all receivers receive of a transmission, by which places are compared."""
 
 import math
 from collections.abc import Sequence
@@ -30,22 +30,22 @@ class LocatedFold(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Fingerprints:
-    """Values that a model predicts at candidate places, from ``fingerprints``.
+    """The map of ``locate``: fingerprints that a model predicts at candidate places.
 
-    ``locate`` looks a value up in them.
+    ``locate`` compares received fingerprints with these.
 
     Attributes:
-        task: Task of the values.
+        task: Task of the labels.
         frequency: Carrier [Hz]; None if unknown.
-        receivers: Names of the receivers.
-        candidates: Where the values are predicted, g places.
-        axes: Axes of a label's numbers along which errors are independent and of the same size
-            (m, k).
+        receivers: Names of the r receivers.
+        candidates: The g places of the predictions.
+        axes: Axes (m, k) along which the errors of a label's m numbers are independent and of the
+            same size.
         values: Predictions at the candidates along these axes (g, r, k).
         deviations: Standard deviations of labels of one number (g, r); else 1.
-        reception_probabilities: Probability that each receiver receives a transmitter there (g, r);
-            without links a half.
-        degrees, temper: Arguments of ``log_likelihood``.
+        reception_probabilities: Probability that each receiver receives a transmission from each
+            candidate (g, r); without links a half.
+        degrees, temper: Degrees of freedom and power of Student's t in ``log_likelihood``.
         held: Held-out fingerprints of each fold, which calibrate regions; empty without links.
         frame: Place of x and y on a map; None if unknown.
 
@@ -83,8 +83,8 @@ class Fingerprints:
     def drops(self, unknown_power: bool = False, step: float | None = None) -> Float[Tensor, " h"]:
         """Log ratios of the highest posterior density to the density at the true place, ascending.
 
-        There is one for each held-out fingerprint; with a ``step`` [m], fingerprints are the values
-        of a ``walk``. Results are kept, as a walk takes long.
+        There is one for each held-out fingerprint. With a ``step`` [m] they are sorted into a
+        ``walk`` and located as a track. Results are cached, as a track takes long.
         """
         if (unknown_power, step) not in self._drops:
             drops = [torch.zeros(0, dtype=torch.float64)]

@@ -37,7 +37,7 @@ def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor,
 
 
 class Mismatch(NamedTuple):
-    """Differences of n values from the predictions at g candidates."""
+    """Errors of n received fingerprints against the predictions at g candidates."""
 
     squares: Float[Tensor, "n g"]  # sum of squared errors over squared deviations
     log_deviations: Float[Tensor, "n g"]  # sum of the logarithms of the deviations
@@ -50,14 +50,15 @@ class Mismatch(NamedTuple):
 def mismatch(
     prints: Fingerprints, received: Float[Tensor, "n r k"], unknown_power: bool = False
 ) -> Mismatch:
-    """Differences of values from a map's predictions, and the probability of their reception.
+    """Errors of received fingerprints against predicted ones, and the probability of reception.
 
     Args:
-        prints: The map, g candidates.
-        received: Values along ``prints.axes``, NaN where a receiver has received none.
-        unknown_power: True if the transmission's power is unknown. Squared errors are then the
-            least over all offsets of a value's levels, or all factors of predicted spectra or
-            channels, and reception tells nothing.
+        prints: Predictions of k numbers for r receivers at g candidates.
+        received: Fingerprints of n transmissions along ``prints.axes``; NaN where a receiver has
+            received nothing.
+        unknown_power: True if the power of each transmission is unknown. The error is then the
+            least over all offsets of its levels, or over all factors of the predicted spectra or
+            channels. Who receives the transmission then tells nothing of its place.
     """
     is_received = ~received[..., 0].isnan()  # (n, r)
     if prints.task.shape:
@@ -70,7 +71,7 @@ def mismatch(
     if not unknown_power:
         likely = is_received.float() @ prints.reception_probabilities.log().mT
         unlikely = (~is_received).float() @ (-prints.reception_probabilities).log1p().mT
-        # In a track, a value that no receiver has received may not have been sent.
+        # In a track, a transmission that no receiver has received may not have been sent.
         reception = (likely + unlikely) * (counts > 0)[:, None]
     elif not prints.task.shape:
         counts = counts - 1  # the fitted offset takes one degree of freedom
@@ -130,17 +131,17 @@ def _array_squares(
     return predicted_powers.mean(1, keepdim=True) * (1 - cosines)
 
 
-def log_likelihood(difference: Mismatch, degrees: float, temper: float) -> Float[Tensor, "n g"]:
+def log_likelihood(difference: Mismatch, freedom: float, temper: float) -> Float[Tensor, "n g"]:
     """Log likelihood of candidates: Student's t of all receivers together, and their reception.
 
     Args:
-        difference: Values and predictions compared.
-        degrees: Degrees of freedom. The fewer, the less one unlike place or receiver counts.
+        difference: Errors of the received fingerprints.
+        freedom: Degrees of freedom. The fewer there are, the less a large error counts.
         temper: Power of Student's t. It is below 1 where receivers' errors are correlated: their
             evidence counts less than independent errors would.
     """
-    exponent = (degrees + difference.counts[:, None]) / 2
-    together = exponent * torch.log1p(difference.squares / degrees) + difference.log_deviations
+    exponent = (freedom + difference.counts[:, None]) / 2
+    together = exponent * torch.log1p(difference.squares / freedom) + difference.log_deviations
     return (difference.reception - temper * together).double()
 
 
@@ -151,14 +152,18 @@ class UnseenPrints(NamedTuple):
     differences: Sequence[Mismatch]  # with known and with unknown power
     truth: Float[Tensor, "n 3"]  # places of the fingerprints [m]
 
-    def score(self, degrees: float, temper: float, draws: int = 128) -> float:
-        """Sum of the energy scores of the posteriors that a likelihood gives; lower is better [m].
+    def score(self, freedom: float, temper: float, draws: int = 128) -> float:
+        """Sum over fingerprints of the energy score of their posterior [m]; lower is better.
+
+        Args:
+            freedom, temper: As for ``log_likelihood``.
+            draws: Number of samples of each posterior.
 
         Source: Gneiting and Raftery, Strictly proper scoring rules, prediction, and estimation,
         2007, section 4.3.
         """
         places, prior, _ = self.prints.candidates
-        logarithms = log_likelihood(self.differences[0], degrees, temper) + prior
+        logarithms = log_likelihood(self.differences[0], freedom, temper) + prior
         probabilities = torch.softmax(logarithms, 1)
         rng = torch.Generator().manual_seed(0)
         drawn = places[torch.multinomial(probabilities, draws, True, generator=rng)]  # (n, d, 3)
@@ -171,27 +176,29 @@ class UnseenPrints(NamedTuple):
 def choose_likelihood(
     prints: Fingerprints,
     trials: Sequence[UnseenPrints],
-    degrees: Sequence[float] = (0.25, 1.0, 4.0, 30.0),
+    freedoms: Sequence[float] = (0.25, 1.0, 4.0, 30.0),
     half_octaves: Iterable[int] = range(-8, 17),
     fewest: int = 20,
 ) -> Fingerprints:
-    """The map with the ``degrees`` and ``temper`` of the least energy score of held-out values.
+    """The map with the degrees of freedom and the temper of the least energy score.
 
-    Regions are calibrated by held-out fingerprints whose own fold has no part in the choice: for
-    each fold the other folds choose.
+    The fingerprints in ``held``, which calibrate regions, must have no part in this choice. So in
+    each fold their likelihoods are those that the other folds choose.
 
     Args:
-        degrees: Degrees of freedom to choose from, the heaviest tails first.
+        prints: The map of the model that knows all training links.
+        trials: Held-out fingerprints of each fold.
+        freedoms: Degrees of freedom to choose from, the heaviest tails first.
         half_octaves: Integers i; the tempers to choose from are 2^(i / 2).
-        fewest: Number of fingerprints below which the degrees are not chosen: so few hardly show
-            whether one of twenty is an outlier. Levels then keep the likelihood of ``prints``, and
-            other labels take the heaviest tails.
+        fewest: Number of fingerprints below which the degrees of freedom are not chosen: so few
+            hardly show whether one of twenty is an outlier. Levels then keep the likelihood of
+            ``prints``, and other labels take the heaviest tails.
     """
     tempers = [2.0 ** (power / 2) for power in half_octaves]
     if sum(len(trial.truth) for trial in trials) >= fewest:
-        choices = [*itertools.product(degrees, tempers)]
+        choices = [*itertools.product(freedoms, tempers)]
     elif prints.task.shape:
-        choices = [*itertools.product(degrees[:1], tempers)]
+        choices = [*itertools.product(freedoms[:1], tempers)]
     else:
         choices = [(prints.degrees, prints.temper)]
     rows = []
@@ -206,5 +213,5 @@ def choose_likelihood(
         choice = choices[int(others.argmin())]
         likelihoods = [log_likelihood(part, *choice).float() for part in trial.differences]
         held.append(LocatedFold(trial.prints.candidates, torch.stack(likelihoods), trial.truth))
-    best_degrees, best_temper = choices[int(total.argmin())]
-    return replace(prints, degrees=best_degrees, temper=best_temper, held=tuple(held))
+    best_freedom, best_temper = choices[int(total.argmin())]
+    return replace(prints, degrees=best_freedom, temper=best_temper, held=tuple(held))

@@ -20,15 +20,15 @@ class Location:
 
     Attributes:
         places: Candidate places (g, 3) [m].
-        probabilities: Probability of each candidate, for each value (n, g).
-        mean: Mean place of each value (n, 3) [m].
+        probabilities: Probability of each candidate for each transmission (n, g).
+        mean: Mean place by these probabilities (n, 3) [m].
         median: Place with the least expected distance from the transmitter (n, 3) [m].
-        likeliest: Place of the highest density (n, 3) [m].
-        region: True for candidates in the region that holds the transmitter with the asked
-            probability (n, g).
-        sizes: Prior probability of each region (n,).
-        calibrated: True if held-out fingerprints set the region; else the posterior does, often too
-            small.
+        likeliest: Candidate of the highest density (n, 3) [m].
+        region: True for candidates in the region that holds the transmitter with probability
+            ``level`` of ``locate`` (n, g).
+        sizes: Prior probability of each region (n,), a measure of its size.
+        calibrated: True if held-out fingerprints set the size of regions; else the posterior does,
+            and regions are often too small.
         frame: Place of x and y on a map; None if unknown.
 
     Example:
@@ -54,7 +54,7 @@ class Location:
         return f"<{self.summary()}>"
 
     def summary(self) -> str:
-        """One sentence: the place and the region of the first value."""
+        """One sentence: the place and the region of the first transmission."""
         count = len(self.median)
         place = ", ".join(f"{x:.2f}" for x in self.median[0].tolist())
         which = "transmitter" if count == 1 else f"{count} transmitters, the first"
@@ -62,15 +62,15 @@ class Location:
         return f"{which} near ({place}) m, in a region of {size}"
 
     def holds(self, places: Float[Tensor, "n 3"]) -> Bool[Tensor, " n"]:
-        """True for each value whose region has the candidate nearest to a place."""
+        """True for each transmission whose region has the candidate nearest to its place."""
         nearest = distances(places.double(), self.places.double()).argmin(1)
         return self.region.gather(1, nearest[:, None])[:, 0]
 
     def save(self, path: str | Path) -> None:
-        """Writes a CSV table with a row for each value.
+        """Writes a CSV table with a row for each transmission.
 
-        It has the mean, median and likeliest place, with a ``frame`` also their eastings and
-        northings, and the size of the region.
+        Columns are the mean, median and likeliest place [m], with a ``frame`` also their eastings
+        and northings, and ``region_share``, the prior probability of the region.
         """
         write_columns(path, self.columns())
 
@@ -87,7 +87,7 @@ class Location:
 
 
 def joined(parts: Sequence[Location]) -> Location:
-    """The values of several locations of the same candidates, one after another."""
+    """The transmissions of several locations of the same candidates, one after another."""
     fields = {}
     for name in ("probabilities", "mean", "median", "likeliest", "region", "sizes"):
         fields[name] = torch.cat([getattr(part, name) for part in parts])

@@ -23,16 +23,16 @@ def neighbours(
     groups: Int[Tensor, " k"],
     most: int = 500,
 ) -> Float[Tensor, "n 3"]:
-    """Means of the known places with the nearest fingerprints, weighted by 1 / distance.
+    """Places of fingerprints: means of known places, weighted by 1 / distance of fingerprints.
 
-    The number of neighbours is a member of ``COUNTS``: the one with the least mean error of known
-    transmissions, without their own group.
+    The known places are those of the nearest fingerprints. Their number is the member of ``COUNTS``
+    with the least mean error at known transmissions, each located without its own group.
 
     Args:
-        values: Fingerprints to locate. A receiver that has not received a transmission counts as
-            the least known value.
+        values: Fingerprints to locate. Where a receiver has received nothing, the least known level
+            stands in, or 0 for labels of several numbers.
         known: Fingerprints at the known ``places`` [m].
-        groups: Groups of known fingerprints that are left out together.
+        groups: Group of each known fingerprint, such as its place.
         most: Largest number of known transmissions that choose the number of neighbours.
     """
     least = known[~known.isnan()].min() if known.shape[2] == 1 else 0.0
@@ -55,7 +55,7 @@ def weighted_mean(
     """Means of the ``count`` nearest places, weighted by 1 / distance.
 
     Args:
-        apart: Distances of n fingerprints from the fingerprints of the places.
+        apart: Distance of each of n fingerprints from the fingerprint at each of k places.
     """
     nearest = apart.topk(min(count, apart.shape[1]), largest=False)
     weights = 1 / nearest.values.clamp_min(1e-6)

@@ -37,29 +37,29 @@ def locate(
     *,
     progress: bool = True,
 ) -> Location:
-    """Places where transmitters may be, by the values that receivers measure of them.
+    """Places where transmitters may be, by what the receivers receive of them.
 
     Args:
-        model: A model with intervals; or its ``fingerprints``, which then take a few milliseconds a
-            value.
-        value: A label of each receiver (r, *shape), or of each transmission and receiver (n, r,
-            *shape), scaled as the training labels; with one receiver also (*shape) or (n, *shape);
-            or a mapping of the receivers' names to their labels, (*shape) or (n, *shape). NaN, of
-            channels also zeros, where a receiver has not received it, as if a mapping lacks it; of
-            a track, a value may be received by none.
+        model: A model with intervals; or its ``fingerprints``, with which a transmission takes a
+            few milliseconds.
+        value: A label of each of r receivers (r, *shape), or of n transmissions (n, r, *shape), in
+            the unit of the training labels; with one receiver also (*shape) or (n, *shape). A
+            mapping gives labels (*shape) or (n, *shape) by the receivers' names. A receiver has
+            received nothing where its label is NaN, or zero in a channel, or its name is missing.
+            In a track all receivers may have missed a transmission.
         links, region: As for ``fingerprints``.
         unknown_power: True if all labels of a transmission share an unknown offset [dB], or factor
             of amplitudes. Channels are always compared without their power and phase.
-        step: Standard deviation of the move from one value to the next along each axis, if values
-            are a track [m].
-        level: Probability with which the region holds the transmitter, by held-out fingerprints (9
-            or more for 0.9), with ``step`` by walks among them, once for each step. With fewer and
-            without links the posterior counts, whose regions are often too small.
+        step: Standard deviation of a transmitter's move along each axis from one transmission to
+            the next [m], if they are a track; None: they are independent.
+        level: Probability with which the region holds the transmitter. Held-out fingerprints set
+            the region, with ``step`` those of a walk among their places; a level of 0.9 takes 9 of
+            them. With fewer, or without links, the posterior sets it, often too small.
         progress: False for no bars.
 
     Raises:
-        ValueError: A value has another shape than the labels, or was received by no receiver and is
-            no part of a track; or an option is impossible.
+        ValueError: ``value`` has another shape than the labels, all receivers have missed a
+            transmission that is no part of a track, or an option is impossible.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -96,11 +96,12 @@ def locate(
 def excess_of(
     values: Float[Tensor, "n r 1"], prints: Fingerprints, deviations: float = 5.0
 ) -> float | None:
-    """Largest excess of readings over the range of all predictions; None if it is plausible.
+    """How far received levels lie outside the range of all predictions, at most; None if plausible.
 
     Args:
-        deviations: Largest plausible number of standard deviations; half the range of the
-            predictions is plausible, too.
+        values: Levels of n transmissions at r receivers, in the label's unit, as the result.
+        deviations: Largest plausible excess, in standard deviations of the predictions; half the
+            range of the predictions is plausible, too.
     """
     lowest, highest = prints.values.aminmax()
     excess = torch.maximum(values - highest, lowest - values).nan_to_num(0).max()
@@ -115,7 +116,9 @@ def posterior(
     step: float | None,
     level: float,
 ) -> Location:
-    """Locations of fingerprints, as ``Task.fingerprint`` gives them, by the options of ``locate``.
+    """The location of fingerprints ``values``, by the options of ``locate``.
+
+    Each of n transmissions has m numbers a receiver, by ``Task.fingerprint``.
 
     Raises:
         ValueError: ``level`` or ``step`` is out of range.
@@ -130,7 +133,7 @@ def posterior(
     drop = conformal_drop(prints, unknown_power, step, level)
     is_calibrated = prints.held_out_count >= fewest(level)
     locations = []
-    # In parts: a value takes 60 bytes a candidate, and its posterior 9. A track is one part.
+    # In parts: a transmission takes 60 bytes a candidate, its posterior 9. A track is one part.
     for part in values.split(64 if step is None else len(values)):
         difference = mismatch(prints, part @ prints.axes, unknown_power)
         candidates = prints.candidates
@@ -147,8 +150,8 @@ def conformal_drop(
 ) -> Float[Tensor, ""] | None:
     """How far below its maximum the log density is at the edge of a region.
 
-    The region of all denser candidates holds the transmitter with probability ``level``, as
-    held-out fingerprints show. None without these.
+    A region has all candidates that are denser than its edge. With this drop it holds the
+    transmitter with probability ``level``, as held-out fingerprints show; None without these.
     """
     drops = prints.drops(unknown_power, step)
     count = prints.held_out_count
@@ -166,11 +169,12 @@ def located(
     drop: Float[Tensor, ""] | None,
     is_calibrated: bool,
 ) -> Location:
-    """Places and regions of n values.
+    """Places and regions of n transmissions.
 
     Args:
-        logarithms: Logarithms of the posteriors, up to a constant for each value.
-        drop: Edge of the regions, from ``conformal_drop``.
+        logarithms: Logarithms of the posteriors, up to a constant for each transmission.
+        level: Probability with which a region holds the transmitter.
+        drop: Edge of the regions, from ``conformal_drop``; None: the posterior sets it.
         is_calibrated: True if the drop alone sets a region; else the posterior may widen it.
     """
     places = candidates.places

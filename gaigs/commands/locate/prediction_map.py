@@ -1,4 +1,4 @@
-"""The map of a model's predictions, in which ``locate`` looks values up."""
+"""The map of a model's predictions, with which ``locate`` compares what was received."""
 
 import time
 import warnings
@@ -40,18 +40,18 @@ def fingerprints(
     *,
     progress: bool = True,
 ) -> Fingerprints:
-    """The map of predictions in which ``locate`` looks values up; make it once for many of them.
+    """The map of predictions with which ``locate`` compares; one serves many transmissions.
 
     Args:
         model: Trained, fitted or loaded, with intervals.
-        links: Links that the model was trained on. Transmitters are then likely where the known
-            ones are dense, and held-out ones set the width of the likelihood and the size of
-            regions. None: they are anywhere alike, and the errors of a label's numbers are
+        links: Links that the model was trained on. Transmitters are then likely where known ones
+            are dense, and held-out ones set the width of the likelihood and the size of regions.
+            None: all places are equally likely, and the errors of a label's numbers count as
             independent, which makes regions too small.
-        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m] in which transmitters are
-            anywhere alike; None: the box of the training transmitters.
-        frequency: Carrier of known links, with a region any [Hz]; None: that of the training links,
-            of several the middle one.
+        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m] in which all places are equally
+            likely; None: the box of the training transmitters.
+        frequency: Carrier [Hz], one of the training links' unless there is a ``region``; None: that
+            of the training links, or the middle one of several.
         points: Number of candidate places; None: 20,000, fewer where the model takes more than a
             minute for them.
         progress: False for no bars.
@@ -161,13 +161,13 @@ class MapMaker:
     """Makes maps of models that know all or some of the same links."""
 
     box: Float[Tensor, "2 3"]  # corners of the box of the candidates [m]
-    is_region: bool  # True if transmitters are anywhere in the box alike
+    is_region: bool  # True if all places in the box are equally likely
     points: int  # number of candidates
     frequency: float | None  # carrier [Hz]; None if unknown
     links: Links | None = None  # links with a split; None for a map of the model alone
 
     def make(self, model: Model, known: Int[Tensor, " k"]) -> Fingerprints:
-        """The map of a model that knows some links, along the numbers of a label."""
+        """The map of a model that knows some links; its axes are the numbers of a label."""
         scene = model.scene
         if self.is_region:
             candidates = even_candidates(self.box, self.points)
@@ -195,7 +195,7 @@ class MapMaker:
     def has_whole_transmissions(self) -> bool:
         """True if no transmission of a known link has a link in the test.
 
-        A receiver without a link of a transmission has then not received it.
+        Then a receiver without a known link of a transmission has not received this transmission.
         """
         rows = rows_of(self.links)
         known = rows[at_carrier(self.links, self.frequency, "train", "validation")]
@@ -271,10 +271,11 @@ def trials_of(folds: Sequence[PrintFold], most: int = 200) -> list[UnseenPrints]
 
 
 def along(prints: Fingerprints, errors: Sequence[Float[Tensor, "_ r m"]]) -> Fingerprints:
-    """A map along the axes on which errors of a label's numbers are independent.
+    """The map with its predictions along axes on which errors of a label's numbers are independent.
 
     Args:
-        errors: Errors of fingerprints; without any, the map's deviations from its mean count.
+        errors: Errors of held-out fingerprints by fold, NaN where nothing was received. Without
+            any, the deviations of the predictions from their mean stand in for errors.
     """
     if not prints.task.shape:
         return replace(prints, axes=torch.eye(1))

@@ -1,4 +1,4 @@
-"""Tracks: the places of several values, where a transmitter moves little from one to the next."""
+"""Tracks: places of consecutive transmissions, between which a transmitter moves little."""
 
 import itertools
 import math
@@ -12,14 +12,15 @@ from gaigs.kriging.links import distances
 
 
 def walk(places: Float[Tensor, "n 3"], step: float, most: int = 10) -> Int[Tensor, " k"]:
-    """Numbers of places in the order of a walk, always to the nearest place not yet visited.
+    """Numbers of the places in the order of a walk, always to the nearest place not yet visited.
 
-    The walk stays at each place for as many values as steps take to the next one: errors of values
-    that are received near each other have much in common.
+    Each number is repeated as often as a transmitter with moves of ``step`` would send on its way
+    to the next place. Errors of fingerprints received near each other have much in common, and so
+    the repeated ones have the same.
 
     Args:
         step: Standard deviation of a move along each axis [m].
-        most: Largest number of values at each place.
+        most: Largest number of repetitions.
     """
     apart = distances(places, places)
     is_free = torch.ones(len(places), dtype=torch.bool)
@@ -42,15 +43,16 @@ def track(
     is_received: Bool[Tensor, " n"],
     spread: int = 75,
 ) -> tuple[Candidates, Float[Tensor, "n j"]]:
-    """The posterior of a track, over a part of the candidates as ``smoothed`` takes only few.
+    """The posterior of a track, over every m-th candidate: ``smoothed`` takes only few.
 
     Args:
+        logarithms: Log posterior of each transmission alone.
         step, is_received: See ``smoothed``.
-        spread: Number of the part's candidates over which the posterior of a single value spreads.
-            Regions of tracks reach far beyond the likeliest candidates.
+        spread: Number of the j candidates over which the posterior of one transmission spreads; it
+            sets m. Regions of tracks reach far beyond the likeliest candidates.
 
     Returns:
-        Every m-th candidate, and the logarithms of the posterior at these j places.
+        The j candidates, and the logarithms of the track's posterior at them.
     """
     # The inverse sum of squared probabilities: among c equally likely candidates it is c.
     posteriors = torch.softmax(logarithms[is_received], 1)
@@ -65,7 +67,7 @@ def track(
 
 
 class Moves:
-    """Moves of a transmitter between candidates of consecutive values.
+    """Moves of a transmitter between candidates of consecutive transmissions.
 
     Args:
         places, step, jump: As for ``smoothed``.
@@ -112,13 +114,16 @@ def smoothed(
     most: int = 1500,
     jump: float = 1e-4,
 ) -> Float[Tensor, "n g"]:
-    """Posterior of each place of a track given all values, from those given each value alone.
+    """Log posterior of each place of a track given all transmissions.
 
     Args:
+        logarithms: Log posterior of each place given each transmission alone.
+        places: The g candidates [m].
         step: Standard deviation of a move along each axis [m].
-        is_received: True for values that a receiver has received. The track is near
+        is_received: True for transmissions that a receiver has received. The track is near
             ``straight_lines`` where it is False.
-        most: Largest number of candidates of each value that are linked to those before and after.
+        most: Largest number of candidates of a transmission that are linked to those of the one
+            before and the one after.
         jump: Density of a move to any place over the density of no move: a track may jump.
 
     Source: Rabiner, A tutorial on hidden Markov models, 1989, the forward-backward algorithm.
@@ -150,9 +155,10 @@ def straight_lines(
     places: Float[Tensor, "g 3"],
     is_received: Bool[Tensor, " n"],
 ) -> Float[Tensor, "n 3"]:
-    """The place of each value on the line between its received neighbours in time [m].
+    """Places of all transmissions on straight lines between the received ones [m].
 
-    The likeliest places of the received values before and after it are the line's ends.
+    A received transmission is at its likeliest candidate. One that no receiver has received divides
+    the line from the received one before to the next by its number.
     """
     received = is_received.nonzero()[:, 0]
     numbers = torch.arange(len(is_received))

@@ -1,4 +1,4 @@
-"""Received values, as a user gives them: tensors, mappings and files."""
+"""What receivers received, as a user gives it: tensors, mappings and files."""
 
 import math
 from collections.abc import Mapping
@@ -20,10 +20,10 @@ from gaigs.io.tables import find_file, read_table, shortened
 def as_fingerprints(
     value: object, prints: Fingerprints, is_track: bool = False
 ) -> Float[Tensor, "n r m"]:
-    """Fingerprints of received values, NaN where a receiver has received nothing.
+    """Fingerprints of the ``value`` of ``locate``; NaN where a receiver has received nothing.
 
     Args:
-        is_track: True if values may be received by no receiver.
+        is_track: True if all receivers may have missed a transmission.
     """
     if isinstance(value, Mapping):
         value = in_order(value, prints)
@@ -81,7 +81,7 @@ def as_values(value: object, prints: Fingerprints) -> Tensor:
 
 
 def read_value(file: Path, links: Links) -> object:
-    """Received values of a file, as ``locate`` takes them.
+    """The ``value`` of ``locate`` from a file.
 
     A ``.npy`` file gives its array (n, r, *shape). For labels of one number, a table with a column
     for each receiver gives its columns by name, NaN for an empty cell.

@@ -12,13 +12,13 @@ from gaigs.core.stages import track
 
 
 class Coverage:
-    """Chance that the best receiver's reading is above a threshold [%].
+    """Probability that the best receiver's reading is above a threshold [%].
 
-    All readings are below it with the product of their chances to be below.
+    Readings are independent: the product of their probabilities to be below is that of all.
 
     Args:
-        values: Expected readings of receivers at places (r, g) [dBm].
-        deviations: Standard deviations of the readings (r, g) [dB].
+        values: Expected readings of r receivers at g places [dBm].
+        deviations: Standard deviations of the readings [dB].
         threshold: The threshold [dBm].
     """
 
@@ -42,9 +42,10 @@ class Coverage:
 
 
 class MeanLevel(Coverage):
-    """Expected reading of the best receiver [dBm].
+    """Expected reading of the best receiver [dBm]; arguments as for ``Coverage``.
 
-    For a level a below all readings it is a + integral from a on of P(best reading > t) dt.
+    For a level a below all readings it is a + integral from a on of P(best reading > t) dt, over
+    ``steps`` levels t.
     """
 
     def __init__(
@@ -64,13 +65,13 @@ class LocationError:
 
     Readings at a place y give a place y' an expected likelihood: a normal density of the difference
     of the means, a product over receivers (Jebara, Kondor and Howard, Probability product kernels,
-    2004). Half the mean square distance by these weights is the variance of the location. It is
-    the Cramér-Rao bound where readings are linear in the place, and counts distant places that look
-    alike, which the bound does not know.
+    2004). Half the mean square distance by these weights is the variance of the location. Where
+    readings are linear in the place, this is the Cramér-Rao bound. Distant places that give the
+    same readings count too, which the bound does not know.
 
     Args:
         values, deviations: As of ``Coverage``.
-        places: Possible places, all alike (g, 3) [m].
+        places: Possible places, equally likely (g, 3) [m].
     """
 
     sign = -1  # lower is better
@@ -102,12 +103,15 @@ class LocationError:
 def choose(
     rule: Coverage | LocationError, standing: int, count: int
 ) -> tuple[Int[Tensor, " n"], Float[Tensor, "n1 g"]]:
-    """Chooses ``count`` receivers beside the first ``standing`` ones.
+    """Chooses ``count`` receivers beside the first ``standing`` ones of a rule.
 
     Each is the best beside those before it; then single ones are exchanged as long as that helps.
     Coverage and mean level are monotone and submodular, so they gain at least 1 - 1/e of what the
     best set gains (Nemhauser, Wolsey and Fisher, An analysis of approximations for maximizing
     submodular set functions, 1978, which has both steps).
+
+    Args:
+        rule: The objective, with standing receivers first and then the possible ones.
 
     Returns:
         The chosen receivers, and the quality of each place before and after each of them.
@@ -134,6 +138,11 @@ def extend(
     most: int = 4_000_000,
 ) -> tuple[Int[Tensor, " n"], float]:
     """Adds ``count`` candidates to a set, each the best beside those before it.
+
+    Args:
+        members: Numbers of the set's receivers.
+        candidates: Numbers of the receivers that may be added.
+        most: Largest number of factors in memory at a time.
 
     Returns:
         The larger set and its score, the mean quality over places, higher for better.

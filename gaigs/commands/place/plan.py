@@ -114,7 +114,7 @@ def place(
             ``mean``: reading of the best receiver; ``locate``: error of a location by all readings.
         threshold: Level that ``coverage`` asks for, in the unit of the labels.
         region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the objective is the
-            mean; None: the box of the training transmitters, of several floors these.
+            mean; None: the box of the training transmitters, or a box for each of several floors.
         known: True: the model's receivers stand already; False: they are ignored.
         frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
         progress: False for no bars.

@@ -63,11 +63,12 @@ def measured_places(
     """The measured places, and how much each of them lowers the mean error.
 
     Args:
+        processes: Process of each receiver, with its readings.
         evaluated: Coordinates of the places over which the error is the mean.
         factor: Mean absolute error of a label over its standard deviation.
-        most: Largest number of readings of a receiver that count; of more, an even part.
-        tolerated: Largest factor on the mean error without the superfluous places. These are the
-            places of the least losses.
+        most: Largest number of readings of a receiver that count, evenly chosen.
+        tolerated: Largest ratio of the mean error without the superfluous places to the error with
+            all. Superfluous are the places that lower the error least.
     """
     rows = []
     places = []

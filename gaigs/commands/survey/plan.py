@@ -39,7 +39,7 @@ class SurveyPlan:
         errors: Expected mean absolute error of a label over the region and all receivers, before
             and after each place, in the label's unit (n + 1,); None without a model.
         known: Places that were measured (k, 3) [m].
-        losses: Rise of ``known_error`` if one of them had been left out (k,).
+        losses: Rise of ``known_error`` if this known place had been left out (k,).
         superfluous: Known places that together raise ``known_error`` by at most 5 % if left out
             (k,).
         unit: Unit of the errors.
@@ -134,7 +134,7 @@ def survey(
 ) -> SurveyPlan:
     """The next places to measure: each lowers the mean variance over a region and receivers most.
 
-    A receiver counts at a place as much as it is likely to hear it, by the measured places around.
+    A receiver counts at a place by its probability of reception, from the measured places around.
     Labels do not enter beyond the fitted process, so a plan is made before anything is measured.
     The largest variance would be a poor guide: it is in the corners. Places stand half a
     correlation length apart or more, as long as there is room. The first places of a longer plan
@@ -144,8 +144,8 @@ def survey(
         model: ``gaussian_process``, or a trained model with kriging; None: nothing is measured yet,
             and a default process takes its place.
         region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the error is stated;
-            None: the candidates or, without these, the box of the training transmitters, of several
-            floors these.
+            None: the candidates or, without these, the box of the training transmitters, or a box
+            for each of several floors.
         count: Number of places; at most as many as there are candidates.
         candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
         frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
@@ -312,7 +312,7 @@ class Selection:
 
     Args:
         processes: Process of each receiver, with its readings.
-        everywhere: Coordinates of ``places.all``.
+        everywhere: Coordinates of ``places.all``, as the processes take them.
         places: Candidates, and places over which the error is stated.
         factor: Mean absolute error of a label over its standard deviation.
     """
@@ -335,6 +335,9 @@ class Selection:
         self, count: int, spacing: "Spacing | None" = None, enough: float = -math.inf
     ) -> tuple[list[int], Float[Tensor, " n1"]]:
         """Chooses up to ``count`` candidates, until the error is at most ``enough``.
+
+        Args:
+            spacing: Keeps the candidates apart; None: they may be neighbours.
 
         Returns:
             Numbers of the candidates; and the expected error before and after each.
@@ -390,14 +393,14 @@ class Selection:
 class Spacing:
     """Keeps the places of a plan apart, by the correlation of their labels.
 
-    A second place nearby mostly averages noise, and a hyperparameter that is wrong makes it look
-    better than a place farther off.
+    A second place nearby mostly averages noise. A wrong hyperparameter would make such a place look
+    better than one farther off.
 
     Args:
         processes: Processes of the receivers, without their trends.
         candidates: Coordinates of the candidates.
-        most: Largest mean correlation of two places of a plan; the default is
-            reached at half a correlation length.
+        most: Largest mean correlation of two places of a plan; the default is reached at half a
+            correlation length.
     """
 
     def __init__(
@@ -412,9 +415,9 @@ class Spacing:
         self.nearest = torch.zeros(len(candidates))  # largest correlation with a chosen place
 
     def apart(self, is_free: Bool[Tensor, " c"]) -> Bool[Tensor, " c"]:
-        """True for free candidates away from the chosen ones.
+        """True for free candidates whose correlation with each chosen one is at most ``most``.
 
-        Once there is none, half the distance is enough: the root of the largest correlation.
+        If there is none, ``most`` becomes its root, which half the distance reaches.
         """
         while self.most < 0.99:
             is_apart = is_free & (self.nearest <= self.most)

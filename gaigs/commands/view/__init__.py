@@ -77,7 +77,7 @@ class View:
             serving.serve_forever()
 
     def page(self, stored: dict | None = None) -> str:
-        """The HTML page; without stored predictions it asks the server that sent it."""
+        """The HTML page; without stored predictions the page asks its server for them."""
         # Amplitudes and maps, paths, errors, and Gaussians.
         colours = {}
         for name in ("viridis", "plasma_r", "YlOrRd", "Blues"):
@@ -96,9 +96,9 @@ class View:
         """Predictions at even places in the box of the training transmitters, for all receivers.
 
         Args:
-            places: About as many places of a transmitter with one receiver, fewer with more.
-            fewest: About as many places with any number of receivers.
-            maps: Largest number of slices of radio maps.
+            places: Number of stored predictions of a model, about, shared by its receivers.
+            fewest: Least number of places, however many receivers there are.
+            maps: Largest number of slices of radio maps, over all heights and receivers.
             step: Rows and columns from one stored pixel of a spectrum to the next.
         """
         scene = self.contents[0].scene

@@ -43,7 +43,7 @@ class Contents:
         model: A trained, fitted or loaded model.
         links: Its data; None: no true walls and no test links are shown.
         title: Name above the picture.
-        points: Points along the longer side of a slice of the radio map, and places that are
+        points: Points along the longer side of a slice of the radio map; so many places are also
             predicted at a time.
         compared: Largest number of test links that are shown with their errors.
 
@@ -321,7 +321,8 @@ def obstacle_splats(matter: Matter) -> dict:
     widths = matter.widths
     losses = matter.densities * math.sqrt(2 * math.pi) * np.exp(np.log(widths).mean(1))  # [dB]
     covariances = widths[:, :, None] ** 2 * np.eye(3)
-    # A box as the Gaussian with its mean and covariance.
+    # A box as the Gaussian with its mean and covariance. Over an edge of half length s the variance
+    # is s² / 3, and each s is met at 8 corners.
     middles = matter.boxes.mean(1)
     sides = matter.boxes - middles[:, None]  # (m, 8, 3), half an edge along each axis
     covariances = np.concatenate((covariances, np.einsum("mci,mcj->mij", sides, sides) / 24))

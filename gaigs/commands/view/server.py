@@ -16,8 +16,8 @@ log = logging.getLogger(__name__)
 def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServer:
     """A server, not started, of the page at ``/`` and of answers.
 
-    The answers are at ``/answer``, ``/slice`` and ``/comparison``. It answers to names of this
-    machine alone: a page of a foreign name that is made to lead here reads nothing.
+    The answers are at ``/answer``, ``/slice`` and ``/comparison``. The server answers to names of
+    this machine alone: a page under a foreign name that resolves to this machine reads nothing.
     """
 
     class Handler(BaseHTTPRequestHandler):

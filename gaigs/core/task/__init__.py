@@ -20,7 +20,7 @@ class Metric(NamedTuple):
     """A number of a table.
 
     Attributes:
-        title: Name for a reader, with the unit in brackets.
+        title: Name in tables and figures, with the unit in brackets.
         higher_is_better: True for a similarity, False for an error.
         is_brief: True if a terminal's table shows it too.
 
@@ -58,7 +58,8 @@ class Task(ABC):
         frequencies: Subcarriers [Hz], the last axis of channels; None for other labels.
         phase: What is unknown of a channel's phase, see ``Csi``.
         lowest: Least possible number of a real label.
-        limits: Bounds of labels that are read; numbers beyond them have another unit, or are marks.
+        limits: Bounds of labels that are read; numbers beyond them have another unit, or mean "not
+            received".
         beyond: Advice in errors on numbers beyond these bounds.
     """
 

@@ -98,10 +98,11 @@ class Spectrum(Task):
         }
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
-        """SSIM s becomes 2 s / (1 + s), below 0 becomes 0; absolute errors fall by the root of 2.
+        """Scores that the mean of many spectra would reach as a prediction of each.
 
-        Two labels with the same mean that scatter about a pattern have as SSIM the pattern's share
-        s of the variance; the pattern and one label have 2 s / (1 + s).
+        An SSIM of s becomes 2 s / (1 + s), and one below 0 becomes 0. Absolute errors fall by the
+        root of 2. For two labels with the same mean that scatter about a pattern, SSIM is the
+        pattern's share s of the variance; for the pattern and one label it is 2 s / (1 + s).
         """
         shares = scores["ssim"].clamp(min=0)
         return {"ssim": 2 * shares / (1 + shares), "mae": scores["mae"] / math.sqrt(2)}

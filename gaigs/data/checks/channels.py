@@ -77,7 +77,8 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
     """Findings if phases of channels do not follow the geometry, or are not as ``data.phase`` says.
 
     Args:
-        train: Links of the sample.
+        train: Numbers of the sample's links in ``links``.
+        sample: These links.
     """
     task = links.task
     few = sample.thinned(192)
@@ -166,9 +167,10 @@ def _strange_findings(name: str, parts: StrangeParts) -> Iterator[Finding]:
 
 
 def best_convention(sample: Sample, score: Measure) -> Finding | None:
-    """A finding about the conventions that explain the channels best, if they do so clearly.
+    """A finding about the conventions by which geometry explains channels clearly better.
 
-    Conventions that explain them equally well are named together.
+    Conventions that explain them equally well are named together. ``score`` is the measure, with
+    the bounds of what is clear.
     """
     read = score.measure(sample)
     if read > score.enough or len(sample.labels) < MANY:

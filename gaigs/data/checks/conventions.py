@@ -1,4 +1,4 @@
-"""Conventions of places, arrays and channels, with what mends data that were written under them."""
+"""Conventions of places, arrays and channels, and how to correct data written under another one."""
 
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -21,9 +21,12 @@ Move = Callable[[Tensor], Tensor]
 
 
 def conventions(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[Hypothesis]:
-    """All other conventions of a sample; of equal ones the first is the likeliest fault.
+    """All conventions other than the one read, the likeliest faults first.
 
-    The order of receivers is the best one by a measure of the geometry, such as ``coherence``.
+    Args:
+        sample: Links as read.
+        measure: How well geometry explains a sample, such as ``coherence``; the order of receivers
+            that it finds best is one of the conventions.
     """
     ends: list[tuple[str, ...]] = [("tx",), ("rx",), ("tx", "rx")]
     yield from of_subcarriers(sample)
@@ -207,12 +210,12 @@ def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator
 
 
 def changing(name: str, parts: Sequence[str], move: Move, mend: str) -> Hypothesis:
-    """A convention that moves the fields ``parts`` of a ``Sample``."""
+    """A convention that changes the fields ``parts`` of a ``Sample`` by ``move``."""
     return Hypothesis(name, partial(_changed, parts=parts, move=move), mend)
 
 
 def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hypothesis:
-    """A convention that multiplies points of ``ends`` by a matrix; ``mend`` does so in numpy."""
+    """A convention that multiplies points of ``ends`` by a matrix, as ``mend`` does in numpy."""
     parts = {"tx": "transmitters", "rx": "positions", "elements": "elements"}
     lines = "; ".join(f"{end} = {end}{mend}" for end in ends)
     return changing(
@@ -227,7 +230,7 @@ def _scaled(ends: Sequence[str], unit: str, factor: float) -> Hypothesis:
 
 
 def _changed(sample: Sample, parts: Sequence[str], move: Move) -> Sample:
-    """The sample with ``move`` of the fields ``parts``, or of each array in a tuple of arrays."""
+    """The sample with ``move`` applied to the fields ``parts``, or to each array in a tuple."""
     moved = {}
     for name in parts:
         value = getattr(sample, name)

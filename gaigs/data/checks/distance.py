@@ -41,13 +41,13 @@ def decades_of(distances: Float[Tensor, "*h n"]) -> Float[Tensor, "*h n"]:
 
 
 def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = False) -> Law:
-    """The law of distance of each receiver, which a few wrong levels do not bend (Huber's weights).
+    """The law of distance of each receiver, by Huber's weights, so that wrong levels count little.
 
     Args:
-        logarithms: Logarithms of the links' distances, under h conventions at once.
+        logarithms: Decimal logarithms of the links' distances, under h conventions at once.
         sample: Receivers and levels of the links.
-        patterns: True for receivers with a main direction: a harmonic of the azimuth is fitted,
-            too; without h.
+        patterns: True to fit a harmonic of the azimuth, too, for receivers with a main direction;
+            ``logarithms`` are then (n,).
 
     Source: Huber, Robust estimation of a location parameter, 1964.
     """
@@ -82,7 +82,7 @@ def explained(sample: Sample) -> float:
 def compare(
     read: Float[Tensor, " n"], fits: Float[Tensor, " n"], sample: Sample, cells: int = 6
 ) -> Gain:
-    """The gain of another law's errors ``fits`` over the errors ``read`` [dB].
+    """How much smaller the errors ``fits`` of another law are than the errors ``read`` [dB].
 
     An error above 30 dB counts as 30 dB. Shadowing is alike at near places: all links of a receiver
     in a cell of the plan, with at most ``cells`` cells along x and along y, are one observation.

@@ -8,9 +8,9 @@ class Finding:
     """A fault that data probably have.
 
     Attributes:
-        fault: Its short name, such as "order of the quaternion".
+        fault: Short name, such as "order of the quaternion".
         text: What was found, and by how much.
-        mend: An option or a line of numpy that mends it; empty if there is none.
+        mend: Correction of the data, an option or a line of numpy; empty if there is none.
         read: Score of the data as they were read; None if nothing was compared.
         fits: The same score under the convention that fits.
         score: Meaning of both scores with their unit.

@@ -51,7 +51,7 @@ class Hypothesis(NamedTuple):
 
     name: str
     change: Callable[[Sample], Sample]  # gives the sample as read by the convention
-    mend: str  # line of numpy that mends the data
+    mend: str  # line of numpy that corrects the data
 
 
 def sample_of(links: Any, most: int) -> Sample:

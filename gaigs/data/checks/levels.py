@@ -1,4 +1,4 @@
-"""Checks of received levels: units, signs, marks, wrong single levels, places of receivers."""
+"""Checks of received levels: units, signs, codes of "not heard", wrong levels, wrong places."""
 
 import math
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ from gaigs.io.tables import shortened
 
 
 def check_levels(links: Any) -> Iterator[Finding]:
-    """Findings about unit, sign and marks of levels, about single levels, and about receivers."""
+    """Findings about units, signs, codes of "not heard", single levels, and receivers' places."""
     levels = links.labels[torch.arange(len(links))].double()
     nonzero = levels[levels != 0]
     if len(nonzero) and (nonzero > 0).double().mean() > 0.9:
@@ -62,11 +62,14 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 
 
 def _linear_unit(sample: Sample | None, text: str, median: float) -> Finding:
-    """The finding that levels are volts, watts or mW instead of decibels, with its mend.
+    """The finding that positive levels are volts, watts, mW or less instead of decibels.
+
+    By 10 log10, amplitudes fall by 10 dB a decade of distance, and powers by 20: such a slope tells
+    volts. Else the size of the levels tells watts from mW.
 
     Args:
-        sample: Some links of the receivers whose places are given; None if no place is given.
-        text: What was found so far.
+        sample: Links of the receivers whose places are given, for the slope; None: no place is.
+        text: Start of the finding's text.
         median: 10 log10 of the median level.
     """
     score = "share of the spread that the distance explains"
@@ -194,8 +197,9 @@ def check_places_of_levels(
     """A finding if levels follow neither distance nor neighbours, as in a wrong order of rows.
 
     Args:
+        sample: Links of all receivers.
         excess: Levels above their neighbours [dB], as of ``above_neighbours``.
-        is_placed: True for receivers at given places; the others do not count.
+        is_placed: True for receivers at given places; links of the others do not count.
     """
     counts = is_placed[sample.receivers] & (excess != 0)
     # A law of equal distances leaves levels less their receiver's mean.

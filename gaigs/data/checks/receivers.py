@@ -176,7 +176,7 @@ def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain
 def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) -> Gain | None:
     """The gain of another law's errors ``fits``; None if chance or directional antennas explain it.
 
-    With ``is_fitted`` its places were fitted to the levels, and it has to be clearly better.
+    With ``is_fitted`` the places of the law were fitted to the levels: the bounds are higher.
     """
     logarithms = decades(sample)
     gain = compare(fit_law(logarithms, sample).errors, fits, sample)

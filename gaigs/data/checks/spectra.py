@@ -26,7 +26,7 @@ from gaigs.data.checks.places import scale_of
 
 
 def check_extremes(links: Any) -> Iterator[Finding]:
-    """Counts of constant spectra, and of min-max spectra without a pixel of 0 or of 1.
+    """Findings that count constant spectra, and min-max scaled ones without a pixel of 0 or of 1.
 
     A ``ValueError`` if all spectra are constant, or too small for SSIM.
     """
@@ -80,10 +80,10 @@ class Limits:
 def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Finding]:
     """The convention by which spectra are bright towards their transmitters, if not the one read.
 
-    The score of a spectrum says how rare a pixel is that is as bright as the one towards its
-    transmitter, less the same in other spectra of the receiver. So what is bright in every spectrum
-    scores nothing, and a link behind walls about 0 by every convention. The strongest pixel need
-    not be the direct path.
+    A link's score says how few pixels are as bright as the one towards its transmitter, less the
+    same in the other spectra of the receiver. So what is bright in every spectrum adds nothing, and
+    a link behind walls scores about 0 by every convention. The strongest pixel need not be the
+    direct path.
     """
     limits = limits or Limits()
     sample = sample_of(links, limits.most)
@@ -134,11 +134,13 @@ class Trials(NamedTuple):
 def trials(
     links: Any, sample: Sample, directions: "Directions", is_known: bool, limits: Limits
 ) -> Iterator[Trials]:
-    """Rounds of conventions: single ones, then axes, then pairs of both.
+    """Rounds of conventions to compare: single ones, then axes, then pairs of both.
 
     Args:
-        is_known: True if the data as read score well, so that they have no two faults at once;
-            there is no round of pairs then.
+        directions: Brightness of the sample's spectra.
+        is_known: True if the data as read score well. Two faults at once are then impossible, and
+            the round of pairs is left out.
+        limits: Errors by which a round must be better.
     """
     axes = [*of_axes(sample, [("tx",), ("rx",), ("tx", "rx")])]
     units = [*of_units([("tx",), ("rx",)])]  # in any unit of both, directions are the same
@@ -189,7 +191,7 @@ def best_directions(
 
 
 def near_likeness(sample: Sample) -> float:
-    """Mean correlation of each spectrum with the nearest other place's, less the mean spectrum."""
+    """Mean correlation of each spectrum with that of the nearest place, both less the mean."""
     pixels = sample.labels.flatten(1)
     likeness = torch.corrcoef(pixels - pixels.mean(0))  # (n, n)
     apart = torch.cdist(sample.transmitters, sample.transmitters).fill_diagonal_(math.inf)
@@ -202,7 +204,8 @@ class Directions:
     Attributes:
         grid: Directions of the pixels that are compared.
         ranks: Rank of each pixel, 0 for the darkest and 1 for the brightest (n, rows, columns).
-        places: Number of places that count: within a sixth of the room spectra are alike.
+        places: Number of independent places: those within a sixth of the room count as one, since
+            their spectra are alike.
     """
 
     def __init__(self, grid: Grid, sample: Sample, pixels: tuple[int, int]):

@@ -78,8 +78,8 @@ def check_powers(sample: Sample) -> Iterator[Finding]:
 def order_of_subcarriers(sample: Sample) -> Finding | None:
     """A finding if channels jump within the band, and go on from its last to its first subcarrier.
 
-    The correlation of neighbouring subcarriers tells, for which each link may have a phase and a
-    delay of its own.
+    A low correlation of neighbouring subcarriers is a jump. A phase and a delay of each link do not
+    change this correlation.
     """
     order = sample.frequencies.argsort()
     count = len(order)

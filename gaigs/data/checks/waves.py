@@ -27,7 +27,7 @@ class FewWaves(NamedTuple):
     frequencies: Float[Tensor, " s"]
 
     def without_waves(self) -> tuple[Complex[Tensor, "n e s"], Complex[Tensor, "n e s"]]:
-        """Channels without the direct wave's phase: by its sign exp(-j ...), and by the other."""
+        """Channels without the phase of ``waves``, and channels without the opposite phase."""
         return self.channels * self.waves.conj(), self.channels * self.waves
 
 
@@ -72,10 +72,11 @@ def without_geometry(sample: Sample) -> Sample:
 
 
 def shares(sample: Sample, is_calibrated: bool = False) -> Float[Tensor, "2 r"]:
-    """Share of power that the direct wave keeps in each receiver's mean, by sign of its phase.
+    """Share of power that each receiver's mean channel keeps without the direct wave's phase.
 
-    The share of chance is taken off. Unless arrays are calibrated, each element and subcarrier may
-    have a phase of its own, the same in all links.
+    There is a row for either sign of this phase. The mean is over links, and the share expected by
+    chance is subtracted. Elements and subcarriers have a mean each, as they may have unknown phases
+    that all links share; with ``is_calibrated`` they have one mean together.
     """
     counts = sample.receivers.bincount(minlength=len(sample.positions))
     by_sign = []

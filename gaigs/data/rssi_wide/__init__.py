@@ -16,7 +16,7 @@ from gaigs.core.query import Query
 from gaigs.core.task.rssi import Rssi
 from gaigs.data import Links
 from gaigs.data.maps import check_metres, is_utm, to_utm
-from gaigs.data.readings import and_list, carriers_of, gateway, loud_remark
+from gaigs.data.readings import and_list, carriers_of, gateway, remark_on_zeros
 from gaigs.data.rssi_wide.columns import Axes, find_axes, find_gateways
 from gaigs.data.rssi_wide.places import name_of_gateways, read_gateways, read_points
 from gaigs.data.rssi_wide.readings import Survey, averaged, pivoted, refuse_readings
@@ -49,7 +49,7 @@ def read(
     Args:
         file: The table. Levels lie in [-150, 30] dBm. Empty cells and NaN were not received.
         gateways: Table of ``name,x,y,z``, or YAML of ``name: [x, y, z]``, in the coordinates of the
-            places. Gateways that it does not have, or all if it is None, get their place from the
+            places. Gateways that the table lacks, or all without a table, get their place from the
             training links.
         coordinates: Columns of x, y and optionally z or floor; longitude and easting come first.
             None: by their names.
@@ -138,7 +138,7 @@ def from_table(
 
     positions = [stands.get(name) for name in names]
     links = _to_links(survey, names, positions, frequency)
-    text = "; ".join(filter(None, remarks)) + loud_remark(links.labels.tolist())
+    text = "; ".join(filter(None, remarks)) + remark_on_zeros(links.labels.tolist())
     return replace(links, frame=world.frame, remarks=text)
 
 
@@ -148,10 +148,11 @@ def _to_links(
     positions: Sequence[Sequence[float] | None],
     frequency: float | None,
 ) -> Links:
-    """Links of the gateways ``names``, in the order of their columns with a reading.
+    """Links of the gateways that have a reading.
 
     Args:
-        positions: Position of each gateway [m]; None if unknown.
+        names: Names of these gateways, in the order of their columns.
+        positions: Position of each of them [m]; None if unknown.
     """
     rows, columns = survey.counts.nonzero()
     receivers = np.unique(columns, return_inverse=True)[1]

@@ -1,4 +1,4 @@
-"""Columns of a wide table: coordinates with their units, gateways, marks of "not heard"."""
+"""Columns of a wide table: coordinates with their units, gateways, codes of "not heard"."""
 
 import re
 from collections.abc import Collection, Sequence
@@ -162,10 +162,11 @@ def find_gateways(
     ignore: Sequence[str],
     not_heard: float | list[float] | None,
 ) -> Columns:
-    """The columns of gateways, and the marks of "not heard" in them.
+    """The columns of gateways, and the values that mean "not heard" in them.
 
-    A gateway is a column named in ``placed`` or one of mostly low levels. A column without a level
-    is left out. A ``ValueError`` if there is no gateway, or if one of its cells is no level.
+    A gateway is a column of mostly low levels, or one named in ``placed``, the gateways with a
+    given place. A column without a level is left out. A ``ValueError`` if there is no gateway, or
+    if one of its cells is no level.
     """
     reserved = {axes.x, axes.y, axes.z, *(table.column(name) for name in ignore)}
     free = [k for k in range(len(table.names)) if k not in reserved]

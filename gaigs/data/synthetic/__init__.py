@@ -116,8 +116,8 @@ def default_room(order: int, receivers: int | None = None) -> SimulatedRoom:
 def wall_poses(room: Room, count: int) -> tuple[Pose, ...]:
     """Poses along the walls, 0.1 m off them and outside furniture, that face the room's middle.
 
-    They divide the walls evenly; heights are the multiples of the golden ratio, modulo 1, from 1.2
-    to 2.6 m.
+    They divide the walls evenly. Their heights fill 1.2 to 2.6 m evenly, in steps of the golden
+    ratio modulo 1, so that neighbours differ.
     """
     if count < 1:
         raise ValueError(f"receivers must be at least 1, got {count}")
