@@ -1,4 +1,4 @@
-"""What kriging asks a posterior of residuals for."""
+"""The contract of a posterior of residuals, which kriging uses."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -22,10 +22,11 @@ class Posterior(nn.Module):
     Attributes:
         chooses_weight: True if validation links choose the weight of kriging, else 1.
         by_paths: True if strengths of paths are kriged, not labels.
-        start: Choices of a fit to nearly the same links, from which the next one starts; None: no
-            fit before.
-        seen: Links by which the fit has chosen; None: all.
-        is_lazy: True if few places will be asked for: many known links are then not all solved.
+        start: Result of an earlier fit to nearly the same links, from which the next fit starts;
+            None: no earlier fit.
+        seen: Known links that the fit has held out to choose hyperparameters; None: all.
+        is_lazy: True if predictions are wanted at few places. With many known links only those near
+            these places are then solved for.
     """
 
     chooses_weight = False
@@ -35,7 +36,7 @@ class Posterior(nn.Module):
     is_lazy = False
 
     def cleaned(self, links: Links) -> Links:
-        """The links without those that would move the whole fit; by default all."""
+        """The links without gross errors that would move the whole fit; by default all links."""
         return links
 
     def fit(self, links: Links, candidates: Mapping[float, Tensor]) -> float:
@@ -43,13 +44,13 @@ class Posterior(nn.Module):
 
         Args:
             links: Links with a split.
-            candidates: Residuals of the known links (k, m), ``thin_labels`` of them, by trend
-                weight.
+            candidates: Residuals of the known links (k, m), thinned by ``thin_labels``, for each
+                candidate weight of the trend.
         """
         raise NotImplementedError
 
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
-        """Takes the known links; ``residuals`` gives residuals of some rows (j, *shape)."""
+        """Takes the known links; ``residuals`` is a function from j rows to their (j, *shape)."""
         raise NotImplementedError
 
     def start_from(self, other: Any) -> None:
