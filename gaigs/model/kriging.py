@@ -49,9 +49,10 @@ class Kriging(Wrapper):
 
     z comes from one of three posteriors. ``ScalarPosterior`` is for labels of one real number, with
     hyperparameters of each receiver. ``FieldPosterior`` is for other labels. ``PathPosterior`` is
-    for a trend whose paths have ``margins``: strengths are kriged path by path. The first and the
-    last have a weight of 1, or 0. Where validation links are surely better by kriged labels than by
-    kriged paths, such as at places closer than half a wavelength, labels are kriged.
+    for a trend with ``margins``, the fields by which its paths may deviate: strengths are kriged
+    path by path. The first and the last have a weight of 1, or 0. Where validation links are surely
+    better by kriged labels than by kriged paths, such as at places closer than half a wavelength,
+    labels are kriged.
 
     A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal
     components. If a receiver has more than ``LIMIT`` known links, an even part of them is used;
@@ -174,7 +175,7 @@ class Kriging(Wrapper):
     def _krige_better(
         self, links: Links, values: Tensor, is_final: bool, is_few: bool
     ) -> "Kriging":
-        """``krige`` by paths; by labels if those are surely better at enough validation links."""
+        """``krige`` by paths, or by labels where enough validation links surely prefer these."""
         if is_few:
             return self._krige_paths(links, values, is_final)
         of_labels = self._krige_labels(links, values, False)

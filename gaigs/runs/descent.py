@@ -171,7 +171,7 @@ def _run(
     validation: InOrder | None,
     resumed: Path | None,
 ) -> None:
-    """All steps of a training; after a signal ``Stopped``, with the former handlers."""
+    """Makes all steps of a training. A signal raises ``Stopped`` once handlers are restored."""
     expected = (
         ".*LeafSpec",  # Lightning's use of torch
         "You defined a `validation_step` but",  # a split without validation links

@@ -247,9 +247,10 @@ def score(
 ) -> Scores:
     """Scores of every test link by models and look-ups; predictions of the first in a folder.
 
-    Look-ups and models with a calibration have scores of intervals too. If subcarriers are held
-    out, ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as an
-    uplink is taken for a downlink. Fitted look-ups come into ``fits``, for their next fit.
+    Look-ups and models with a calibration have scores of intervals, too. If subcarriers are held
+    out, ``nearest_frequency`` takes a link's label at the nearest known subcarrier as a prediction,
+    as an uplink is taken for a downlink. ``fits`` receives the fitted look-ups, whose choices a
+    next fit may keep.
     """
     test = LinkScores(links)
     look_ups = able_look_ups(look_ups, links)
@@ -387,7 +388,7 @@ def validate(
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
-    """The table's numbers for each receiver with test links, by the names of receiver and model."""
+    """The table's numbers of each receiver with test links, by names of receiver and model."""
     receivers = links.query.receivers[links.split.test]
     summaries: dict[str, dict] = {}
     for number, receiver in enumerate(links.receivers):

@@ -128,7 +128,7 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
 
 
 def fingerprint(links: Links) -> str:
-    """A digest of queries, receivers and labels, of these only in memory: decoding is slow."""
+    """A digest of queries and receivers, and of labels in memory: files are slow to decode."""
     parts = [links.query.transmitters, links.query.receivers]
     for receiver in links.receivers:
         parts += [receiver.pose.position, receiver.pose.rotation, receiver.array.elements]

@@ -22,7 +22,8 @@ def receivers(
 ) -> Split:
     """Whole receivers test: the error where no receiver has stood.
 
-    Where three receivers or more are left, whole receivers validate, too; of two, random places.
+    If three receivers or more are left, whole receivers validate, too. If two are left, random
+    places validate.
 
     Args:
         hold: Names of the receivers that test, or one; None: random ones.
