@@ -26,8 +26,7 @@ class EquivariantLinear(nn.Module):
 
     It is a sum of basis maps: the projection to each of the n + 1 grades and, with a null vector
     e0, e0 times each grade but the highest. Multiplication by the pseudoscalar is excluded, because
-    a mirror changes its sign. Scalars mix with the multivectors' component 1, and only these have a
-    bias.
+    a mirror changes its sign. Scalars mix with the multivectors' component 1; both have a bias.
 
     Args:
         algebra: The algebra.
@@ -189,8 +188,8 @@ class GeometricAttention(nn.Module):
         """Attention of one token, once for each of ``count`` alternatives, such as transmitters.
 
         The first ``count`` tokens are the alternatives, and the next token is the one that attends.
-        In result i it attends to alternative i, to itself and to all tokens behind it. The result
-        has ``count`` tokens.
+        In result i it attends to alternative i, to itself and to all tokens behind it. There are
+        ``count`` results.
         """
         query, key, value = self._project(multivectors, scalars)  # (*batch, heads, tokens, f)
         # eq. (8): softmax of the logits over the root of their number of features.

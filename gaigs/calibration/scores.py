@@ -25,8 +25,7 @@ def interval_scores(
 
     ``coverage_50`` and ``coverage_90`` are the shares of a label's numbers within its intervals,
     and ``width_90`` is the width of the intervals of 90 %. ``crps`` [label's unit] and ``nll``,
-    -log p, are of a normal distribution with the estimate's ``std``, for channels of real and
-    imaginary part.
+    -log p, are of a normal distribution with the estimate's ``std``, for channels of both parts.
 
     Args:
         labels: Labels, aligned to the predictions.

@@ -29,7 +29,7 @@ class Process:
     def whitened(
         self, asked: Float[Tensor, "g d"], rows: Int[Tensor, " j"] | slice = slice(None)
     ) -> tuple[Float[Tensor, "j g"], Float[Tensor, "j j"]]:
-        """Whitened covariances L^-1 C, and L. C is between known readings and places, L L' among
+        """Whitened covariances L^-1 C, and L. C is between readings and places, L L' among
         readings.
 
         The known readings lower the variance at a place by the sum of squares of its column.
@@ -112,8 +112,7 @@ def kriging_weights(
     The variance is over the signal's and includes the noise of the asked label.
 
     Args:
-        asked, around: Places of the asked links, and of j known links around each, see
-            ``coordinates`` [m].
+        asked, around: ``coordinates`` of the asked links, and of j known links around each [m].
         length: Correlation length of the kernel [m].
         nugget: Variance of the noise over the signal's.
 

@@ -53,8 +53,9 @@ def conditional(
     """Means and variances of z at places, from ``covariances``, the readings around, and the
     variances of their noise.
 
-    Mean w'y and variance k - 2 w'c + w'(C + N) w have weights w = (C + N)^-1 c that minimise the
-    variance.
+    The mean is w'y, and the variance k - 2 w'c + w'(C + N) w. Here y are the readings, N the
+    variances of their noise, and C, c and k the covariances among readings, with the place and at
+    the place. The weights w = (C + N)^-1 c minimise the variance.
     """
     noisy = between[:, :-1, :-1] + torch.diag_embed(variances)
     towards = between[:, :-1, -1]  # c (m, j)
@@ -77,15 +78,13 @@ def slopes(
     of_mean: Float[Tensor, " m"],
     of_variance: Float[Tensor, " m"],
 ) -> Float[Tensor, "m 4"]:
-    """Derivatives of a cost by the logarithms of length, signal, readings' noise and carriers'
-    scale.
+    """Derivatives of a cost by logarithms of length, signal, readings' noise and carriers' scale.
 
     The weights minimise the variance. So a change dC of all covariances changes the variance by e'
     dC e and the mean by -e' dC s, with ``errors`` e and ``solved`` s of ``solution``.
 
     Args:
-        around, hyperparameters, choice, between, variances: As for ``covariances`` and
-            ``conditional``.
+        around, hyperparameters, choice, between, variances: As for the functions above.
         solution: Result of ``conditional``.
         of_mean, of_variance: Derivatives of the cost by the means and variances of ``solution``.
     """
@@ -115,8 +114,7 @@ def expected_factors(
 ) -> Float[Tensor, "m j"]:
     """Expected variance of each reading's noise over ``noises``, by Student's t.
 
-    Only the readings around a place count: the held-out reading there must have no part in its own
-    prediction.
+    Only the readings around a place count: the held-out reading there must have no part in it.
 
     Args:
         between: Covariances of z at the readings.

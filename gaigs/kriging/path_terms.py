@@ -56,8 +56,7 @@ class PathTerms(nn.Module):
         + c2 h + c3 sin e + c4 (3 sin² e - 1) / 2 + c5 max(0, log10 d - log10 d0).
 
     d0 is the break point. Coefficients have a normal prior, whose deviation falls with the harmonic
-    q of a lobe. Terms (lobes, height, break point) are added one by one, the same for all
-    receivers.
+    q of a lobe. Terms (lobes, height, break point) are added one by one, at all receivers.
 
     Source: Feuerstein et al., Path loss, delay spread, and outage models as functions of antenna
     height, 1994 (break point); Hoerl and Kennard, Ridge regression, 1970.
@@ -98,8 +97,8 @@ class PathTerms(nn.Module):
     def fit(self, links: Links, errors: Float[Tensor, " k"], chooses: bool) -> None:
         """Fits the coefficients to ``errors`` of a law at the known links.
 
-        With ``chooses`` the terms are chosen first. A receiver without links gets the means over
-        the others.
+        With ``chooses`` the terms are chosen first. A receiver without links gets the others'
+        means.
         """
         if links.uncertainties is not None:
             self.regions.copy_(links.uncertainties)

@@ -414,8 +414,8 @@ class ScalarPosterior(Posterior):
     """Kriged residuals of labels of one number, with a ``ScalarProcess``.
 
     The trend's weight is the mean of its candidates, each weighted by the likelihood of the
-    validation links. All readings of a place count as one. Without validation links all candidates
-    count alike.
+    validation links. All readings of a place count as one. Without validation links all count
+    alike.
     """
 
     def __init__(self, scene: Scene):

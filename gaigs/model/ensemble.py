@@ -100,8 +100,7 @@ class Ensemble(Wrapper):
         """Deviations of labels: the members' root mean square difference over a label's numbers.
 
         Few members may agree by chance, so the ``typical`` mean square counts as four more members.
-        A blend of different models has the weighted root mean square of the deviations that these
-        state.
+        A blend of different models has the weighted root mean square of its members' deviations.
         """
         if not self.is_blend:
             count = len(self._members) - 1
@@ -138,8 +137,7 @@ class Ensemble(Wrapper):
     def unseen(self, links: Links) -> Iterator[Unseen]:
         """Models like this one with links that no member has seen.
 
-        If a member is trained, these are the validation links, and look-ups are fitted without
-        them.
+        If a member is trained, these are validation links, and look-ups are fitted without them.
         """
         if not self.is_blend or not self.is_trained:
             yield from super().unseen(links)

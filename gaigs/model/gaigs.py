@@ -195,8 +195,7 @@ class GaussianSplatting(Model):
             )
 
     def _built_gaussians(self, options: Mapping | None, zone: Any) -> Gaussians | None:
-        """Free Gaussians, which no placement brings, within elevations ``zone`` [rad]; None without
-        options.
+        """Free Gaussians, brought by no placement, at elevations in ``zone`` [rad]; or None.
 
         Beside Gaussians of a placement their signal must not depend on the direction (degree 0).
         """

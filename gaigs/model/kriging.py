@@ -433,10 +433,10 @@ class Kriging(Wrapper):
     def unseen(self, links: Links, enough: int = 1000, most: int = 4000) -> Iterator[Unseen]:
         """Yields models that krige the training links, with validation links that they do not know.
 
-        Each of two models comes with one half of these links; the other half has chosen its weights
-        and hyperparameters. Links of one group, which cannot be halved, do both. If ``enough`` of
-        them have chosen nothing (``chosen_by``), this model itself comes with these. For labels of
-        one number ``most`` links suffice: more say no more of quantiles.
+        Each of two models comes with one half of the validation links; the other half has chosen
+        its weights and hyperparameters. Links of a single group, which cannot be halved, do both.
+        If ``enough`` validation links have chosen nothing (``chosen_by``), this model itself comes
+        with these. For labels of one number ``most`` links suffice for quantiles.
         """
         if not len(links.split.validation):
             return

@@ -94,9 +94,7 @@ class MirroredSplatting(GaussianSplatting):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits the pipeline. Searches planes in spectra and channels; prepares the search in
-        levels.
-        """
+        """Fits the pipeline; searches planes in spectra and channels, or prepares it in levels."""
         super().fit(links)
         self.places = thin_links(links.query[links.split.train])
         is_known = links.query.frequencies is not None or len(self.scene.frequencies) == 1

@@ -128,8 +128,7 @@ def shared_coefficients(
     """Non-negative coefficients c of features x in y = level + exponent log10(d) + c . x.
 
     Level and exponent differ from receiver to receiver, c is shared. A ridge draws each coefficient
-    towards 0 as much as one more link with the value 0. A feature that level and exponent explain
-    has the coefficient 0.
+    towards 0, like one more link. A feature that level and exponent explain has the coefficient 0.
 
     Args:
         columns: Level y of each link [dBm], then its features x. A loss has a negative sign, since

@@ -87,8 +87,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
 
         Returns:
             At most four walls, which have all places on one side, and at most four planes amid the
-            places, each list best first. In a single list planes amid the places would displace
-            walls.
+            places, each list best first. In one list those amid the places would displace walls.
         """
         walls: list[Candidate] = []
         amid: list[Candidate] = []

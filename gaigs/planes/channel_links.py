@@ -218,7 +218,7 @@ class ReceiverChannels:
         """Waves of all paths after their reflections; 0 for a path that does not meet its planes.
 
         Reflection coefficients are those at the frequencies ``at`` [Hz], by default each
-        subcarrier's. A single frequency saves work with half-spaces, which reflect alike at all
+        subcarrier's. A single one saves work with half-spaces, which reflect alike at all
         frequencies.
         """
         at = self.frequencies if at is None else at
@@ -340,8 +340,7 @@ class ChannelData:
     ) -> list[Complex[Tensor, " c"]]:
         """Phase of the direct paths to each receiver, as numbers of magnitude 1.
 
-        A receiver has one phase for all places (1,) if channels share a phase, else one for each
-        place (b,).
+        There is one for all places (1,) if channels share a phase, else one for each place (b,).
         """
         phases = []
         for receiver in receivers:

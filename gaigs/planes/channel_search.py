@@ -154,8 +154,8 @@ class ChannelSearch:
         return search.sweep(room, turns, "search of planes", replace).planes
 
     def resolve(self, planes: Float[Tensor, "w 4"]) -> SlabRoom:
-        """The room of planes whose offsets are known to a fraction of the wavelength, with the best
-        slabs.
+        """The room with each plane's offset known to a fraction of the wavelength, and its best
+        slab.
 
         Planes are moved one after the other, in three rounds. A plane that has not been moved yet
         keeps complex strengths, see ``ChannelScore.measure``.

@@ -98,8 +98,8 @@ class CommonGains:
     ) -> Float[Tensor, "w 4"]:
         """Known walls moved to where phases agree, by at most ``drawing_error``.
 
-        In each round the wall that explains most is placed. The others are then fitted beside this
-        wall.
+        In each round the wall that explains most is placed, beside which the others are then
+        fitted.
         """
         planes = self.start.clone()
         waiting = list(range(len(self.start)))

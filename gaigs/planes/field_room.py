@@ -132,8 +132,7 @@ class FieldFit:
         data: Training channels with a phase in common.
         floor: Share of the mean power below which an error hardly counts; the default is -20 dB.
         damping: Share of the mean squared derivative added in each step of Gauss and Newton.
-        largest: About the number of channel values of a ``PlaceBlock``, for the time of its
-            Cholesky factor.
+        largest: About the number of channel values of a ``PlaceBlock``; a larger one costs time.
 
     Attributes:
         values: Channel values of all receivers (m,), scaled to a mean power of 1 at each.
@@ -230,8 +229,7 @@ class FieldFit:
 
         Args:
             room: Planes, and gains at the start.
-            steps: Number of steps. A step that raises the error is undone, and the next has more
-                damping.
+            steps: Number of steps. One that raises the error is undone, and damping then grows.
             waves: The room's ``waves`` if they are known.
             kriged: The room's ``krige`` if it is known.
         """
@@ -303,8 +301,7 @@ class FieldFit:
 
     @torch.no_grad()
     def krige(self, room: FieldRoom, waves: Complex[Tensor, "m n"]) -> Kriged:
-        """Operators by which the residuals of a room are whitened, and predicted from place to
-        place.
+        """Operators that whiten the residuals of a room, and that predict each place from others.
 
         The covariance of two channel values is the product of their paths' fields, summed over
         paths, times the kernel of their places; on the diagonal noise is added.
@@ -367,8 +364,7 @@ class FieldFit:
 def group_places(places: Float[Tensor, "b 3"], count: int) -> Int[Tensor, " b"]:
     """Group of each place, of ``count`` groups of neighbours, a power of two.
 
-    All places are one group at first. Groups are halved at the median of their longest axis until
-    there are ``count``.
+    Groups are halved at the median of their longest axis until there are ``count``.
     """
     groups = torch.zeros(len(places), dtype=torch.long)
     while groups.max() + 1 < count:

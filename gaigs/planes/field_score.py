@@ -64,8 +64,7 @@ class FieldScore(Score[FieldRoom]):
     # --- ratings ---
 
     def rate(self, room: FieldRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
-        """Ratings of planes by the ``rated`` bands. Noise gives about 1 for each receiver and
-        group.
+        """Ratings of planes by the ``rated`` bands; noise gives 1 for each receiver and group.
 
         The grid is rated with places in ``groups``, single planes with all places together.
         """
@@ -181,11 +180,9 @@ class FieldScore(Score[FieldRoom]):
         return self.descend(room, 40)
 
     def square(self, room: FieldRoom) -> FieldRoom:
-        """The room with planes set upright and along axes, if their tilts explain no more than
-        noise.
+        """The room with planes upright and along axes, if tilts explain no more than noise does.
 
-        By chance each number that is fitted may lower the sum of log errors over n values by log(n)
-        / 2.
+        By chance each fitted number may lower the sum of log errors over n values by log(n) / 2.
 
         Source: Schwarz, Estimating the dimension of a model, 1978.
         """

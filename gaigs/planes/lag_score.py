@@ -199,8 +199,7 @@ class LagScore(Score[LagRoom]):
 
         First the direct path is blocked at links whose error it raises by more than
         ``LagOptions.blocked``. Then all planes descend. The moved planes are kept only if the mean
-        error falls by more than ``LagOptions.certain`` standard errors. The room's ``errors`` are
-        not renewed.
+        error falls by more than ``LagOptions.certain`` standard errors. ``errors`` are not renewed.
         """
         with_direct = self.errors(room.planes, room.opened(0, True))
         without = self.errors(room.planes, room.opened(0, False))
@@ -246,11 +245,9 @@ class LagScore(Score[LagRoom]):
     def _rate_powers(
         self, maps: list[Float[Tensor, "b 1 k k"]], planes: Float[Tensor, "c 4"]
     ) -> Float[Tensor, " c"]:
-        """Fall of the errors by the power of a reflection at each plane, over the norm of that
-        power.
+        """Fall of the errors by the power of a reflection at each plane, over that power's norm.
 
-        ``maps`` have the fall of each link's error by a wave from each direction, on a grid of k
-        sines of two angles.
+        ``maps`` have each link's fall by a wave from each direction, on a grid of k x k sines.
         """
         total, square = planes.new_zeros(2, len(planes))
         for receiver, falls in zip(self.paths.receivers, maps, strict=True):

@@ -133,8 +133,7 @@ class ReceiverLags:
     def slopes(self, lags: Complex[Tensor, "b l"]) -> Complex[Tensor, "b e e"]:
         """Negative gradient M of the errors by the covariances.
 
-        A further wave x lowers the errors by x' M x, and by 2 Re x' M y by interference with a wave
-        y of the model.
+        A further wave x lowers the errors by x' M x, and by 2 Re x' M y with a known wave y.
         """
         with torch.enable_grad():
             lags = lags.detach().requires_grad_()

@@ -238,8 +238,7 @@ class LevelSearch:
 
     @torch.no_grad()
     def locate(self, placement: Mirrored) -> list[int]:
-        """Moves planes of the placement to clear maxima, one after the other; their paths
-        interfere.
+        """Moves the placement's planes to clear maxima, one by one, and lets paths interfere.
 
         Returns:
             Numbers of these planes in the placement.

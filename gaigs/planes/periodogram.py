@@ -187,8 +187,7 @@ def periodogram(
     Args:
         values, rates: As of ``Likeness``, of one plane.
         moves: Moves of the plane along the normal [m].
-        turns: Turns towards two axes [rad], from 0 up. The result also has the negative turns, in
-            ascending order.
+        turns: Turns towards two axes [rad], from 0 up; the result begins with their negatives.
     """
     phases = rates[:, :1] * moves
     moved = values[:, None] * torch.polar(torch.ones_like(phases), phases)  # (b, m)

@@ -99,8 +99,7 @@ class PlaneSearch(Generic[R]):
     Args:
         frame: Transmitters and receivers.
         score: How well planes explain the labels.
-        turn, shift: First steps of the random search about a maximum: of normals [rad], and of
-            offsets [diagonals].
+        turn, shift: First steps about a maximum, of normals [rad] and of offsets [diagonals].
 
     Source: Hough, Method and means for recognizing complex patterns, 1962, for the candidates.
     """
@@ -222,8 +221,7 @@ def descend(
 
     Args:
         loss: Function from planes and ``others`` to the value that is minimised.
-        receivers: ``ReceiverChannels`` or ``ReceiverLags``; planes turn about their
-            ``mean_bounces``.
+        receivers: Planes turn about their ``mean_bounces`` at these.
         planes: Planes at the start.
         others: Further tensors at the start.
         steps: Number of steps, whose size falls to 3 % of the first.

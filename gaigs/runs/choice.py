@@ -311,8 +311,7 @@ def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
     A candidate whose scores are not finite is behind all others.
 
     Scores are compared place by place, since a hard place is hard for both. A candidate is compared
-    with each other one, not with the best alone: with few places the best mean often has the most
-    scatter.
+    with each other one, not with the best alone: of few places the best mean often scatters most.
 
     Source: Breiman, Friedman, Olshen and Stone, Classification and regression trees, 1984, section
     3.4.3, the rule of one standard error; of all pairs as in Hansen, Lunde and Nason, The model

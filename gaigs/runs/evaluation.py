@@ -77,8 +77,8 @@ def fitted(
 ) -> Model:
     """A copy of a model without a training, fitted to the known links.
 
-    If these are more than ``many``, it keeps the choices of ``before``: the same model, fitted to
-    most of them.
+    With more than ``many`` known links the copy keeps the choices of ``before``, the same model
+    fitted to most of these links.
     """
     if before is not None and len(links.split.known) > many:
         return before.refitted(links)

@@ -22,7 +22,7 @@ ANOTHER = "choose another folder (hydra.run.dir)"
 
 
 def claim(folder: Path, config: dict) -> None:
-    """Writes the configuration into a run folder, or checks that the run there has this one.
+    """Writes the configuration into a run folder, or checks that the folder's run has the same.
 
     Other files there, or another run to resume, are a ``ValueError``.
     """

@@ -22,8 +22,7 @@ def receivers(
 ) -> Split:
     """Whole receivers test: the error where no receiver has stood.
 
-    If three receivers or more are left, whole receivers validate, too. If two are left, random
-    places validate.
+    Where three receivers or more are left, whole receivers validate, too; else random places.
 
     Args:
         hold: Names of the receivers that test, or one; None: random ones.

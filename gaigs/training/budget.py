@@ -29,7 +29,7 @@ class Budget(Callback):
         max_time: Limit of search and training together [s]; The training gets at least half,
             however long the search. None: steps alone end the training.
         every: Least time between validations [s]; these take at most a fifth of the training. None:
-            they come by steps.
+            by steps.
         searched: Duration of the search before the training [s]; of several processes the first
             one's counts.
 

@@ -106,8 +106,7 @@ class KeepBest(Checkpoint):
 
 
 class KeepLast(Checkpoint):
-    """Writes the checkpoint to resume from: ``every`` [s], at a signal that stops a run, at the
-    end.
+    """Writes the checkpoint to resume from: ``every`` [s], at a signal to stop, and at the end.
 
     The checkpoint is written between two steps, after a due validation and all other callbacks. So
     a resumed training equals an uninterrupted one. At the first signal the training stops there, at

@@ -233,7 +233,7 @@ def test_a_plane_that_a_false_one_moved_returns(monkeypatch):
         return SlabRoom(planes + lobe, slabs)
 
     monkeypatch.setattr(own, "find_free", lambda known: found)
-    monkeypatch.setattr(own.free, "descend", lambda planes, *options: planes)
+    monkeypatch.setattr(own.free, "descend", lambda planes, **options: planes)
     monkeypatch.setattr(own, "resolve", resolved)
     monkeypatch.setattr(own.along_axes, "grow_along", lambda room, *_: room)
     torch.testing.assert_close(own.run()[0], walls, rtol=0, atol=5e-3)
