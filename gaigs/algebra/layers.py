@@ -188,7 +188,7 @@ class GeometricAttention(nn.Module):
         """Attention of one token, once for each of ``count`` alternatives, such as transmitters.
 
         The first ``count`` tokens are the alternatives, and the next token is the one that attends.
-        In result i it attends to alternative i, to itself and to all tokens behind it. There are
+        Result i attends to alternative i, to the token itself and to all tokens behind. There are
         ``count`` results.
         """
         query, key, value = self._project(multivectors, scalars)  # (*batch, heads, tokens, f)

@@ -1,4 +1,4 @@
-"""Links that calibrate a model: those that it, or a model like it, has not seen."""
+"""Links that calibrate a model, since neither the model nor its like has seen them."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator

@@ -15,7 +15,7 @@ def validation_scores(
 ) -> Float[Tensor, " k"]:
     """The task's monitored score of predictions ``values``, turned so that higher is better.
 
-    They are of the validation links, or of the links ``index``.
+    The predictions are of the validation links, or of the links ``index``.
     """
     task = links.task
     labels = links.labels[links.split.validation if index is None else index]

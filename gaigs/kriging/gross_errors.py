@@ -79,7 +79,7 @@ def are_alone(
 
 
 def errors_of_law(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-    """Levels [dB] minus a line over ``decades``, log10 of the distances, by Cauchy's weights.
+    """Levels minus a line over ``decades``, log10 of distances, fitted with Cauchy's weights.
 
     Few levels with gross errors hardly move the line.
     """

@@ -97,7 +97,7 @@ def covariance(places: Float[Tensor, "k d"], length: float, nugget: float) -> Fl
 def cholesky_factor(
     places: Float[Tensor, "k d"], length: float, nugget: float
 ) -> Float[Tensor, "k k"]:
-    """Lower Cholesky factor of ``covariance``."""
+    """Lower Cholesky factor of ``covariance``, with the same arguments."""
     return torch.linalg.cholesky(covariance(places, length, nugget))
 
 

@@ -144,7 +144,7 @@ class PathField(nn.Module):
     ) -> Float[Tensor, "b n"]:
         """Variances of each path's process at some places, as if the elements resolved all paths.
 
-        Only the ``most`` nearest known links of a place count: they screen those behind them.
+        Only the ``most`` known links nearest to a place count, since these screen those behind.
         """
         apart = distances(places, self.places)
         near = apart.topk(min(most, len(self.places)), largest=False).indices  # (b, j)

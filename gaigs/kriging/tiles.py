@@ -24,7 +24,7 @@ class Tiles(nn.Module):
     """Groups of the readings of a receiver that has too many for one covariance matrix.
 
     A tile is solved with ``size`` readings in this order: the ``core`` readings or fewer that
-    belong to the tile, the readings around each of these, which screen those behind them, and the
+    belong to the tile, the readings around each of these, which screen those behind, and the
     readings nearest to the tile's centre. A place is predicted by the tile of the nearest reading.
     A tile is solved when a place in it is first asked for.
     """

@@ -54,7 +54,7 @@ class Kriging(Wrapper):
     better by kriged labels than by kriged paths, such as at places closer than half a wavelength,
     labels are kriged.
 
-    A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal
+    A run makes this model by ``kriging=true``. A checkpoint holds the residuals as a few principal
     components. If a receiver has more than ``LIMIT`` known links, an even part of them is used;
     labels of one number use all.
 

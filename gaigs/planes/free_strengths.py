@@ -105,7 +105,7 @@ class FreeScore(Score[FreeRoom]):
     def descend(
         self, planes: Float[Tensor, "w 4"], steps: int, rate: float
     ) -> Float[Tensor, "w 4"]:
-        """Planes after a descent on the error at random links; as in ``search.descend``."""
+        """Planes after a descent at random links; ``steps``, ``rate``: as in ``search.descend``."""
         sequences = self.data.sequences(planes)
 
         def loss(planes: Float[Tensor, "w 4"]) -> Float[Tensor, ""]:

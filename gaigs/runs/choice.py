@@ -263,8 +263,8 @@ def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
     """The chosen candidate, or a blend of the candidates that no other surely leads.
 
     A blend is scored with shares fitted without each place's fold. It is chosen unless a candidate
-    surely leads it, since the error of a mean is at most the mean of the errors. Complex channels
-    of unknown phase have no mean.
+    surely leads, since the error of a mean is at most the mean of the errors. Complex channels of
+    unknown phase have no mean.
     """
     choice = pick(tried, links.task)
     level = choice.level

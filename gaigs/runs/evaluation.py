@@ -418,7 +418,7 @@ def render_ms(model: Model, links: Links) -> float | None:
 
 
 def median_ms(work: Callable, warm_up: int = 5, repeats: int = 25) -> float:
-    """Median duration of a call [ms], after warm-up."""
+    """Median duration of ``work`` [ms] in some ``repeats``, after ``warm_up`` calls."""
     wait = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
     seconds = []
     for _ in range(warm_up + repeats):

@@ -26,12 +26,11 @@ class Budget(Callback):
     counts. Lightning's own ``max_time`` gives each process its own clock.
 
     Args:
-        max_time: Limit of search and training together [s]; The training gets at least half,
+        max_time: Limit of search and training together [s]. The training gets at least half,
             however long the search. None: steps alone end the training.
         every: Least time between validations [s]; these take at most a fifth of the training. None:
             by steps.
-        searched: Duration of the search before the training [s]; of several processes the first
-            one's counts.
+        searched: Duration of the search before the training [s], by the first process's clock.
 
     Attributes:
         end: Time at which the limit of the run ends the training, at least a second after the

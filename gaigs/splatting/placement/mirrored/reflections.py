@@ -196,8 +196,9 @@ def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, 
 def square_normals(normals: Float[Tensor, "w 3"], plane: int) -> list[Float[Tensor, "3"]]:
     """A plane's normal, and normals within 18 degrees of it that would make the room square.
 
-    These are level, upright, or square to another plane. Why they are tried: a fit of powers leaves
-    tilts wrong by some degrees, and with a wrong tilt phases agree at few places only.
+    The further ones are level, upright, or square to another plane. They are tried because a fit of
+    powers leaves tilts wrong by some degrees, and with a wrong tilt phases agree at few places
+    only.
     """
     up = normals.new_tensor([0.0, 0.0, 1.0])
     normal = normals[plane]
