@@ -361,7 +361,7 @@ def link_quantiles(
         inside: True for the numbers of the group.
         levels: Levels of the intervals.
         clusters: Numbers of links that err together; a new link is one of a new cluster.
-        level: Level at which ``effective_count`` is computed, for all levels.
+        level: Level at which the scatter of the links' shares is measured, for all levels.
     """
     held = (errors <= quantile(ordered, levels.new_tensor(level))) & inside
     both = torch.stack((held.sum(1), inside.sum(1)))  # (2, n)

@@ -110,8 +110,8 @@ def fit_hyperparameters(
         most: Held-out links of all receivers together; 300 take seconds at most.
         nuggets: Bounds of the nugget. The lower keeps matrices regular in float64 if places are
             measured twice.
-        edges: Longest correlation length [longest edges of the box of places]. Beyond it the kernel
-            is nearly linear within the box, so the length no longer shows.
+        edges: Longest correlation length, in longest edges of the box of places: beyond it the
+            kernel is a line in the box.
     """
     lengths = scene.spacing, edges * (scene.upper - scene.lower).max().item()
     scales = [scale_bounds(scene)] if scene.has_band else []
@@ -209,7 +209,7 @@ def negative_log_likelihood(
     """-2 log p(held-out labels | labels around them) without constants, a mean over a label's
     numbers.
 
-    The signal's variance is the one with the largest likelihood at the receiver.
+    The signal's variance is the receiver's most likely one.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """
