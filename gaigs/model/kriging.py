@@ -49,10 +49,9 @@ class Kriging(Wrapper):
 
     z comes from one of three posteriors. ``ScalarPosterior`` is for labels of one real number, with
     hyperparameters of each receiver. ``FieldPosterior`` is for other labels. ``PathPosterior`` is
-    for a trend with ``margins``, the fields by which its paths may deviate: strengths are kriged
-    path by path. The first and the last have a weight of 1, or 0. Where validation links are surely
-    better by kriged labels than by kriged paths, such as at places closer than half a wavelength,
-    labels are kriged.
+    for a trend with ``margins``, fields by which paths may deviate: strengths of paths are kriged.
+    The first and the last have a weight of 1, or 0. Where validation links are surely better by
+    kriged labels than by paths, as at places closer than half a wavelength, labels are kriged.
 
     A run makes this model by ``kriging=true``. A checkpoint holds the residuals as a few principal
     components. If a receiver has more than ``LIMIT`` known links, an even part of them is used;
