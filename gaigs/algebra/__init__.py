@@ -102,8 +102,8 @@ class Algebra:
     ) -> Float[Tensor, "*batch k"]:
         """Regressive product x ∨ y, the dual of the duals' wedge.
 
-        Of projective points it is the line through them. A mirror changes its sign besides
-        mirroring it: join(ux, uy) = -u join(x, y) for an odd versor u.
+        The join of two projective points is the line through both. Under a mirror u it also changes
+        sign: join(ux, uy) = -u join(x, y), as for every odd versor.
         """
         return self._multiply("join", x, y)
 
@@ -263,8 +263,8 @@ def _products(algebra: Algebra) -> tuple[Tensor, Tensor]:
 def _number_maps(algebra: Algebra, null_blades: list[int]) -> Tensor:
     """Numbers of the equivariant linear maps by blade of null vectors and component (2**r, k).
 
-    Motions leave null vectors unchanged, so the wedge of a grade with one of their blades, 1
-    included, is equivariant. Maps are numbered by blade, then by grade.
+    Motions leave null vectors unchanged, so a wedge with one of their blades, 1 included, is an
+    equivariant map of a grade. Maps are numbered by blade, then by grade.
     """
     grades = torch.tensor(algebra.grades)
     first = 0

@@ -26,7 +26,7 @@ class EquivariantLinear(nn.Module):
 
     It is a sum of basis maps: the projection to each of the n + 1 grades and, with a null vector
     e0, e0 times each grade but the highest. Multiplication by the pseudoscalar is excluded, because
-    a mirror changes its sign. Scalars mix with the multivectors' component 1, which has the bias.
+    a mirror changes its sign. Scalars mix with the multivectors' component 1; both have a bias.
 
     Args:
         algebra: The algebra.
@@ -185,9 +185,11 @@ class GeometricAttention(nn.Module):
     def look(
         self, multivectors: Multivectors, scalars: Scalars, count: int
     ) -> tuple[Multivectors, Scalars]:
-        """Attention of the token behind the first ``count``, once for each of these.
+        """Attention of one token, once for each of ``count`` alternatives, such as transmitters.
 
-        It sees one of them, itself and all tokens that follow; the result has ``count`` tokens.
+        The first ``count`` tokens are the alternatives, and the next token is the one that attends.
+        Result i attends to alternative i, to the token itself and to all tokens behind. There are
+        ``count`` results.
         """
         query, key, value = self._project(multivectors, scalars)  # (*batch, heads, tokens, f)
         # eq. (8): softmax of the logits over the root of their number of features.
@@ -294,7 +296,10 @@ class GATrBlock(nn.Module):
     def look(
         self, multivectors: Multivectors, scalars: Scalars, count: int
     ) -> tuple[Multivectors, Scalars]:
-        """The block's first half for one token alone; see ``GeometricAttention.look``."""
+        """The block's attention for one token, once for each of the first ``count`` tokens.
+
+        See ``GeometricAttention.look``; ``transform`` is the second half.
+        """
         normal = equivariant_norm(self.algebra, multivectors, scalars)
         attended, attended_scalars = self.attention.look(*normal, count)
         multivectors = multivectors[..., count : count + 1, :, :] + attended

@@ -1,6 +1,4 @@
-"""Intervals of predictions, by conformal prediction on links that the predicting model has not
-seen.
-"""
+"""Intervals of predictions, calibrated at links that the predicting model has not seen."""
 
 from gaigs.calibration.conformal import Calibration, Estimate, fewest
 

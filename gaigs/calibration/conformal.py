@@ -26,8 +26,8 @@ class Calibration:
     ``effective_count``, so the probability is about p.
 
     Each receiver is a group where all have at least 100 links. If a model states no deviation,
-    links are also grouped by the distance to the nearest known place of their receiver, if errors
-    rise with it. Pixels of a spectrum are also grouped by their predicted amplitude, see
+    links are also grouped by the distance to their receiver's nearest known place, where errors
+    rise with this distance. Pixels of a spectrum are also grouped by their predicted amplitude, see
     ``bin_numbers``.
 
     Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; by groups of
@@ -117,7 +117,7 @@ class Calibration:
         )
 
     def at_receivers(self, widths: Float[Tensor, " w"]) -> "Calibration | None":
-        """The calibration for receivers without links, with the relative ``widths`` of intervals.
+        """The calibration for receivers without links; ``widths``: factor of the intervals at each.
 
         None if too few receivers have calibrated it.
         """
@@ -240,7 +240,7 @@ class Calibration:
     def mean_error(self) -> float:
         """Mean absolute error over the model's own deviation, by the stored quantiles.
 
-        It is a little too large: quantiles are those of intervals for new links.
+        The mean is a little too large, since stored quantiles are those for a new link.
         """
         return torch.trapezoid(self.quantiles, dx=1 / self.steps).mean().item()
 
@@ -288,8 +288,8 @@ def group_links(
     Args:
         query, known, near: As for ``Calibration.of``.
         errors: Errors of the links over their deviations.
-        enough: Links that a group needs for intervals of its own.
-        most: Most groups of distances.
+        enough: Least number of links of a group.
+        most: Largest number of groups by distance.
     """
     receivers = query.receivers
     count = int(torch.cat((receivers, known.receivers)).max()) + 1
@@ -328,10 +328,10 @@ class Bins(NamedTuple):
 
 
 def bin_numbers(values: Inexact[Tensor, "n m"], most: int = 8) -> Bins:
-    """Bins of predictions: where the amplitude is high, errors are larger.
+    """Bins of predictions by their amplitude, since errors are larger where this is high.
 
-    Labels of one number and channels have one bin. Spectra have eight, halved until at least
-    ``fewest(0.9)`` links have pixels in each: errors of a bin should not be those of a few links.
+    Labels of one number and channels have one bin. Spectra have ``most`` bins of as many pixels
+    each; the number is halved until ``fewest(0.9)`` links or more have pixels in each bin.
     """
     numbers = (values.abs() if values.is_complex() else values).double()
     sample = numbers.flatten()[evenly(torch.arange(numbers.numel()), 10**6)]
@@ -382,8 +382,9 @@ def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float
 def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float:
     """Number of independent numbers that would calibrate an interval as well as some links do.
 
-    Numbers of a link err together, so links with ``counts`` numbers, of which ``held`` are within
-    the interval, count less than all these numbers, and at least as much as the links themselves.
+    Numbers of one link err together, so they count as fewer than there are, but as no fewer than
+    the links. ``counts`` is the number of each link's numbers, ``held`` how many of these are
+    within the interval.
     """
     total = counts.sum().double()
     weights = counts / total
@@ -402,7 +403,7 @@ def fewest(level: float) -> int:
 
 
 def usual_deviations(value: Tensor) -> Float[Tensor, " b"]:
-    """Deviations of a model that states none: 1; for channels each value's root mean square."""
+    """Deviations for a model without any: 1, or each predicted channel's root mean square."""
     if value.is_complex():
         return value.abs().square().flatten(1).mean(1).sqrt()
     return torch.ones(len(value), device=value.device)
@@ -442,7 +443,7 @@ def thinned(
     values: Inexact[Tensor, " n *shape"],
     deviations: Float[Tensor, " n ..."],
 ) -> Thinned:
-    """Thins labels, which are aligned to the predictions first, predictions and deviations.
+    """Thins labels, predictions and deviations alike; labels are first aligned to predictions.
 
     Deviations (n,), one for each link, stay as they are.
     """

@@ -1,4 +1,4 @@
-"""Links that calibrate a model: those that it, or a model like it, has not seen."""
+"""Links that calibrate a model, since neither the model nor its like has seen them."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -45,7 +45,8 @@ class Answers(NamedTuple):
 def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -> Iterator[Fold]:
     """Holds out one fold of the known links after the other, until the time is up.
 
-    About ``most`` links of all ``count`` folds together are to be predicted.
+    A fold's links are to be predicted by a model of all others. Of all ``count`` folds together
+    about ``most`` links are yielded, evenly chosen.
     """
     index, receivers = links.split.known, links.scene.radio_of(links.query.receivers)
     folds = folds_of(links, index) % count

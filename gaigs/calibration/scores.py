@@ -21,11 +21,11 @@ def holds(estimate: Estimate, labels: Inexact[Tensor, " k *shape"]) -> Bool[Tens
 def interval_scores(
     labels: Inexact[Tensor, " k *shape"], half: Estimate, most: Estimate
 ) -> dict[str, Float[Tensor, " k"]]:
-    """Scores of each link's intervals, by name.
+    """Scores of each of k links' intervals, by name.
 
-    They are the shares of its numbers within intervals of 50 % and 90 %, the width of the latter,
-    and CRPS [the label's unit] and -log p of a normal distribution with the estimate's ``std``; for
-    channels of real and imaginary part.
+    ``coverage_50`` and ``coverage_90`` are the shares of a label's numbers within its intervals,
+    and ``width_90`` is the width of the intervals of 90 %. ``crps`` [label's unit] and ``nll``,
+    -log p, are of a normal distribution with the estimate's ``std``, for channels of both parts.
 
     Args:
         labels: Labels, aligned to the predictions.
@@ -88,7 +88,7 @@ def scores_of_links(
 def shares_within(
     calibration: Calibration, links: Thinned, query: Query, most: int = 300
 ) -> np.ndarray:
-    """Shares of labels within intervals of levels 0.05, 0.1, ..., 0.95 (19,).
+    """Shares of numbers within intervals of levels 0.05, 0.1, ..., 0.95 (19,), at ``most`` links.
 
     A share is NaN where too few links calibrate its level.
     """
@@ -107,7 +107,7 @@ def shares_within(
 def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
     """Means of ``scores_of_links`` over links, and standard errors of the coverages.
 
-    The errors are ``coverage_50_error`` and ``coverage_90_error``.
+    These errors are named ``coverage_50_error`` and ``coverage_90_error``.
     """
     numbers = {}
     for name, score in scores.items():
@@ -127,9 +127,9 @@ def coverage_error(
 ) -> float:
     """Standard error of the mean share of links within intervals; NaN with one place.
 
-    Errors of one place depend on each other, errors of different places count as independent. The
-    calibration's links scatter as the test's, and add to the error. If all links have the same
-    share, the level gives the scatter: level (1 - level).
+    Links at one place depend on each other; different places count as independent. The links that
+    calibrate are a sample, too, and add to the error by their number. If all links have the same
+    share, the variance is taken as level (1 - level).
 
     Source: Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015.
     """

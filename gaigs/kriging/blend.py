@@ -13,7 +13,10 @@ from gaigs.data import Links
 def validation_scores(
     links: Links, values: Tensor, index: Int[Tensor, " k"] | None = None
 ) -> Float[Tensor, " k"]:
-    """Monitored scores of predictions of the validation links, or others, higher ones better."""
+    """The task's monitored score of predictions ``values``, turned so that higher is better.
+
+    The predictions are of the validation links, or of the links ``index``.
+    """
     task = links.task
     labels = links.labels[links.split.validation if index is None else index]
     scores = task.scores(labels, values)[task.monitor].double()
@@ -21,9 +24,10 @@ def validation_scores(
 
 
 def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -> Tensor:
-    """weight one + (1 - weight) other, a tensor of its own; of channels of unknown phase, ``one``
-    is aligned to ``other``. A part without weight may be None: it is not read, since a NaN of it
-    would count.
+    """weight one + (1 - weight) other, as a new tensor.
+
+    Channels of unknown phase: ``one`` is first aligned to ``other``. A prediction whose weight is 0
+    is not read, since its NaN would spoil the sum, and may be None.
     """
     if weight in (0, 1):
         return (one if weight else other).clone()
@@ -33,6 +37,9 @@ def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -
 def is_surely_better(
     one: Float[Tensor, " k"], other: Float[Tensor, " k"], *, errors: float = 2.0
 ) -> bool:
-    """True if scores are higher by more than some standard errors; False of fewer than two."""
+    """True if the mean of ``one`` is higher than that of ``other`` by ``errors`` standard errors.
+
+    The error is the one of paired differences, link by link. False for fewer than two scores.
+    """
     gain = one - other
     return len(gain) > 1 and bool(gain.mean() > errors * gain.std() / math.sqrt(len(gain)))

@@ -20,8 +20,9 @@ from gaigs.kriging.posterior import Posterior
 
 
 class Field(nn.Module):
-    """The kriged residual at one receiver, from k known links and q principal components of their
-    residuals.
+    """The kriged residual at one receiver: places and weights of k known links.
+
+    Residuals are stored as scores of q principal components, since labels have many numbers.
     """
 
     places: Tensor  # places of the links (k, d) [m], see ``coordinates``
@@ -51,7 +52,10 @@ class Field(nn.Module):
         process: Hyperparameters,
         share: float = 5e-4,
     ) -> None:
-        """Takes residuals (k, *shape) at their places; components lack a ``share`` of energy."""
+        """Computes components and weights from residuals (k, *shape) at known places.
+
+        The components leave out at most ``share`` of the residuals' energy.
+        """
         residuals = residuals.reshape(len(residuals), -1)  # (k, m)
         components = principal_components(residuals, share)  # (q, m)
         if components.is_complex():
@@ -216,10 +220,9 @@ def _like_loaded(buffer: Tensor, values: Tensor) -> Tensor:
 def principal_components(
     residuals: Inexact[Tensor, "k m"], share: float = 5e-4, most: int = 256, exact: int = 512
 ) -> Inexact[Tensor, "q m"]:
-    """The fewest principal components that leave out at most a share of the energy, each scaled to
-    a maximum of 1.
+    """The fewest principal components that leave out at most a share of the residuals' energy.
 
-    Residuals of 0 have none.
+    Each is scaled to a largest magnitude of 1. Residuals of 0 have no components.
 
     Args:
         residuals: Residuals of links.

@@ -42,7 +42,7 @@ class Hyperparameters(NamedTuple):
         return facts if math.isnan(self.scale) else {**facts, "frequency_scale_m": self.scale}
 
     def at(self, places: Float[Tensor, "k d"], signal: float) -> Process:
-        """The process of known labels at ``coordinates`` of scale 1, with the signal's variance."""
+        """The process of labels at ``places``, ``coordinates`` of scale 1; variance ``signal``."""
         noise = self.nugget * signal
 
         def covariances(a: Float[Tensor, "m d"], b: Float[Tensor, "n d"]) -> Float[Tensor, "m n"]:
@@ -71,11 +71,11 @@ def damping(
     receivers: Int[Tensor, " k"],
     most: float = 10.0,
 ) -> Float[Tensor, " k"]:
-    """Factors that limit the residuals of channels to ``most`` times the median channel of each
-    link's receiver.
+    """Factors, at most 1, by which the residuals of k channels are multiplied before kriging.
 
-    Residuals within decimetres of a receiver are that large; a reading that is far too loud must
-    not spoil the whole room.
+    They limit the norm of a residual to ``most`` times the median norm of the known channels of its
+    receiver. Places within decimetres of a receiver pass the limit, and so do readings with a gross
+    error, one of which would spoil the predictions of the whole room.
     """
     sizes, levels = norms(residuals), norms(labels)
     factors = torch.ones_like(sizes)
@@ -100,8 +100,8 @@ def fit_hyperparameters(
     nuggets: tuple[float, float] = (1e-4, 1e2),
     edges: float = 8.0,
 ) -> tuple[Hyperparameters, float]:
-    """Hyperparameters with the largest likelihood, and ``negative_log_likelihood``; -inf if all
-    residuals are 0.
+    """Hyperparameters with the largest likelihood, and their ``negative_log_likelihood`` summed
+    over receivers, -inf if all residuals are 0.
 
     Args:
         scene: Receivers and task.
@@ -165,12 +165,12 @@ def hold_out(
     most: int,
     neighbours: int = 64,
 ) -> HeldOut | None:
-    """At most ``most`` held-out links of a receiver; None if their residuals are all 0 or no other
-    place is known.
+    """At most ``most`` held-out links of one receiver, and the known links that predict them.
 
-    Validation links are held out from the training links. With fewer than ``FEWEST`` of them,
-    training links are held out one by one, each with all that share its place. Each has so many
-    ``neighbours`` that predict it.
+    Validation links are held out, and training links predict them. With fewer than ``FEWEST``
+    validation links, training links are held out one by one, each with all links at its place. The
+    ``neighbours`` nearest links predict a held-out one; ``scale`` is that of ``coordinates`` [m].
+    None if all residuals are 0, or if no other place is known.
     """
     split, query = links.split, links.query
     radios = scene.radio_of(query.receivers)
@@ -206,7 +206,7 @@ def hold_out(
 def negative_log_likelihood(
     scene: Scene, held: HeldOut, length: Tensor, nugget: Tensor, scale: Tensor | float = math.nan
 ) -> Float[Tensor, ""]:
-    """-2 log p(held-out labels | labels around them) but for a constant, a mean over the label's
+    """-2 log p(held-out labels | labels around them) without constants, a mean over a label's
     numbers.
 
     The signal's variance is the receiver's most likely one.
@@ -233,8 +233,9 @@ def local_deviations(
     process: Hyperparameters,
     neighbours: int = 64,
 ) -> Float[Tensor, " b"]:
-    """Standard deviations of noisy labels over the signal's, given the nearest known places; see
-    ``coordinates``.
+    """Standard deviations of noisy labels at ``asked`` places, over the signal's.
+
+    They are given the ``neighbours`` nearest of the known places; all are ``coordinates``.
     """
     count = min(neighbours, len(known))
     variances = [asked.new_zeros(0)]

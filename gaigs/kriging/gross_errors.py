@@ -1,4 +1,4 @@
-"""Levels that no room explains."""
+"""Received levels with gross errors, which the levels around them contradict."""
 
 import math
 from dataclasses import replace
@@ -13,15 +13,15 @@ from gaigs.kriging.links import coordinates, distances
 
 
 def without_gross_errors(links: Links, size: float = 6.0) -> Links:
-    """Links of one number each without known levels that no room explains: one of them moves a
-    whole fit.
+    """The links without known levels that have a gross error, since one of these moves a whole fit.
 
-    Levels fall with the logarithm of the distance to their receiver. A level is left out if its
-    error by this law is more than ``size`` standard deviations, and as far from the errors of the
-    five nearest levels of its receiver: what neighbours share is a part of the room. So is what
-    more than one in twenty have. The line has Cauchy's weights, so few levels do not move it. The
-    deviation is 1.48 times the median error, the larger one of the receiver and of all receivers, 1
-    dB or more. Fewer than 20 known links keep all.
+    Labels are one number each. Levels follow a law, a line over the logarithm of the distance to
+    their receiver, fitted with Cauchy's weights, which a few wrong levels do not move. A level is
+    left out if its error by the law exceeds ``size`` standard deviations and differs by as much
+    from the errors of the five nearest levels at its receiver. Errors that neighbours share, or
+    that more than one level in twenty has, are effects of the room and stay. The standard deviation
+    is 1.48 times the median error, of the receiver or of all receivers, whichever is larger, and at
+    least 1 dB. With fewer than 20 known links all stay.
 
     Source: Maronna, Martin and Yohai, Robust Statistics, 2006, sections 4.4 and 5.2.
     """
@@ -42,8 +42,8 @@ def without_gross_errors(links: Links, size: float = 6.0) -> Links:
     is_kept = torch.ones_like(index, dtype=torch.bool)
     for radio in radios.unique():
         rows = (radios == radio).nonzero()[:, 0]
-        most = size * torch.maximum(common, robust_deviation(errors[rows]))
-        is_kept[rows] = ~are_alone(places[rows], errors[rows], most)
+        threshold = size * torch.maximum(common, robust_deviation(errors[rows]))
+        is_kept[rows] = ~are_alone(places[rows], errors[rows], threshold)
     parts = links.split.parts()
     train, validation = (
         parts[name][torch.isin(parts[name], index[is_kept])] for name in ("train", "validation")
@@ -55,32 +55,33 @@ def without_gross_errors(links: Links, size: float = 6.0) -> Links:
 def are_alone(
     places: Float[Tensor, "k d"],
     errors: Float[Tensor, " k"],
-    most: Float[Tensor, ""],
+    threshold: Float[Tensor, ""],
     neighbours: int = 5,
 ) -> Bool[Tensor, " k"]:
-    """True for errors above ``most`` that differ by more than ``most`` from all errors nearby.
+    """True for errors larger than ``threshold`` that differ by more than it from all errors nearby.
 
-    These are at the nearest ``neighbours`` places. All are False if more than one in twenty would
-    be True: what so many have is a part of the room.
+    Nearby are the nearest ``neighbours`` places. If more than one error in twenty would be True,
+    all are False: so many are an effect of the room.
     """
     is_alone = torch.zeros_like(errors, dtype=torch.bool)
-    far = (errors.abs() > most).nonzero()[:, 0]
-    if len(errors) <= neighbours or not len(far):
+    large = (errors.abs() > threshold).nonzero()[:, 0]
+    if len(errors) <= neighbours or not len(large):
         return is_alone
     near = []
-    for part in far.split(256):  # for memory's sake
+    for part in large.split(256):  # for memory's sake
         apart = distances(places[part], places)  # (f, k)
         itself = part[:, None] == torch.arange(len(errors))
         near.append(apart.masked_fill(itself, math.inf).topk(neighbours, largest=False).indices)
-    differs = (errors[far, None] - errors[torch.cat(near)]).abs().amin(1) > most
+    differs = (errors[large, None] - errors[torch.cat(near)]).abs().amin(1) > threshold
     is_few = differs.sum() <= max(1, len(errors) // 20)
-    is_alone[far] = differs & is_few
+    is_alone[large] = differs & is_few
     return is_alone
 
 
 def errors_of_law(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-    """Levels less a line over the logarithm of the distance, by least squares with
-    Cauchy's weights.
+    """Levels minus a line over ``decades``, log10 of distances, fitted with Cauchy's weights.
+
+    Few levels with gross errors hardly move the line.
     """
     weights = torch.ones_like(levels)
     for _ in range(20):
@@ -95,5 +96,5 @@ def errors_of_law(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> 
 
 
 def robust_deviation(errors: Float[Tensor, " k"]) -> Float[Tensor, ""]:
-    """Standard deviation of normal errors by their median size, at least 1 in the label's unit."""
+    """Standard deviation of normal errors by their median magnitude; at least 1 [label's unit]."""
     return (1.4826 * errors.abs().median()).clamp_min(1.0)

@@ -29,10 +29,14 @@ class Process:
     def whitened(
         self, asked: Float[Tensor, "g d"], rows: Int[Tensor, " j"] | slice = slice(None)
     ) -> tuple[Float[Tensor, "j g"], Float[Tensor, "j j"]]:
-        """Covariances of known readings, or some rows of them, with places, divided by the
-        readings' Cholesky factor; and this factor.
+        """Whitened covariances L^-1 C, and L. C is between readings and places, L L' among
+        readings.
 
-        Their squares, summed over the readings, are taken off the variance at a place.
+        The known readings lower the variance at a place by the sum of squares of its column.
+
+        Args:
+            asked: Places, ``coordinates`` of scale 1 [m].
+            rows: Known readings that count; by default all.
         """
         places = self.places[rows]
         between = self.covariances(places, places)
@@ -43,7 +47,7 @@ class Process:
 
 
 def resize(module: nn.Module, state: Mapping[str, Tensor], prefix: str, *names: str) -> None:
-    """Gives buffers the shapes that they have in a state, which is then loaded."""
+    """Gives the buffers ``names`` the shapes that they have in a ``state`` about to be loaded."""
     for name in names:
         if f"{prefix}{name}" in state:
             setattr(module, name, getattr(module, name).new_empty(state[f"{prefix}{name}"].shape))
@@ -84,7 +88,7 @@ def kernel(
 
 
 def covariance(places: Float[Tensor, "k d"], length: float, nugget: float) -> Float[Tensor, "k k"]:
-    """Covariances of noisy labels over the signal's variance, see ``kriging_weights``."""
+    """Covariances of noisy labels over the signal's variance; options of ``kriging_weights``."""
     covariances = kernel(places, places, length)
     covariances.diagonal().add_(nugget)
     return covariances
@@ -93,7 +97,7 @@ def covariance(places: Float[Tensor, "k d"], length: float, nugget: float) -> Fl
 def cholesky_factor(
     places: Float[Tensor, "k d"], length: float, nugget: float
 ) -> Float[Tensor, "k k"]:
-    """Lower Cholesky factor of ``covariance``."""
+    """Lower Cholesky factor of ``covariance``, with the same arguments."""
     return torch.linalg.cholesky(covariance(places, length, nugget))
 
 
@@ -103,11 +107,12 @@ def kriging_weights(
     length: float | Tensor,
     nugget: float | Tensor,
 ) -> tuple[Float[Tensor, "b j"], Float[Tensor, " b"]]:
-    """Weights of the known links around each asked link, and the variance of its label over the
-    signal's.
+    """Weights w of the known links around each asked link, and the variance of w'y as a prediction.
+
+    The variance is over the signal's and includes the noise of the asked label.
 
     Args:
-        asked, around: Places, see ``coordinates`` [m].
+        asked, around: ``coordinates`` of the asked links, and of j known links around each [m].
         length: Correlation length of the kernel [m].
         nugget: Variance of the noise over the signal's.
 

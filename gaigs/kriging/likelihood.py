@@ -31,7 +31,7 @@ class Conditional(NamedTuple):
 def covariances(
     around: Around, hyperparameters: Float[Tensor, "r 3"], choice: Choice
 ) -> Float[Tensor, "m i i"]:
-    """Covariances of z at the readings around each place, and at the place itself.
+    """Covariances of the process z at the readings around each place, and at the place itself.
 
     ``hyperparameters`` are length, deviation of the signal and of the noise at each receiver.
     """
@@ -53,8 +53,9 @@ def conditional(
     """Means and variances of z at places, from ``covariances``, the readings around, and the
     variances of their noise.
 
-    Mean w'y and variance k - 2 w'c + w'(C + N) w have weights w = (C + N)^-1 c that minimise the
-    variance.
+    The mean is w'y, and the variance k - 2 w'c + w'(C + N) w. Here y are the readings, N the
+    variances of their noise, and C, c and k the covariances among readings, with the place and at
+    the place. The weights w = (C + N)^-1 c minimise the variance.
     """
     noisy = between[:, :-1, :-1] + torch.diag_embed(variances)
     towards = between[:, :-1, -1]  # c (m, j)
@@ -77,11 +78,15 @@ def slopes(
     of_mean: Float[Tensor, " m"],
     of_variance: Float[Tensor, " m"],
 ) -> Float[Tensor, "m 4"]:
-    """Derivatives by logarithms of length, signal, noise of the readings and scale of carriers,
-    from those by means and variances of ``conditional``.
+    """Derivatives of a cost by logarithms of length, signal, readings' noise and carriers' scale.
 
-    As the weights minimise the variance, a change dC of all covariances changes it by e' dC e, and
-    the mean by -e' dC s, with ``errors`` e and ``solved`` s.
+    The weights minimise the variance. So a change dC of all covariances changes the variance by e'
+    dC e and the mean by -e' dC s, with ``errors`` e and ``solved`` s of ``solution``.
+
+    Args:
+        around, hyperparameters, choice, between, variances: As for the functions above.
+        solution: Result of ``conditional``.
+        of_mean, of_variance: Derivatives of the cost by the means and variances of ``solution``.
     """
     errors, solved = solution.errors, solution.solved
     right = of_variance[:, None] * errors - of_mean[:, None] * solved  # (m, j + 1)
@@ -107,8 +112,16 @@ def expected_factors(
     degrees: float,
     rounds: int = 3,
 ) -> Float[Tensor, "m j"]:
-    """Variances of the noise of the readings around each place over ``noises``, from these readings
-    alone: a held-out reading must have no part in them.
+    """Expected variance of each reading's noise over ``noises``, by Student's t.
+
+    Only the readings around a place count: the held-out reading there must have no part in it.
+
+    Args:
+        between: Covariances of z at the readings.
+        values: The readings.
+        noises: Squared scale of the noise at each place's receiver.
+        degrees: Degrees of freedom of Student's t.
+        rounds: Repetitions of expectation and maximisation.
 
     Source: Lange, Little and Taylor, Robust statistical modeling using the t distribution, 1989.
     """
@@ -131,12 +144,12 @@ def log_density(
     noises: Float[Tensor, " m"],
     degrees: float,
 ) -> Float[Tensor, " m"]:
-    """log p of errors that are the sum of a normal variable and of noise with ``noises`` as squared
-    scale.
+    """log p of errors, each the sum of a normal variable and of noise.
 
-    Student's t is a mixture of normal distributions, whose precision times ``noises`` is a gamma
-    variable: the trapezoidal rule over its logarithm is exact to 1e-3 up to a hundred standard
-    deviations.
+    The normal variable has the ``variances``. The noise has Student's t with ``degrees`` of freedom
+    and ``noises`` as squared scale; infinite ``degrees`` make it normal. Student's t is a mixture
+    of normal distributions, whose precision times ``noises`` is a gamma variable. The trapezoidal
+    rule over its logarithm is exact to 1e-3 up to a hundred standard deviations.
     """
     if math.isinf(degrees):
         return _log_normal(errors, variances + noises)

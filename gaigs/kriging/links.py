@@ -1,6 +1,4 @@
-"""Links as look-ups see them: known links, distances between links, labels in the directions of a
-batch.
-"""
+"""Known links, distances between links, and labels in the directions of a batch."""
 
 import math
 from dataclasses import replace
@@ -21,9 +19,13 @@ PART = 256
 
 
 def known_links(links: Links, any_receiver: bool = False) -> list[Int[Tensor, " k"]]:
-    """Training and validation links of each receiver, of ``one_radio`` all together; raises a
-    ``ValueError`` for a receiver without, unless the split holds out receivers for a model of
-    ``any_receiver``.
+    """Indices of the training and validation links, a tensor for each receiver.
+
+    With ``one_radio`` all links are in a single tensor.
+
+    Raises:
+        ValueError: A receiver has no links. With ``any_receiver``, for a model that needs none
+            there, this is allowed where the split holds out receivers.
     """
     if links.one_radio:
         return [links.split.known]
@@ -56,7 +58,7 @@ def limit_known(links: Links, most: int) -> Links:
 
 
 def folds_of(links: Links, index: Int[Tensor, " k"], count: int = 10) -> Int[Tensor, " k"]:
-    """Fold of some links, from 0; groups of the split, or places, are random whole folds."""
+    """Random fold, from 0, of some links; a group of the split, or a place, stays in one."""
     groups = links.split.groups
     if groups is None:
         groups = place_numbers(links.query.transmitters[index])
@@ -74,7 +76,7 @@ def place_numbers(places: Float[Tensor, "k 3"]) -> Int[Tensor, " k"]:
 
 
 def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]:
-    """One random link a place, receiver and carrier: repeated ones have nearly the same error."""
+    """One random link of each place, receiver and carrier: repeated ones have alike errors."""
     if not len(index):
         return index
     _, which = links.query[index].unique(with_receivers=True)
@@ -111,7 +113,7 @@ def edges_of(places: Float[Tensor, "*k d"]) -> int:
 
 
 def distances(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"]) -> Float[Tensor, "*c m n"]:
-    """Distances of all pairs [m], by differences: products would part copies of a place."""
+    """Distances of all pairs [m], by differences: products would give equal places a distance."""
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
@@ -140,15 +142,14 @@ def reception_probability(
     prior: float | Tensor,
     neighbours: int = 8,
 ) -> Float[Tensor, "g r"]:
-    """Probability that each receiver receives from a place: the share of the nearest known places
-    from which it does.
+    """Probability that each receiver receives from a place.
 
     Args:
-        asked: Places.
-        known: Known places.
+        asked: Places [m].
+        known: Known places [m].
         receives: 1 where a receiver receives from a known place.
-        prior: Share of one more place, which is counted beside them.
-        neighbours: Number of known places around another.
+        prior: Probability before any measurement; it counts as one more known place.
+        neighbours: Number of nearest known places whose share is taken.
     """
     count = min(neighbours, len(known))
     parts = []
@@ -159,10 +160,11 @@ def reception_probability(
 
 
 def scale_bounds(scene: Scene) -> tuple[float, float]:
-    """Least and largest ``scale`` of ``coordinates`` that the training links can distinguish [m].
+    """Least and largest ``scale`` [m] of ``coordinates`` that the training links can distinguish.
 
-    The least puts the whole band as far as the next place, the largest the next carrier as far as
-    the longest edge.
+    The scale turns the logarithm of the carrier into a distance. With the least scale the whole
+    band is as long as the spacing of the places. With the largest, neighbouring carriers are as far
+    apart as the longest edge of the transmitters' box.
     """
     logarithms = scene.frequencies.double().log()
     edge = (scene.upper - scene.lower).max().item()

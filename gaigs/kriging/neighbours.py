@@ -1,4 +1,4 @@
-"""Known readings around places: the nearest ones, which screen those behind them."""
+"""Known readings around places. The nearest ones screen those behind them."""
 
 import math
 from typing import NamedTuple
@@ -44,7 +44,7 @@ class HeldOutReadings(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """Known readings, of which ``count`` are around a place."""
+    """Known readings, and the number of them that count as around a place."""
 
     scene: Scene  # receivers and carriers
     places: Float[Tensor, "k d"]  # places, see ``coordinates`` of scale 1
@@ -61,17 +61,16 @@ class Readings(NamedTuple):
         size: int = 2048,
         most: int = 6000,
     ) -> Nearest:
-        """The nearest known readings, see ``Around``.
+        """The ``count`` known readings nearest to each place, of the same receiver.
 
         Args:
-            places, receivers: What is asked.
-            own: Folds of the places, whose readings are left out; None: no folds.
+            places, receivers: Asked places, ``coordinates`` of scale 1, and their receivers.
+            own: Fold of each asked place, whose readings are left out; None: no folds.
             folds: Folds of the known readings.
-            reach: True if half of the readings lie farther and farther away: near ones alone say
-                little on lengths.
+            reach: True to choose half of the readings at growing distances: near ones alone say
+                little on correlation lengths. It acts with folds.
             size: Places whose neighbours are held in memory at a time.
-            most: Known readings of a receiver among which those of other folds are sought, evenly
-                chosen.
+            most: With folds, readings of a receiver that are searched, evenly chosen.
 
         Source: Stein, Chi and Welty, Approximating likelihoods for large spatial data sets, 2004.
         """
@@ -138,10 +137,11 @@ class Readings(NamedTuple):
     def held_out(
         self, rows: Int[Tensor, " h"], folds: Int[Tensor, " k"], most: int
     ) -> HeldOutReadings:
-        """About ``most`` of the rows that may be held out, and the readings of other folds around
+        """Held-out readings, evenly chosen from ``rows``, and the readings of other folds around
         each.
 
-        Receivers have 16 each or more, unless that makes four times as many.
+        All receivers together have about ``most``. A receiver has at least 16, unless the sum would
+        then exceed four times ``most``.
         """
         receivers = self.receivers[rows].unique()
         each = max(1, most // len(receivers), min(16, 4 * most // len(receivers)))

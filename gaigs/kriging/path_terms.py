@@ -33,8 +33,12 @@ class TermOptions:
 
 
 class Solution(NamedTuple):
-    """Coefficients without each fold (f, n), their squared errors over the variance of a reading
-    (f, n), and the numbers of the break points among their candidates (f,).
+    """Coefficients of n terms, fitted once for each fold from the readings outside of it.
+
+    Attributes:
+        coefficients: Coefficients without each fold.
+        variances: Their squared standard errors over the variance of a reading.
+        numbers: Chosen break point without each fold, an index into the candidates.
     """
 
     coefficients: Float[Tensor, "f n"]
@@ -43,16 +47,16 @@ class Solution(NamedTuple):
 
 
 class PathTerms(nn.Module):
-    """Corrections of a path-loss law at each receiver, of the terms that held-out readings want.
+    """Corrections of a path-loss law at each receiver, by terms that lower held-out errors.
 
     With azimuth a and elevation e of the transmitter, seen from the receiver in the world's frame,
-    and its height h from -1 to 1 in the box of the links, a level is corrected by
+    and its height h from -1 to 1 in the box of the links, a level at distance d is corrected by
 
         c0 + c1 log10 d + sum over q of (a_q cos q a + b_q sin q a)
         + c2 h + c3 sin e + c4 (3 sin² e - 1) / 2 + c5 max(0, log10 d - log10 d0).
 
-    Coefficients have a normal prior, for a lobe the narrower, the higher its harmonic. Terms
-    (lobes, height, break point) are added one by one, the same for all receivers.
+    d0 is the break point. Coefficients have a normal prior, whose deviation falls with the harmonic
+    q of a lobe. Terms (lobes, height, break point) are added one by one, at all receivers.
 
     Source: Feuerstein et al., Path loss, delay spread, and outage models as functions of antenna
     height, 1994 (break point); Hoerl and Kennard, Ridge regression, 1970.
@@ -91,8 +95,10 @@ class PathTerms(nn.Module):
         return (columns * self.coefficients[radios]).sum(1).to(transmitters)
 
     def fit(self, links: Links, errors: Float[Tensor, " k"], chooses: bool) -> None:
-        """Fits the coefficients to errors of a law at the known links; ``chooses`` the terms
-        first. A receiver without links has the means over the others.
+        """Fits the coefficients to ``errors`` of a law at the known links.
+
+        With ``chooses`` the terms are chosen first. A receiver without links gets the others'
+        means.
         """
         if links.uncertainties is not None:
             self.regions.copy_(links.uncertainties)
@@ -165,7 +171,7 @@ class PathTerms(nn.Module):
         folds: Int[Tensor, " k"],
         used: Bool[Tensor, " t"],
     ) -> Float[Tensor, " k"]:
-        """Errors that terms leave over, fitted without the reading's fold."""
+        """Errors after the ``used`` terms, which are fitted without the reading's fold."""
         left = errors.clone()
         radios = self.scene.radio_of(receivers)
         for radio in radios.unique().tolist():
@@ -186,7 +192,7 @@ class PathTerms(nn.Module):
         folds: Int[Tensor, " k"],
         used: Bool[Tensor, " t"],
     ) -> Solution:
-        """Likeliest coefficients without each fold, with the best break point; one fold stays."""
+        """Likeliest coefficients without each fold, at the best break point; one fold is kept."""
         both = torch.cat((columns, levels[:, None]), 1)
         parts = [both[folds == fold] for fold in range(int(folds.max()) + 1)]
         own = torch.stack([part.T @ part for part in parts])  # (f, m + 1, m + 1)
@@ -236,7 +242,7 @@ class PathTerms(nn.Module):
         receivers: Int[Tensor, " b"],
         breaks: Float[Tensor, "b j"],
     ) -> Float[Tensor, "b m"]:
-        """What coefficients multiply: 1, decades, lobes, heights, decades beyond each break."""
+        """Factors of coefficients: 1, decades, lobes, heights, decades beyond each break point."""
         positions = self.scene.positions(transmitters)[receivers]
         steps = (transmitters - positions).double()  # (b, 3)
         # As of the law, distances below 0.1 m count as 0.1 m.

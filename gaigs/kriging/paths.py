@@ -28,9 +28,9 @@ class PathProcess(NamedTuple):
 
     @classmethod
     def usual(cls, spacing: float) -> "PathProcess":
-        """Where neighbouring places are ``spacing`` apart [m].
+        """The usual process where neighbouring places are ``spacing`` apart [m].
 
-        A longer length raises the mean score further, but may lower the median.
+        A longer correlation length raises the mean score further, but may lower the median.
         """
         return cls(spacing / 2, 1.0, 0.2)
 
@@ -41,13 +41,13 @@ class PathProcess(NamedTuple):
 
 @dataclass(frozen=True)
 class Equations:
-    """Knowledge of k links about the processes u of their n paths.
+    """What k links say about the processes u of their n paths.
 
-    The channel of a link is predicted as h + sum_i u_i m_i, with the field m_i of path i per unit
-    of its process. With the residual r, and noise of ``nugget`` times p, the log likelihood is -|r
-    - sum_i u_i m_i|² / (nugget p): a quadratic form. p is the mean power of the residual's numbers,
-    plus a ten-thousandth of the label's, which has the gain of the prediction: links in
-    shadow have far larger residuals than others.
+    The channel of a link is predicted as h + sum_i u_i m_i, with m_i the field by which path i
+    deviates for u_i = 1. With the residual r, and noise of ``nugget`` times p, the log likelihood
+    is -|r - sum_i u_i m_i|² / (nugget p), quadratic in u. The noise power p is the mean power of
+    the residual's numbers plus a ten-thousandth of the label's. So links with large residuals, as
+    in shadow, count less.
     """
 
     places: Float[Tensor, "k 3"]  # [m]
@@ -63,14 +63,14 @@ class Equations:
         residuals: Complex[Tensor, "k e s"],
         least: float = 1e-4,
     ) -> "Equations":
-        """Equations of links, in parts: all fields together may take gigabytes.
+        """Equations of links, computed in parts: all fields together may take gigabytes.
 
         Args:
             places: Places of the links [m].
-            margins: Fields m_i of a slice of the links.
+            margins: Function from a slice of the links to their fields m_i.
             labels: Channels of the links.
             residuals: Labels minus predictions.
-            least: Least noise power of a link as a share of its power.
+            least: Share of the label's power that is added to the noise power p.
         """
         if not len(places):  # a receiver without links
             empty = torch.zeros(0, 0, 0, dtype=torch.complex128)
@@ -108,10 +108,9 @@ class PathField(nn.Module):
         self.register_buffer("precisions", torch.zeros(0, 0, dtype=torch.float64))
 
     def solve(self, equations: Equations, process: PathProcess, jitter: float = 1e-6) -> None:
-        """Solves the strengths of all paths at all places together, by conjugate gradients.
+        """Solves for the strengths of all paths at all known places, by conjugate gradients.
 
-        ``jitter`` is the variance of the processes that places do not share, over their variance:
-        for places that are measured twice.
+        ``jitter`` is added to the diagonal of the kernel, since a place may be measured twice.
         """
         identity = torch.eye(len(equations.places), dtype=torch.float64)
         between = kernel(equations.places, equations.places, process.length) + jitter * identity
@@ -137,15 +136,15 @@ class PathField(nn.Module):
         self.precisions = equations.grams.diagonal(dim1=1, dim2=2).real / process.nugget
 
     def forward(self, places: Float[Tensor, "b d"], process: PathProcess) -> Complex[Tensor, "b n"]:
-        """Mean of the processes at some places."""
+        """Mean of each path's process at some places."""
         return kernel(places, self.places, process.length).to(self.weights) @ self.weights
 
     def variances(
         self, places: Float[Tensor, "b d"], process: PathProcess, most: int = 64
     ) -> Float[Tensor, "b n"]:
-        """Variances of the processes at some places, as if the elements resolved all paths.
+        """Variances of each path's process at some places, as if the elements resolved all paths.
 
-        The ``most`` nearest known links of each place count: this kernel hides those behind them.
+        Only the ``most`` known links nearest to a place count, since these screen those behind.
         """
         apart = distances(places, self.places)
         near = apart.topk(min(most, len(self.places)), largest=False).indices  # (b, j)
@@ -169,15 +168,14 @@ class PathField(nn.Module):
 
 
 class PathPosterior(Posterior):
-    """Kriged strengths of paths, a ``PathField`` for each receiver; phases stay those of the
-    geometry.
+    """Kriged strengths of paths, a ``PathField`` for each receiver.
 
-    The process is always the same.
+    Phases of paths stay as geometry gives them. Hyperparameters follow from the places' spacing.
 
     Args:
         scene: Receivers and task.
         margins: Function from links to one receiver to the channels by which each of their paths
-            may deviate (b, n, e, s).
+            may deviate, one standard deviation each (b, n, e, s).
     """
 
     by_paths = True
@@ -229,7 +227,7 @@ class PathPosterior(Posterior):
         self.fields.to(device)
 
     def mean_at(self, query: Query, device: torch.device) -> Complex[Tensor, "e s"]:
-        """Mean residual of a single link, on the CPU; margins are computed on the device."""
+        """Mean residual of one link, on the CPU; fields of paths are computed on ``device``."""
         field: Any = self.fields[int(query.receivers)]
         if not len(field.places):
             return torch.zeros(self.scene.task.shape, dtype=self.scene.task.dtype)
@@ -274,7 +272,7 @@ def conjugate_gradients(
     right: Tensor,
     most: int = 300,
 ) -> Tensor:
-    """The x of times(x) = right for a Hermitian positive map, to a relative residual of 1e-6.
+    """The solution x of times(x) = right, to a relative residual of 1e-6.
 
     Source: Hestenes and Stiefel, Methods of Conjugate Gradients for Solving Linear Systems, 1952.
     """

@@ -1,4 +1,4 @@
-"""What kriging asks a posterior of residuals for."""
+"""The contract of a posterior of residuals, which kriging uses."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -35,7 +35,7 @@ class Posterior(nn.Module):
     is_lazy = False
 
     def cleaned(self, links: Links) -> Links:
-        """The links without those that would move the whole fit; by default all."""
+        """The links without gross errors that would move the whole fit; by default all links."""
         return links
 
     def fit(self, links: Links, candidates: Mapping[float, Tensor]) -> float:
@@ -43,13 +43,13 @@ class Posterior(nn.Module):
 
         Args:
             links: Links with a split.
-            candidates: Residuals of the known links (k, m), ``thin_labels`` of them, by trend
-                weight.
+            candidates: Residuals of the known links (k, m), thinned by ``thin_labels``, for each
+                candidate weight of the trend.
         """
         raise NotImplementedError
 
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
-        """Takes the known links; ``residuals`` gives residuals of some rows (j, *shape)."""
+        """Takes the known links; ``residuals`` is a function from j rows to their (j, *shape)."""
         raise NotImplementedError
 
     def start_from(self, other: Any) -> None:

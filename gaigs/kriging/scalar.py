@@ -37,11 +37,12 @@ class ScalarProcess(nn.Module):
     Each receiver has a correlation length l [m], a standard deviation of z and one of the noise, in
     the label's unit. Their logarithms scatter about the logarithms of all receivers as Student's t:
     one receiver may be far noisier than the others. Kernel (Matern-1/2 or -3/2) and noise (normal,
-    or Student's t) are the same for all receivers. All maximise the likelihood of held-out
-    readings, each given those around it. ``options`` has the numbers.
+    or Student's t) are the same for all receivers. All hyperparameters maximise the likelihood of
+    held-out readings, each given the readings around it. ``options`` has the numbers.
 
     Student's t is a normal distribution whose variance is random. Expectation and maximisation give
-    each reading a variance of its own, so that one that disagrees with all around it counts little.
+    each reading its own variance of the noise. So a reading that disagrees with all around it
+    counts little.
 
     Attributes:
         options: Numbers of the fit and of predictions.
@@ -293,8 +294,8 @@ class ScalarProcess(nn.Module):
     ) -> None:
         """Takes residuals of known readings and weights them for predictions.
 
-        ``fit`` has chosen the hyperparameters before. With ``is_lazy`` readings are weighted when
-        many places are asked for; a few places have the readings around them.
+        ``fit`` has chosen the hyperparameters before. With ``is_lazy`` the weights are computed
+        only once many places are asked for; few places are predicted from the readings around them.
         """
         self.places, self.receivers, self.values = places, receivers, values.clone()
         self.variances = (2 * self.logarithms[receivers, 2]).exp()

@@ -53,8 +53,8 @@ class ScalarOptions:
         edges: Longest correlation length, in longest edges of the box of places: beyond it the
             kernel is a line in the box.
         widest: Largest deviation of the signal over the residuals' root mean square. Readings
-            millimetres apart show only the deviation's ratio to a power of the length. Without a
-            bound it could grow until it gives levels that no receiver hears.
+            millimetres apart show only the deviation's ratio to a power of the length. An unbounded
+            deviation would predict levels that no receiver reports.
         largest: Largest deviation of the noise over the residuals' root mean square. Its inverse is
             the least deviation of signal and noise. The noise keeps matrices regular where a place
             is measured twice.
@@ -95,9 +95,9 @@ class ScalarFit(NamedTuple):
 class HeldOutCost:
     """Negative log posterior of hyperparameters, given held-out readings.
 
-    A point has the logarithms of length, signal and noise of all receivers, of the scale of
-    carriers where there are several, and with ``has_deviations`` each receiver's deviations from
-    the first three, in units of their scatter.
+    A point in the space of the search is a row of numbers: the logarithms of length, signal and
+    noise, common to all receivers; that of the scale of carriers where there are several; and with
+    ``has_deviations`` each receiver's deviations from the first three, in units of their scatter.
 
     Args:
         scene: Receivers and carriers.
@@ -213,8 +213,9 @@ class HeldOutCost:
         return np.concatenate((point, np.zeros(len(self.bounds) - self.shared)))
 
     def expect(self, point: np.ndarray) -> None:
-        """Takes the expected variances of the noise of single readings: one that disagrees with all
-        around it counts little."""
+        """Sets ``factors`` to the expected variances of single readings' noise, given a point. A
+        reading that disagrees with all around it then counts little.
+        """
         logarithms, choice = self.unpacked(torch.from_numpy(point))
         between = covariances(self.around, logarithms.exp(), choice)[:, :-1, :-1]
         noises = (2 * logarithms[self.around.receivers, 2]).exp()

@@ -1,4 +1,4 @@
-"""Means of a process of many readings: tiles of the floor, each solved with the readings around."""
+"""Means of a process of very many readings: places in tiles, each solved by nearby readings."""
 
 import math
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from gaigs.kriging.links import nearest_places
 
 
 class Merged(NamedTuple):
-    """Readings of a receiver; of many, those at one place and carrier are one."""
+    """Readings of a receiver; several at one place and carrier may be merged into one."""
 
     rows: Int[Tensor, " m"]  # of the first at each place
     values: Float[Tensor, " m"]  # means, weighted by 1 / variance
@@ -21,11 +21,12 @@ class Merged(NamedTuple):
 
 
 class Tiles(nn.Module):
-    """Parts of the readings of receivers that have too many for one covariance matrix.
+    """Groups of the readings of a receiver that has too many for one covariance matrix.
 
-    A tile is solved with ``size`` readings: its own, ``core`` at most, then those around each of
-    its own, which screen those behind them, then those nearest to its centre. The tile of a place
-    is that of the nearest reading. Tiles are solved when a place in them is first asked for.
+    A tile is solved with ``size`` readings in this order: the ``core`` readings or fewer that
+    belong to the tile, the readings around each of these, which screen those behind, and the
+    readings nearest to the tile's centre. A place is predicted by the tile of the nearest reading.
+    A tile is solved when a place in it is first asked for.
     """
 
     core = 64
@@ -66,7 +67,7 @@ class Tiles(nn.Module):
         self.rows = self.rows.new_zeros(0, self.size)
 
     def add(self, places: Float[Tensor, "m d"], readings: Merged) -> None:
-        """Divides the readings of a receiver at some places."""
+        """Divides the readings of one more receiver, at ``places``, into tiles."""
         parts = halves(places, self.core)
         centres = torch.stack([places[part].mean(0) for part in parts])
         near = nearest_places(centres, places, self.size).rows  # (t, j)
@@ -87,7 +88,9 @@ class Tiles(nn.Module):
     def numbers(
         self, asked: Float[Tensor, "b d"], places: Float[Tensor, "k d"], known: Bool[Tensor, " k"]
     ) -> Int[Tensor, " _"]:
-        """Tiles of ``places`` that are ``known`` to a receiver; none if it has no tiles."""
+        """Tile of each asked place, by the nearest of ``places`` ``known`` to a receiver; empty if
+        the receiver has no tiles.
+        """
         is_own = known[self.readings]
         rows, owners = self.readings[is_own], self.owners[is_own]
         if not len(rows):
@@ -102,7 +105,15 @@ class Tiles(nn.Module):
         covariances: Callable[[Tensor, Tensor], Tensor],
         solve: Callable[[Merged], Tensor],
     ) -> Float[Tensor, " b"]:
-        """Means at places in their ``tiles``: ``covariances`` times weights of the readings."""
+        """Means of the process at ``asked`` places, each by its tile.
+
+        Args:
+            asked: Places, see ``coordinates``.
+            tiles: Tile of each asked place.
+            places: Places of all known readings.
+            covariances: Function from two sets of places to their covariances.
+            solve: Function from readings to their weights.
+        """
         means = asked.new_zeros(len(asked))
         order = tiles.argsort()
         numbers, counts = tiles[order].unique_consecutive(return_counts=True)
@@ -127,7 +138,7 @@ class Tiles(nn.Module):
 def merged(
     places: Float[Tensor, "k d"], values: Float[Tensor, " k"], variances: Float[Tensor, " k"]
 ) -> Merged:
-    """Readings whose process is that of the given ones, with those of one place as one."""
+    """Readings, one a place, from which the process follows as from all the given ones."""
     unique, numbers = places.unique(dim=0, return_inverse=True)
     rows = torch.arange(len(places), device=places.device)
     first = rows.new_full((len(unique),), len(rows)).scatter_reduce(0, numbers, rows, "amin")

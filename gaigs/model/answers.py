@@ -24,8 +24,8 @@ from gaigs.registry import name_of
 def batch_size(links: Links, model: Model | None = None) -> int:
     """Number of links to predict at a time.
 
-    It is larger for labels of one number, which take little memory, and largest for a look-up, as
-    each batch costs time for every receiver in it.
+    Labels of one number have larger batches, since they take little memory. Look-ups have the
+    largest, since a batch costs them time for every receiver.
     """
     if not links.task.is_scalar:
         return 64
@@ -87,7 +87,7 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
 def at_new_receivers(
     model: Model, links: Links, most: int = 1000, receivers: int = 40
 ) -> Calibration | None:
-    """The calibration of a model at receivers without links; None with fewer than three.
+    """The calibration of a model at receivers without links; None with fewer than three receivers.
 
     Each receiver with links in turn is predicted as a new one, from the other receivers. Receivers
     err as a whole: the errors of one are a cluster.
@@ -144,7 +144,7 @@ def at_new_receivers(
 
 
 def random_effects(errors: Sequence[Tensor]) -> Float[Tensor, "2"]:
-    """Variances of errors between receivers and within one receiver (2,).
+    """Variances of errors between receivers and within one receiver (2,) [label's unit squared].
 
     Args:
         errors: Errors of each receiver's links.

@@ -407,8 +407,9 @@ class Model(Movable):
         return None
 
     def learnt_room(self, links: Links | None = None) -> Any:
-        """The learnt room for figures, a ``gaigs.planes.learnt_room.LearntRoom``; without links by
-        the state alone. None for a model that learns no room."""
+        """The learnt room for figures, a ``gaigs.planes.learnt_room.LearntRoom``. Without links
+        only the state tells where planes end. None for a model that learns no room.
+        """
         return None
 
     def learnt_paths(self, query: Query) -> list:
@@ -439,8 +440,9 @@ class Model(Movable):
     # --- what a model knows of its errors ---
 
     def deviations(self, batch: Batch) -> Tensor | None:
-        """Standard deviations of the labels up to a common factor, (b, *shape), or their root mean
-        squares (b,) over a label's numbers. None if they are unknown."""
+        """Standard deviations (b, *shape) of the labels up to a common factor, or root mean squares
+        (b,) of these over a label's numbers. None if unknown.
+        """
         return None
 
     def process_at(self, receiver: int) -> Process | None:
@@ -449,15 +451,15 @@ class Model(Movable):
 
     @property
     def has_margins(self) -> bool:
-        """True if ``margins`` gives the paths of channels."""
+        """True if a model of channels knows its paths, so that ``margins`` is defined."""
         return False
 
     def margins(self, query: Query) -> Complex[Tensor, "b n e s"]:
-        """Channels by which each path of links to one receiver may deviate, for kriging."""
+        """Channel by which each of n paths may deviate, one standard deviation, for kriging."""
         raise ValueError("the model has no paths of channels; ask has_margins first")
 
     def refit(self, links: Links) -> None:
-        """Fits to links most of which an earlier fit had: its choices may stay, to be faster."""
+        """Fits again to mostly the same links; may keep choices of the earlier fit, to be fast."""
         self.fit(links)
 
     def take_hyperparameters(self, other: "Model") -> None:
@@ -471,9 +473,10 @@ class Model(Movable):
     def unseen(self, links: Links) -> Iterator[Unseen]:
         """Yields models like this one, each with links that it has not seen.
 
-        A look-up is fitted anew without each fold of the known links, as are estimated places of
-        receivers. A trained model comes with the validation links, which have chosen its step of
-        the training. Repeated readings count once. Folds end with the time limit of a run.
+        A look-up is fitted anew without each fold of the known links; estimated places of receivers
+        are estimated anew, too. A trained model comes with the validation links, which have chosen
+        its step of the training. Repeated readings count once. Folds end with the time limit of a
+        run.
         """
         if not self.is_trained:
             for fold in held_out_folds(links):

@@ -110,7 +110,7 @@ def save(model: nn.Module, path: str | Path) -> None:
 def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Module:
     """The model of a checkpoint in evaluation mode, on the CPU; errors as of ``gaigs.load``.
 
-    ``recorded`` has the digests of plug-ins of a checkpoint that lacks them, of an earlier version.
+    ``recorded`` gives digests of plug-ins for a checkpoint of an earlier version, which has none.
     """
     content = read(path)
     weights, scene = content["state_dict"], content[KEY]["scene"]

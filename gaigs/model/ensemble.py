@@ -97,10 +97,10 @@ class Ensemble(Wrapper):
         return Prediction(torch.tensordot(values.new_tensor(self.weights), values, 1), {})
 
     def deviations(self, batch: Batch) -> Tensor | None:
-        """Root mean square difference of the members, over the numbers of a label.
+        """Deviations of labels: the members' root mean square difference over a label's numbers.
 
-        A few members differ by chance: so the typical square counts as much as four of them.
-        Different models state deviations of their own: the weighted root mean square of these.
+        Few members may agree by chance, so the ``typical`` mean square counts as four more members.
+        A blend of different models has the weighted root mean square of its members' deviations.
         """
         if not self.is_blend:
             count = len(self._members) - 1
@@ -137,7 +137,7 @@ class Ensemble(Wrapper):
     def unseen(self, links: Links) -> Iterator[Unseen]:
         """Models like this one with links that no member has seen.
 
-        With a trained member these are validation links; look-ups are fitted without them.
+        If a member is trained, these are validation links, and look-ups are fitted without them.
         """
         if not self.is_blend or not self.is_trained:
             yield from super().unseen(links)

@@ -28,7 +28,7 @@ from gaigs.splatting.rasterizer import Rasterizer
 
 
 class Excited(NamedTuple):
-    """The Gaussians as each of some places excites them."""
+    """The Gaussians as a transmitter at each of some places excites them."""
 
     placed: Placed  # Gaussians before the deformation
     residuals: Residuals  # changes by the deformation
@@ -45,9 +45,11 @@ class Strengths(NamedTuple):
 
 @register("model", "gaigs")
 class GaussianSplatting(Model):
-    """Placement, tokens, residuals, Gaussians as the query excites them, splats, map, value.
+    """The paper's pipeline of splatting, of exchangeable parts.
 
-    If the pooling takes paths, there are no splats and no map.
+    A placement gives Gaussians for each query. A tokenizer and a deformation change these. A
+    projection and a rasterizer draw them as a map over directions, and the pooling turns the map
+    into the label. If the pooling takes paths, there are no splats and no map.
 
     Args:
         scene: Receivers and task.
@@ -193,7 +195,10 @@ class GaussianSplatting(Model):
             )
 
     def _built_gaussians(self, options: Mapping | None, zone: Any) -> Gaussians | None:
-        """Free Gaussians within elevations ``zone`` [rad]; None if the placement brings all."""
+        """Free Gaussians, brought by no placement, at elevations in ``zone`` [rad]; or None.
+
+        Beside Gaussians of a placement their signal must not depend on the direction (degree 0).
+        """
         name = name_of(self.placement)
         if options is None:
             if not self.placement.has_own:

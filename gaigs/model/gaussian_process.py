@@ -116,9 +116,9 @@ class GaussianProcess(LookUp):
     def refit(self, links: Links) -> None:
         """Fits to some of the known links with the choices of ``fit``.
 
-        For vector labels all hyperparameters stay. For scalar labels the kernel, the noise and the
-        chosen trend stay; length scales and deviations are fitted anew, unless there are more than
-        ``options.large`` of the process.
+        For labels of many numbers all hyperparameters stay. For labels of one number the kernel,
+        the noise and the chosen trend stay. Length and deviations are then fitted anew, unless more
+        than ``ScalarOptions.large`` links are known.
         """
         self._fit(links, chooses=False)
 
@@ -218,7 +218,7 @@ class GaussianProcess(LookUp):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """The last trend alone, for levels a law of distance.
+        """The last of the trends alone; for received levels this is a law of distance.
 
         Residuals at one receiver do not correlate with those at others. The process stays where the
         receivers are places of one radio.

@@ -140,8 +140,9 @@ class KNearestNeighbours(LookUp):
     ) -> Float[Tensor, " b"]:
         """Predictions of labels of one number, for a receiver with known links ``index``.
 
-        The ``count`` nearest of these are searched; four times as many, at most ``size`` distances
-        at a time, for links at which the last one ties with the last neighbour in use.
+        The ``count`` nearest known links are searched. Where the last of these is as near as the
+        last neighbour in use, more may be as near, so four times as many are searched, with at most
+        ``size`` distances in memory.
         """
         asked = coordinates(self.scene, query, self.scale)
         known = coordinates(self.home, self.links.query[index], self.scale)
@@ -186,8 +187,8 @@ class KNearestNeighbours(LookUp):
     def _held_out(self, folds: Sequence[Int[Tensor, " _"]] | None = None) -> Iterator[HeldOutLinks]:
         """Holds out at most about 256 known links of all receivers together, in groups of 32.
 
-        All known links at the place of a held-out link are held out with it; with ``folds``, which
-        give the fold of each receiver's known links, all links of its fold.
+        All known links at the place of a held-out link are held out, too. With ``folds``, the fold
+        of each known link of each receiver, the whole fold of a held-out link is held out.
         """
         for receiver, index in enumerate(self.known):
             for rows in evenly(torch.arange(len(index)), max(1, 256 // len(self.known))).split(32):

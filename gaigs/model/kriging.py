@@ -49,11 +49,11 @@ class Kriging(Wrapper):
 
     z comes from one of three posteriors. ``ScalarPosterior`` is for labels of one real number, with
     hyperparameters of each receiver. ``FieldPosterior`` is for other labels. ``PathPosterior`` is
-    for a trend whose paths have ``margins``: strengths are kriged path by path. The first and the
-    last have a weight of 1, or 0. Where validation links are surely better by kriged labels than by
-    kriged paths, such as at places closer than half a wavelength, labels are kriged.
+    for a trend with ``margins``, fields by which paths may deviate: strengths of paths are kriged.
+    The first and the last have a weight of 1, or 0. Where validation links are surely better by
+    kriged labels than by paths, as at places closer than half a wavelength, labels are kriged.
 
-    A run makes it by ``kriging=true``. A checkpoint holds the residuals as a few principal
+    A run makes this model by ``kriging=true``. A checkpoint holds the residuals as a few principal
     components. If a receiver has more than ``LIMIT`` known links, an even part of them is used;
     labels of one number use all.
 
@@ -174,7 +174,7 @@ class Kriging(Wrapper):
     def _krige_better(
         self, links: Links, values: Tensor, is_final: bool, is_few: bool
     ) -> "Kriging":
-        """``krige`` by paths; by labels if those are surely better at enough validation links."""
+        """``krige`` by paths, or by labels where enough validation links surely prefer these."""
         if is_few:
             return self._krige_paths(links, values, is_final)
         of_labels = self._krige_labels(links, values, False)
@@ -432,10 +432,10 @@ class Kriging(Wrapper):
     def unseen(self, links: Links, enough: int = 1000, most: int = 4000) -> Iterator[Unseen]:
         """Yields models that krige the training links, with validation links that they do not know.
 
-        Each of two models comes with one half of these links; the other half has chosen its weights
-        and hyperparameters. Links of one group, which cannot be halved, do both. If ``enough`` of
-        them have chosen nothing (``chosen_by``), this model itself comes with these. For labels of
-        one number ``most`` links suffice: more say no more of quantiles.
+        Each of two models comes with one half of the validation links; the other half has chosen
+        its weights and hyperparameters. Links of a single group, which cannot be halved, do both.
+        If ``enough`` validation links have chosen nothing (``chosen_by``), this model itself comes
+        with these. For labels of one number ``most`` links suffice for quantiles.
         """
         if not len(links.split.validation):
             return

@@ -94,7 +94,7 @@ class MirroredSplatting(GaussianSplatting):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits the pipeline; searches planes in spectra and channels, prepares this for levels."""
+        """Fits the pipeline; searches planes in spectra and channels, or prepares it in levels."""
         super().fit(links)
         self.places = thin_links(links.query[links.split.train])
         is_known = links.query.frequencies is not None or len(self.scene.frequencies) == 1
@@ -245,7 +245,8 @@ class MirroredSplatting(GaussianSplatting):
     ) -> Complex[Tensor, " r"]:
         """Gain of each receiver's training links over the pooling's waves, by ``fit_gain``.
 
-        It is 0.1 where the phases follow no sign: a stronger start would be worse than silence.
+        The gain is 0.1 where phases follow neither sign convention: a strong start with wrong
+        phases would be worse than no signal.
         """
         gains = []
         radios = self.scene.radio_of(query.receivers)
@@ -342,20 +343,20 @@ class MirroredSplatting(GaussianSplatting):
 
     @property
     def has_margins(self) -> bool:
-        """True for ``margins``: channels are sums of mirrored paths alone."""
+        """True if channels are sums of mirrored paths alone, so that ``margins`` is defined."""
         alone = self.trend is None and self.gaussians is None
         return alone and self.takes_paths and isinstance(self.pooling, ChannelPooling)
 
     @torch.no_grad()
     def margins(self, query: Query) -> Complex[Tensor, "b n e s"]:
-        """Channels of each path with the strength ``PathFields.margins``, for kriging.
+        """Channels by which each path may deviate, one standard deviation each, for kriging.
 
-        All links are to one receiver.
+        All links are to one receiver. The paths have the strengths of ``PathFields.margins``.
         """
         return self._separate(query, self.placement.margins(query))
 
     def _separate(self, query: Query, strengths: Complex[Tensor, "b n"]) -> Tensor:
-        """Channels by each path of links to one receiver, with these strengths (b, n, e, s)."""
+        """Channel of each path alone (b, n, e, s), with given strengths, at one receiver."""
         with self.placement.holding():
             self.placement.held = strengths
             which = torch.arange(len(query), device=query.transmitters.device)

@@ -22,10 +22,10 @@ class Movable(nn.Module):
     Attributes:
         any_frequency: True if channels are a function of frequency, read from
             ``scene.task.frequencies``.
-        any_receiver: True if the model predicts for receivers without links. Each of its modules
-            may name buffers with a row for each receiver in ``of_receivers``, whose mean a new
-            receiver gets; do more in ``take_receivers``; and name in ``of_level`` the buffer that
-            ``adapt`` moves.
+        any_receiver: True if the model predicts for receivers without links. A module of the model
+            names in ``of_receivers`` its buffers with a row for each receiver: a new receiver gets
+            the mean row. What else has to change, ``take_receivers`` changes. ``of_level`` names
+            the buffer that ``adapt`` moves.
     """
 
     scene: Scene

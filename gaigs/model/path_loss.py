@@ -20,11 +20,11 @@ class PathLoss(Model):
     It is meant for RSSI [dBm], and accepts any task of one real number a link. T and gamma are
     fitted by least squares. Exponents gamma are then drawn towards the mean of all receivers, as
     far as chance explains their scatter (``shrunk``): a few readings alone give wild slopes. A
-    receiver whose links are equally long gets this mean, or 2, as in free space, if no receiver has
-    an exponent. Negative exponents are kept: there distance explains nothing. Distances below 0.1 m
-    count as 0.1 m: within about a wavelength the field does not follow the law. If a receiver's
-    place is estimated, the logarithm is averaged over the region in which it may stand, so there is
-    no peak in its middle.
+    receiver whose links are equally long gets this mean. If no receiver has an exponent, it gets 2,
+    as in free space. Negative exponents are kept: there distance explains nothing. Distances below
+    0.1 m count as 0.1 m: within about a wavelength the field does not follow the law. If a
+    receiver's place is estimated, the logarithm is averaged over the region in which it may stand,
+    so there is no peak in its middle.
 
     Raises:
         ValueError: A label is more than one real number.

@@ -130,9 +130,9 @@ class Request(NamedTuple):
     def arranged(self, values: Tensor, scene: Scene, axes: tuple[int, ...] | None = None) -> Any:
         """Reshapes values of links (b, ...) to the axes of the answer, or to other ones.
 
-        Channels are padded to the largest array and all subcarriers. Where receivers differ in
-        these, the padding is cut: all receivers give a dictionary of tensors by name, one receiver
-        gives the tensor of its own elements and subcarriers.
+        Channels come padded to the largest array and to all subcarriers. Where receivers differ in
+        these, the padding is cut: a request for all receivers then gives a dictionary of tensors by
+        name, a request for one receiver its tensor.
         """
         axes = self.axes if axes is None else axes
         receivers = scene.receivers
@@ -158,9 +158,9 @@ class Request(NamedTuple):
 def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver | None:
     """The new receiver that an argument of ``Model.predict`` gives; None for names and indices.
 
-    The argument may be a ``Receiver``, a pose, or a position; the last two get the array of the
-    scene's receivers, which for a position must have no orientation. Three whole numbers beside
-    three transmitters are indices.
+    The argument may be a ``Receiver``, a pose, or a position [m]. A pose or position gets the array
+    of the scene's receivers; for a position that array must need no orientation. Three whole
+    numbers beside three transmitters are indices of receivers.
     """
     if isinstance(receiver, Receiver) or receiver is None:
         return receiver

@@ -127,13 +127,14 @@ def shared_coefficients(
 ) -> Float[Tensor, " f"]:
     """Non-negative coefficients c of features x in y = level + exponent log10(d) + c . x.
 
-    Level and exponent differ from receiver to receiver, c is shared. Coefficients are drawn towards
-    0 as by one link each. A feature that level and exponent explain has the coefficient 0.
+    Level and exponent differ from receiver to receiver, c is shared. A ridge draws each coefficient
+    towards 0, like one more link. A feature that level and exponent explain has the coefficient 0.
 
     Args:
-        columns: Level y of each link [dBm], then its features x.
+        columns: Level y of each link [dBm], then its features x. A loss has a negative sign, since
+            c is not negative.
         lengths: Distances d [m].
-        receivers: Receiver of each link.
+        receivers: Number of each link's receiver.
 
     Source: Frisch and Waugh, Partial time regressions as compared with individual trends, 1933.
     """

@@ -20,8 +20,9 @@ log = logging.getLogger(__name__)
 class AxisPlanes(PlaneSearch[SlabRoom]):
     """Search for planes along the axes of a room, near its known planes.
 
-    Only offsets are searched, so fainter planes stand out from noise, and walls behind the array
-    from the direct path. Walls go first. All planes move a little whenever there is one more.
+    Normals are those of the room's axes, and only offsets are searched. With so few candidates,
+    fainter planes stand out from noise, and walls behind the array from the direct path. Walls are
+    added before other planes. After each addition all planes move a little.
     """
 
     score: ChannelScore
@@ -31,9 +32,9 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         self.data = data
 
     def find_upright(self, room: SlabRoom) -> SlabRoom:
-        """A room of the one upright plane that explains most alone; an empty room without any.
+        """A room of the single upright plane that explains most; empty if there is none.
 
-        It stands along the axes of ``room``.
+        The plane is along the axes of ``room``.
         """
         axes = room_axes(room.planes)
         nothing = SlabRoom(room.planes[:0], room.slabs[:0])
@@ -52,8 +53,8 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
     ) -> SlabRoom:
         """The room with further planes, ``most`` in all.
 
-        Each is a wall along the room's axes; or else a plane along them amid the places; or else
-        one of ``others``.
+        Added first are walls along the room's axes, then planes along these axes amid the places,
+        then planes of ``others``.
         """
         count = len(room.planes)
 
@@ -86,7 +87,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
 
         Returns:
             At most four walls, which have all places on one side, and at most four planes amid the
-            places, each list best first. Planes amid the places would outdo walls in one list.
+            places, each list best first. In one list those amid the places would displace walls.
         """
         walls: list[Candidate] = []
         amid: list[Candidate] = []
@@ -101,7 +102,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         return _strongest(walls, least), _strongest(amid, least)
 
     def add_best(self, room: SlabRoom, candidates: list[Float[Tensor, "4"]]) -> SlabRoom:
-        """The room with the best candidate after its move; unchanged if all move to known ones."""
+        """The room with the best candidate, moved; unchanged if all move to known planes."""
         trials = []
         number = len(room.planes)
         for plane in candidates:
@@ -110,7 +111,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
                 if not self.frame.is_like(room.planes, moved).any():
                     trials.append(room.with_plane(moved, material))
         best = self.score.choose_best(trials)
-        return self.score.polish(best[0], 12, 5e-4, number) if best else room
+        return self.score.polish(best[0], steps=12, rate=5e-4, only=number) if best else room
 
     def settle(self, room: SlabRoom, polishes: bool = False) -> SlabRoom:
         """The room with each plane moved once more, as the others are known now.
@@ -121,7 +122,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         room = self.sweep(room, range(len(room.planes)), move=move)
         if stages.is_up():
             return room
-        return self.score.choose_best([room, self.score.polish(room, 30, 3e-4)])[0]
+        return self.score.choose_best([room, self.score.polish(room, steps=30, rate=3e-4)])[0]
 
     def _propose_by_phases(self, planes: Float[Tensor, "w 4"], number: int, tilt: float) -> list:
         """Planes near plane ``number``, with every third slab of ``SLABS``."""
@@ -137,8 +138,8 @@ def _strongest(candidates: list[Candidate], least: float) -> list[Float[Tensor, 
 def room_axes(planes: Float[Tensor, "w 4"]) -> Float[Tensor, "k 3"]:
     """Normals along which a room may have further planes.
 
-    They are the planes' own; the vertical; the horizontal parts of steep planes' normals; and the
-    horizontal normals at right angles to these.
+    They are the normals of the planes, the vertical, the horizontal parts of steep planes' normals,
+    and the horizontal normals at right angles to these parts.
     """
     normals = planes[:, :3]
     up = planes.new_tensor([0.0, 0.0, 1.0])

@@ -53,15 +53,15 @@ class Cuboid(NamedTuple):
 class BoxSearch:
     """Boxes, each shared by all paths of all receivers, that lower the errors of links.
 
-    A box starts in one of the cells in which paths are most too strong, and its faces move to the
-    least mean error. It holds no transmitter and no receiver, since these stand in the open. The
-    best box whose fall of the error is clear stays, all take turns, and a gap is cut through boxes
-    that cover two things.
+    A box starts as one of the cells whose loss lowers the errors most, and its faces then move to
+    the least mean error. A box holds no transmitter and no receiver, since these stand in the open.
+    The box that lowers the error most stays if the fall is clear. Then all boxes are adjusted in
+    turn, and a gap is cut through a box that covers two obstacles.
 
     Attributes:
         most: Boxes after which the search ends; cuts at most double them.
         seeds: Cells from which each box is tried.
-        steps: Moves of a face, and the shortest edge [cells].
+        steps: Moves of a face [cells]; the last is also the shortest edge.
         losses: Least and largest loss [Np]: below 3 dB materials and gains may be wrong as well.
         clear: Least fall of the mean error [standard errors].
         price: Least fall of the mean error by a box or a cut.

@@ -153,7 +153,7 @@ class ReceiverChannels:
         return speed_of_light / float(self.frequencies.mean())
 
     def about(self, middle: Float[Tensor, "3"]) -> "ReceiverChannels":
-        """The same channels, with positions from a point ``middle`` [m]."""
+        """The same channels, with all positions relative to the point ``middle`` [m]."""
         points = {name: getattr(self, name) - middle for name in ("places", "position", "elements")}
         return replace(self, **points)
 
@@ -176,8 +176,7 @@ class ReceiverChannels:
         return replace(self, **parts, channels=self.channels.to(torch.complex64))
 
     def of_unique_places(self) -> "ReceiverChannels":
-        """The first link of each place that is received: two links of a place would predict each
-        other."""
+        """The first received link of each place: links of one place would predict each other."""
         received = self.at(self.channels.abs().amax((1, 2)) > 0)
         _, which = received.places.unique(dim=0, return_inverse=True)
         first: dict[int, int] = {}
@@ -192,7 +191,7 @@ class ReceiverChannels:
 
     @property
     def few_subcarriers(self) -> slice:
-        """Every fifth subcarrier, or a smaller step that leaves a channel about 64 numbers."""
+        """Every fifth subcarrier, or more of them if a channel would keep fewer than 64 numbers."""
         return slice(None, None, min(5, max(1, self.flat.shape[1] // 64)))
 
     def images(
@@ -218,8 +217,9 @@ class ReceiverChannels:
     ) -> Complex[Tensor, "b n k"]:
         """Waves of all paths after their reflections; 0 for a path that does not meet its planes.
 
-        Slabs reflect as at the frequencies ``at`` [Hz], by default each subcarrier's. One frequency
-        saves work with half-spaces, which reflect alike at all.
+        Reflection coefficients are those at the frequencies ``at`` [Hz], by default each
+        subcarrier's. A single one saves work with half-spaces, which reflect alike at all
+        frequencies.
         """
         at = self.frequencies if at is None else at
         planes = room.planes.to(self.places)
@@ -329,16 +329,18 @@ class ChannelData:
     def fit_free(
         self, receiver: ReceiverChannels, planes: Float[Tensor, "w 4"], ridge: float | None = None
     ) -> FreeFit:
-        """Free strengths of all paths at planes, by default with the ridge of the options."""
+        """Complex strengths of all paths at planes, fitted at each place; see
+        ``strengths.fit_free``.
+        """
         waves = receiver.waves(receiver.images(planes, self.sequences(planes)))
         return fit_free(waves, receiver.flat, self.options.ridge if ridge is None else ridge)
 
     def reference_phases(
         self, planes: Float[Tensor, "w 4"], receivers: list[ReceiverChannels]
     ) -> list[Complex[Tensor, " c"]]:
-        """Phase of each receiver's direct paths, as a number of magnitude 1.
+        """Phase of the direct paths to each receiver, as numbers of magnitude 1.
 
-        It is one for all places (1,) if channels have a common phase, else one for each place (b,).
+        There is one for all places (1,) if channels share a phase, else one for each place (b,).
         """
         phases = []
         for receiver in receivers:

@@ -30,8 +30,9 @@ class ChannelScore(Score[SlabRoom]):
     """Planes by the phases of reflections at slabs, with real strengths that are not negative.
 
     A true plane's strengths vary little from place to place, so channels are predicted with the
-    strengths of the nearest places. The error is what the prediction leaves, and a price of each
-    plane. A false plane that explains one place by chance fails at the next.
+    strengths of the nearest places. The error of a room is the mean log of the share of power that
+    the prediction leaves, plus a price for each plane. A false plane that explains one place by
+    chance fails at the next.
 
     Args:
         data: Training channels.
@@ -61,7 +62,7 @@ class ChannelScore(Score[SlabRoom]):
         room: SlabRoom,
         sequences: Int[Tensor, "n order"],
     ) -> Float[Tensor, " t"]:
-        """Log of the share of each target's power that its neighbours' strengths do not explain."""
+        """Log of the share of each predicted place's power that neighbours do not explain."""
         receiver = links.receiver.at(slice(None), links.receiver.few_subcarriers).single()
         channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
         power = receiver.flat.abs().square().sum(1)[:, None, None]
@@ -110,18 +111,20 @@ class ChannelScore(Score[SlabRoom]):
         return SlabRoom(room.planes[others], room.slabs[others])
 
     def refine(self, room: SlabRoom) -> SlabRoom:
-        return self.polish(room, 60, 3e-4)
+        return self.polish(room, steps=60, rate=3e-4)
 
     def move(self, room: SlabRoom, number: int) -> SlabRoom:
         return self._best_moves(room, number)[0]
 
     def move_and_polish(self, room: SlabRoom, number: int) -> SlabRoom:
-        """The best room of ``move`` or of a descent with each of its best trials.
+        """The best of the three best moves of a plane, and of a descent from each.
 
-        The descent also fits the slab: a wrong one may hide the best offset.
+        The descent also fits the slab, since a wrong slab may hide the best offset.
         """
         best = self._best_moves(room, number)
-        return self.choose_best(best + [self.polish(trial, 12, 5e-4, number) for trial in best])[0]
+        return self.choose_best(
+            best + [self.polish(trial, steps=12, rate=5e-4, only=number) for trial in best]
+        )[0]
 
     def _best_moves(self, room: SlabRoom, number: int) -> list[SlabRoom]:
         """At most three rooms, best first: the room, or its plane moved to where phases agree."""
@@ -137,7 +140,7 @@ class ChannelScore(Score[SlabRoom]):
     def choose_best(self, rooms: list[SlabRoom]) -> list[SlabRoom]:
         """At most three rooms of the smallest ``measure``, best first.
 
-        A third of the places chooses the three.
+        A third of the places chooses the three; all places sort them.
         """
         if not rooms:
             return []
@@ -152,8 +155,8 @@ class ChannelScore(Score[SlabRoom]):
     ) -> Float[Tensor, ""]:
         """Mean log of the share of power that real strengths do not explain.
 
-        Paths at planes that are not ``resolved`` have complex strengths: their planes are not known
-        to a fraction of the wavelength.
+        A plane is ``resolved`` once its offset is known to a fraction of the wavelength. Paths at
+        other planes have complex strengths, since their phases say nothing yet.
         """
         shares = []
         residuals = self.residuals(sample, room, resolved)
@@ -164,7 +167,7 @@ class ChannelScore(Score[SlabRoom]):
     def residuals(
         self, sample: ChannelSample, room: SlabRoom, resolved: Bool[Tensor, " w"] | bool = True
     ) -> list[Complex[Tensor, "b k"]]:
-        """Residuals of each receiver's channels after the strengths of ``measure``."""
+        """Residuals of each receiver's channels, with strengths as in ``measure``."""
         sequences = self.data.sequences(room.planes)
         resolved = torch.as_tensor(resolved).expand(len(room.planes))
         is_free = torch.isin(sequences, (~resolved).nonzero()).any(1)
@@ -223,7 +226,7 @@ class ChannelScore(Score[SlabRoom]):
         return GridRatings(ratings, lambda planes: self.added_shares(room, planes))
 
     def added_shares(self, room: SlabRoom, planes: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
-        """Mean share, 0 to 1, of the residual that an image in each plane explains.
+        """Mean share, 0 to 1, of the residual's power that an image in each plane explains.
 
         The residual is what known paths leave. Only the part of the image's wave that known paths
         do not explain counts, in numerator and denominator: the image in a wall behind the array

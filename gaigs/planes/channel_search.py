@@ -27,12 +27,13 @@ class ChannelSearch:
     """Planes whose images explain the training channels.
 
     1. ``FreeScore`` finds planes one after the other, without a guess of the room.
-    2. Phases count: a periodogram over offset and two tilts proposes planes and slabs whose
-       reflections have like phases at all places, and the residual decides. It sees delays too, so
-       it distinguishes planes half a wavelength apart.
+    2. Phases are used: a periodogram over offset and two tilts proposes planes and slabs whose
+       reflections have like phases at all places. The residual decides between these; delays enter
+       into it, so planes half a wavelength apart differ.
     3. Planes with which neighbouring places do not predict each other better are dropped
-       (``ChannelScore``), and what they explained is searched anew.
-    4. Where planes are tilted, or walls known, ``CommonGains`` finds a second room, along the axes.
+       (``ChannelScore``), and the search is repeated for what these explained.
+    4. Where planes are tilted, or walls known, a second room along the axes is searched. For
+       channels of few numbers ``CommonGains`` finds its planes.
     5. The room grows along its axes (``AxisPlanes``), which shows planes that hide behind the
        direct path.
 
@@ -81,7 +82,7 @@ class ChannelSearch:
             planes = self.find_free(self.start)
         best = SlabRoom(planes, planes[:, :3])  # kept if it is empty
         if len(planes):
-            best = self.prune(self.resolve(self.free.descend(planes, 300, 5e-3)))
+            best = self.prune(self.resolve(self.free.descend(planes, steps=300, rate=5e-3)))
         if stages.is_up():
             return best
         # Free strengths may find tilted planes in place of upright ones, or no plane, and move
@@ -107,13 +108,13 @@ class ChannelSearch:
         return self.prune(self.along_axes.grow_along(best, self.most))
 
     def search_anew(self, room: SlabRoom) -> SlabRoom:
-        """The best of a room and two variants of it, after pruning dropped planes.
+        """The best of a room, from which pruning has dropped planes, and of two variants.
 
-        The first adds planes for what the dropped ones explained. The second resolves the best room
-        so far again, because false planes had moved the others.
+        The first variant has further planes for what the dropped ones explained. The second is the
+        better room so far, resolved again, because false planes had moved the others.
         """
-        planes = self.find_free(self.free.descend(room.planes, 100, 1e-2))
-        again = self.prune(self.resolve(self.free.descend(planes, 300, 5e-3)))
+        planes = self.find_free(self.free.descend(room.planes, steps=100, rate=1e-2))
+        again = self.prune(self.resolve(self.free.descend(planes, steps=300, rate=5e-3)))
         room = min(room, again, key=self.score.error)
         return min(room, self.resolve(room.planes), key=self.score.error)
 
@@ -153,9 +154,11 @@ class ChannelSearch:
         return search.sweep(room, turns, "search of planes", replace).planes
 
     def resolve(self, planes: Float[Tensor, "w 4"]) -> SlabRoom:
-        """The room with each plane moved to a fraction of the wavelength, and its best slab.
+        """The room with each plane's offset known to a fraction of the wavelength, and its best
+        slab.
 
-        A plane that is not moved yet keeps complex strengths, see ``ChannelScore.measure``.
+        Planes are moved one after the other, in three rounds. A plane that has not been moved yet
+        keeps complex strengths, see ``ChannelScore.measure``.
         """
         room = half_spaces(planes)
         resolved = torch.zeros(len(planes), dtype=torch.bool)
@@ -164,7 +167,8 @@ class ChannelSearch:
         def measure(room: SlabRoom) -> tuple[float, SlabRoom]:
             return self.score.measure(sample, room, resolved).item(), room
 
-        # Reaches [m] and tilts [rad] of the three rounds: the first also turns planes square.
+        # Reaches [m] and tilts [rad] of the three rounds. The first also turns planes square, and
+        # tries every third slab, as the slab hardly matters before the offset is known.
         for reach, tilt, slabs in (
             (0.07, 0.04, SLABS[::3]),
             (0.05, 0.006, SLABS),
@@ -184,9 +188,11 @@ class ChannelSearch:
                     ):
                         trials.append(measure(room.replace_plane(number, plane, material)))
                 trials.sort(key=lambda trial: trial[0])
-                if resolved.all():
+                if resolved.all():  # a descent on phases needs the phases of all planes
                     for _, trial in trials[:3]:
-                        trials.append(measure(self.score.polish(trial, 12, 5e-4, number)))
+                        trials.append(
+                            measure(self.score.polish(trial, steps=12, rate=5e-4, only=number))
+                        )
                 room = min(trials, key=lambda trial: trial[0])[1]
         return self.score.refine(room)
 

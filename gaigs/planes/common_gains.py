@@ -26,11 +26,11 @@ class BestOffset(NamedTuple):
 
 
 class CommonGains:
-    """Planes square to the axes of coordinates, one after the other: a matching pursuit.
+    """Planes square to the axes of coordinates, found one after the other: a matching pursuit.
 
-    Each image has one real gain for all places, as by a half-space. Free strengths at each place
-    would explain channels of few numbers by any plane. A common gain explains hardly anything by
-    chance, so offsets show to millimetres.
+    Each image has one real gain that all places share, as by a half-space. A strength of its own at
+    each place would explain channels of few numbers by any plane. A common gain explains hardly
+    anything by chance, and shows offsets to millimetres.
 
     Args:
         data: Training channels.
@@ -49,8 +49,7 @@ class CommonGains:
         """Half-spaces of the known walls and of further planes square to the axes.
 
         Known walls move along their normals where that explains more than by chance. The result is
-        empty if the room is so many wavelengths large that ``most_waves`` allows fewer than 50
-        places.
+        empty for a room of so many wavelengths that ``most_waves`` allows fewer than 50 places.
         """
         options = self.data.options
         frame = self.data.frame
@@ -86,7 +85,7 @@ class CommonGains:
     def _without_chance_planes(
         self, receivers: list[ReceiverChannels], planes: Float[Tensor, "w 4"], by_chance: float
     ) -> Float[Tensor, "v 4"]:
-        """Known walls, and those further planes that lower the residual by more than chance."""
+        """Known walls, and the further planes that lower the residual by more than chance does."""
         for number in reversed(range(len(self.start), len(planes))):
             others = _without(planes, number)
             share = self.fit(receivers, half_spaces(planes)).share
@@ -99,7 +98,8 @@ class CommonGains:
     ) -> Float[Tensor, "w 4"]:
         """Known walls moved to where phases agree, by at most ``drawing_error``.
 
-        In each round the wall that explains most is placed; it then counts as known to the others.
+        In each round the wall that explains most is placed, beside which the others are then
+        fitted.
         """
         planes = self.start.clone()
         waiting = list(range(len(self.start)))
@@ -121,9 +121,9 @@ class CommonGains:
         lines: Float[Tensor, "c 4"],
         by_chance: float,
     ) -> Float[Tensor, "v 4"]:
-        """The planes, followed by planes of ``lines`` until none explains more than chance.
+        """The planes, and further ones chosen from ``lines`` while one explains more than chance.
 
-        Each is the one that explains most of the residual (a matching pursuit).
+        Each choice is the plane that explains most of the residual (a matching pursuit).
         """
         while len(planes) < self.most:
             known = self.fit(receivers, half_spaces(planes))
@@ -178,7 +178,7 @@ class CommonGains:
             receivers: Channels.
             others: Planes whose images the fit has already.
             plane: The plane, at its present offset.
-            bonus: Advantage of the present offset, as a share of the power that the others leave.
+            bonus: Advantage given to the present offset [share of the power that the others leave].
         """
         known = self.fit(receivers, half_spaces(others))
         error = self.data.options.drawing_error
@@ -191,9 +191,9 @@ class CommonGains:
         return BestOffset(shares.max().item(), line[shares.argmax()])
 
     def fit(self, receivers: list[ReceiverChannels], room: SlabRoom, order: int = 1) -> CommonFit:
-        """Least squares of one real gain of each path, not negative, for all places.
+        """Least squares of one real gain for each path, not negative and common to all places.
 
-        Each place counts alike: its squares are over its power.
+        Places count alike: the squares of each are divided by the place's power.
         """
         sequences = all_sequences(len(room.planes), order)
         waves = []
@@ -231,7 +231,7 @@ class CommonGains:
         residuals: list[Complex[Tensor, "b k"]],
         line: Float[Tensor, "c 4"],
     ) -> Float[Tensor, " c"]:
-        """Share of power that the image in each plane of a line explains by a common gain."""
+        """Share of power that the image in each plane of ``line`` explains by a common gain."""
         total, size = line.new_zeros(2, len(line))
         for receiver, residual in zip(receivers, residuals, strict=True):
             single = receiver.single()

@@ -14,11 +14,11 @@ from gaigs.splatting.placement.mirrored.reflections import all_sequences
 
 
 class FieldRoom(NamedTuple):
-    """Planes in the frame, their slabs as in ``SLABS``, and gains over the slabs' reflections.
+    """Planes in the frame, their slabs as in ``SLABS``, and gains that multiply the reflections.
 
-    A path's strength is the product of its planes' gains and the receiver's: a few planes explain
-    many paths. Bands share the planes, but each has gains of its own, which stay 0 where a band
-    does not use the plane.
+    A path's strength is the product of its planes' gains and the receiver's gain, so a few numbers
+    explain many paths. All bands have the same planes, but each band has other gains. These stay 0
+    where a band does not use the plane.
     """
 
     planes: Float[Tensor, "w 4"]
@@ -56,7 +56,7 @@ Operator = Callable[[Tensor], Tensor]
 
 
 class Kriged(NamedTuple):
-    """Operators on residuals, which krige each path's field from the places nearby."""
+    """Linear operators on residuals, by kriging of each path's field from the places nearby."""
 
     whiten: Operator  # decorrelates residuals: by the inverse Cholesky factor
     unseen: Operator  # errors of each place as the other places of its block predict it
@@ -126,14 +126,13 @@ class PlaceBlock(NamedTuple):
 class FieldFit:
     """Least squares of fields by the images in a room's planes, over all places at once.
 
-    Every number counts relative to its receiver's mean at its distance; otherwise near places would
-    dominate.
+    Every number is multiplied by the link's distance, else near places would dominate.
 
     Args:
         data: Training channels with a phase in common.
-        floor: Share of the mean power below which an error hardly counts: 20 dB.
+        floor: Share of the mean power below which an error hardly counts; the default is -20 dB.
         damping: Share of the mean squared derivative added in each step of Gauss and Newton.
-        largest: Channel values of a ``PlaceBlock``; a Cholesky factor of more costs time.
+        largest: About the number of channel values of a ``PlaceBlock``; a larger one costs time.
 
     Attributes:
         values: Channel values of all receivers (m,), scaled to a mean power of 1 at each.
@@ -224,13 +223,13 @@ class FieldFit:
         waves: Complex[Tensor, "m n"] | None = None,
         kriged: Kriged | None = None,
     ) -> FieldRoom:
-        """The room with the gains of least mean log error: damped steps of Gauss and Newton.
+        """The room with gains that minimise the mean log error, by damped Gauss-Newton steps.
 
         Weights turn least squares into the mean logarithm (iteratively reweighted least squares).
 
         Args:
             room: Planes, and gains at the start.
-            steps: Number of steps; one that raises the error is taken back, with more damping.
+            steps: Number of steps. One that raises the error is undone, and damping then grows.
             waves: The room's ``waves`` if they are known.
             kriged: The room's ``krige`` if it is known.
         """
@@ -296,13 +295,13 @@ class FieldFit:
         return self.values - room.receivers[self.owner] * total
 
     def products(self, room: FieldRoom) -> Complex[Tensor, "bands n"]:
-        """Products of the gains of each path in each band."""
+        """Product of the planes' gains for each path, in each band."""
         sequences = all_sequences(len(room.planes), self.order)
         return torch.stack([multiply_gains(gains, sequences).products for gains in room.gains])
 
     @torch.no_grad()
     def krige(self, room: FieldRoom, waves: Complex[Tensor, "m n"]) -> Kriged:
-        """Operators that krige a room's residuals path by path.
+        """Operators that whiten the residuals of a room, and that predict each place from others.
 
         The covariance of two channel values is the product of their paths' fields, summed over
         paths, times the kernel of their places; on the diagonal noise is added.
@@ -333,19 +332,19 @@ class FieldFit:
         return Kriged(partial(self._apply, whitening), partial(self._apply, unseen))
 
     def _apply(self, operators: list[Tensor], rest: Tensor) -> Tensor:
-        """Residuals (m, ...) after each block's matrix."""
+        """Residuals (m, ...), each block multiplied by its matrix of ``operators``."""
         applied = torch.empty_like(rest)
         for block, operator in zip(self.blocks, operators, strict=True):
             applied[block.rows] = operator @ rest[block.rows]
         return applied
 
     def unseen(self, room: FieldRoom) -> Complex[Tensor, " m"]:
-        """Scaled errors of each place as the other places of its block predict it."""
+        """Scaled errors at each place, which the other places of the block predict."""
         waves = self.waves(room.planes, room)
         return self.krige(room, waves).unseen(self.residual(room, waves))
 
     def choose_variation(self, room: FieldRoom) -> None:
-        """Sets ``variations``: in each band the one with which places predict each other best."""
+        """Sets ``variations``: for each band the one by which places best predict each other."""
         waves = self.waves(room.planes, room)
         rest = self.residual(room, waves)
         errors = []
@@ -365,7 +364,7 @@ class FieldFit:
 def group_places(places: Float[Tensor, "b 3"], count: int) -> Int[Tensor, " b"]:
     """Group of each place, of ``count`` groups of neighbours, a power of two.
 
-    Each group is halved at the median of its longest axis until there are as many.
+    Groups are halved at the median of their longest axis until there are ``count``.
     """
     groups = torch.zeros(len(places), dtype=torch.long)
     while groups.max() + 1 < count:

@@ -20,20 +20,22 @@ from gaigs.splatting.placement.mirrored.reflections import reflect
 class FieldScore(Score[FieldRoom]):
     """Planes by the power that an image explains with one gain for all places.
 
-    Any planes explain one number at each place by free gains, but not by gains that all places
-    share: a few hundred places are one large array, over which a wrong plane's phases differ.
-    Receivers and groups of places, whose relative gains are unknown, add up as powers.
+    One number at each place is explained by any plane if each place has a gain of its own, but not
+    if all places share the gain. A few hundred places are then one large array, over which the
+    phases of a wrong plane do not fit. Receivers and groups of places, whose relative phases are
+    unknown, are summed as powers.
 
     Args:
         data: Training channels with a phase in common.
         price: Least fall by a true plane of the sum of log squared errors over all channel values.
             The best of n false planes reaches about log n.
         chunk: Waves that are computed at a time.
-        upright: Least cosine of a plane that is tried upright, or along an axis: 3.6 degrees.
+        upright: Cosine of the largest tilt, 3.6 degrees, from which a plane is tried upright or
+            along an axis.
 
     Attributes:
-        groups: Groups of places in ratings of a grid.
-        rated: True for bands that rate planes.
+        groups: Number of groups of places in ratings of a grid.
+        rated: True for bands whose links rate planes.
 
     Source: Mallat and Zhang, Matching pursuits with time-frequency dictionaries, 1993.
     """
@@ -62,7 +64,7 @@ class FieldScore(Score[FieldRoom]):
     # --- ratings ---
 
     def rate(self, room: FieldRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
-        """Ratings in the ``rated`` bands; 1 for each receiver and group would be noise.
+        """Ratings of planes by the ``rated`` bands; noise gives 1 for each receiver and group.
 
         The grid is rated with places in ``groups``, single planes with all places together.
         """
@@ -157,8 +159,8 @@ class FieldScore(Score[FieldRoom]):
     def _readings(self, room: FieldRoom, plane: Float[Tensor, "4"]) -> list[Float[Tensor, "4"]]:
         """A found plane, and the planes that would give its image together with a known plane.
 
-        With a single receiver position, an image of second order looks like the image in a plane of
-        its own. So the true plane may reflect before or after a known one.
+        With a single receiver position, an image of second order looks like the image in one
+        further plane. So the true plane may be one that reflects before or after a known plane.
         """
         readings = [plane]
         position = self.data.receivers[0].position
@@ -178,9 +180,9 @@ class FieldScore(Score[FieldRoom]):
         return self.descend(room, 40)
 
     def square(self, room: FieldRoom) -> FieldRoom:
-        """The room with planes upright and along axes, if noise explains what tilts gain.
+        """The room with planes upright and along axes, if tilts explain no more than noise does.
 
-        A free number may lower the sum over n values by log(n) / 2 by chance.
+        By chance each fitted number may lower the sum of log errors over n values by log(n) / 2.
 
         Source: Schwarz, Estimating the dimension of a model, 1978.
         """
@@ -201,7 +203,9 @@ class FieldScore(Score[FieldRoom]):
         return trial if self.error(trial) < self.error(room) + chance else room
 
     def descend(self, room: FieldRoom, steps: int, turns: float = 0.4) -> FieldRoom:
-        """The room after a descent of the planes, with gains projected out.
+        """The room after a descent of the planes; gains are fitted anew in each step.
+
+        ``steps`` and ``turns`` are as in ``search.descend``.
 
         Source: Golub and Pereyra, 1973.
         """

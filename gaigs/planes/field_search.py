@@ -39,12 +39,12 @@ class PlaneGrid(NamedTuple):
 
 
 class FieldSearch:
-    """Planes whose images explain fields of few numbers a place, coherent over places.
+    """Planes whose images explain fields of few numbers a place, with phases that all places share.
 
-    Planes along the axes of the room come first, then upright ones, then any: the more planes are
-    tried, the more chance explains. Where a grid of planes is too large for all places at once, a
-    coarser one is rated by groups of neighbouring places, whose relative phases do not count.
-    Planes about its maxima are then rated by all places.
+    Planes along the axes of the room come first, then upright ones, then tilted ones, since the
+    more planes are tried, the more one of them explains by chance. Where a grid of planes is too
+    large for all places at once, a coarser one is rated by groups of neighbouring places, whose
+    relative phases do not count. Planes about its maxima are then rated by all places.
 
     Args:
         links: Their training links count; of the task ``csi``, with a known phase.
@@ -54,8 +54,8 @@ class FieldSearch:
         start: Planes known before (w, 4).
         options: Options of the search.
         smallest: Fewest places of a group.
-        fewest: Fewest numbers of a search: ten for each plane of a box. Of 22, a false plane
-            explained more than its price.
+        fewest: Fewest channel values for a search, ten for each plane of a box. With 22 values a
+            false plane explained more than its price.
 
     Source: ours.
     """
@@ -105,7 +105,7 @@ class FieldSearch:
         return self.score.square(room)
 
     def _extend(self, room: FieldRoom, grids: list[PlaneGrid]) -> FieldRoom | None:
-        """The room with one more plane: the best of the first grid with one that lowers the error.
+        """The room with one more plane, from the first grid that has one which lowers the error.
 
         None if no grid has any.
         """
@@ -136,7 +136,8 @@ class FieldSearch:
     def _rated(self) -> list[Bool[Tensor, " bands"]]:
         """Masks of the bands that rate planes: all bands, and each alone if there are several.
 
-        Shadows and lengths of waves differ: what one band shows clearly may be noise in the others.
+        Shadows and wavelengths differ between bands, so a plane that one band shows may be lost in
+        the noise of the others.
         """
         alone = torch.eye(len(self.score.fit.bands), dtype=torch.bool)
         together = torch.ones_like(alone[:1])
@@ -145,7 +146,7 @@ class FieldSearch:
     # --- grids ---
 
     def _make_axes(self, room: FieldRoom) -> PlaneGrid:
-        """Planes along the axes of the room's planes, of the places and of coordinates."""
+        """Planes along three sets of axes: the room's planes', the places' and the coordinates'."""
         turn = upright_turn(self.frame.points).to(self.frame.points)
         axes = torch.cat((room_axes(room.planes), torch.eye(3).to(turn), turn.mT))
         normals = torch.stack(distinct(axes, 2e-4))

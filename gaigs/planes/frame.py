@@ -52,7 +52,7 @@ class RoomFrame:
     def grid(
         self, normals: Float[Tensor, "n 3"], count: int, margin: float
     ) -> Float[Tensor, "n k 4"]:
-        """Planes at ``count`` offsets of each normal, to a margin [diagonals] beyond all points."""
+        """Planes at ``count`` offsets of each normal, to a ``margin`` [diagonals] beyond points."""
         along = self.points @ normals.mT  # (points, n)
         beyond = margin * self.diagonal
         low = along.amin(0) - beyond

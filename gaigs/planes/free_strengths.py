@@ -1,4 +1,4 @@
-"""The score of planes by free strengths: delay profiles of residuals, and variable projection."""
+"""The score of planes by free strengths, complex numbers fitted for each path at each place."""
 
 import math
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from gaigs.planes.strengths import fit_free, log_share
 
 
 class FreeRoom(NamedTuple):
-    """Planes, and how far free strengths at each place explain the channels by them."""
+    """Planes, and how far their paths explain channels, with free strengths at each place."""
 
     planes: Float[Tensor, "w 4"]  # planes in the frame
     error: float  # mean over links of the log of the share of power that remains
@@ -24,9 +24,10 @@ class FreeRoom(NamedTuple):
 class FreeScore(Score[FreeRoom]):
     """Planes by the power of their images, with a free complex strength of each path and place.
 
-    Neither phases nor blockage are assumed. A candidate's rating is the share of the residual's
-    power that its image explains, summed over places and receivers: a Hough transform over normals
-    and offsets. Planes are refined by variable projection: strengths are solved for at each step.
+    Neither phases nor blockage are assumed. A candidate's rating is the share of the channels'
+    power that its image explains in the residual, a mean over places and receivers: a Hough
+    transform over normals and offsets. Planes are refined by variable projection: strengths are
+    solved for at each step.
 
     Attributes:
         links: At most 200 random training links, for errors and ratings.
@@ -104,7 +105,7 @@ class FreeScore(Score[FreeRoom]):
     def descend(
         self, planes: Float[Tensor, "w 4"], steps: int, rate: float
     ) -> Float[Tensor, "w 4"]:
-        """Planes after a descent on the error at random links, see ``search.descend``."""
+        """Planes after a descent at random links; ``steps``, ``rate``: as in ``search.descend``."""
         sequences = self.data.sequences(planes)
 
         def loss(planes: Float[Tensor, "w 4"]) -> Float[Tensor, ""]:
@@ -122,10 +123,11 @@ class FreeScore(Score[FreeRoom]):
     def compute_profile(
         self, receiver: ReceiverChannels, residual: Complex[Tensor, "b k"]
     ) -> Float[Tensor, "b e t 2"]:
-        """Delay profiles of a residual at each element, over the root of the channel's power.
+        """Delay profiles of a residual at each of e elements, at t delays, over the channel's norm.
 
-        With them a candidate costs one look-up for each element in place of a sum over subcarriers.
-        Delays are relative to the mean carrier; the last dimension is real and imaginary part.
+        A candidate plane is then rated by one look-up for each element, not by a sum over
+        subcarriers. Delays are relative to the mean carrier; the last dimension is real and
+        imaginary part.
         """
         residual = residual / (
             receiver.flat.norm(dim=1, keepdim=True) * math.sqrt(residual.shape[1])
@@ -187,9 +189,9 @@ class _ProfileTable:
     def image_powers(
         self, normal: Float[Tensor, "3"], heights: Float[Tensor, "b k"]
     ) -> Float[Tensor, "b k"]:
-        """Power of profiles summed over the elements with the phases of an image's wave.
+        """Power of profiles, summed over elements in phase with an image's wave, at b places.
 
-        ``heights`` of the places are above planes with one normal [m].
+        The k planes share ``normal``. ``heights`` are the places' signed distances from them [m].
         """
         moves = 2 * heights[..., None].float() * normal.float()
         points = self.places[:, None] - moves  # (b, k, 3)

@@ -1,4 +1,4 @@
-"""The score of planes by spectra: lags of the array's elements, and which paths are open."""
+"""The score of planes by spectra: covariances of the array's elements, and blocked paths."""
 
 import copy
 import math
@@ -39,7 +39,7 @@ class LagOptions:
 
 
 class LagRoom(NamedTuple):
-    """Planes of the room, and which paths are open at each link."""
+    """Planes of the room, and which paths are open, that is not blocked, at each link."""
 
     planes: Float[Tensor, "w 4"]  # normals and offsets [m]
     # True where paths are open at a link: column 0 the direct path, then all paths at each plane
@@ -89,7 +89,7 @@ class LinkPaths:
         return list(zip(self.receivers, parts, strict=True))
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
-        """Sequences of planes without those of several reflections whose power is faint."""
+        """Sequences of planes; of several reflections only those whose power is not faint."""
         sequences = all_sequences(len(planes), self.order)
         powers = self.powers(planes, sequences)
         is_short = (sequences >= 0).sum(1) <= 1
@@ -114,10 +114,10 @@ class LinkPaths:
 class LagScore(Score[LagRoom]):
     """Planes by the spectra of an array, with one material and without obstacles.
 
-    A spectrum gives back the covariances of the array's elements (``Beamformer.lags``), so a model
-    is compared with it at once. At each link the paths at a plane may be blocked, for a price. A
-    plane is moved to a maximum of ``PlanePeriodogram``; the error decides between the maxima.
-    Further planes come by their power alone.
+    Covariances of the array's elements follow from a spectrum (``Beamformer.lags``), so predicted
+    covariances are compared with measured spectra. At each link the paths at a plane may be
+    blocked, for a price. A plane is moved to a maximum of ``PlanePeriodogram``; the error decides
+    between the maxima. Further planes are rated by their power alone, without phases.
 
     Source: ours; Van Trees, Optimum Array Processing, 2002, section 2.4, for the covariances.
     """
@@ -136,7 +136,7 @@ class LagScore(Score[LagRoom]):
         sequences: Int[Tensor, "n order"] | None = None,
         every: int = 1,
     ) -> Float[Tensor, " c"]:
-        """Log of the share of each spectrum that paths do not explain, for ``every`` k-th link.
+        """Log of the share of each spectrum that paths do not explain, at one link of ``every``.
 
         Logarithms keep single links from dominating a mean. ``open_`` is as in ``LagRoom``.
         """
@@ -151,10 +151,10 @@ class LagScore(Score[LagRoom]):
     # --- moves ---
 
     def move(self, room: LagRoom, number: int) -> LagRoom:
-        """The room with a plane at the peak of its periodogram where the error is least.
+        """The room with plane ``number`` moved to the peak of its periodogram with the least error.
 
-        Normals near its own are tried, and normals square to another plane. The plane's paths are
-        open where that lowers a link's error.
+        The normals of ``square_normals`` are tried. The plane stays if no peak is surely better.
+        Its paths are open at links whose error they lower.
         """
         # The wave that the other planes' paths lack, and the errors without this plane.
         is_other = torch.arange(len(room.planes)) != number
@@ -187,7 +187,7 @@ class LagScore(Score[LagRoom]):
         open_: Bool[Tensor, "b v"],
         sequences: Int[Tensor, "n order"],
     ) -> list[FurtherWave]:
-        """The wave that each receiver's links lack beside the paths at planes."""
+        """For each receiver, the wave that the paths at planes lack to explain the spectra."""
         waves = []
         for receiver, passing in self.paths.split(open_):
             paths = receiver.paths(planes, sequences, passing)
@@ -195,10 +195,11 @@ class LagScore(Score[LagRoom]):
         return waves
 
     def refine(self, room: LagRoom) -> LagRoom:
-        """The room after a descent with all planes, if that certainly lowers the error.
+        """The room after a descent with all planes.
 
-        Before it the direct path is blocked at links whose error falls by more than
-        ``LagOptions.blocked`` without it. ``errors`` stay as the last move has left them.
+        First the direct path is blocked at links whose error it raises by more than
+        ``LagOptions.blocked``. Then all planes descend. The moved planes are kept only if the mean
+        error falls by more than ``LagOptions.certain`` standard errors. ``errors`` are not renewed.
         """
         with_direct = self.errors(room.planes, room.opened(0, True))
         without = self.errors(room.planes, room.opened(0, False))
@@ -244,9 +245,9 @@ class LagScore(Score[LagRoom]):
     def _rate_powers(
         self, maps: list[Float[Tensor, "b 1 k k"]], planes: Float[Tensor, "c 4"]
     ) -> Float[Tensor, " c"]:
-        """Fall of the errors by the power of a reflection at each plane, over the power's norm.
+        """Fall of the errors by the power of a reflection at each plane, over that power's norm.
 
-        ``maps`` have each link's fall by a wave from each direction, as an image of two sines.
+        ``maps`` have each link's fall by a wave from each direction, on a grid of k x k sines.
         """
         total, square = planes.new_zeros(2, len(planes))
         for receiver, falls in zip(self.paths.receivers, maps, strict=True):

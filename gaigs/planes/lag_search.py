@@ -72,14 +72,15 @@ class LagSearch:
     Args:
         links: Their training links count; of the task ``spectrum``.
         frequencies: Carrier of each link [Hz].
-        lags_of: Function from labels and their query to each label's lags, up to a factor, and
-            to the share of each label that its lags do not explain.
+        lags_of: Function from labels and their query to two things: the covariances of each label
+            at the array's lags, up to a factor, and the share of each label that these do not
+            explain.
         order: Largest number of reflections of a path; more than 2 count as 2.
         most: As for ``group_links``.
         options: Options of the search.
 
     Attributes:
-        doubts: Sentences on what speaks against the data's geometry.
+        doubts: Sentences for the log, on signs that the data's geometry is wrong.
         paths: Paths at the receivers whose spectra their arrays explain.
 
     Source: ours.
@@ -168,8 +169,8 @@ class LagSearch:
         """Sets the best of some bandwidths, and returns the start with all planes moved.
 
         The best is the one with which moving the strongest plane leaves the smallest error. The
-        first choice, nearly a single carrier, is compared once more with all planes moved: one
-        plane among others in the wrong places hardly interferes.
+        best and the first choice, nearly a single carrier, are compared once more with all planes
+        moved: while other planes are in the wrong places, one hardly interferes.
         """
         best = choices[0]
         if len(choices) > 1:

@@ -38,8 +38,8 @@ class ArrayPaths(NamedTuple):
 class FurtherWave(NamedTuple):
     """How a further path would lower the error of the known paths' covariances.
 
-    For a weak further path with conjugate wave w* at the elements, the error falls by 2 Re sum(w*
-    times the weights), summed over known paths and elements.
+    A weak further path with the wave w at the elements lowers the error by 2 Re sum(w* weights),
+    summed over known paths and elements.
     """
 
     # Weights for each known path and element. Without a bandwidth they are summed over the known
@@ -133,8 +133,7 @@ class ReceiverLags:
     def slopes(self, lags: Complex[Tensor, "b l"]) -> Complex[Tensor, "b e e"]:
         """Negative gradient M of the errors by the covariances.
 
-        A further wave x lowers them by x' M x, and by 2 Re x' M y where it interferes with a wave y
-        of the model.
+        A further wave x lowers the errors by x' M x, and by 2 Re x' M y with a known wave y.
         """
         with torch.enable_grad():
             lags = lags.detach().requires_grad_()
@@ -168,8 +167,8 @@ class ReceiverLags:
     ) -> ArrayPaths:
         """All paths at planes.
 
-        ``passing`` (b, w + 1) is the share of the direct path's field that obstacles let through,
-        then the share at each plane; true and false for all and nothing.
+        ``passing`` (b, w + 1) has the share of the field that obstacles let through, of the direct
+        path first, then of the paths at each plane. Booleans stand for all and nothing. None: all.
         """
         normals, offsets = planes[:, :3], planes[:, 3]
         points = images(self.places, sequences, normals, offsets)
@@ -225,7 +224,7 @@ class ReceiverLags:
         return SingleReflections(directions, lengths, gains, cosines)
 
     def describe_doubts(self, name: str) -> list[str]:
-        """A sentence if the direct path shows in another direction than geometry says."""
+        """A sentence for the log if spectra show the direct path elsewhere than geometry does."""
         _, pairs, _ = self.array.lags
         matrices = self.lags[:, pairs].view(-1, len(self.array), len(self.array))
         directions, _ = self.look_at(self.places)

@@ -74,8 +74,8 @@ class LearntRoom(NamedTuple):
 def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
     """The learnt room as paths of links show it.
 
-    Paths of some training links outline the planes; without links paths of ``spread_links`` do.
-    The room's own paths lead from the first test transmitter; without links it has none.
+    Paths of some training links outline the planes; without links paths of ``spread_links`` do. The
+    paths that are drawn lead from the first test transmitter; without links none are.
     """
     if links is None:
         query = spread_links(placement.scene)
@@ -122,9 +122,9 @@ def tabulate_planes(placement: Mirrored, ends: Float[ndarray, "k 3"]) -> PlaneTa
 
 
 def other_offset(scene: Scene, planes: PlaneTable, number: int) -> float | None:
-    """The other offset at which a plane reflects paths of the same lengths [m], see ``FlatAxis``.
+    """The second offset [m] at which a plane would give all paths the same lengths.
 
-    None unless the plane stands across a flat axis.
+    It exists for a plane square to an axis that places do not span, see ``FlatAxis``; else None.
     """
     normal = planes.normals[number]
     for flat in scene.flat_axes:
@@ -146,7 +146,7 @@ def outline_planes(placement: Mirrored, traced: TracedPaths) -> list[LearntPlane
 
     A wall has all transmitters and receivers on one side. It reaches to the other walls, to the
     edge of its reflecting area, or to the box around the paths' ends, whichever is nearest. Any
-    other plane, such as furniture, is the rectangle around its bounces, within walls and box.
+    other plane, such as furniture, is the rectangle around its bounces, cut by walls and box.
     Planes without paths, or outside the box, are left out.
     """
     table = tabulate_planes(placement, traced.ends)
@@ -197,7 +197,7 @@ def outline_planes(placement: Mirrored, traced: TracedPaths) -> list[LearntPlane
 def _furniture_corners(
     table: PlaneTable, number: int, traced: TracedPaths, tolerance: np.floating
 ) -> Float[ndarray, "4 3"]:
-    """The rectangle around a plane's bounces; paths below 1 % of its strongest are left out."""
+    """The rectangle around a plane's bounces, without those of paths below 1 % of the strongest."""
     shares = traced.shares
     link, path, step = np.nonzero((traced.sequences == number) & (shares > 0)[..., None])
     share = shares[link, path]

@@ -56,7 +56,7 @@ class ReceiverLevels(ReceiverLags):
 
 
 class LevelRoom(NamedTuple):
-    """Planes of the room, and what a model knows of them from powers."""
+    """Planes of the room, and what a model that adds powers knows about their paths."""
 
     planes: Float[Tensor, "w 4"]  # normals and offsets [m]
     located: Bool[Tensor, " w"]  # True for planes whose paths interfere
@@ -69,10 +69,10 @@ class LevelRoom(NamedTuple):
 
 
 class LevelScore(Score[LevelRoom]):
-    """Planes by levels: only paths at located planes interfere, the others add as powers.
+    """Planes by received levels. Only paths at located planes interfere, others add as powers.
 
-    A wrong phase would be worse than an unknown one. The error is the negative gain of the plane
-    located last.
+    A plane is located once its phases are known: a wrong phase would be worse than none. The error
+    is the negative gain of the plane located last.
     """
 
     def __init__(self, paths: LinkPaths, options: LevelOptions):
@@ -85,7 +85,7 @@ class LevelScore(Score[LevelRoom]):
     def move(self, room: LevelRoom, number: int) -> LevelRoom:
         """The room with a plane moved to where its phases lower the errors most clearly.
 
-        ``gain`` of the result is 0 if the phases lower them nowhere.
+        ``gain`` of the result is 0 if no place of the plane lowers the errors.
         """
         sequences = self.paths.sequences(room.planes)
         phased = is_phased(sequences, room.located)  # (n,)
@@ -148,7 +148,7 @@ class LevelScore(Score[LevelRoom]):
         return powers[:, None]
 
     def measure_chance(self, room: LevelRoom, numbers: list[int], enough: float) -> float:
-        """Largest gain of planes ``numbers`` by chance: with errors shuffled among links.
+        """Largest gain of planes ``numbers`` by chance, measured with errors shuffled among links.
 
         The first gain above ``enough`` ends the trials. The result is infinite if the time is up.
         """
@@ -185,7 +185,7 @@ class LevelSearch:
         frequencies: Carrier of each link [Hz].
         trend: Levels on which the paths' powers stand [dB].
         planes: Normals and offsets at the start (w, 4) [m]. Each is searched near its start.
-        numbers: Numbers of these planes in the placement.
+        numbers: Numbers of the planes in the placement.
         order: Largest number of reflections of a path; more than 2 count as 2.
         most: Links that count, of all receivers together.
         options: Options of the search.
@@ -238,7 +238,7 @@ class LevelSearch:
 
     @torch.no_grad()
     def locate(self, placement: Mirrored) -> list[int]:
-        """Moves the placement's planes to where they are clear, and lets their paths interfere.
+        """Moves the placement's planes to clear maxima, one by one, and lets paths interfere.
 
         Returns:
             Numbers of these planes in the placement.
@@ -276,7 +276,7 @@ class LevelSearch:
     def locate_one(
         self, room: LevelRoom, numbers: list[int], bandwidths: list[float]
     ) -> LevelRoom | None:
-        """The room with the clearest of planes ``numbers`` moved; None if the time is up.
+        """The room with one of planes ``numbers`` moved, the clearest; None if the time is up.
 
         Each plane is tried with each of ``bandwidths`` [Hz]. The best one stays set in ``paths``.
         """
@@ -301,8 +301,8 @@ class LevelSearch:
     def passing(self, placement: Mirrored, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b v"]:
         """Shares of fields that a model's obstacles let through, see ``LevelRoom.passing``.
 
-        They are the model's fields over the fields by reflection alone, at most 1: near Brewster's
-        angle the quotient has no meaning, as planes reflect next to nothing.
+        They are the model's fields over the fields by reflection alone. They are limited to 1,
+        since near Brewster's angle planes reflect next to nothing and the quotient has no meaning.
         """
         columns = [0, *(number + 1 for number in self.numbers)]
         parts = []

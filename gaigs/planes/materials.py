@@ -36,9 +36,9 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
 
     The material is the one whose reflections have the least squared difference from the learnt ones
     at the bounces of these paths, weighted by the paths' powers. A learnt reflection includes the
-    plane's gain, and an equal share for each bounce of the path's gain over the direct path's.
-    Magnitudes are compared where paths have phases of their own. The thickness is the learnt one
-    or, if a half-space fits better, 1 m.
+    plane's gain, and a share of the path's gain over the direct path's, the same at each bounce. If
+    phases of paths are learnt, only magnitudes are compared. The thickness is the learnt one or, if
+    a half-space fits better, 1 m.
 
     Source: ITU-R P.2040-3, table 3; outside 1 to 40 GHz its formulas are extrapolated.
     """

@@ -1,6 +1,7 @@
 """Surfaces of learnt obstacles, for ray tracers and 3-D programs.
 
-Thin sheets stand around the Gaussians of matter, where these have one density.
+A sheet is a thin absorbing surface around matter, through points of equal density. Sheets stand for
+learnt obstacles in programs that know only surfaces.
 """
 
 import itertools
@@ -25,7 +26,7 @@ from gaigs.splatting.placement.mirrored.paths import Mirrored
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """Options of the fit of sheets."""
+    """Options of the fit of sheets, thin absorbing surfaces that stand for obstacles."""
 
     # Number of densities with sheets: more are more exact, but a ray tracer counts each crossing as
     # an interaction.
@@ -44,9 +45,9 @@ class SurfaceOptions:
 class Sheet(NamedTuple):
     """A closed surface of even density of matter, as a thin material that absorbs.
 
-    It is far thinner than the wavelength. ``conductance`` is the sheet's over the admittance of
+    The sheet is far thinner than the wavelength. ``conductance`` is relative to the admittance of
     free space. With c the cosine of the angle of incidence, the field falls to 1 / (1 + conductance
-    / (2 c)) for TE and to 1 / (1 + c conductance / 2) for TM. Its phase does not turn.
+    / (2 c)) for TE and to 1 / (1 + c conductance / 2) for TM. The phase does not change.
 
     Source: the limit of ITU-R P.2040-3, equation 43b, for a thin slab.
     """
@@ -57,7 +58,7 @@ class Sheet(NamedTuple):
 
     @property
     def loss_db(self) -> float:
-        """Loss of a wave that passes it at normal incidence [dB]."""
+        """Loss of a wave that passes the sheet at normal incidence [dB]."""
         return 20 / math.log(10) * math.log1p(self.conductance / 2)
 
 
@@ -197,7 +198,7 @@ def find_crossings(
 
 
 def sheets_of_boxes(obstacles: Obstacles, middle: Float[ndarray, "3"]) -> list[Sheet]:
-    """Boxes as sheets: a path crosses two faces, and each takes half of the loss."""
+    """A sheet for each box of the obstacles; a path crosses two faces of half the loss each."""
     import trimesh.creation  # slow to import
 
     axes = obstacles.box_axes.cpu().double().numpy()
@@ -214,7 +215,7 @@ def sheets_of_boxes(obstacles: Obstacles, middle: Float[ndarray, "3"]) -> list[S
 def attenuate_paths(
     placement: Mirrored, obstacles: Obstacles, query: Query, options: SurfaceOptions
 ) -> AttenuatedPaths:
-    """Paths of a query's links, evenly thinned to ``options.paths``, with what obstacles pass."""
+    """Paths of a query's links, at most ``options.paths``, and the shares that obstacles pass."""
     sequences = placement.sequences[placement.kept]
     query = query[:: math.ceil(len(query) * len(sequences) / options.paths)]
     query = query.to(placement.middle.device)
@@ -241,7 +242,7 @@ def attenuate_paths(
 
 
 def choose_densities(paths: AttenuatedPaths, count: int) -> list[float]:
-    """Densities of matter [Np/m] at which paths lose their fields; empty if they lose nothing.
+    """``count`` densities of matter [Np/m] in which paths lose their fields; empty without loss.
 
     Their logarithms are evenly spaced. A tenth of the loss happens in matter thinner than the first
     one, and a tenth in matter denser than the last.
@@ -260,13 +261,13 @@ def choose_densities(paths: AttenuatedPaths, count: int) -> list[float]:
 
 
 class SheetFit:
-    """Conductances of sheets that attenuate paths most as obstacles do.
+    """Fit of conductances, so that sheets attenuate paths as nearly as obstacles do.
 
-    Errors of a link's fields count in decibels, in the mean over links: neither deep shadow nor the
-    best links decide.
+    The error of a link's fields is taken in decibels and averaged over links, so neither links in
+    deep shadow nor the strongest links dominate.
 
     Args:
-        paths: With obstacles.
+        paths: Fields of paths, and the shares that obstacles pass.
         crossings: Crossings for each density.
     """
 
@@ -340,11 +341,11 @@ def fit_sheets(
     upper: Float[ndarray, "3"],
     options: SurfaceOptions | None = None,
 ) -> tuple[list[Sheet], float]:
-    """Sheets that attenuate a query's paths most as the obstacles do.
+    """Sheets that attenuate a query's paths as nearly as the learnt obstacles do.
 
-    Candidates are densities at which these paths lose their fields. All sets of
-    ``options.densities`` are fitted, each density with one conductance. In the best set each
-    surface gets a conductance of its own.
+    A sheet is a thin absorbing surface through matter of one density. Candidates are densities in
+    which these paths lose their fields. All sets of ``options.densities`` are fitted, each density
+    with one conductance. In the best set each surface is then fitted with its own conductance.
 
     Args:
         placement: The learnt room; without obstacles there are no sheets.
@@ -352,7 +353,7 @@ def fit_sheets(
         lower, upper: Corners of the room [m].
 
     Returns:
-        The sheets, and the gain of all paths beside them [Np].
+        The sheets, and a gain [Np] that all paths have besides the losses in sheets.
     """
     options = options or SurfaceOptions()
     obstacles = placement.obstacles

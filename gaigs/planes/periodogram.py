@@ -16,7 +16,7 @@ from gaigs.splatting.placement.mirrored.reflections import reflect, tangents
 
 
 class Likeness(NamedTuple):
-    """Likeness of the reflections at planes to a further wave, at each link."""
+    """Products of the reflections at c planes with a further wave, at b links."""
 
     values: Complex[Tensor, "c b"]  # products of both waves, of about the same size at all links
     # Change of their phases if the plane moves [rad/m], or turns about its pivot towards two axes
@@ -25,7 +25,7 @@ class Likeness(NamedTuple):
 
 
 class TilePeak(NamedTuple):
-    """Maximum of a periodogram: its height, its plane, and the point about which that turns [m]."""
+    """Maximum of a periodogram: height, plane, and the point about which the plane turns [m]."""
 
     height: float
     plane: Float[Tensor, "4"]
@@ -33,18 +33,19 @@ class TilePeak(NamedTuple):
 
 
 class PlanePeriodogram:
-    """Search for the plane whose reflections are a further wave: its maxima near a known plane.
+    """Search near a known plane for the plane whose reflections best match a further wave.
 
-    The gradient of the error by the covariances, times the waves of known paths, is the wave of one
-    more path. Its phase follows from the path's length. Lengths are linear within a tile of offsets
-    and tilts, so the sum over links is a Fourier sum on each tile.
+    The gradient of the error by the covariances, times the waves of known paths, is the wave that
+    one more path should have (``FurtherWave``). The phase of a reflection follows from the path's
+    length. Within a tile of offsets and tilts lengths are linear, so the match, summed over links,
+    is a Fourier sum.
 
     Args:
         receivers: Training links.
-        wavelength: Shortest of them [m].
+        wavelength: Shortest wavelength of the links [m].
         diagonal: Diagonal of the room [m].
-        reach: Distance over which a plane is moved on either side [diagonals].
-        widest: Largest distance [wavelengths]: a thousand errors for each normal.
+        reach: Largest distance by which a plane is moved on either side [diagonals].
+        widest: Largest such distance [wavelengths], for the number of trials.
         tile: Half the width of a tile [rad]: over some metres, lengths are linear within it.
         turn: Step of a turn [wavelengths over the places' mean distance from the pivot]: about 2
             rad.
@@ -79,7 +80,7 @@ class PlanePeriodogram:
             waves: Further wave of each receiver's links.
             bandwidth: Band over which powers are averaged [Hz].
             normal: Normal about which planes turn.
-            plane: The known plane, which these replace.
+            plane: The known plane, which a maximum may replace.
         """
         (bounce,) = mean_bounces(self.receivers, plane[None])
         # Tiles lie in a row along the normal; each reaches this far on either side [m].
@@ -121,7 +122,7 @@ class PlanePeriodogram:
         return torch.linspace(0, self.tile, math.ceil(self.tile / step) + 1)
 
     def _distinct(self, peaks: list[TilePeak]) -> list[TilePeak]:
-        """At most six of sorted peaks above 0, each in a main lobe of its own."""
+        """At most six of sorted peaks above 0, no two in the same main lobe."""
         distinct: list[TilePeak] = []
         for peak in peaks:
             if peak.height <= 0 or len(distinct) == 6:
@@ -145,7 +146,7 @@ def compare_with_wave(
     pivots: Float[Tensor, "c 3"],  # points about which the planes turn [m]
     axes: Float[Tensor, "2 3"],  # unit vectors towards which the normals turn
 ) -> Likeness:
-    """Likeness of the reflection at each plane to a further wave."""
+    """Products of the reflection at each plane with a further wave, at each link."""
     single = receiver.reflect_once(planes)
     directions = single.directions.transpose(0, 1)  # (c, b, 3)
     lengths = single.lengths.transpose(0, 1)  # (c, b)
@@ -185,9 +186,8 @@ def periodogram(
 
     Args:
         values, rates: As of ``Likeness``, of one plane.
-        moves: Along the normal [m].
-        turns: Towards two axes [rad], from 0 up. Their negatives are taken too; the result has them
-            in ascending order.
+        moves: Moves of the plane along the normal [m].
+        turns: Turns towards two axes [rad], from 0 up; the result begins with their negatives.
     """
     phases = rates[:, :1] * moves
     moved = values[:, None] * torch.polar(torch.ones_like(phases), phases)  # (b, m)

@@ -15,7 +15,7 @@ from gaigs.splatting.placement.mirrored.reflections import polarised, reflect, t
 
 
 class Phasors(NamedTuple):
-    """Single reflections at a plane, at some places."""
+    """Single reflections at a plane, at b places."""
 
     # Strengths over the channels' root power, with the phase against the direct path.
     values: Complex[Tensor, " b"]

@@ -40,16 +40,15 @@ def move_planes(
 ) -> list[float]:
     """Moves each used plane to the least error, the strongest first.
 
-    It moves along its normal, or along one that is perpendicular to the other planes' normals, see
-    ``square_normals``. A model that draws maps takes long for each trial, so its planes keep their
-    normals.
+    A plane moves along its normal, and may turn square to other planes, see ``square_normals``. In
+    a model that draws maps a trial takes long, so planes do not turn.
 
     Args:
-        model: With a placement ``mirrored``.
+        model: Model with a placement ``mirrored``.
         batch: Links whose errors count.
         wavelength: Wavelength of the carrier [m].
         least: Least distance searched on either side [m].
-        widest: Largest distance [wavelengths].
+        widest: Limit of this distance [wavelengths].
 
     Returns:
         Moves along the normals [m].
@@ -74,8 +73,8 @@ def move_plane(
 ) -> float:
     """Moves a plane to the least error of a batch; returns the move along the normal [m].
 
-    It moves by at most ``reach`` [m] in steps of a tenth of the wavelength [m]. With ``turns`` it
-    may also take one of ``square_normals``.
+    The plane moves by at most ``reach`` [m], in steps of a tenth of the ``wavelength`` [m]. With
+    ``turns`` the plane may also take one of ``square_normals``.
     """
     placement: Mirrored = model.placement
     origin = placement.origin[plane]
@@ -143,10 +142,10 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: flo
     """Drops planes, then paths, without which no batch's loss rises by 0.1 %, weakest first.
 
     Args:
-        placement: Its ``kept`` changes.
+        placement: Placement whose ``kept`` is changed.
         batches: Links that count; the first sorts planes and paths by power.
         loss: Loss of the model on a batch.
-        negligible: Share of the strongest path's power below which a path goes in any case.
+        negligible: Share of the strongest path's power below which a path is dropped untested.
 
     Returns:
         A sentence for the log.
@@ -188,7 +187,7 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: flo
 
 
 def sort_by_strength(placement: Mirrored, batch: Batch) -> list[int]:
-    """Used planes, strongest received power first."""
+    """Numbers of used planes, the one with the most received power first."""
     shares = _path_shares(placement, batch)
     sequences = placement.sequences[placement.kept]
     powers = {

@@ -69,7 +69,7 @@ def _summarize_paths(traced: TracedPaths) -> list[dict]:
 
 @torch.no_grad()
 def write_room(placement: Mirrored, query: Query, folder: Path) -> None:
-    """Writes ``planes.obj``, as far as the query's paths reach, and any obstacles' ``.ply``."""
+    """Writes ``planes.obj``, with planes as far as paths reach, and ``obstacles.ply`` if any."""
     write_text(folder / "planes.obj", wavefront_obj(placement, trace_paths(placement, query)))
     blobs = placement.obstacles
     if blobs is None:
@@ -90,7 +90,7 @@ def write_room(placement: Mirrored, query: Query, folder: Path) -> None:
 
 
 def wavefront_obj(placement: Mirrored, traced: TracedPaths, sheets: Sequence[Sheet] = ()) -> str:
-    """Planes and sheets of obstacles as the text of a Wavefront OBJ file [m], z up.
+    """The text of a Wavefront OBJ file [m], z up, of planes and of obstacles as ``sheets``.
 
     A plane is one face, counterclockwise as seen from outside.
     """

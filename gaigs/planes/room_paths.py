@@ -72,7 +72,7 @@ def spread_links(scene: Scene) -> Query:
 
 @torch.no_grad()
 def trace_paths(placement: Mirrored, query: Query) -> TracedPaths:
-    """Powers and bounces of the kept paths of some links, without a deformation."""
+    """Powers and bounces of the kept paths of some links."""
     device = placement.sequences.device
     sequences = placement.sequences[placement.kept]
     powers = []

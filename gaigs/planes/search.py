@@ -98,9 +98,8 @@ class PlaneSearch(Generic[R]):
 
     Args:
         frame: Transmitters and receivers.
-        score: What planes explain in the labels.
-        turn, shift: First steps of the search about a maximum, of normals [rad] and of offsets
-            [diagonals].
+        score: How well planes explain the labels.
+        turn, shift: First steps about a maximum, of normals [rad] and of offsets [diagonals].
 
     Source: Hough, Method and means for recognizing complex patterns, 1962, for the candidates.
     """
@@ -120,7 +119,7 @@ class PlaneSearch(Generic[R]):
     def propose(self, room: R, lines: Float[Tensor, "n k 4"]) -> list[Candidate]:
         """At most three candidates: the highest maxima of a grid, sharpened by a random search.
 
-        Planes like the room's, or like a better candidate, are left out.
+        Planes close to one of the room's, or to a better candidate, are left out.
         """
         rough = self.score.rate(room, lines)
         grid = lines.flatten(0, 1)  # (n k, 4)
@@ -186,8 +185,8 @@ class PlaneSearch(Generic[R]):
     ) -> R:
         """The room with planes ``numbers`` moved one after the other.
 
-        Each is moved by ``move`` in the room that the moves before it have left; None: by
-        ``Score.move``.
+        ``move`` takes the room with all moves so far, and a number; None: ``Score.move``. ``title``
+        names the progress bar.
         """
         for number in stages.track(numbers, title):
             if stages.is_up():
@@ -220,8 +219,14 @@ def descend(
 ) -> list[Tensor]:
     """Planes and ``others``, the further arguments of a loss, after a descent by Adam.
 
-    Planes turn about their ``mean_bounces`` at the receivers. ``rate`` is the first step of a plane
-    [m], and ``turns`` times it the first turn [rad]; steps fall to 3 % of it.
+    Args:
+        loss: Function from planes and ``others`` to the value that is minimised.
+        receivers: Planes turn about their ``mean_bounces`` at these.
+        planes: Planes at the start.
+        others: Further tensors at the start.
+        steps: Number of steps, whose size falls to 3 % of the first.
+        rate: First step of a plane along its normal [m].
+        turns: First turn of a plane over ``rate`` [rad/m]; 0 for none.
     """
     if not len(planes):
         return [planes, *others]

@@ -1,4 +1,4 @@
-"""Strengths of known waves in channels: least squares at each place, free, or real."""
+"""Strengths of known waves in channels, by least squares at each place: complex (free) or real."""
 
 from typing import NamedTuple
 
@@ -37,7 +37,7 @@ def real_residual(
     signed: Bool[Tensor, " n"],
     ridge: float,
 ) -> Complex[Tensor, "b k"]:
-    """Residual of channels after the best real strengths; only ``signed`` ones may be negative."""
+    """Residual of channels after the best real strengths, negative only where ``signed``."""
     gram = ridged((waves.conj() @ waves.mT).real, ridge)
     strengths = real_strengths(gram, (waves.conj() @ channels[..., None]).real, signed)
     return channels - (strengths.mT.to(waves) @ waves)[:, 0]
@@ -62,7 +62,7 @@ def real_strengths(
 def log_share(
     rest: Complex[Tensor, "b k"], channels: Complex[Tensor, "b k"], floor: float = 1e-3
 ) -> Float[Tensor, " b"]:
-    """Logarithm of each residual's share of its channel's power, plus ``floor``."""
+    """log(|residual|² / |channel|² + ``floor``) of each of b channels."""
     power = channels.abs().square().sum(-1)
     return (rest.abs().square().sum(-1) / torch.where(power > 0, power, 1) + floor).log()
 

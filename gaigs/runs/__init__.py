@@ -137,7 +137,7 @@ def configuration_of(folder: str | Path) -> dict:
 
 
 def links_of(folder: str | Path, trust: bool) -> Links:
-    """The links of a run, read again, by a reader that ``load`` would import."""
+    """The links of a run, read again. ``trust`` is as for ``load``."""
     config = configuration_of(folder)
     if config["data"]["name"] == "arrays":
         raise ValueError(
@@ -148,7 +148,7 @@ def links_of(folder: str | Path, trust: bool) -> Links:
 
 
 def _check_options(config: dict) -> None:
-    """Raises a ``ValueError`` for an unknown option of a part: data may take long to read."""
+    """Raises a ``ValueError`` for an unknown option of a part, before data are read."""
     parts = {kind: config[kind] for kind in ("data", "split", "loss", "model", "training")}
     if config["model"]["name"] == "auto":
         del parts["model"]  # no component: the choice checks its options

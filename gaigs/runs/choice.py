@@ -39,7 +39,7 @@ NAME = "auto"
 
 
 class Tried(NamedTuple):
-    """A candidate and its scores where it has not learnt."""
+    """A candidate and its scores at places that it has not learnt from."""
 
     label: str  # its name and options
     config: dict  # configuration of a run with it
@@ -66,13 +66,12 @@ class ChosenModel(NamedTuple):
 
 
 def choose(links: Links, config: dict, folder: Path) -> Fitted:
-    """The simplest candidate that no other surely leads, or a blend of those that are level, as a
-    run of its own gives it, under the name ``auto``.
+    """Trains candidates, and returns the simplest that no other surely leads, or a blend of those.
 
-    Look-ups are compared at all known places, by folds of which each is predicted from the others;
-    the best of them with trained candidates at the validation places. Each candidate is a run in
-    ``candidates/<number>``, with which a stopped choice goes on. The folder gets checkpoint and log
-    of the chosen one.
+    The result is that of a run, under the name ``auto``. Look-ups are compared at all known places,
+    in folds of which each is predicted from the others. The best look-up is then compared with
+    trained candidates at the validation places. Each candidate is a run in ``candidates/<number>``,
+    with which a stopped choice goes on. The folder gets checkpoint and log of the chosen one.
 
     Args:
         links: Links with validation links.
@@ -261,11 +260,11 @@ def _labels(links: Links, index: Int[Tensor, " k"]) -> Tensor:
 
 
 def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
-    """One candidate, or a blend of those that no other surely leads.
+    """The chosen candidate, or a blend of the candidates that no other surely leads.
 
-    A blend is scored by shares that are fitted without each place's fold, and taken unless a
-    candidate surely leads it: the error of a mean is at most the mean of the errors. Complex
-    channels of unknown phase have no mean.
+    A blend is scored with shares fitted without each place's fold. It is chosen unless a candidate
+    surely leads, since the error of a mean is at most the mean of the errors. Complex channels of
+    unknown phase have no mean.
     """
     choice = pick(tried, links.task)
     level = choice.level
@@ -285,7 +284,7 @@ def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
 
 
 def _blended(tried: Sequence[Tried], weights: Sequence[float]) -> Tried:
-    """A blend of candidates; of a blend its members count."""
+    """A blend of candidates by weights; a blend among them enters by its members."""
     members: dict[str, Tried] = {}
     shares: dict[str, float] = {}
     for weight, part in zip(weights, tried, strict=True):
@@ -311,8 +310,8 @@ def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
 
     A candidate whose scores are not finite is behind all others.
 
-    Differences are paired: what is hard at a place is hard for both. All pairs count, as the best
-    mean of few places is often that of the candidate whose scores scatter most.
+    Scores are compared place by place, since a hard place is hard for both. A candidate is compared
+    with each other one, not with the best alone: of few places the best mean often scatters most.
 
     Source: Breiman, Friedman, Olshen and Stone, Classification and regression trees, 1984, section
     3.4.3, the rule of one standard error; of all pairs as in Hansen, Lunde and Nason, The model
@@ -368,8 +367,8 @@ def _fit(config: dict, links: Links, folder: Path) -> Fitted:
 
 
 def _finish(chosen: Tried, links: Links, folder: Path, seconds: float) -> Fitted:
-    """The result of the chosen candidate's run, whose checkpoint and log the folder gets; or the
-    blend of several results. A look-up is fitted to all known links.
+    """The result of the chosen candidate's run, or the blend of several. The folder gets its
+    checkpoint and log. A look-up is fitted to all known links.
     """
     parts = chosen.members or (chosen,)
     results = [one.fitted or _fit(one.config, links, one.folder) for one in parts]

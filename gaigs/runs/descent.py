@@ -42,13 +42,13 @@ def descend(
     searched: float,
     rival: float | None = None,
 ) -> tuple[Model, float]:
-    """Trains a model by gradient descent, which ``Model.fit`` has prepared in ``searched`` [s].
+    """Trains a model by gradient descent, after ``Model.fit``, which took ``searched`` [s].
 
-    It ends when the validation would stay below the score of a ``rival``.
+    The training ends early if its validation score would stay below ``rival``.
 
     Returns:
         The model at the step with the best validation score, or at the last step without validation
-        links; and the duration of both [s], summed over the parts of an interrupted run.
+        links; and the duration of fit and descent [s], summed over the parts of an interrupted run.
     """
     seed = config["seed"]
     identity = _identity(links, config)
@@ -171,7 +171,7 @@ def _run(
     validation: InOrder | None,
     resumed: Path | None,
 ) -> None:
-    """All steps of a training; after a signal ``Stopped``, with the former handlers."""
+    """Makes all steps of a training. A signal raises ``Stopped`` once handlers are restored."""
     expected = (
         ".*LeafSpec",  # Lightning's use of torch
         "You defined a `validation_step` but",  # a split without validation links

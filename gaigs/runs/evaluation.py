@@ -77,8 +77,8 @@ def fitted(
 ) -> Model:
     """A copy of a model without a training, fitted to the known links.
 
-    If these are more than ``many``, it keeps the choices of ``before``: the same model, fitted to
-    most of them.
+    With more than ``many`` known links the copy keeps the choices of ``before``, the same model
+    fitted to most of these links.
     """
     if before is not None and len(links.split.known) > many:
         return before.refitted(links)
@@ -247,9 +247,10 @@ def score(
 ) -> Scores:
     """Scores of every test link by models and look-ups; predictions of the first in a folder.
 
-    Look-ups and models with a calibration have scores of intervals too. If subcarriers are held
-    out, ``nearest_frequency`` scores the test links' own labels at the nearest other ones, as an
-    uplink is taken for a downlink. Fitted look-ups come into ``fits``, for their next fit.
+    Look-ups and models with a calibration have scores of intervals, too. If subcarriers are held
+    out, ``nearest_frequency`` takes a link's label at the nearest known subcarrier as a prediction,
+    as an uplink is taken for a downlink. ``fits`` receives the fitted look-ups, whose choices a
+    next fit may keep.
     """
     test = LinkScores(links)
     look_ups = able_look_ups(look_ups, links)
@@ -387,7 +388,7 @@ def validate(
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
-    """The table's numbers for each receiver with test links, by the names of receiver and model."""
+    """The table's numbers of each receiver with test links, by names of receiver and model."""
     receivers = links.query.receivers[links.split.test]
     summaries: dict[str, dict] = {}
     for number, receiver in enumerate(links.receivers):
@@ -417,7 +418,7 @@ def render_ms(model: Model, links: Links) -> float | None:
 
 
 def median_ms(work: Callable, warm_up: int = 5, repeats: int = 25) -> float:
-    """Median duration of a call [ms], after warm-up."""
+    """Median duration of ``work`` [ms] in some ``repeats``, after ``warm_up`` calls."""
     wait = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
     seconds = []
     for _ in range(warm_up + repeats):

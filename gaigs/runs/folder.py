@@ -22,7 +22,7 @@ ANOTHER = "choose another folder (hydra.run.dir)"
 
 
 def claim(folder: Path, config: dict) -> None:
-    """Writes the configuration into a run folder, or checks that the run there has this one.
+    """Writes the configuration into a run folder, or checks that the folder's run has the same.
 
     Other files there, or another run to resume, are a ``ValueError``.
     """
@@ -128,7 +128,7 @@ def check_same_links(there: dict, here: dict, path: Path) -> None:
 
 
 def fingerprint(links: Links) -> str:
-    """A digest of queries, receivers and labels, of these only in memory: decoding is slow."""
+    """A digest of queries and receivers, and of labels in memory: files are slow to decode."""
     parts = [links.query.transmitters, links.query.receivers]
     for receiver in links.receivers:
         parts += [receiver.pose.position, receiver.pose.rotation, receiver.array.elements]

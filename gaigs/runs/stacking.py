@@ -14,13 +14,16 @@ def stack(
     places: Int[Tensor, " k"],
     folds: Int[Tensor, " k"],
 ) -> tuple[Float[Tensor, " c"], Float[Tensor, "c k"]]:
-    """Shares of models with the least mean square error, and those by all folds but a link's own.
+    """Shares of c models in a blend with the least mean square error.
 
     Args:
         labels: Labels of some links.
         values: Predictions of each model that has not seen them (k, *shape), the simplest first.
         places: Number of each link's place; all count alike.
         folds: Number of each link's fold.
+
+    Returns:
+        The shares (c,), and for each link the shares fitted to all folds but the link's (c, k).
 
     Source: Breiman, Stacked regressions, 1996; van der Laan, Polley and Hubbard, Super learner,
     2007.
@@ -37,8 +40,8 @@ def stack(
 
 
 def shares_of(products: Float[Tensor, "k c c"], places: Int[Tensor, " k"]) -> Float[Tensor, " c"]:
-    """Shares w >= 0 of sum 1 with the least w' G w, in tenths; G is the mean of products of errors
-    over places.
+    """Shares w >= 0 of sum 1 with the least w' G w, in tenths; G is the mean of ``products`` of the
+    models' errors over places.
     """
     _, which, links = places.unique(return_inverse=True, return_counts=True)
     gram = torch.tensordot(1.0 / links[which].double() / len(links), products, 1)  # (c, c)

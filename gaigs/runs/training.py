@@ -36,8 +36,8 @@ def train(
 
     Args:
         model: Name of a registered model, or ``"auto"``, the default, which tries several and takes
-            the best by the validation links; or a model, which is trained in place, of a kriged one
-            a copy of its trend.
+            the best by the validation links; or a model, which is trained in place. Of a kriged
+            model a copy of the trend is trained.
         links: Links to learn from; validation links choose the best step. Test links are not used.
         overrides: Command-line words, e.g. ``"variant=ga"`` or ``"trainer.max_steps=300"``.
         folder: Gets the configuration, the log and the checkpoints; the same call resumes a stopped

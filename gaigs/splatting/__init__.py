@@ -1,1 +1,1 @@
-"""The paper's pipeline, from Gaussians and their placement to the value that a receiver reports."""
+"""The paper's pipeline, from Gaussians and their placement to the label of a receiver."""

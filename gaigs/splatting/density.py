@@ -29,8 +29,8 @@ def prune(
     """Removes Gaussians.
 
     Args:
-        gaussians: They lose rows in place.
-        optimizer: Their optimizer.
+        gaussians: Gaussians, which lose rows in place.
+        optimizer: Optimizer of the Gaussians.
         gone: True for each Gaussian to remove.
         follower: Deformation whose parameters with a row for each Gaussian lose these rows too.
 
@@ -112,7 +112,7 @@ def _rearrange(
     select_state: SelectRows,
     follower: Deformation | None,
 ) -> None:
-    """Replaces rows of the parameters in the modules and in the optimizer.
+    """Replaces rows of parameters in the modules, and of their state in the optimizer.
 
     Args:
         gaussians, optimizer, follower: As for ``prune``.

@@ -22,7 +22,7 @@ SH_DC = 0.5 / math.sqrt(math.pi)
 
 
 class Gaussians(nn.Module):
-    """n anisotropic Gaussians, each a virtual transmitter: raw parameters, activated properties.
+    """n anisotropic Gaussians, each a virtual transmitter, as trainable parameters.
 
     Each receiver gets an equal number of Gaussians on a Fibonacci lattice over a zone of the
     sphere, at random distances. ``count`` sets the angular detail: over the upper hemisphere
@@ -32,7 +32,7 @@ class Gaussians(nn.Module):
         scene: Its receivers are the centres of the lattices.
         zone: Lowest and highest elevation of the lattice, in the receivers' frames [rad].
         channels: Signal channels of a Gaussian.
-        count: Initial number of Gaussians for all receivers together; it grows to one a receiver.
+        count: Initial number of Gaussians for all receivers together; at least one a receiver.
         near, far: Range of the initial distances to their receiver [m].
         spread: Initial standard deviation, as a fraction of the distance to the next Gaussian of
             the lattice.
@@ -144,11 +144,11 @@ class Gaussians(nn.Module):
 
     @property
     def bands(self) -> Float[Tensor, "n c k"]:
-        """Coefficients of the signal up to ``degree``."""
+        """Spherical harmonics' coefficients of the signal up to ``degree``: n, c channels, k."""
         return self.signal[..., : (self.degree + 1) ** 2]
 
     def resize(self, count: int) -> None:
-        """Changes the number of Gaussians; values are undefined."""
+        """Changes the number of Gaussians; all parameters are then undefined."""
         for name in self.PARAMETERS:
             old = getattr(self, name)
             new = nn.Parameter(old.new_empty(count, *old.shape[1:]), old.requires_grad)
@@ -173,7 +173,7 @@ class Gaussians(nn.Module):
 
 
 def fibonacci_lattice(count: int, low: float, high: float) -> Float[Tensor, "count 3"]:
-    """Unit vectors evenly over a zone of the sphere between two elevations [rad].
+    """``count`` unit vectors, evenly over the sphere between elevations ``low`` and ``high`` [rad].
 
     Source: Swinbank and Purser, Fibonacci grids, 2006.
     """
@@ -226,9 +226,9 @@ class Placed(NamedTuple):
         lengths: Length of each Gaussian's path from transmitter to receiver (b, n) [m]; None if
             unknown.
         quats, scales, opacities, signal: As in ``Gaussians``; scales (1 or b, n, 3) [m], signal (n,
-            c, 1) or (b, n, c, 1). None: the free Gaussians have them.
+            c, 1) or (b, n, c, 1). None: those of ``Gaussians``.
         gains: Complex factor of the signal, phase included (b, n). None: 1.
-        coherences: Share of each path's field, in [0, 1] (n,), with a known phase; the rest adds as
+        coherences: Share of each path's field with a known phase, in [0, 1] (n,). The rest adds as
             power. None: 1.
         bandwidth: Band over which powers are averaged, a scalar [Hz]; None: one carrier.
     """
@@ -245,7 +245,7 @@ class Placed(NamedTuple):
 
 
 class Tokens(NamedTuple):
-    """Embeddings that a tokenizer gives to a deformation; any width may be 0.
+    """Embeddings that a tokenizer gives to a deformation; the last axis of each may be 0 long.
 
     Attributes:
         scene: CLS for each query.

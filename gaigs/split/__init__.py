@@ -51,8 +51,8 @@ def part(
         links: All links.
         groups: Number of each link's group.
         test: Fraction of the links to test on; 0 for none.
-        validation: Fraction of the training links to validate on; 0 for none. None: 0.1, and of few
-            links as many more as intervals of 90 % need, see ``hold_out``.
+        validation: Fraction of the training links to validate on; 0 for none. None: 0.1, or more of
+            few links, as intervals of 90 % need, see ``hold_out``.
         seed: Seed of all random numbers.
         train: Groups to train and validate on; None for all that do not test.
         rows: Row of each link, for an order that repeated places do not change; see ``drawn``.
@@ -87,8 +87,8 @@ def drawn(
 ) -> Int[Tensor, " g"]:
     """The groups of the numbered links in random order.
 
-    With ``rows``, where groups are named by their first rows, all rows are shuffled: then the order
-    of the other groups does not depend on repeated places.
+    With ``rows`` all rows of the links are shuffled, and a group stands where its first row comes.
+    So a place measured again does not change the order of other groups.
     """
     shuffled = groups[links] if rows is None else torch.cat((groups[links], rows[links]))
     shuffled = shuffled.unique()
@@ -121,8 +121,8 @@ def hold_out(
         links: Ascending numbers of the links to divide, of two groups or more.
         groups: Group of each link of the data.
         votes: Weight of each link of the data.
-        fraction: Fraction of the links' votes to hold out, as nearly as groups allow. None: 0.1, or
-            up to 0.3 if the nine links that intervals of 90 % need take it.
+        fraction: Fraction of the links' votes to hold out, as nearly as groups allow. None: 0.1.
+            Intervals of 90 % need nine links: where 0.1 gives fewer, up to 0.3.
         at_most: True to hold out no more than the fraction, but one group at least.
         rows: See ``drawn``.
     """

@@ -22,7 +22,7 @@ def receivers(
 ) -> Split:
     """Whole receivers test: the error where no receiver has stood.
 
-    Where three receivers or more are left, whole receivers validate, too; of two, random places.
+    Where three receivers or more are left, whole receivers validate, too; else random places.
 
     Args:
         hold: Names of the receivers that test, or one; None: random ones.

@@ -19,19 +19,18 @@ resumption misses.
 
 
 class Budget(Callback):
-    """Measures a training's time, ends it when its time is up, and has it validate by time.
+    """Measures the time of a training, ends the training in time, and sets times of validation.
 
-    The clock of the first process decides for all, after each step. It starts with the search for
-    planes, runs during validations, and a resumed training starts with the time spent before.
-    Lightning's own ``max_time`` gives each process its own clock.
+    The clock of the first process decides for all, after each step. The clock starts with the
+    search for planes and runs during validations. In a resumed training the time spent before
+    counts. Lightning's own ``max_time`` gives each process its own clock.
 
     Args:
-        max_time: Limit of search and training together [s]; None if steps alone end the training,
-            which has half of it or more.
-        every: Least time between validations [s], which take at most a fifth of the training; None:
+        max_time: Limit of search and training together [s]. The training gets at least half,
+            however long the search. None: steps alone end the training.
+        every: Least time between validations [s]; these take at most a fifth of the training. None:
             by steps.
-        searched: Duration of the search before the training [s]; of several processes the first
-            one's counts.
+        searched: Duration of the search before the training [s], by the first process's clock.
 
     Attributes:
         end: Time at which the limit of the run ends the training, at least a second after the
@@ -129,10 +128,10 @@ class Budget(Callback):
 
 
 def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
-    """The options of Lightning's trainer without the budget's, and the budget after a search
-    [s].
+    """Options of Lightning's trainer without the budget's, and the budget itself.
 
-    The budget takes ``max_time`` and a ``val_check_interval`` that is a time.
+    The budget takes ``max_time`` and a ``val_check_interval`` that is a time. ``searched`` is the
+    duration of the search before [s].
 
     Raises:
         TypeError: A number of steps is not a whole number.
@@ -204,7 +203,7 @@ def _budgets(trainer) -> list[Budget]:
 
 
 def share_done(trainer) -> Callable[[int], float]:
-    """A function of the step: the share of the training's steps or of its time, if that is more."""
+    """A function of the step: share of the training's steps done, or of its time if larger."""
 
     def share(step: int) -> float:
         by_steps = step / trainer.max_steps if trainer.max_steps > 0 else 0.0

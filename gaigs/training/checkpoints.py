@@ -24,8 +24,8 @@ class KeepBest(Checkpoint):
     """Writes the checkpoint of the best validation score (``Task.monitor``), or of the last step
     without validation.
 
-    After ``patience`` validations without a better score it stops the training; also once scores
-    that rise on as they did between the last two validations would end below a ``rival`` score.
+    The training stops after ``patience`` validations without a better score. It also stops if
+    scores, rising on as between the last two validations, would end below a ``rival`` score.
     """
 
     def __init__(self, path: Path, patience: int | None, rival: float | None = None):
@@ -106,13 +106,12 @@ class KeepBest(Checkpoint):
 
 
 class KeepLast(Checkpoint):
-    """Writes the checkpoint to go on from: at intervals [s], at a signal that stops a run, and at
-    the end.
+    """Writes the checkpoint to resume from: ``every`` [s], at a signal to stop, and at the end.
 
-    It writes between two steps, after a due validation and the other callbacks, so that a training
-    goes on as if it had never stopped. At the first signal the training stops there, at the second
-    at once. Several processes follow the clock of the first, and stop together whichever of them
-    got the signal. (Lightning's ``ModelCheckpoint`` saves before a due validation, by each
+    The checkpoint is written between two steps, after a due validation and all other callbacks. So
+    a resumed training equals an uninterrupted one. At the first signal the training stops there, at
+    the second at once. Several processes follow the clock of the first, and stop together whichever
+    of them got the signal. (Lightning's ``ModelCheckpoint`` saves before a due validation, by each
     process's own clock.)
     """
 

@@ -10,9 +10,9 @@ from gaigs.training import seeded
 class DensityControl(Callback):
     """Prunes, clones and splits Gaussians on a schedule.
 
-    The pull at a Gaussian is its mean positional gradient since the last round times its distance
-    to the receivers' middle. Where it exceeds ``gradient``, a wide Gaussian is split and a narrow
-    one is cloned.
+    The pull at a Gaussian is the mean gradient of the loss by its position since the last round,
+    times its distance to the receivers' middle. Where it exceeds ``gradient``, a wide Gaussian is
+    split and a narrow one is cloned.
 
     Args:
         every: Steps between two rounds.

@@ -40,9 +40,9 @@ def _stopping_when_time_is_up(trainer, model: nn.Module) -> Iterator[None]:
 class Revision(Callback):
     """Calls ``Model.revise`` after the shares of the training in ``Model.revisions``.
 
-    Shares are of the training's steps or of its time, whichever comes first. A revision that is not
-    done when the time of the training is up leaves the model as it was. All processes choose the
-    same links by the seed, so that they decide alike.
+    Shares are of the training's steps or of its time, whichever comes first. If the training's time
+    ends during a revision, the model stays as before the revision. All processes choose the same
+    links by the seed, so that all decide alike.
 
     Args:
         links: Links with a split.

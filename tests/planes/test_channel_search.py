@@ -233,7 +233,7 @@ def test_a_plane_that_a_false_one_moved_returns(monkeypatch):
         return SlabRoom(planes + lobe, slabs)
 
     monkeypatch.setattr(own, "find_free", lambda known: found)
-    monkeypatch.setattr(own.free, "descend", lambda planes, *options: planes)
+    monkeypatch.setattr(own.free, "descend", lambda planes, **options: planes)
     monkeypatch.setattr(own, "resolve", resolved)
     monkeypatch.setattr(own.along_axes, "grow_along", lambda room, *_: room)
     torch.testing.assert_close(own.run()[0], walls, rtol=0, atol=5e-3)
@@ -325,7 +325,7 @@ def test_walls_of_a_drawing_stand_where_phases_agree(error, monkeypatch):
     own = search(few(links), start=walls + torch.tensor([0, 0, 0, error]))
     monkeypatch.setattr(own, "find_free", lambda start: start)
     monkeypatch.setattr(
-        own.free, "descend", lambda planes, *options: planes + torch.tensor([0, 0, 0, 0.3])
+        own.free, "descend", lambda planes, **options: planes + torch.tensor([0, 0, 0, 0.3])
     )
     monkeypatch.setattr(own, "resolve", half_spaces)
     planes, _ = own.run()
@@ -357,7 +357,7 @@ def test_planes_along_axes_replace_a_tilted_one(walls, known, tilt, monkeypatch)
     monkeypatch.setattr(
         own, "find_free", lambda start: torch.cat((start, seen_from(tilted, own.frame.middle)))
     )
-    monkeypatch.setattr(own.free, "descend", lambda planes, *options: planes)
+    monkeypatch.setattr(own.free, "descend", lambda planes, **options: planes)
     monkeypatch.setattr(own, "resolve", lambda planes: SlabRoom(planes, SLABS[: len(planes)]))
     monkeypatch.setattr(own, "prune", lambda room: room)
     planes, _ = own.run()

@@ -18,7 +18,7 @@ class Residuals(NamedTuple):
         delta_scales: d_scaling, added to the standard deviations [m].
         delta_signal: d_signal, added to the coefficients of the signal.
         delta_opacities: d_attn, added to the opacities.
-        attenuations: delta in (0, 1], the share that passes a Gaussian.
+        attenuations: delta in (0, 1], the share of the field that passes a Gaussian.
 
     Source: GAI-GS, "Scene Mapping Network"; delta is of eq. (11).
     """
@@ -33,15 +33,16 @@ class Residuals(NamedTuple):
 class Deformation(nn.Module, ABC):
     """The contract of kind ``deformation``.
 
-    A constructor may take ``scene``, ``channels``, ``tokenizer_widths`` and ``count``, the number
-    of free Gaussians, or None where a placement adds others.
+    A constructor may take ``scene``; ``channels``, the number of signal channels;
+    ``tokenizer_widths``; and ``count``, the number of Gaussians, which is None where a placement
+    adds further ones.
 
     Attributes:
         reads_tokens: True if it needs tokens; if False, no tokenizer is built.
         sees_receivers: True if the change depends on the receiver.
         follows: Names of parameters with a row for each Gaussian; density control prunes and copies
             their rows.
-        learning_rate: Of the group ``network``, in place of the model's default.
+        learning_rate: Rate of the parameter group ``network``; None: the model's default.
     """
 
     reads_tokens: bool = True

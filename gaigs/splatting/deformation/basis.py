@@ -17,9 +17,10 @@ from gaigs.splatting.gaussians import Placed, Tokens
 class Basis(Deformation):
     """Residuals of signal and opacity as sums of features of the transmitter.
 
-    With h = F(E(P_TX), CLS), the residual of Gaussian n is w_n h, and w_n is a parameter of this
-    Gaussian. The network runs once for a transmitter, and not for every pair of a transmitter and a
-    Gaussian, so a step of b transmitters and n Gaussians costs n times less.
+    A network F turns a transmitter's tokens into features h = F(E(P_TX), CLS). The residual of
+    Gaussian n is w_n h, and w_n is a parameter of this Gaussian. The network runs once for a
+    transmitter, and not for every pair of a transmitter and a Gaussian, so a step of b transmitters
+    and n Gaussians costs n times less.
 
     Args:
         scene: Its number of training places sets the width.

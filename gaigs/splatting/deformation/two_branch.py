@@ -23,7 +23,8 @@ LEAST_ATTENUATION = 1e-6
 class TokenLinear(nn.Module):
     """A linear layer on [hidden, E(P_x), E(P_TX), CLS] of every pair of transmitter and Gaussian.
 
-    It is the sum of a linear map of each part, computed b x n times only for ``hidden``.
+    The layer is the sum of one linear map for each part. Only the map of ``hidden`` is computed for
+    all b x n pairs.
 
     Args:
         tokens: Widths of (scene, gaussians, transmitters); a part of width 0 has no map.
@@ -135,7 +136,7 @@ class TwoBranch(Deformation):
         self._start_heads()
 
     def _add_heads(self, heads: Sequence[str], sizes: dict[str, int], width: int) -> None:
-        """Adds the heads in use, on features of a width, by their numbers of outputs."""
+        """Adds the ``heads`` in use, with their ``sizes`` of outputs, on features of ``width``."""
         for name, size in sizes.items():
             if name in heads:
                 self.heads[name] = nn.Linear(width, size)

@@ -10,7 +10,7 @@ from gaigs.splatting.loss.errors import MeanError
 
 @register("loss", "huber")
 class Huber(MeanError):
-    """Half the square of an error up to ``delta``, and linear beyond.
+    """The mean of half the squared error up to ``delta``, and of a line beyond.
 
     Args:
         delta: Error at which the square turns into a line, in the label's unit (dB for RSSI).

@@ -16,8 +16,8 @@ from gaigs.registry import register
 class L1Ssim:
     """(1 - ssim) L_MAE + ssim (1 - SSIM) on the label's grid or a thinned one.
 
-    The uniform SSIM window spans the same angle as the reported score's 7 pixels on the label's own
-    grid, at least 3 and at most all pixels of the thinned grid.
+    The SSIM window has uniform weights. On a thinned grid its edge spans about the angle of 7
+    pixels of the label's own grid, as in the reported score; it has 3 pixels or more.
 
     Args:
         task: Task of the labels, which has directions.
@@ -54,13 +54,13 @@ class L1Ssim:
 
 
 def find_window(loss: str, directions: Directions | None, pitch: float, pixels: int) -> int:
-    """Edge of an SSIM window on a thinned grid [pixels], odd.
+    """Edge of an SSIM window on a thinned grid [pixels], odd, of the same angle as on the full one.
 
     Args:
         loss: Name of the loss, for errors.
         directions: The thinned grid.
         pitch: Angle between neighbouring rows of the label's own grid [rad].
-        pixels: Edge of the window on the label's own grid, odd; its angle is kept.
+        pixels: Edge of the window on the label's own grid, odd.
     """
     if not isinstance(directions, Grid):
         raise ValueError(

@@ -12,9 +12,9 @@ from gaigs.splatting.loss.relative_error import RelativeError
 class LogRelativeError(RelativeError):
     """The mean over the links of ln((1 + r / floor) / (1 + r floor)), r = |h - h'|² / |h|².
 
-    It is the SNR between two bounds, -10 log10(floor) and 10 log10(floor) dB. Between these the
-    loss is linear in the SNR in dB, so all links have equal weight. Beyond them a link pulls less
-    and less.
+    -10 log10 r is a link's SNR [dB]. Between the bounds -10 log10(floor) and 10 log10(floor) dB the
+    loss is linear in the SNR, so all links have equal weight. Beyond the bounds a link has less and
+    less weight.
 
     Args:
         task: Task of the labels, which are complex.

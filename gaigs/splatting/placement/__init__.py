@@ -16,9 +16,10 @@ class Placement(nn.Module, ABC):
 
     Attributes:
         sees_receivers: True if the Gaussians of a transmitter depend on the receiver.
-        model: Name of the model of its results; None: any. Numbers under the name GAI-GS are the
-            paper's.
-        has_own: True if it brings Gaussians of its own and needs no free ones.
+        model: Name of the only model that may have this placement, so that results named GAI-GS are
+            of the paper's placement; None: any model.
+        has_own: True if the placement makes Gaussians itself, so that the free (trainable) ones of
+            ``Gaussians`` may be left out.
         learning_rates: Default learning rate of each parameter group; ``training.learning_rates``
             overrides it.
         penalty_weights: Default weight of each penalty; ``training.penalties`` overrides it.

@@ -19,7 +19,7 @@ class Pooling(nn.Module, ABC):
             part of a path.
         grid: Directions of the map that it sums over. None: the map is rendered in the label's
             directions.
-        zone: Lowest and highest elevation from which the receiver hears anything [rad]; read where
+        zone: Lowest and highest elevation from which the receiver gets power [rad]; used where
             ``grid`` is set.
 
     Source: the final step of GAI-GS, "Projection and Render Module".

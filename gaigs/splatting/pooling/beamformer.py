@@ -30,8 +30,8 @@ class Beamformer:
         s(u) = sqrt(sum_D n_D R(D) exp(-j 2 pi D . u / lambda))
         label = (s - min s) / (max s - min s)
 
-    with R(D) the mean covariance of the n_D pairs of elements that are D apart. It is the root of
-    the paper's |a^H y|², eq. (4).
+    with u the direction cosines of a pixel, and R(D) the mean covariance of the n_D pairs of
+    elements that are D apart, a lag. s is the root of the paper's |a^H y|², eq. (4).
 
     Args:
         owner: Component named in errors.
@@ -115,8 +115,8 @@ class Beamformer:
 
         Up to a factor a label is y = s - m, with m the least amplitude. So s² = y² + 2 m y + m² is
         linear in the covariances, which are fitted with m. Combinations of lags that hardly change
-        the spectrum are set to 0 (``rtol``): closely spaced elements have many, and noise of the
-        labels would swamp them.
+        the spectrum are set to 0 (``rtol``): closely spaced elements have many such combinations,
+        and a fit would find noise there.
         """
         grid = self.scene.task.directions
         # At least 40 x 40 pixels.
@@ -162,7 +162,7 @@ class Beamformer:
     def _amplitudes(
         self, parts: Float[Tensor, "b m"], carrier: float, query: Query, directions: Directions
     ) -> Float[Tensor, "b k"]:
-        """Amplitudes of the beamformer in some directions, by ``parts`` of the relative lags."""
+        """Amplitudes of the beamformer in some directions, from ``parts`` as rows of ``_basis``."""
         power = parts @ self._stored_basis(parts, carrier, query, directions)  # (b, k)
         least = 1e-6  # of the mean power: sums of tens of float32 terms round at this
         if torch.is_grad_enabled():
@@ -189,9 +189,10 @@ class Beamformer:
         return self._bases[key]
 
     def _basis(self, carrier: float, query: Query, directions: Directions) -> Float[Tensor, "m k"]:
-        """Contribution of each lag to the power in each direction, float64.
+        """Contribution of each covariance to the power in each direction, float64.
 
-        Rows are the real and then the imaginary part of each lag of the later half.
+        Rows are the real and then the imaginary parts of the later half of the lags; the other half
+        is their conjugate.
         """
         array = self.array(query)
         steps, _, counts = array.lags
@@ -207,9 +208,9 @@ class Beamformer:
 def _scaled(amplitudes: Float[Tensor, "b k"], shown: Float[Tensor, "b j"]) -> Float[Tensor, "b k"]:
     """Amplitudes on the scale from the least of ``shown``, 0, to the largest, 1.
 
-    Pixels are many, and each pass over them in memory costs as much as the beamformer itself.
-    Gradients of amin and amax take four passes, gradients of min and max hardly one; without
-    gradients amin and amax are faster.
+    A pass over the many pixels in memory costs as much as the beamformer. Gradients of ``amin`` and
+    ``amax`` take four passes, those of ``min`` and ``max`` hardly one. Without gradients ``amin``
+    and ``amax`` are faster.
     """
     if shown.requires_grad:
         low = shown.min(1, keepdim=True).values  # (b, 1)

@@ -26,7 +26,7 @@ class ElementSum(ChannelPooling):
     imaginary ones. x_e is an element's place, a its pattern, w the share of the direction's solid
     angle. F is the wave of free space over the direct distance d (without a common clock its
     amplitude), g the channels' ``strength`` over it. s is ``array_sign``. At other subcarriers than
-    the labels' it is the map of the nearest one.
+    the labels' the map of the nearest one is used.
 
     Args:
         scene: Its task has the subcarriers, its receivers the elements.
@@ -66,7 +66,7 @@ class ElementSum(ChannelPooling):
         return self.received(query, channels * (self.strength.double() * direct).to(waves))
 
     def _steering(self, receiver: int, sign: int) -> Complex[Tensor, "s p e"]:
-        """Contribution of a wave from each direction of the map to each element, float64."""
+        """Field at e elements of a unit wave from p directions, at s subcarriers; float64."""
         array = self.scene.receivers[receiver].array
         directions = self.grid.flatten().vectors().double()  # (p, 3)
         # A wave from the direction u reaches an element at x earlier by x . u / c than the middle.

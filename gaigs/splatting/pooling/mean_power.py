@@ -17,8 +17,8 @@ class MeanPower(Pooling):
     """The mean power over all directions plus the power of the receiver's noise, in dB.
 
     The power of a pixel is |C_0|^2, or |C_0|^2 + |C_1|^2, eq. (3). Powers add, so paths do not
-    cancel: RSSI is averaged over bandwidth and time. A receiver hears its own noise even where
-    nothing arrives, so a silent map is at the floor, with a gradient of 0.
+    cancel: RSSI is averaged over bandwidth and time. The receiver's noise is there even if nothing
+    arrives, so an empty map is at the floor, with a gradient of 0.
 
     Args:
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.

@@ -73,7 +73,7 @@ class PathPooling(Pooling):
 
 
 class LagPooling(PathPooling):
-    """Base of poolings that read the covariance of the array's elements, in which powers add.
+    """Base of poolings that read covariances of the array's elements, in which powers may add.
 
     Args:
         scene: Its receivers have planar arrays.
@@ -105,7 +105,8 @@ class LagPooling(PathPooling):
     def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b l"]:
         """Mean covariance of the pairs of elements that are ``array.lags`` apart.
 
-        At lag 0 it is the power. Where powers add, elements a lag D apart, in wavelengths, have
+        At lag 0 the covariance is the power. Where powers add, elements that are D apart
+        [wavelengths] have the covariance
 
             sum |A|² exp(-(2 pi)² D' S D / 2 + j 2 pi D . u)
 
@@ -244,7 +245,7 @@ class _PathDifferences(NamedTuple):
 def _path_differences(
     points: Float[Tensor, "b n 3"], elements: Float[Tensor, "e 3"]
 ) -> _PathDifferences:
-    """Compares the distances of points in the array's frame, without a loss of digits."""
+    """Distances of points to elements minus those to the array's middle, without loss of digits."""
     to_middle = points.norm(dim=-1, keepdim=True)  # |p|, (b, n, 1)
     # Plain differences: by the matrix product an element far from a near point would lose its
     # digits.

@@ -15,7 +15,7 @@ from gaigs.splatting.pooling import Pooling, sphere
 
 @register("pooling", "softmax_attention")
 class SoftmaxAttention(Pooling):
-    """The attention-weighted average of a map of levels, in bels: the label is ten times it, in dB.
+    """The attention-weighted average of a map of levels [bel]; the label in dB is ten times this.
 
     Each pixel weighs (1 - prior) softmax((m - mean m) / temperature) + prior / pixels. The prior is
     uniform over pixels, and so over the sphere where their solid angles are equal, as on
@@ -26,8 +26,7 @@ class SoftmaxAttention(Pooling):
         temperature: How far below the brightest pixel a pixel still counts, between 1e-6 and 1e6
             [bel]; far below the map's range the attention finds the maximum, far above it the mean.
         prior: Share of the uniform weights, between 0 and 1; with 1 the average is the plain mean.
-        learn: Train both, as the temperature's logarithm and the prior's logit, which keeps them in
-            their ranges.
+        learn: True to train both, as logarithm and logit, which keeps both in range.
 
     Raises:
         ValueError: An option is out of range.

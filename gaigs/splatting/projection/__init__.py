@@ -98,7 +98,7 @@ class Projection(ABC):
         """u repeats after this; None: it does not."""
 
     def check_sees(self, directions: Directions) -> None:
-        """Raises a ``ValueError`` if directions below the array's plane fall on ones above it."""
+        """Raises a ``ValueError`` for directions below the array's plane that are folded up."""
         if not self.sees_below and directions.elevations.min() < 0:
             raise ValueError(
                 f"the grid reaches below the array's plane, which {name_of(self)} folds up; "

@@ -12,10 +12,10 @@ from gaigs.splatting.projection import Projection
 class DirectionCosine(Projection):
     """(u, v) = (cos(el) cos(az), cos(el) sin(az)), the direction cosines l and m.
 
-    A planar array's response is shift-invariant in them. There is no seam and no pole: the map is
-    smooth on the whole hemisphere. As with a planar array, a direction below the array's plane and
-    its mirror image above are one. Rows and columns of a spectrum mix, so ``plane`` gives full
-    grids.
+    The response of a planar array is shift-invariant in u and v. There is no seam and no pole: the
+    map is smooth on the whole hemisphere. As with a planar array, a direction below the array's
+    plane and its mirror image above are one. u and v depend on both angles, so a ``Plane`` has a
+    pair (u, v) for each pixel, not one u a column and one v a row.
 
     Source: Van Trees, Optimum Array Processing, 2002, chapter 4.
     """

@@ -13,10 +13,10 @@ from gaigs.splatting.projection.cylindrical import Cylindrical
 class Mercator(Cylindrical):
     """u = azimuth, v = alpha log tan(pi / 4 + elevation / 2).
 
-    It is computed as the equal v = alpha asinh(tan(elevation)), which is exact near the horizon.
-    alpha maps the elevation limit to the plane's edge v = pi, so that the plane is as high as it is
-    wide. At the default limit, atan(sinh(pi)) = 85.0511 degrees, alpha is 1 and the projection
-    conformal: a small round Gaussian stays round wherever it lies.
+    v is computed as alpha asinh(tan(elevation)), which is equal, and exact near the horizon. alpha
+    maps the elevation limit to the plane's edge v = pi, so that the plane is as high as it is wide.
+    At the default limit, atan(sinh(pi)) = 85.0511 degrees, alpha is 1 and the projection conformal:
+    a small round Gaussian stays round wherever it lies.
 
     Options: see ``Cylindrical``.
 

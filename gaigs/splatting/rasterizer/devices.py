@@ -18,12 +18,12 @@ def default_device() -> str:
 
 @functools.cache
 def _process() -> int:
-    """The process that uses OpenCL first."""
+    """Number of the process that was the first to use OpenCL."""
     return os.getpid()
 
 
 def is_forked() -> bool:
-    """True in a fork of a process with OpenCL, which would wait for its threads for ever."""
+    """True in a fork of a process with OpenCL, which lacks the driver's threads."""
     return _process() != os.getpid()
 
 
@@ -102,7 +102,7 @@ def _choose(name: str | None):
 def find_fault(queue: cl.CommandQueue) -> str | None:
     """The driver's reason why a device builds no kernels, or None.
 
-    The device may be a processor that the driver's compiler does not know.
+    One reason is a processor that the driver's compiler does not know.
     """
     try:
         cl.Program(queue.context, "kernel void probe(global int *value) { value[0] = 1; }").build()

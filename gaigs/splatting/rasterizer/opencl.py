@@ -43,10 +43,10 @@ LAYOUT = KernelLayout()
 
 @register("rasterizer", "opencl")
 class OpenCLRasterizer:
-    """Tiles of 16 rows of 8 pixels, a work-item each, their rows in vector registers.
+    """A rasterizer by tiles of 16 rows of 8 pixels; a work-item draws a tile, row by row.
 
-    Splats are sorted by depth once, and listed by the tiles that their ellipses reach: once for all
-    transmitters where these share covariances, which then share footprints too. The gradient is
+    Splats are sorted by depth once. Each tile has a list of the splats whose ellipses reach it.
+    Where all transmitters share covariances, they share lists and footprints, too. The gradient is
     written by hand. A CPU device reads tensors without a copy. Two runs give the same bits.
 
     Args:
@@ -55,7 +55,7 @@ class OpenCLRasterizer:
             made.
 
     Attributes:
-        too_many: Number of splats that is too large: an entry of a list has 24 bits for the splat.
+        too_many: Number of splats that is too large for the 24 bits of an entry of a list.
 
     Raises:
         RuntimeError: No driver works, or the device builds no kernels.
@@ -202,7 +202,7 @@ def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel
 class _CompositeByKernels(torch.autograd.Function):
     """``_Render`` with its gradient.
 
-    Autograd differentiates by the arguments; ``_Render`` has the same tensors in the splats.
+    Autograd differentiates by the tensors of the splats, which ``forward`` takes once more.
     """
 
     @staticmethod
@@ -439,9 +439,9 @@ def _tiling(
         period: As in ``Plane``.
 
     Returns:
-        u and v, filled up by repetition, one a column and one a row where the plane is separable;
-        spans (centre, half size) of u, then of v; and edges, the least v of the rows of each span
-        of v and then their largest.
+        Buffers: u and v, filled up by repetition, one u a column and one v a row where the plane is
+        separable; spans (centre, half size) of u, then of v; and for each span of v the least and
+        the largest v of its rows, as edges.
     """
     u, v = (
         np.frombuffer(data, np.float32).reshape(shape) for data, shape in (u_content, v_content)

@@ -14,18 +14,18 @@ from gaigs.splatting.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
 
 @register("rasterizer", "torch")
 class TorchRasterizer:
-    """Tiles of 16 x 16 pixels, each against the splats that reach it, with a gradient by hand.
+    """A rasterizer by tiles of 16 x 16 pixels, each drawn from the splats that reach it.
 
-    Splats are sorted by depth once, for all transmitters. A tile keeps those whose bounding box, at
-    the opacity ``ALPHA_MIN`` and over all transmitters, meets it. Tiles with lists of similar
-    length are composited together, in small chunks that the backward pass computes anew: memory
-    does not grow with the number of (splat, pixel) pairs.
+    Splats are sorted by depth once, for all transmitters. A tile keeps the splats whose bounding
+    box, at the opacity ``ALPHA_MIN`` and over all transmitters, meets the tile. Tiles with lists of
+    similar length are composited together, in small chunks. The backward pass, written by hand,
+    computes chunks anew, so memory does not grow with the number of (splat, pixel) pairs.
 
     Attributes:
         chunk: (transmitter, splat, pixel) triples worked on at a time on the CPU: an array of
             float32 then has 4 MiB, which a core's cache holds. Some sixteen arrays live at a time.
-        large_chunk: Triples on other devices, 64 MiB: a GPU starts an operation as slowly as it
-            does a million triples.
+        large_chunk: Triples on other devices, 64 MiB, since a GPU takes as long to start an
+            operation as to compute a million triples.
 
     Source: tiles of Kerbl et al., 3D Gaussian Splatting, 2023, section 6; GAI-GS, "Projection and
     Render Module", eq. (13) and (14).
@@ -200,7 +200,7 @@ class _SplatParts(NamedTuple):
     def filled(
         cls, means: Tensor, factors: Tensor, signal: Tensor, opacities: Tensor, logs: Tensor | None
     ) -> "_SplatParts":
-        """Adds behind them a splat that does nothing, which fills the tiles' lists up."""
+        """Adds a splat that does nothing behind all others, to fill the tiles' lists up."""
         pad = torch.nn.functional.pad
         row = (0, 0, 0, 1)
         return cls(
@@ -260,9 +260,9 @@ def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _SplatParts) -> _We
 class _Composite(torch.autograd.Function):
     """Composites sorted splats, with the gradient by hand.
 
-    With R the transmittance behind all splats, D_i = signal_i . image gradient and S_i =
-    sum_{j>i} D_j A_j T_j + R (gradient of R), the derivative by A_i is T_i D_i - S_i / (1 - A_i),
-    and a change of log T behind splat i acts with S_i.
+    With R the transmittance behind all splats, D_i = signal_i . image gradient and S_i = sum_{j>i}
+    D_j A_j T_j + R (gradient of R), the derivative by A_i is T_i D_i - S_i / (1 - A_i), and the
+    derivative by log T behind splat i is S_i.
     """
 
     @staticmethod

@@ -37,8 +37,8 @@ class EuclideanTokenizer(nn.Module):
             metre.
         transmitter_octaves: The same for the transmitter; None: see ``learnable_octaves``.
         hidden: Width of the transmitter network's hidden layer.
-        width: Width of E(P_TX). With None for both there is no network, and E(P_TX) are the
-            features themselves.
+        width: Width of E(P_TX). If ``hidden`` and ``width`` are None, there is no network, and
+            E(P_TX) are the features themselves.
 
     Raises:
         ValueError: One of ``hidden`` and ``width`` is None, or a number is out of range.
@@ -106,9 +106,9 @@ def learnable_octaves(scene: Scene) -> tuple[int, int]:
     """Lowest and highest octave of the transmitter's features that suit the training transmitters.
 
     Periods range from twice the box's longest edge down to 16 distances between neighbouring
-    transmitters: the network multiplies frequencies, so its input must be well below their sampling
-    limit. For noisy labels they are at least 16 m: an RSSI scatters by decibels at any distance,
-    and the network finds how sharp a wall's shadow is.
+    transmitters. The network's output has multiples of the input's frequencies, so these must be
+    well below the sampling limit. For noisy labels periods are at least 16 m: an RSSI scatters by
+    decibels at any distance, and the network can still learn a sharp shadow.
     """
     neighbours = 16  # chosen on validation parts of rfid-s23-200 and the built-in room
     highest = min(round(-math.log2(neighbours * scene.spacing)), MAX_OCTAVE)
@@ -140,7 +140,7 @@ def fourier_features(
 ) -> Float[Tensor, "*batch features"]:
     """[x, sin(w x), cos(w x)] for every coordinate x [m] and angular frequency w [rad/m].
 
-    They are d (1 + 2 octaves) numbers for each point.
+    Each point has d (1 + 2 octaves) numbers.
 
     Source: Tancik et al., Fourier Features, 2020.
 

@@ -1,4 +1,4 @@
-"""Planes that a placement learns: where they start, how they move, and which paths use them."""
+"""Planes that a placement learns: their start, their moves, and the paths that use them."""
 
 import logging
 from pathlib import Path
@@ -24,15 +24,16 @@ log = logging.getLogger(__name__)
 class MovablePlanes(Placement):
     """Planes about the middle of the room, and the sequences in which paths meet them.
 
-    Neither rounding nor a turn of a plane depends on the world's origin.
+    Offsets are from the middle, so neither rounding nor a turn of a plane depends on the world's
+    origin.
 
     Attributes:
         middle: Middle of the room [m].
         diagonal: Diagonal of the box that holds transmitters and receivers [m].
         turn: Rotation from the world's axes to the first planes' axes.
-        origin: Normals and offsets at the start, or at the last change of ``step`` (w, 4); the
-            offsets are in metres from ``middle``.
-        first: Value of ``origin`` before any training; ``fit`` compares the two.
+        origin: Normals and offsets (w, 4) to which ``shifts`` are added: those at the start, or at
+            the last change of ``step``. Offsets are from ``middle`` [m].
+        first: ``origin`` before any training, by which ``fit`` sees whether planes are new.
         shifts: Learnt changes of normals and offsets (w, 4), in units of ``step`` for normals, and
             of ``step`` times ``unit`` diagonals for offsets.
         step: Size of a unit of ``shifts``; it follows the wavelength once phases count.
@@ -185,7 +186,7 @@ class MovablePlanes(Placement):
         return numbers[numbers >= 0]
 
     def sequences_of(self, planes: Int[Tensor, " k"]) -> Bool[Tensor, " n"]:
-        """True for each sequence without any other plane; the direct path always is one."""
+        """True for each sequence of these planes alone, the direct path included."""
         planes = torch.cat((planes, planes.new_tensor([-1]))).to(self.sequences.device)
         return torch.isin(self.sequences, planes).all(1)
 

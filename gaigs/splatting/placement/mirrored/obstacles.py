@@ -11,18 +11,18 @@ from torch import Tensor, nn
 class Obstacles(nn.Module):
     """Gaussians of matter: along a segment the field is multiplied by exp(-depth).
 
-    depth = sum_i rho_i integral exp(-|S_i^-1 (x - c_i)|² / 2) dx along the segment, S_i =
-    diag(widths), a closed form: with the ray a + t (b - a) in units of the widths, A = |ray|², B =
-    ray . offset, C = |offset|²,
+    depth = sum_i rho_i integral exp(-|S_i^-1 (x - c_i)|² / 2) dx along the segment, with S_i =
+    diag(widths). For a segment from a to b, in units of the widths, let ray = b - a, offset = a -
+    c, A = |ray|², B = ray . offset and C = |offset|². Then each obstacle has
 
         depth = rho length sqrt(pi / (2 A)) exp(-(C - B²/A) / 2) (erf((A + B) / sqrt(2 A)) - erf(B /
         sqrt(2 A)))
 
-    Boxes have sharp edges: each adds one depth to all segments through it, of any length, and is
-    learnt by a search (``place_boxes``); descent learns its depth alone.
+    Boxes have sharp edges. A box adds one depth to all segments through it, however long the way
+    inside. A search finds boxes (``place_boxes``); descent then learns their depths alone.
 
     Matter also slows waves. With ``has_phases`` each obstacle has a learnt ratio of phase lag to
-    attenuation, its turn at all frequencies, and the depth is complex. ``lower`` and ``upper`` are
+    attenuation, the same at all frequencies, and the depth is complex. ``lower`` and ``upper`` are
     corners of the box around transmitters and receivers [m].
 
     Source: Wilson and Patwari, Radio Tomographic Imaging, 2010, for the idea.
@@ -97,7 +97,7 @@ class Obstacles(nn.Module):
 
     @property
     def used(self) -> Bool[Tensor, " k"]:
-        """True for the boxes that a search has found."""
+        """True for boxes in use, those that a search has found."""
         return self.boxes[:, 1, 0] > self.boxes[:, 0, 0]
 
     @property

@@ -57,14 +57,15 @@ class PathFields(MovablePlanes):
     Attributes:
         is_complex: True for channels.
         bands: Different bands of the receivers [Hz].
-        is_bare: True while only the direct path counts, without obstacles.
+        is_bare: True while channels have only the direct path, without obstacles.
         is_heard: True for receivers with training links (r,); others have ``_common_gain``.
-        known_blur: Logarithm of the standard deviation of a known path's phase at the start [rad].
+        known_blur: Logarithm of the standard deviation [rad] of a path's phase at the start, for a
+            path that interferes.
         unknown_blur: The same logarithm for a path that adds as power, whose coherence is 0.
-        faint: Share of a link's power, without obstacles, up to which a path skips the obstacles
-            and saves their time: two of three paths.
-        fewest_numbers: Numbers of a channel, elements times subcarriers, below which one path
-            explains any of them, so that only all places together locate planes.
+        faint: Share of a link's power, without obstacles, up to which a path's obstacles are not
+            computed. That saves two of three paths.
+        fewest_numbers: Elements times subcarriers of a channel below which few paths explain any
+            channel, so that only all places together locate planes.
     """
 
     known_blur = math.log(0.3)
@@ -154,7 +155,7 @@ class PathFields(MovablePlanes):
     def place(
         self, number: int, plane: Float[Tensor, "4"], material: Float[Tensor, "3"] | None = None
     ) -> None:
-        """Replaces a plane by one in the world's frame, with the material of a slab if given.
+        """Replaces plane ``number`` by one in the world's frame, with a slab's material if given.
 
         A material has logarithms: of the permittivity's real part over 1, of its imaginary part,
         and of the thickness [m].
@@ -166,7 +167,7 @@ class PathFields(MovablePlanes):
             self.log_thicknesses[number] = material[2]
 
     def folded(self, query: Query) -> FoldedLinks:
-        """The kept paths of links through the room."""
+        """The kept paths of links, folded through the room."""
         sequences = self.sequences[self.kept]
         normals = self.normals
         offsets = self.offsets
@@ -211,7 +212,7 @@ class PathFields(MovablePlanes):
     ) -> Inexact[Tensor, "b n"]:
         """Depth of each path through the obstacles [Np]; 0 for a path that does not exist.
 
-        With ``skips_faint`` it is 0 for faint paths too.
+        With ``skips_faint`` the depth is 0 for faint paths, too.
         """
         depths = torch.zeros_like(strengths.real if obstacles.turns is None else strengths)
         with torch.no_grad():
@@ -244,10 +245,10 @@ class PathFields(MovablePlanes):
         return fields / self.gains_at(query.receivers).real[:, None].exp()
 
     def margins(self, query: Query) -> Complex[Tensor, "b n"]:
-        """Standard deviation of each kept path's field over free space, with the field's phase.
+        """Field by which each of n kept paths may deviate, one standard deviation, over free space.
 
-        It holds before any residual is known: the path's field times the share that obstacles
-        block, and a tenth of the field without obstacles.
+        The deviation before any residual is known is the path's field times the share that
+        obstacles block, plus a tenth of the field without obstacles. Its phase is the field's.
         """
         links = self.folded(query)
         field = self.strengths(query, links.paths)

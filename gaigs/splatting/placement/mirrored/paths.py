@@ -20,11 +20,11 @@ from gaigs.splatting.placement.mirrored.reflections import fold, images
 
 @register("placement", "mirrored")
 class Mirrored(PathFields):
-    """Gaussians at p_k = V_k x ~V_k: transmitter x, products V_k of up to ``order`` planes.
+    """Gaussians at the images p_k = V_k x ~V_k of the transmitter x in up to ``order`` planes.
 
-    In projective geometric algebra a plane is a vector, and its sandwich product mirrors. All paths
-    and receivers share the planes, so direction, path length and spreading follow from geometry;
-    ``PathFields`` has their fields.
+    V_k is the product of a sequence of planes: in projective geometric algebra a plane is a vector,
+    and the sandwich product with it mirrors. All paths and receivers share the planes, so
+    direction, path length and spreading follow from geometry; ``PathFields`` has their fields.
 
     Paths add as powers until ``enable_phases``. Channels start from free space until
     ``enable_reflections``.
@@ -40,8 +40,8 @@ class Mirrored(PathFields):
     Args:
         scene: Its box and receivers give the first planes.
         channels: Channels of the signal, 1 (amplitude) or 2 (complex).
-        planes: Largest number of planes; six at the start; the searches of spectra and channels
-            find others.
+        planes: Largest number of planes. Six are used at the start; searches in spectra and
+            channels find others.
         order: Largest number of reflections of a path; at most 100,000 sequences of planes.
         obstacles: Number of Gaussians of matter in the room; with 0 no boxes are searched either.
         walls: File whose largest planes are the first ones: a floor plan ``.csv`` of consecutive
@@ -112,7 +112,8 @@ class Mirrored(PathFields):
     def locate(self, *planes: int) -> None:
         """Lets paths at these planes and at ``located`` ones interfere.
 
-        The others add as powers. Without an argument only the direct path has a phase.
+        All other paths add as powers. Without an argument no plane is located any longer, and only
+        the direct path has a phase.
         """
         located = self.located if planes else self.located & False
         located[list(planes)] = True
@@ -144,10 +145,10 @@ class Mirrored(PathFields):
         """Sets the paths' strengths to products of gains of the first planes.
 
         Args:
-            gains: Complex gains of the first planes over their slabs' reflections, in each of
-                ``bands``.
+            gains: Complex gains of the first planes, in each of ``bands``, which multiply the
+                reflections of their slabs.
             receivers: Numbers of receivers.
-            receiver_gains: Their gains over the pooling's unit.
+            receiver_gains: Gains of these receivers over the pooling's unit.
         """
         least = 1e-3  # a logarithm needs some gain
         ones = gains.new_ones(len(gains), len(self.origin) + 1 - gains.shape[1])

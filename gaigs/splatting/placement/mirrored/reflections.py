@@ -11,11 +11,11 @@ from torch.nn import functional
 
 
 class Folded(NamedTuple):
-    """Paths of n sequences through the room; a leg is a straight piece between two bounces.
+    """Paths of n sequences of planes through the room; a leg is a straight piece of a path.
 
     Legs stand in the order of folding, from the receiver back: the legs that start at the last
     bounces of all sequences, then those that start at the last but one, and so on; at last the n
-    legs that start at the transmitter. A bounce is the start of each leg but these.
+    legs that start at the transmitter. Each leg but these starts at a bounce.
     """
 
     # Ends of all legs [m].
@@ -92,7 +92,7 @@ def reflect(
 ) -> Float[Tensor, "*batch 3"]:
     """Images of points [m] in planes n . x = d: x - 2 (n . x - d) n.
 
-    It is the closed form of the sandwich product with a plane's vector.
+    The formula is the closed form of the sandwich product with a plane's vector.
     """
     return points - 2 * ((points * normals).sum(-1) - offsets)[..., None] * normals
 
@@ -127,11 +127,11 @@ def fold(
     normals: Float[Tensor, "w 3"],
     offsets: Float[Tensor, " w"],
 ) -> Folded:
-    """Folds straight lines from the receivers to the last of ``images`` back into the room.
+    """Folds straight lines from the receivers to the last images back into the room.
 
-    A line that does not cross its plane is bent at the end nearer to it; such a path does not
-    exist. Nor does a path with an end on the plane, so no path meets two coincident planes in a
-    row.
+    A path whose line does not cross its plane does not exist; the line is then bent at the end
+    nearer to the plane. A path with an end on the plane does not exist either, so no path meets two
+    coincident planes in a row.
     """
     # Where each path has arrived on its way back from the receiver (b, n, 3).
     here = receivers[:, None].expand(-1, len(sequences), -1)
@@ -185,7 +185,7 @@ def fold(
 
 
 def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "3"]]:
-    """Normals without later ones that are parallel: with a cosine within ``least`` of 1."""
+    """Normals, of parallel ones the first alone; parallel is a cosine within ``least`` of 1."""
     apart: list[Tensor] = []
     for normal in normals:
         if all((normal @ other).abs() < 1 - least for other in apart):
@@ -194,10 +194,11 @@ def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, 
 
 
 def square_normals(normals: Float[Tensor, "w 3"], plane: int) -> list[Float[Tensor, "3"]]:
-    """A plane's normal, and normals within 18 degrees that make a room square.
+    """A plane's normal, and normals within 18 degrees of it that would make the room square.
 
-    These are level, upright, or square to another plane. Powers locate planes to some degrees, and
-    phases of a tilted plane match at few places.
+    The further ones are level, upright, or square to another plane. They are tried because a fit of
+    powers leaves tilts wrong by some degrees, and with a wrong tilt phases agree at few places
+    only.
     """
     up = normals.new_tensor([0.0, 0.0, 1.0])
     normal = normals[plane]
@@ -222,7 +223,7 @@ def reflection_points(
 ) -> Float[Tensor, "b w 3"]:
     """Points at which planes reflect waves from starts to ends [m].
 
-    Ends on two sides of a plane count as if they were on one.
+    Where start and end are on two sides of a plane, the point is as if both were on one side.
     """
     normals, offsets = planes[:, :3], planes[:, 3]
     start_heights = starts @ normals.T - offsets  # (b, w)

@@ -30,8 +30,8 @@ def read_planes(
     Args:
         file: ``.csv`` with consecutive vertices x,y of a floor plan [m], whose walls are upright,
             or ``.obj`` with the faces of a mesh [m].
-        lower, upper: Corners of the box of transmitters and receivers, with floor and ceiling of a
-            floor plan unless all stand at one height.
+        lower, upper: Corners of the box of transmitters and receivers [m]. A floor plan gets its
+            floor and ceiling there, unless all stand at one height.
         shortest: Least length of a wall and of the edges of a face [m].
     """
     if not file.is_file():
