@@ -1,41 +1,45 @@
 """Scores of spectra in drawn rooms from two starts: planes searched, or planes learnt alone.
 
-    python benchmarks/spectrum_rooms.py --rooms 0 1 2 3 4 5 --folder runs/spectrum_rooms
+    python benchmarks/spectrum_rooms.py --rooms 0 1 2 3 4 5
 
 Draws a room for each number: an oblique wall, an L, a leaning wall or a corner cut off, with other
 materials, furniture and place of the array, traced by Sionna RT (plugins/sionna/README.md). Prints
-the median SSIM of the test and of the validation links of ``+experiment=mirrored`` without kriging:
-as it is, and from the faces of the box, which the training alone moves. Further words are options
-of both runs, such as ``trainer.max_steps=300``. docs/results.md has the numbers.
+for mirrored Gaussians without kriging, from planes that a search finds and from the faces of the
+box, which the training moves: the median SSIM of the test links, the mean of the validation links,
+and processor seconds; and the median of the start that validation chooses. Further words are
+options of all trainings, such as ``trainer.max_steps=300``. docs/results.md has the numbers.
 """
 
 import argparse
 import math
 import random
 import sys
+import time
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 import gaigs
+from gaigs.model.answers import predicted
 from gaigs.report.table import markdown
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "plugins" / "sionna"))
 from gaigs_sionna.meshes import Cuboid, MeshRoom
 from gaigs_sionna.rooms import ROOMS
 
-SPLITS = {
-    "official": [],
-    "blocks 1 m": ["split=blocks", "split.edge=1.0"],
-    "60 places": ["split=sparse", "split.train=60"],
+SPLITS: dict[str, dict] = {
+    "official": {},
+    "blocks 1 m": {"split": "blocks", "edge": 1.0},
+    "60 places": {"split": "sparse", "train": 60},
 }
 """Options of each split."""
 
-STARTS = {"searched": ["model.search=true"], "learnt": ["model.search=false"]}
-"""Options of each start."""
+STARTS = {"searched": "true", "learnt": "false"}
+"""Value of ``model.search`` for each start."""
 
 
 def outline(shape: int, draw: random.Random) -> tuple[list[tuple[float, float]], tuple]:
@@ -110,36 +114,46 @@ def draw_room(number: int) -> MeshRoom:
     return replace(room, furniture=furnish(room, draw))
 
 
-def run(number: int, words: list[str], folder: Path) -> tuple[float, float]:
-    """Median SSIM of the test and of the validation links of a room."""
-    name = f"drawn_{number}"
-    ROOMS.setdefault(name, draw_room(number))
-    options = ["+experiment=mirrored", "data=sionna", f"data.room={name}", "kriging=false"]
-    metrics = gaigs.run(gaigs.compose(*options, "baselines=[]", *words), folder)
-    test, validation = metrics["models"], metrics["validation"]
-    own = next(iter(validation))  # the test has parts of the model, too
-    return test[own]["ssim_median"], validation[own]["ssim_median"]
+class Scores(NamedTuple):
+    """Scores of one training."""
+
+    test: float  # median SSIM of the test links
+    validation: float  # mean SSIM of the validation links, which chooses
+    seconds: float  # processor time of search and training [s]
+
+
+def train(links: gaigs.Links, start: str, words: list[str]) -> Scores:
+    """Scores of mirrored Gaussians from a start."""
+    began = time.process_time()
+    words = [f"model.search={STARTS[start]}", "kriging=false", *words]
+    model = gaigs.train("mirrored", links, *words, progress=False)
+    seconds = time.process_time() - began
+    found = []
+    for part in (links.split.test, links.split.validation):
+        found.append(links.task.scores(links.labels[part], predicted(model, links, part))["ssim"])
+    return Scores(found[0].median().item(), found[1].mean().item(), seconds)
 
 
 def main() -> None:
     shape = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=shape)
-    parser.add_argument("words", nargs="*", metavar="KEY=VALUE", help="options of the runs")
+    parser.add_argument("words", nargs="*", metavar="KEY=VALUE", help="options of the trainings")
     parser.add_argument("--rooms", type=int, nargs="+", default=[*range(6)])
     parser.add_argument("--splits", nargs="+", choices=SPLITS, default=[*SPLITS])
-    parser.add_argument("--starts", nargs="+", choices=STARTS, default=[*STARTS])
-    parser.add_argument("--folder", type=Path, default=Path("runs/spectrum_rooms"))
     options = parser.parse_args()
-    titles = [f"{start}, {links}" for start in options.starts for links in ("test", "validation")]
-    rows = [("room", "split", *titles)]
+    titles = [f"{start}, {name}" for start in STARTS for name in ("test", "validation", "seconds")]
+    rows = [("room", "split", *titles, "by validation")]
     for number, split in product(options.rooms, options.splits):
-        cells = [str(number), split]
-        for start in options.starts:
-            folder = options.folder / f"room{number}-{split.replace(' ', '')}-{start}"
-            words = [*SPLITS[split], *STARTS[start], *options.words]
-            cells += [f"{value:.3f}" for value in run(number, words, folder)]
-        rows.append(tuple(cells))
-        print(*cells, flush=True)
+        name = f"drawn_{number}"
+        ROOMS[name] = draw_room(number)
+        links = gaigs.links("sionna", room=name, **SPLITS[split])
+        scores = [train(links, start, options.words) for start in STARTS]
+        cells = []
+        for own in scores:
+            cells += [f"{own.test:.3f}", f"{own.validation:.4f}", f"{own.seconds:.0f}"]
+        chosen = max(scores, key=lambda own: own.validation)
+        rows.append((str(number), split, *cells, f"{chosen.test:.3f}"))
+        print(*rows[-1], flush=True)
     print(markdown(rows))
 
 
