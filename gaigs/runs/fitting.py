@@ -172,7 +172,7 @@ def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, fold
     A limit in time is for one training, so the second one is left out.
     """
     own = Start(model, config, 0.0)
-    is_limited = config["trainer"]["max_time"] is not None
+    is_limited = config["trainer"].get("max_time") is not None
     if is_limited or not model.second_start or not len(links.split.validation):
         return own
     second = config | {"model": config["model"] | model.second_start}
