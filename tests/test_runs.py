@@ -665,7 +665,7 @@ def test_validation_chooses_the_start_of_mirrored_gaussians(tmp_path, monkeypatc
     options = (
         "+experiment=mirrored", "data.transmitters=20", "data.order=0", "kriging=false", "baselines=[mean]",
         "placement.planes=6", "placement.order=1", "placement.obstacles=1", "trainer.max_steps=2",
-        "trainer.val_check_interval=1", "trainer.enable_progress_bar=false",
+        "trainer.val_check_interval=1", "trainer.enable_progress_bar=false", "model.search=null",
     )  # fmt: skip
     monkeypatch.setattr(runs, "radio_map", Mock())  # which takes long
     monkeypatch.setattr(LagSearch, "run", lambda *_: torch.tensor([[0.0, 0.0, 1.0, 2.7]]))
