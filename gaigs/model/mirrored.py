@@ -86,7 +86,7 @@ class MirroredSplatting(GaussianSplatting):
         pooling: str | Mapping | Pooling | None = None,
         gaussians: Mapping | None = None,
         trend: str | Mapping | Model | None = None,
-        search: bool | None = True,
+        search: bool | None = None,
     ):
         self.search = search
         image = projection, rasterizer, pooling
