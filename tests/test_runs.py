@@ -31,10 +31,11 @@ from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model import checkpoint
 from gaigs.planes.channel_links import SLABS, SlabRoom
 from gaigs.planes.channel_search import ChannelSearch
+from gaigs.planes.lag_search import LagSearch
 from gaigs.processes import Stopped, stopping
 from gaigs.registry import registry
 from gaigs.report.training_log import read_curves
-from gaigs.runs import evaluation
+from gaigs.runs import descent, evaluation
 from gaigs.runs.folder import claim
 from gaigs.testing import example_links
 from gaigs.training.descent import Descent
@@ -657,6 +658,34 @@ def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path, m
         assert own[name] == pytest.approx(free_space[name], abs=1e-2)
     assert (metrics["paths_kept"], metrics["planes_kept"]) == (1, 0)
     assert gaigs.load(tmp_path / "best.ckpt").predict([[1.0, 2.0, 1.5]]).abs().max() > 0
+
+
+@pytest.mark.parametrize("scores", [(0.9, 0.5), (0.5, 0.9)])
+def test_validation_chooses_the_start_of_mirrored_gaussians(tmp_path, monkeypatch, scores):
+    options = (
+        "+experiment=mirrored", "data.transmitters=20", "data.order=0", "kriging=false", "baselines=[mean]",
+        "placement.planes=6", "placement.order=1", "placement.obstacles=1", "trainer.max_steps=2",
+        "trainer.val_check_interval=1", "trainer.enable_progress_bar=false", "model.search=null",
+    )  # fmt: skip
+    monkeypatch.setattr(runs, "radio_map", Mock())  # which takes long
+    monkeypatch.setattr(LagSearch, "run", lambda *_: torch.tensor([[0.0, 0.0, 1.0, 2.7]]))
+    given = {tmp_path: scores[0], tmp_path / "second_start": scores[1]}
+
+    def descend(model, loss, links, config, folder, *rest, **named):
+        trained = descent.descend(model, loss, links, config, folder, *rest, **named)
+        content = checkpoint.read(folder / "best.ckpt")
+        content["callbacks"]["KeepBest"]["best"] = given[folder]
+        checkpoint.write(content, folder / "best.ckpt")
+        return trained
+
+    monkeypatch.setattr("gaigs.runs.fitting.descend", descend)
+    runs.run(gaigs.compose(*options), tmp_path)
+    second = gaigs.load(tmp_path / "second_start" / "best.ckpt")
+    model = gaigs.load(tmp_path)
+    is_second = scores[0] < scores[1]
+    assert model.search is (False if is_second else None)
+    places = [[1.0, 2.0, 1.5]]
+    assert torch.equal(model.predict(places), second.predict(places)) == is_second
 
 
 # --- the software of a run ---

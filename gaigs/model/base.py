@@ -71,6 +71,8 @@ class Model(Movable):
         revisions: Fractions of the training after which ``revise`` is called.
         settles: True if no revision to come lowers errors at once: a training whose errors would
             stay above those of a law of distance may end.
+        second_start: Options of a second training from another start; validation chooses. Empty
+            for one training.
         predicts_untrained: True if values before the training are worth a score.
         any_frequency, any_receiver: See ``Movable``.
         configuration: Options that a registered model was made with; ``save`` stores them.
@@ -104,6 +106,7 @@ class Model(Movable):
     chunk: int | None = None
     revisions: tuple[float, ...] = ()
     settles: bool = False
+    second_start: Mapping[str, Any] = {}
     predicts_untrained: bool = False
     primitives: Gaussians | None = None
     calibration: Calibration | None = None

@@ -56,6 +56,10 @@ class MirroredSplatting(GaussianSplatting):
     Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that
     suits it.
 
+    Args:
+        search: Start with spectra: True for planes of ``LagSearch``, False for the faces of the
+            box, None for both, of which validation chooses.
+
     Source: ours; docs/methods.md.
     """
 
@@ -82,7 +86,9 @@ class MirroredSplatting(GaussianSplatting):
         pooling: str | Mapping | Pooling | None = None,
         gaussians: Mapping | None = None,
         trend: str | Mapping | Model | None = None,
+        search: bool | None = None,
     ):
+        self.search = search
         image = projection, rasterizer, pooling
         super().__init__(scene, placement, tokenizer, deformation, *image, gaussians, trend)
 
@@ -99,7 +105,7 @@ class MirroredSplatting(GaussianSplatting):
         self.places = thin_links(links.query[links.split.train])
         is_known = links.query.frequencies is not None or len(self.scene.frequencies) == 1
         searches = is_known and self.placement.order > 0 and not self.placement.fixed
-        if searches and isinstance(self.pooling, PathSpectrum):
+        if searches and self.search is not False and isinstance(self.pooling, PathSpectrum):
             self._search_spectra(links, self.pooling)
         if is_known and isinstance(self.pooling, PathRssi):
             wavelength = speed_of_light / carriers(self.scene, links.query).max().item()
@@ -139,6 +145,9 @@ class MirroredSplatting(GaussianSplatting):
             placement.log_bandwidth.fill_(math.log(search.bandwidth))
         placement.found.fill_(True)
         log.info("%d planes found in spectra", len(planes))
+        # A false plane of the search stays; learnt ones move as strengths become known.
+        if self.search is None and placement.is_new:
+            self.second_start = {"search": False}
 
     def _prepare_levels(self, links: Links) -> None:
         """Makes the search of levels that ``revise`` runs once powers have shown the obstacles."""

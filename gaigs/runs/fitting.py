@@ -22,6 +22,7 @@ from gaigs.processes import is_first
 from gaigs.registry import registry
 from gaigs.runs.descent import descend
 from gaigs.splatting.loss import Loss
+from gaigs.training.checkpoints import KeepBest
 
 log = logging.getLogger(__name__)
 
@@ -38,6 +39,14 @@ class Fitted(NamedTuple):
     seconds: float | None = None
     kriging_seconds: float | None = None  # duration of kriging; None without it
     facts: Mapping[str, Any] = {}  # entries of ``metrics.json`` beside the model's own
+
+
+class Start(NamedTuple):
+    """A model trained from the better of its starts."""
+
+    model: Model
+    config: dict  # which builds it
+    seconds: float  # duration of the second training
 
 
 def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
@@ -68,6 +77,10 @@ def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Pat
         model, seconds = descend(model, loss, links, config, folder, searched, rival)
     if not is_first():
         return None
+    model, config, more = _try_second_start(model, loss, links, config, folder)
+    seconds += more
+    if kriged is not None:
+        kriged = _untrained_kriging(model, links, config)
     trained = None
     if config["ensemble"] > 1:
         model, more = _add_members(model, loss, links, config, folder)
@@ -151,6 +164,38 @@ def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float
         places = torch.cat((places, model.known_places)).unique()
     model.known_places = places
     return time.monotonic() - began, places
+
+
+def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> Start:
+    """The trained model, or one from its second start if that validates better.
+
+    A limit in time is for one training, so the second one is left out.
+    """
+    own = Start(model, config, 0.0)
+    is_limited = config["trainer"].get("max_time") is not None
+    if is_limited or not model.second_start or not len(links.split.validation):
+        return own
+    second = config | {"model": config["model"] | model.second_start}
+    place = folder / "second_start"
+    place.mkdir(exist_ok=True)
+    lightning.seed_everything(config["seed"], verbose=False)
+    with stages.stage(until=0.5 / config["ensemble"]), stages.timed("second start"):
+        if stages.is_up():
+            stages.leave_out("the training from a second start")
+            return own
+        other = registry("model").build(second["model"], scene=links.scene)
+        other.fit(links)
+        other, seconds = descend(other, loss, links, second, place, searched=0.0)
+    other.known_places = model.known_places
+    content = checkpoint.read(place / "best.ckpt")
+    scores = []
+    for trained in (checkpoint.read(folder / "best.ckpt"), content):
+        scores.append(trained["callbacks"][KeepBest.__name__]["best"])
+    log.info("validation: %.4f from the first start, %.4f from %s", *scores, model.second_start)
+    if scores[1] <= scores[0]:
+        return own._replace(seconds=seconds)
+    checkpoint.write(content, folder / "best.ckpt")
+    return Start(other, second, seconds)
 
 
 def _add_members(
