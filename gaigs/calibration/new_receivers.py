@@ -43,9 +43,6 @@ class NewReceivers(NamedTuple):
         the room has learnt err less. If others err more, c is the others' mean, and k their number;
         s is about a mean for each kind.
 
-        A bound without a normal distribution is infinite for 90 % and fewer than nine receivers
-        (Dunn, Wasserman and Ramdas, 2022).
-
         Args:
             errors: Errors of all numbers.
             inside: True for numbers that count.
