@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Inexact, Int
 from torch import Tensor
 
 from gaigs.calibration.estimate import Estimate
+from gaigs.calibration.new_receivers import NewReceivers, quantile
 from gaigs.core.query import Query, evenly, thin_labels
 from gaigs.core.task import Task
 from gaigs.io import FAR
@@ -30,9 +31,7 @@ class Calibration:
     rise with this distance. Pixels of a spectrum are also grouped by their predicted amplitude, see
     ``bin_numbers``.
 
-    Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005; by groups of
-    links: Dunn, Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical
-    models, 2022.
+    Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005.
     """
 
     edges: Float[Tensor, "r e"]  # of the distances (r or 1, g - 1) [m]
@@ -64,7 +63,7 @@ class Calibration:
         query: Query,
         near: Float[Tensor, " n"] | None,
         known: Query,
-        clusters: Int[Tensor, " n"] | None = None,
+        new: NewReceivers | None = None,
         steps: int = 200,
     ) -> "Calibration":
         """Computes the calibration from links that models predicted without knowing them.
@@ -77,7 +76,7 @@ class Calibration:
             near: Distance of each link to the nearest place that its predicting model knows [m];
                 None if the model states deviations, which need no groups of distances.
             known: Links that the calibrated model knows.
-            clusters: Numbers of links that err together; None: each for itself.
+            new: Receivers of the links if they count as new, and so err as a whole.
             steps: Number of levels whose quantiles are stored; a level between two takes the
                 higher one's.
         """
@@ -101,7 +100,11 @@ class Calibration:
                 inside = inside if inside.any() else exists
                 ordered = errors[inside].double().sort().values
                 sizes[group, number] = ordered.square().mean().sqrt()
-                quantiles[group, number] = link_quantiles(ordered, errors, inside, levels, clusters)
+                if new is None:
+                    found = link_quantiles(ordered, errors, inside, levels)
+                else:
+                    found = new.quantiles(errors, inside, levels)
+                quantiles[group, number] = found
         if not groups.edges.shape[1]:
             known = known[:0]
         lowest = torch.tensor(task.lowest, dtype=torch.float64)
@@ -350,7 +353,6 @@ def link_quantiles(
     errors: Float[Tensor, "n m"],
     inside: Bool[Tensor, "n m"],
     levels: Float[Tensor, " q"],
-    clusters: Int[Tensor, " n"] | None = None,
     level: float = 0.9,
 ) -> Float[Tensor, " q"]:
     """Quantiles of a group's errors that are the bounds of a new link's errors.
@@ -360,23 +362,13 @@ def link_quantiles(
         errors: Errors of all numbers.
         inside: True for the numbers of the group.
         levels: Levels of the intervals.
-        clusters: Numbers of links that err together; a new link is one of a new cluster.
         level: Level at which the scatter of the links' shares is measured, for all levels.
     """
     held = (errors <= quantile(ordered, levels.new_tensor(level))) & inside
     both = torch.stack((held.sum(1), inside.sum(1)))  # (2, n)
-    if clusters is not None:
-        numbers = clusters.unique(return_inverse=True)[1]
-        both = both.new_zeros(2, int(numbers.max()) + 1).index_add(1, numbers, both)
     count = effective_count(*both)
     # Quantile p (n + 1) / n: the new link is one of n + 1 exchangeable ones.
     return quantile(ordered, levels * (1 + 1 / count))
-
-
-def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float[Tensor, "*q"]:
-    """The smallest of n sorted numbers at or below which a share ``levels`` of them lies."""
-    ranks = (levels * len(numbers) - 1e-9).ceil().long()
-    return numbers[(ranks - 1).clamp(0, len(numbers) - 1)]
 
 
 def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float:

@@ -28,6 +28,7 @@ class Timekeeper:
 
     Attributes:
         seconds: Time of each ``timed`` part without the parts inside it [s].
+        ends: Function that is true when what now runs has to end, such as a training; or None.
     """
 
     def __init__(self, limit: float = math.inf, shown: bool = True):
@@ -37,6 +38,7 @@ class Timekeeper:
         self.stages: list[Stage] = []
         self.left_out: list[str] = []
         self.seconds: dict[str, float] = {}
+        self.ends: Callable[[], bool] | None = None
         self.bars: Progress | None = None
         self.lock = threading.RLock()  # bars appear in a thread of their own
 
@@ -192,8 +194,9 @@ def left() -> float:
 
 
 def is_up() -> bool:
-    """True if an open stage has to end now."""
-    return left() <= 0
+    """True if an open stage, or what now runs, has to end now."""
+    ends = current().ends
+    return left() <= 0 or (ends is not None and ends())
 
 
 def end_in_time(_: object) -> None:

@@ -13,6 +13,7 @@ from torch import Tensor
 from gaigs.calibration import Calibration
 from gaigs.calibration.conformal import usual_deviations
 from gaigs.calibration.held_out import Answers, calibrate
+from gaigs.calibration.new_receivers import NewReceivers
 from gaigs.core import stages
 from gaigs.core.query import Batch, evenly
 from gaigs.data import Links
@@ -89,21 +90,19 @@ def at_new_receivers(
 ) -> Calibration | None:
     """The calibration of a model at receivers without links; None with fewer than three receivers.
 
-    Each receiver with links in turn is predicted as a new one, from the other receivers. Receivers
-    err as a whole: the errors of one are a cluster.
+    Each receiver with links in turn is predicted as a new one, from the other receivers.
 
     Args:
         model: A model with ``any_receiver``.
         links: Links with the split of the model.
         most: Largest number of links that calibrate.
         receivers: Largest number of receivers that calibrate.
-
-    Source: Dunn, Wasserman and Ramdas, Distribution-free prediction sets for two-layer hierarchical
-    models, 2022.
     """
     split: Any = links.split
     of_links = links.query.receivers
     has_links = of_links[split.train if model.is_trained else split.known].unique()
+    # A look-up is asked without the receiver: it has learnt of none.
+    taught = has_links if model.is_trained else has_links[:0]
     asked = split.known
     # The room has learnt from the training links: validation links show its errors.
     if model.is_trained and not split.by_receivers:
@@ -133,7 +132,7 @@ def at_new_receivers(
         alike,
         None,
         alike,
-        clusters=query.receivers,
+        new=NewReceivers(query.receivers, torch.isin(query.receivers, taught)),
     )
     if not links.task.is_scalar:
         return calibration

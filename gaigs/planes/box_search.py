@@ -1,5 +1,6 @@
 """Search for boxes that explain shadows: tomography with few, sharp obstacles."""
 
+import contextlib
 from typing import NamedTuple
 
 import torch
@@ -99,31 +100,42 @@ class BoxSearch:
 
     @torch.no_grad()
     def run(self) -> list[Cuboid]:
-        """The boxes; none if no box is clear."""
-        for _ in range(self.most):
-            if stages.is_up() or len(self.boxes) >= self.most:
-                break
-            depths = self._depths(self.boxes)
-            before = self.errors(depths)
-            best = None
-            least = before.mean() - self.price
-            for seed in self._seeds(depths):
-                box = self._grown(depths, seed, self.steps[:2], 30)
-                fall = before - self.errors(depths + self._depth(box))
-                is_clear = fall.mean() > self.clear * fall.std() / len(fall) ** 0.5
-                if is_clear and before.mean() - fall.mean() < least:
-                    best, least = box, before.mean() - fall.mean()
-            if best is None:
-                break
-            self.boxes.append(best)
-            self._take_turns(self.steps[1:], 1)
-            for box in [*self.boxes]:
-                self._cut(box)
-        self._take_turns((*self.steps, 0.1), 5)
+        """The boxes; none if no box is clear. A search whose time is up keeps those it has."""
+        with contextlib.suppress(TimeoutError):
+            for _ in range(self.most):
+                if len(self.boxes) >= self.most or not self._add():
+                    break
+            self._take_turns((*self.steps, 0.1), 5)
         return self.boxes
 
+    def _add(self) -> bool:
+        """Adds the box that helps most; False if none is clear."""
+        depths = self._depths(self.boxes)
+        before = self.errors(depths)
+        best = None
+        least = before.mean() - self.price
+        for seed in self._seeds(depths):
+            box = self._grown(depths, seed, self.steps[:2], 30)
+            fall = before - self.errors(depths + self._depth(box))
+            is_clear = fall.mean() > self.clear * fall.std() / len(fall) ** 0.5
+            if is_clear and before.mean() - fall.mean() < least:
+                best, least = box, before.mean() - fall.mean()
+        if best is None:
+            return False
+        self.boxes.append(best)
+        self._take_turns(self.steps[1:], 1)
+        for box in [*self.boxes]:
+            self._cut(box)
+        return True
+
     def _depth(self, box: Cuboid) -> Float[Tensor, "b n"]:
-        """Depths of all paths by a box [Np]."""
+        """Depths of all paths by a box [Np].
+
+        Raises:
+            TimeoutError: The time is up.
+        """
+        if stages.is_up():
+            raise TimeoutError
         hit = passes_box(self.start, self.end, box.corners).nonzero()[:, 0]
         depths = torch.zeros_like(self.errors.matches)
         losses = depths.new_full((len(hit),), box.loss)
@@ -132,7 +144,9 @@ class BoxSearch:
     def _depths(self, boxes: list[Cuboid]) -> Float[Tensor, "b n"]:
         """Depths of all paths by boxes and in common [Np]."""
         depths = torch.full_like(self.errors.matches, self.common)
-        return sum((self._depth(box) for box in boxes), start=depths)
+        for box in boxes:
+            depths = depths + self._depth(box)
+        return depths
 
     def _error(self, depths: Float[Tensor, "b n"], boxes: list[Cuboid]) -> float:
         """Mean error with boxes added."""
@@ -167,8 +181,6 @@ class BoxSearch:
         """The box with each face, place and the loss changed in turn while the error falls."""
         least = self._error(depths, [box])
         for _ in range(rounds):
-            if stages.is_up():
-                break
             before = least
             for part in range(10):
                 for other in self._changed(box, part, steps):

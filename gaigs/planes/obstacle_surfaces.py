@@ -230,7 +230,8 @@ def attenuate_paths(
     paths = link * len(sequences) + folded.path[leg]
     start = folded.start[link, leg].double()
     along = folded.end[link, leg].double() - start
-    depths = obstacles(start.float(), (start + along).float(), has_boxes=False).real.double()
+    no_boxes = torch.zeros(len(start), int(obstacles.used.sum()), dtype=torch.bool)
+    depths = obstacles(start.float(), (start + along).float(), no_boxes).real.double()
     depths = fields.new_zeros(fields.numel()).index_add(0, paths, depths)  # (b n,), of each path
     steps = torch.linspace(0, 1, options.samples).to(along)[:, None]  # (k, 1)
     samples = [

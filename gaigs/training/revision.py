@@ -1,6 +1,7 @@
 """Revisions: changes that a model makes to itself between two steps."""
 
 import contextlib
+import functools
 import logging
 from collections.abc import Iterator
 
@@ -9,6 +10,7 @@ from jaxtyping import Int
 from lightning.pytorch.callbacks import Callback
 from torch import Tensor, nn
 
+from gaigs.core import stages
 from gaigs.core.query import Batch
 from gaigs.data import Links
 from gaigs.training import seeded
@@ -23,16 +25,22 @@ class _TimeUp(Exception):
 
 @contextlib.contextmanager
 def _stopping_when_time_is_up(trainer, model: nn.Module) -> Iterator[None]:
-    """Raises ``_TimeUp`` at the first call of a submodule after the training's time is up."""
+    """Raises ``_TimeUp`` at the first call of a submodule after the training's time is up.
+
+    ``stages.is_up`` tells it to searches that call none.
+    """
 
     def look(*_) -> None:
         if is_time_up(trainer):
             raise _TimeUp
 
     hooks = [part.register_forward_pre_hook(look) for part in model.modules()]
+    keeper = stages.current()
+    keeper.ends = functools.partial(is_time_up, trainer)
     try:
         yield
     finally:
+        keeper.ends = None
         for hook in hooks:
             hook.remove()
 

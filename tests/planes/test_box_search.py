@@ -51,6 +51,20 @@ def test_links_in_the_open_have_no_box(links):
     assert search(links, 0.2 * torch.rand(len(links[1]), generator=generator)) == []
 
 
+@pytest.mark.parametrize("looks", [0, 3, 40, 400])
+def test_search_ends_with_the_time(links, monkeypatch, looks):
+    _, sent, heard = links
+    asked = []
+
+    def is_up():
+        asked.append(len(asked))
+        return len(asked) > looks
+
+    monkeypatch.setattr("gaigs.core.stages.is_up", is_up)
+    search(links, LOSS * passes_box(sent, heard, CORNERS).float())
+    assert len(asked) == looks + 1
+
+
 def test_errors_are_those_of_the_sum_of_paths():
     generator = torch.Generator().manual_seed(2)
     fields = torch.randn(5, 4, 2, 3, generator=generator, dtype=torch.complex64)

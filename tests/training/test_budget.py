@@ -9,6 +9,7 @@ import torch
 from fitting import Plane, fit, make_module
 from lightning.pytorch.callbacks import Callback
 
+from gaigs.core import stages
 from gaigs.training import budget as budget_module
 from gaigs.training.budget import ENDLESS, make_budget, share_done
 from gaigs.training.checkpoints import Interrupted, KeepBest, KeepLast
@@ -168,11 +169,16 @@ class Searched(Turned):
 
     clock = None
 
+    def __init__(self, scene):
+        super().__init__(scene)
+        self.looks = []
+
     def revise(self, number, train, validation, loss):
         self.before = self.slope.clone()
         super().revise(number, train, validation, loss)
         for _ in range(10 if number == 1 else 0):
             self.clock.now += 1.0
+            self.looks.append(stages.is_up())
             self.network(train.query.transmitters)
         return "turned"
 
@@ -193,6 +199,9 @@ def test_a_revision_ends_with_the_time_and_leaves_the_model_as_it_was(train, lin
         "step 3: the time is up within a revision, which is not made",
     ]
     assert (module.model.slope - module.model.before).abs().max() < 0.02, "of one step, not of 0.1"
+    *early, last = module.model.looks  # of searches that call no submodule
+    assert early
+    assert (any(early), last, stages.is_up()) == (False, True, False)
 
 
 @pytest.mark.parametrize("at", [3, 4])

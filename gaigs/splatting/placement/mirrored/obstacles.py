@@ -111,9 +111,12 @@ class Obstacles(nn.Module):
         self,
         start: Float[Tensor, "*batch 3"],
         end: Float[Tensor, "*batch 3"],
-        has_boxes: bool = True,
+        counts: Bool[Tensor, "*batch k"] | None = None,
     ) -> Inexact[Tensor, "*batch"]:
-        """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad]."""
+        """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad].
+
+        Used boxes count where ``counts`` is true; None: everywhere.
+        """
         starts = start.reshape(-1, 3)
         ends = end.reshape(-1, 3)
         size = len(starts) or 1
@@ -128,14 +131,25 @@ class Obstacles(nn.Module):
             for legs in zip(starts.split(size), ends.split(size), strict=True)
         ]
         depths = torch.cat(parts)  # (segments, 1 or 2)
-        if has_boxes:
-            solid = self._box_depths(starts, ends)  # (segments, 1)
-            depths = torch.cat((depths[:, :1] + solid, depths[:, 1:]), 1)
+        solid = self._box_depths(starts, ends, counts)  # (segments, 1)
+        depths = torch.cat((depths[:, :1] + solid, depths[:, 1:]), 1)
         depths = depths[:, 0] if self.turns is None else torch.view_as_complex(depths)
         return depths.view(start.shape[:-1])
 
+    def are_outside(self, sites: Float[Tensor, "b e 3"]) -> Bool[Tensor, "b k"]:
+        """True for links and used boxes that hold no end of the link.
+
+        Transmitters and receivers stand in the open: a box about one is wrong there.
+        """
+        along = (sites @ self.box_axes)[:, :, None]  # (b, e, 1, 3)
+        low, high = self.boxes[self.used].unbind(1)
+        return ~((along > low) & (along < high)).all(-1).any(1)
+
     def _box_depths(
-        self, start: Float[Tensor, "s 3"], end: Float[Tensor, "s 3"]
+        self,
+        start: Float[Tensor, "s 3"],
+        end: Float[Tensor, "s 3"],
+        counts: Bool[Tensor, "*batch k"] | None,
     ) -> Float[Tensor, "s 1"]:
         """Depths of segments through boxes [Np]."""
         start = start @ self.box_axes
@@ -144,6 +158,8 @@ class Obstacles(nn.Module):
         hits = depths.new_zeros(len(start), len(depths))
         for number, box in enumerate(self.boxes[self.used]):
             hits[:, number] = passes_box(start, end, box)
+        if counts is not None:
+            hits = hits * counts.flatten(0, -2)
         return (hits @ depths)[:, None]
 
 

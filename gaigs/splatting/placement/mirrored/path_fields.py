@@ -229,7 +229,11 @@ class PathFields(MovablePlanes):
         # Number of each leg's path among the paths of all links, (b n) in a row.
         paths = folded.path + n * torch.arange(count, device=legs.device)[:, None]
         paths = paths.flatten()[legs]
-        return depths.flatten().index_add(0, paths, obstacles(starts, ends)).view(count, n)
+        # The first leg ends at the receiver, the last one starts at the transmitter.
+        sites = torch.stack((folded.end[:, 0], folded.start[:, -1]), 1)  # (b, 2, 3)
+        links = legs // folded.start.shape[1]
+        blocked = obstacles(starts, ends, obstacles.are_outside(sites)[links])
+        return depths.flatten().index_add(0, paths, blocked).view(count, n)
 
     def passing(self, query: Query) -> Float[Tensor, "b v"]:
         """Fields over free space of the direct path, then of the single reflection at each plane.

@@ -177,6 +177,17 @@ def test_boxes_dim_whatever_the_way_inside(obstacles):
     assert gradient[0] == 2
 
 
+def test_boxes_about_an_end_of_a_link_do_not_count(obstacles):
+    corners = torch.tensor([[[-1.0, -1, -1], [1, 1, 1]], [[2, -1, -1], [3, 1, 1]]]).double()
+    obstacles.place_boxes(torch.eye(3).double(), corners, torch.tensor([1.5, 2.0]).double())
+    obstacles.log_densities.data.fill_(-80)
+    sites = torch.tensor([[[4.0, 0, 0], [-2, 0, 0]], [[4, 0, 0], [0, 0, 0]]]).double()
+    counts = obstacles.are_outside(sites)
+    assert counts.tolist() == [[True, True], [False, True]]
+    depths = obstacles(sites[:, 0], sites[:, 1], counts)
+    torch.testing.assert_close(depths.real, torch.tensor([3.5, 2.0]).double())
+
+
 def test_checkpoint_without_boxes_loads(obstacles):
     state = obstacles.state_dict()
     for name in ("boxes", "box_axes", "box_depths"):

@@ -285,6 +285,19 @@ def test_obstacles_attenuate_paths_along_their_legs():
     assert bare.penalties() == {}
 
 
+def test_box_about_a_receiver_does_not_dim_its_paths():
+    query, placement = ask(), walled(make(1, obstacles=4))
+    clear = placement(None, query).gains
+    place = POSE.position - placement.middle
+    corners = torch.stack((place - 0.01, place + 0.01))[None]
+    placement.obstacles.place_boxes(torch.eye(3), corners, torch.tensor([3.0]))
+    thin = placement(None, query).gains
+    placement.obstacles.place_boxes(torch.eye(3), corners + 0.015, torch.tensor([3.0]))
+    beside = placement(None, query).gains
+    assert (thin.abs() >= clear.abs()).all()  # Gaussians are as faint as at the start
+    assert (beside.abs() < 0.1 * thin.abs()).any()
+
+
 @pytest.mark.parametrize("task", [Rssi(), Csi(16, torch.tensor([FREQUENCY]))])
 def test_obstacles_dim_all_paths_but_faint_ones_of_levels(task):
     query, placement = ask(), walled(make(obstacles=4, task=task))

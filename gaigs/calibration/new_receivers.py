@@ -1,0 +1,92 @@
+"""Bounds of errors at receivers without links, each of which errs as a whole."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.special import stdtrit
+from torch import Tensor
+
+from gaigs.core.geometry import FAINTEST
+
+
+class NewReceivers(NamedTuple):
+    """Receivers of links that models predicted as if their receivers were new.
+
+    Source: Hahn and Meeker, Statistical Intervals, 1991, for the prediction of a normal number.
+    """
+
+    receivers: Int[Tensor, " n"]
+    are_taught: Bool[Tensor, " n"]  # True for links of receivers from which the room has learnt
+
+    def quantiles(
+        self,
+        errors: Float[Tensor, "n m"],
+        inside: Bool[Tensor, "n m"],
+        levels: Float[Tensor, " q"],
+        parts: int = 200,
+        draws: int = 50,
+    ) -> Float[Tensor, " q"]:
+        """Quantiles of the links' errors that are the bounds of errors at one more receiver.
+
+        Receivers differ in their quantile of a level p, whose logarithm is taken as normal. Of k
+        receivers these logarithms have the mean c and the deviation s. That of one more is
+
+            c + s (1 + 1/k)^½ t
+
+        with Student's t of k - 1 degrees of freedom. The bound b holds errors with the chance p
+
+            p = mean over t of F(log b - c - s (1 + 1/k)^½ t)
+
+        with F the distribution of log errors about their receiver's quantile. Receivers from which
+        the room has learnt err less. If others err more, c is the others' mean, and k their number;
+        s is about a mean for each kind.
+
+        Args:
+            errors: Errors of all numbers.
+            inside: True for numbers that count.
+            levels: Levels p of the intervals.
+            parts, draws: Points at which F and the distribution of t are taken.
+        """
+        middles = (torch.arange(parts, dtype=torch.float64) + 0.5) / parts
+        rows, own_bounds, kinds = [], [], []
+        for receiver in self.receivers.unique():
+            own = self.receivers == receiver
+            numbers = errors[own][inside[own]].double().clamp_min(FAINTEST).log().sort().values
+            if len(numbers):
+                rows.append(quantile(numbers, middles))
+                own_bounds.append(quantile(numbers, levels))
+                kinds.append(self.are_taught[own][0])
+        offsets, taught = torch.stack(own_bounds), torch.stack(kinds)  # (k, q), (k,)
+        apart = torch.stack(rows)[:, None] - offsets[..., None]  # (k, q, parts)
+        within = apart.movedim(0, 1).flatten(1).sort().values  # (q, k parts)
+        chances = (torch.arange(draws, dtype=torch.float64) + 0.5) / draws
+        freedom = max(len(taught) - len(taught.unique()), 1)
+        t = torch.from_numpy(stdtrit(freedom, chances.numpy()))  # (draws,)
+        bounds = []
+        for level, offset, logs in zip(levels, offsets.T, within, strict=True):
+            centre, scale = _predictive(offset, taught, freedom)
+            sums = (centre + scale * t)[:, None] + quantile(logs, middles)  # (draws, parts)
+            bounds.append(quantile(sums.flatten().sort().values, level))
+        # Where receivers differ less at a higher level, its bound may be less.
+        logarithms = torch.stack(bounds).cummax(0).values
+        return logarithms.clamp_max(-math.log(FAINTEST)).exp()
+
+
+def _predictive(
+    numbers: Float[Tensor, " k"], are_taught: Bool[Tensor, " k"], freedom: int
+) -> tuple[Tensor, Tensor]:
+    """Centre and scale of Student's t distribution of one more receiver's number."""
+    kinds = [numbers[are_taught == kind] for kind in are_taught.unique()]
+    squares = torch.stack([(own - own.mean()).square().sum() for own in kinds])
+    # The room fits receivers from which it has learnt: that others err less is chance.
+    others = numbers[~are_taught]
+    shown = others if len(others) and others.mean() > numbers.mean() else numbers
+    return shown.mean(), (squares.sum() / freedom * (1 + 1 / len(shown))).sqrt()
+
+
+def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float[Tensor, "*q"]:
+    """The smallest of n sorted numbers at or below which a share ``levels`` of them lies."""
+    ranks = (levels * len(numbers) - 1e-9).ceil().long()
+    return numbers[(ranks - 1).clamp(0, len(numbers) - 1)]
