@@ -112,16 +112,8 @@ class Obstacles(nn.Module):
         start: Float[Tensor, "*batch 3"],
         end: Float[Tensor, "*batch 3"],
         has_boxes: bool = True,
-        is_open: Bool[Tensor, "s k"] | None = None,
     ) -> Inexact[Tensor, "*batch"]:
-        """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad].
-
-        Args:
-            start: Starts of the segments, from the middle of the room [m].
-            end: Ends of the segments [m].
-            has_boxes: False leaves out boxes.
-            is_open: True for used boxes that do not dim a segment.
-        """
+        """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad]."""
         starts = start.reshape(-1, 3)
         ends = end.reshape(-1, 3)
         size = len(starts) or 1
@@ -137,16 +129,13 @@ class Obstacles(nn.Module):
         ]
         depths = torch.cat(parts)  # (segments, 1 or 2)
         if has_boxes:
-            solid = self._box_depths(starts, ends, is_open)  # (segments, 1)
+            solid = self._box_depths(starts, ends)  # (segments, 1)
             depths = torch.cat((depths[:, :1] + solid, depths[:, 1:]), 1)
         depths = depths[:, 0] if self.turns is None else torch.view_as_complex(depths)
         return depths.view(start.shape[:-1])
 
     def _box_depths(
-        self,
-        start: Float[Tensor, "s 3"],
-        end: Float[Tensor, "s 3"],
-        is_open: Bool[Tensor, "s k"] | None,
+        self, start: Float[Tensor, "s 3"], end: Float[Tensor, "s 3"]
     ) -> Float[Tensor, "s 1"]:
         """Depths of segments through boxes [Np]."""
         start = start @ self.box_axes
@@ -155,15 +144,7 @@ class Obstacles(nn.Module):
         hits = depths.new_zeros(len(start), len(depths))
         for number, box in enumerate(self.boxes[self.used]):
             hits[:, number] = passes_box(start, end, box)
-        if is_open is not None:
-            hits = hits.masked_fill(is_open, 0.0)
         return (hits @ depths)[:, None]
-
-    def holding(self, places: Float[Tensor, "b 3"]) -> Bool[Tensor, "b k"]:
-        """True for the used boxes that hold a place, from the middle of the room [m]."""
-        places = (places.to(self.box_axes) @ self.box_axes)[:, None]  # (b, 1, 3)
-        corners = self.boxes[self.used]
-        return ((places > corners[:, 0]) & (places < corners[:, 1])).all(2)
 
 
 def passes_box(

@@ -187,7 +187,7 @@ class PathFields(MovablePlanes):
         fields = torch.complex(gains.exp() * folded.exists, torch.zeros_like(gains))
         fields = folded.reflected(fields, self.coefficients(query, folded))
         if blocked and self.obstacles is not None and not self.is_bare:
-            fields = fields * (-self._depths(self.obstacles, query, folded, fields)).exp()
+            fields = fields * (-self._depths(self.obstacles, folded, fields)).exp()
         return fields
 
     def coefficients(self, query: Query, folded: Folded) -> Complex[Tensor, "b w"]:
@@ -207,11 +207,7 @@ class PathFields(MovablePlanes):
         return polarised(folded.normals, te, tm) * gains
 
     def _depths(
-        self,
-        obstacles: Obstacles,
-        query: Query,
-        folded: Folded,
-        strengths: Complex[Tensor, "b n"],
+        self, obstacles: Obstacles, folded: Folded, strengths: Complex[Tensor, "b n"]
     ) -> Inexact[Tensor, "b n"]:
         """Depth of each path through the obstacles [Np]; 0 for a path that does not exist.
 
@@ -232,13 +228,7 @@ class PathFields(MovablePlanes):
         # Number of each leg's path among the paths of all links, (b n) in a row.
         paths = folded.path + n * torch.arange(count, device=legs.device)[:, None]
         paths = paths.flatten()[legs]
-        receivers = self.scene.positions(query.transmitters)[query.receivers]
-        # Transmitters and receivers stand in the open, new ones too.
-        is_open = obstacles.holding(query.transmitters - self.middle)
-        is_open = is_open | obstacles.holding(receivers - self.middle)  # (b, k)
-        link = paths.div(n, rounding_mode="floor")
-        depth = obstacles(starts, ends, is_open=is_open[link])
-        return depths.flatten().index_add(0, paths, depth).view(count, n)
+        return depths.flatten().index_add(0, paths, obstacles(starts, ends)).view(count, n)
 
     def passing(self, query: Query) -> Float[Tensor, "b v"]:
         """Fields over free space of the direct path, then of the single reflection at each plane.

@@ -182,16 +182,3 @@ def test_checkpoint_without_boxes_loads(obstacles):
     for name in ("boxes", "box_axes", "box_depths"):
         del state[name]
     obstacles.load_state_dict(state)
-
-
-def test_a_box_does_not_dim_links_whose_end_it_holds():
-    obstacles = Obstacles(1, -torch.ones(3), torch.ones(3))
-    box = torch.tensor([[[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]]])
-    obstacles.place_boxes(torch.eye(3), box, torch.tensor([2.0]))
-    places = torch.tensor([[0.0, 0.0, 0.0], [0.9, 0.0, 0.0]])
-    is_open = obstacles.holding(places)
-    assert is_open.tolist() == [[True], [False]]
-    start = torch.tensor([[-0.9, 0.0, 0.0]]).expand(2, 3)
-    whole = obstacles(start, places)
-    opened = obstacles(start, places, is_open=is_open)
-    torch.testing.assert_close(whole - opened, torch.tensor([2.0, 0.0]))
