@@ -12,14 +12,14 @@ from scipy.constants import speed_of_light
 from torch import Tensor, nn
 
 from gaigs.core import stages
-from gaigs.core.propagation import fit_gain
+from gaigs.core.propagation import NEAREST, fit_gain
 from gaigs.core.query import Batch, Query, drawn
 from gaigs.core.scene import Scene, carriers, direct_gains, direct_waves
 from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.model import Model
 from gaigs.model.gaigs import GaussianSplatting
-from gaigs.planes.box_search import BoxSearch, ChannelErrors
+from gaigs.planes.box_search import BoxSearch, ChannelErrors, LevelErrors
 from gaigs.planes.channel_search import ChannelSearch
 from gaigs.planes.field_search import FieldSearch
 from gaigs.planes.lag_search import LagSearch
@@ -73,7 +73,8 @@ class MirroredSplatting(GaussianSplatting):
 
     places: Query | None = None  # set by fit
     levels: LevelSearch | None = None
-    shadowed: Batch | None = None  # channels in which boxes are searched; set by fit
+    shadowed: Batch | None = None  # links in which boxes are searched; set by fit
+    proof: Batch | None = None  # levels whose errors boxes must lower; set by fit
 
     def __init__(
         self,
@@ -113,6 +114,11 @@ class MirroredSplatting(GaussianSplatting):
             # A search by phases needs 20 links of each receiver; places of one radio have fewer.
             if searches and not self.is_wide and not self.scene.one_radio:
                 self._prepare_levels(links)
+        # Levels at known receivers are learnt as well without boxes. Without a carrier, as of
+        # Bluetooth beacons, boxes explained what single receivers have of their own.
+        is_shared = links.split.by_receivers and not self.scene.one_radio
+        if is_known and is_shared and not self.is_wide and isinstance(self.pooling, PathRssi):
+            self._prepare_boxes(links)
         # Without phases powers add to the end, and no later revision locates a plane.
         has_phases = is_known and not self.is_wide and not self.scene.one_radio
         self.settles = isinstance(self.pooling, PathRssi) and not has_phases
@@ -162,6 +168,15 @@ class MirroredSplatting(GaussianSplatting):
             self.placement.used.tolist(),
             self.placement.order,
         )
+
+    def _prepare_boxes(self, links: Links) -> None:
+        """Draws the levels in which ``revise`` searches boxes, and those that prove them."""
+        # With so many a search takes a minute; with 600 it finds a third of the furniture.
+        rows, held = drawn(links.split.train, 1500), drawn(links.split.validation, 1500)
+        # One receiver or two do not tell where along a path an obstacle stands.
+        if len(links.query.receivers[rows].unique()) >= 3 and len(held):
+            self.shadowed = Batch(links.query[rows], labels=links.labels[rows])
+            self.proof = Batch(links.query[held], labels=links.labels[held])
 
     def _fit_channels(self, links: Links, task: Task, pooling: ChannelPooling) -> None:
         """Starts the training from free space, and plans planes for its first revision.
@@ -270,10 +285,20 @@ class MirroredSplatting(GaussianSplatting):
         return super().predicts_untrained or bool(self.placement.is_bare)
 
     def revise(self, number: int, train: Batch, validation: Batch | None, loss: Loss) -> str:
-        """Lets paths interfere, and moves planes to where phases agree; drops needless paths.
+        """Places boxes, lets paths interfere, moves planes to where phases agree, drops paths.
 
         Planes that a search has found do not move.
         """
+        boxes = ""
+        # Boxes need the planes' strengths: those of levels are learnt from powers.
+        if number == 2 and isinstance(self.pooling, PathRssi):
+            boxes = self._place_boxes()
+        return self._revise_planes(number, train, validation, loss) + boxes
+
+    def _revise_planes(
+        self, number: int, train: Batch, validation: Batch | None, loss: Loss
+    ) -> str:
+        """``revise`` without boxes of levels."""
         placement = self.placement
         # Channels are sums of waves: powers alone say nothing, and phases count from the start.
         adds_waves = not isinstance(self.pooling, LagPooling)
@@ -283,7 +308,7 @@ class MirroredSplatting(GaussianSplatting):
         if number == len(self.revisions) - 1 or (number == 1 and placement.found):
             batches = [train] if validation is None else [train, validation]
             dropped = prune(placement, batches, loss)
-            return dropped + (self._place_boxes() if number == 1 else "")
+            return dropped + (self._place_boxes() if placement.is_complex and number == 1 else "")
         if number < 2 and not adds_waves:
             return "planes stay where they are"
         if self.is_wide or (self.scene.one_radio and not adds_waves):
@@ -310,13 +335,46 @@ class MirroredSplatting(GaussianSplatting):
 
     def _place_boxes(self) -> str:
         """Puts boxes that explain the shadows at all receivers in place of learnt obstacles."""
-        placement = self.placement
-        if self.shadowed is None or placement.obstacles is None:
+        obstacles = self.placement.obstacles
+        if self.shadowed is None or obstacles is None:
             return ""
-        query = self.shadowed.query.to(self.device)
-        rows = torch.arange(len(query), device=self.device)
+        search = self._box_search(self.shadowed)
+        boxes = search.run()
+        if stages.is_up():
+            return "; no time for boxes"
+        # Boxes may explain what single receivers have of their own: others must gain, too.
+        if boxes and self.proof is not None and self._box_search(self.proof).gain(boxes) <= 0:
+            return f"; {len(boxes)} boxes found, which held-out receivers do not confirm"
+        if boxes:
+            depths = search.places.new_tensor([box.loss for box in boxes])
+            corners = torch.stack([box.corners for box in boxes])
+            obstacles.place_boxes(self.placement.room_axes, corners, depths)
+        return f"; {len(boxes)} boxes found"
+
+    def _box_search(self, batch: Batch) -> BoxSearch:
+        """The search for boxes in some links, along the axes of the room."""
+        query = batch.query.to(self.device)
+        errors = self._shadow_errors(query, batch.labels.to(self.device))
+        axes = self.placement.room_axes
+        links = self.placement.folded(query)
+        paths = links.paths._replace(start=links.paths.start @ axes, end=links.paths.end @ axes)
+        ends = torch.cat((links.seen[0][:, 0], links.receivers)).unique(dim=0) @ axes
+        return BoxSearch(paths, errors, ends)
+
+    def _shadow_errors(self, query: Query, labels: Tensor) -> ChannelErrors | LevelErrors:
+        """Errors of links by the depths of their paths."""
+        placement = self.placement
+        if not placement.is_complex:
+            links = placement.folded(query)
+            fields = placement.strengths(query, links.paths, blocked=False).abs()
+            fields = fields * placement.patterns(query, links.ways)
+            powers = (fields / links.ways.norm(dim=-1).clamp_min(NEAREST)).square()
+            if self.trend is not None:
+                labels = labels - self.trend(Batch(query)).value
+            return LevelErrors(powers, labels, query.receivers)
         products, matches = [], []
-        for link, channel in zip(rows.split(1), self.shadowed.labels.split(1), strict=True):
+        rows = torch.arange(len(query), device=self.device)
+        for link, channel in zip(rows.split(1), labels.split(1), strict=True):
             asked = query[link]
             folded = placement.folded(asked)
             strengths = placement.strengths(asked, folded.paths, blocked=False)
@@ -324,18 +382,7 @@ class MirroredSplatting(GaussianSplatting):
             errors = ChannelErrors.of(fields, channel.to(fields))
             products.append(errors.products)
             matches.append(errors.matches)
-        axes = placement.room_axes
-        links = placement.folded(query)
-        paths = links.paths._replace(start=links.paths.start @ axes, end=links.paths.end @ axes)
-        ends = torch.cat((links.seen[0][:, 0], links.receivers)).unique(dim=0) @ axes
-        boxes = BoxSearch(paths, ChannelErrors(torch.cat(products), torch.cat(matches)), ends).run()
-        if stages.is_up():
-            return "; no time for boxes"
-        if boxes:
-            depths = ends.new_tensor([box.loss for box in boxes])
-            corners = torch.stack([box.corners for box in boxes])
-            placement.obstacles.place_boxes(axes, corners, depths)
-        return f"; {len(boxes)} boxes found"
+        return ChannelErrors(torch.cat(products), torch.cat(matches))
 
     def _start(self) -> Float[Tensor, "w 4"]:
         """Planes from which a search starts, in the world's frame.

@@ -4,7 +4,7 @@ import contextlib
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Complex, Float
+from jaxtyping import Complex, Float, Int
 from torch import Tensor
 
 from gaigs.core import stages
@@ -42,6 +42,27 @@ class ChannelErrors(NamedTuple):
         terms = (self.products @ passed[..., None])[..., 0] - 2 * self.matches
         errors = (1 + (passed * terms).sum(1)).clamp_min(0)
         return (errors / self.floor).log1p() - (errors * self.floor).log1p()
+
+
+class LevelErrors(NamedTuple):
+    """Logarithms of the squared errors of levels whose paths' powers are dimmed by depths.
+
+    The mean error of each receiver drops out: its gain is not yet right while obstacles are wrong.
+    """
+
+    powers: Float[Tensor, "b n"]  # of each path without obstacles
+    levels: Float[Tensor, " b"]  # [dB]
+    receivers: Int[Tensor, " b"]
+    scale: float = 6.0  # [dB]; larger errors pull less and less
+
+    def __call__(self, depths: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
+        """Error of each link with its paths dimmed by ``depths`` [Np]."""
+        power = (self.powers * (-2 * depths).exp()).sum(1).clamp_min(FAINTEST)
+        errors = 10 * power.log10() - self.levels
+        counts = self.receivers.bincount()
+        sums = errors.new_zeros(len(counts)).index_add(0, self.receivers, errors)
+        errors = errors - (sums / counts.clamp_min(1))[self.receivers]
+        return (errors / self.scale).square().log1p()
 
 
 class Cuboid(NamedTuple):
@@ -82,10 +103,16 @@ class BoxSearch:
     clear = 3.0
     price = 0.004
 
-    def __init__(self, folded: Folded, errors: ChannelErrors, places: Float[Tensor, "k 3"]):
+    def __init__(
+        self,
+        folded: Folded,
+        errors: ChannelErrors | LevelErrors,
+        places: Float[Tensor, "k 3"],
+    ):
         self.errors = errors
         self.places = places
         count, n = folded.exists.shape
+        self.free = places.new_zeros(count, n)  # depths without boxes
         path = folded.path + n * torch.arange(count, device=folded.path.device)[:, None]  # (b, s)
         exists = folded.exists[:, folded.path].flatten().nonzero()[:, 0]
         self.path = path.flatten()[exists]
@@ -128,6 +155,15 @@ class BoxSearch:
             self._cut(box)
         return True
 
+    @torch.no_grad()
+    def gain(self, boxes: list[Cuboid]) -> float:
+        """Fall of the mean error by boxes, which another search may have found; 0 if the time is
+        up.
+        """
+        with contextlib.suppress(TimeoutError):
+            return self._error(self.free, []) - self._error(self.free, boxes)
+        return 0.0
+
     def _depth(self, box: Cuboid) -> Float[Tensor, "b n"]:
         """Depths of all paths by a box [Np].
 
@@ -137,16 +173,14 @@ class BoxSearch:
         if stages.is_up():
             raise TimeoutError
         hit = passes_box(self.start, self.end, box.corners).nonzero()[:, 0]
-        depths = torch.zeros_like(self.errors.matches)
+        depths = self.free
         losses = depths.new_full((len(hit),), box.loss)
         return depths.flatten().index_add(0, self.path[hit], losses).view_as(depths)
 
     def _depths(self, boxes: list[Cuboid]) -> Float[Tensor, "b n"]:
         """Depths of all paths by boxes and in common [Np]."""
-        depths = torch.full_like(self.errors.matches, self.common)
-        for box in boxes:
-            depths = depths + self._depth(box)
-        return depths
+        depths = self.free + self.common
+        return sum((self._depth(box) for box in boxes), start=depths)
 
     def _error(self, depths: Float[Tensor, "b n"], boxes: list[Cuboid]) -> float:
         """Mean error with boxes added."""

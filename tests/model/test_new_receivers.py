@@ -13,6 +13,7 @@ from gaigs.model.friis import Friis
 from gaigs.model.knn import KNearestNeighbours
 from gaigs.model.mirrored import MirroredSplatting
 from gaigs.model.path_loss import PathLoss
+from gaigs.planes.box_search import BoxSearch, Cuboid
 
 PLACES = torch.tensor([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]])
 
@@ -228,3 +229,29 @@ def test_readings_at_a_new_receiver_correct_its_level():
         moved.adapt(far)
     with pytest.raises(ValueError, match="adapt takes a model of levels"):
         gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0)).adapt(far)
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("loss", [1.0, 50.0])
+def test_boxes_of_levels_need_receivers_that_confirm_them(monkeypatch, loss):
+    links = gaigs.links("synthetic_rssi", transmitters=30, receivers=6, split="receivers")
+    model = MirroredSplatting(links.scene, placement={"name": "mirrored", "order": 1})
+    model.fit(links)
+    places = model.shadowed.query.transmitters
+    proving = model.proof.query.receivers
+    assert not torch.isin(proving, model.shadowed.query.receivers).any()
+    ends = places.amin(0), places.amax(0)
+    box = Cuboid(torch.stack(ends) - model.placement.middle, loss)
+    monkeypatch.setattr(BoxSearch, "run", lambda search: [box])
+    monkeypatch.setattr(BoxSearch, "gain", lambda search, boxes: 2.0 - boxes[0].loss)
+    outcome = model._place_boxes()
+    assert model.placement.obstacles.used.any() == (loss < 2)
+    assert ("do not confirm" in outcome) == (loss > 2)
+
+
+def test_levels_at_known_receivers_have_no_boxes():
+    links = gaigs.links("synthetic_rssi", transmitters=30, receivers=6)
+    model = MirroredSplatting(links.scene, placement={"name": "mirrored", "order": 1})
+    model.fit(links)
+    assert model.shadowed is None
+    assert model._place_boxes() == ""

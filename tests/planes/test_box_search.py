@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gaigs.planes.box_search import BoxSearch, ChannelErrors
+from gaigs.planes.box_search import BoxSearch, ChannelErrors, LevelErrors
 from gaigs.splatting.placement.mirrored.obstacles import passes_box
 from gaigs.splatting.placement.mirrored.reflections import fold
 
@@ -74,3 +74,20 @@ def test_errors_are_those_of_the_sum_of_paths():
     share = rest.abs().square().sum((1, 2)) / channels.abs().square().sum((1, 2))
     expected = (share / 1e-3).log1p() - (share * 1e-3).log1p()
     torch.testing.assert_close(ChannelErrors.of(fields, channels)(depths), expected)
+
+
+def test_levels_find_the_box_whatever_the_gains_of_receivers(links):
+    paths, sent, heard = links
+    blocked = passes_box(sent, heard, CORNERS)
+    _, receivers = heard.unique(dim=0, return_inverse=True)
+    powers = (sent - heard).square().sum(1, keepdim=True).reciprocal()
+    clear = 10 * powers[:, 0].log10() + 5 * receivers
+    levels = clear - 20 * LOSS * blocked / torch.tensor(10.0).log()
+    search = BoxSearch(paths, LevelErrors(powers, levels, receivers), torch.cat((sent, heard)))
+    (box,) = search.run()
+    assert box.loss == pytest.approx(LOSS, rel=0.1)
+    assert (passes_box(sent, heard, box.corners) == blocked).float().mean() > 0.97
+    assert search.gain([box]) > 0.1
+    # Receivers in the open do not confirm it.
+    proof = BoxSearch(paths, LevelErrors(powers, clear, receivers), torch.cat((sent, heard)))
+    assert proof.gain([box]) < 0
