@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Inexact, Int
@@ -109,11 +109,21 @@ class Field(nn.Module):
         self._widen()
 
 
+class FieldChoice(NamedTuple):
+    """A candidate of a fit."""
+
+    weight: float  # of the trend
+    has_traits: bool  # True if places correlate by traits, too
+
+
 class FieldPosterior(Posterior):
     """Kriged residuals of labels of many numbers, a ``Field`` for each receiver.
 
     Hyperparameters are the same for all receivers and numbers. The trend weight is the likeliest of
     its candidates. Residuals of channels are limited, see ``damping``.
+
+    Spectra have ``traits``, the trend's spectra by ``coarse``: places correlate the less, the more
+    these differ, as where a shadow ends between them.
     """
 
     chooses_weight = True
@@ -133,30 +143,54 @@ class FieldPosterior(Posterior):
         """The hyperparameters by name."""
         return Hyperparameters(*self.hyperparameters.tolist())
 
-    def fit(self, links: Links, candidates: Mapping[float, Tensor]) -> float:
+    @property
+    def has_traits(self) -> bool:  # type: ignore[override]
+        return not self.scene.has_band and not math.isnan(self.process.scale)
+
+    def fit(
+        self,
+        links: Links,
+        candidates: Mapping[float, Tensor],
+        traits: Float[Tensor, "k c"] | None = None,
+    ) -> float:
         index = links.split.known
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
 
-        def fitted(weight: float, most: int = 300) -> tuple[Hyperparameters, float]:
-            residuals = candidates[weight]
+        def fitted(choice: FieldChoice, most: int = 300) -> tuple[Hyperparameters, float]:
+            residuals = candidates[choice.weight]
             if residuals.is_complex():
                 labels = thin_labels(links.labels[index])
                 radios = self.scene.radio_of(links.query.receivers[index])
                 factors = damping(residuals, labels, radios)
                 residuals = residuals * factors[:, None]
-            return fit_hyperparameters(
-                self.scene, links, lambda part: residuals[rows[part]], most=most
+            process, cost = fit_hyperparameters(
+                self.scene,
+                links,
+                lambda part: residuals[rows[part]],
+                most=most,
+                traits=(lambda part: traits[rows[part]]) if choice.has_traits else None,
             )
+            # A hyperparameter more has to raise the likelihood (Akaike, 1974).
+            return process, cost + 2 * choice.has_traits
 
-        fits = {weight: fitted(weight) for weight in stages.track([*candidates], "kriging")}
-        best = min(candidates, key=lambda weight: fits[weight][1])
+        choices = [FieldChoice(weight, False) for weight in candidates]
+        if traits is not None:
+            choices += [FieldChoice(weight, True) for weight in candidates]
+        fits = {choice: fitted(choice) for choice in stages.track(choices, "kriging")}
+        best = min(choices, key=lambda choice: fits[choice][1])
         process, _ = fits[best]
-        if best:  # residuals of a good trend correlate weakly with position: few links overfit
+        # Residuals of a good trend correlate weakly with position: few links overfit.
+        if best.weight or best.has_traits:
             process, _ = fitted(best, most=1000)
         self.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
-        return best
+        return best.weight
 
-    def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
+    def solve(
+        self,
+        links: Links,
+        residuals: Callable[[Int[Tensor, " j"]], Tensor],
+        traits: Float[Tensor, "k c"] | None = None,
+    ) -> None:
         index = links.split.known
         query, process = links.query[index], self.process
         radios = self.scene.radio_of(query.receivers)
@@ -168,20 +202,23 @@ class FieldPosterior(Posterior):
             if values.is_complex():
                 labels = links.labels[index[rows]]
                 values = values * damping(values, labels, radios[rows])[:, None, None]
-            field.solve(self._places(query[rows]), values, process, self.share)
+            field.solve(self._places(query, traits)[rows], values, process, self.share)
 
-    def mean(self, batch: Batch, like: Tensor) -> Tensor:
+    def mean(
+        self, batch: Batch, like: Tensor, traits: Float[Tensor, "b c"] | None = None
+    ) -> Tensor:
+        all_places = self._places(batch.query, traits)
         mean = torch.zeros_like(like)
         radios = self.scene.radio_of(batch.query.receivers)
         for radio in radios.unique().tolist():
             is_asked = radios == radio
-            places = self._places(batch.query[is_asked])
-            mean[is_asked] = self.fields[radio](places, self.process.length, batch).to(mean)
+            field = self.fields[radio]
+            mean[is_asked] = field(all_places[is_asked], self.process.length, batch).to(mean)
         return mean
 
-    def deviations(self, batch: Batch) -> Tensor:
+    def deviations(self, batch: Batch, traits: Float[Tensor, "b c"] | None = None) -> Tensor:
         query, process = batch.query, self.process
-        places = self._places(query)
+        places = self._places(query, traits)
         squares = places.new_zeros(len(query))
         radios = self.scene.radio_of(query.receivers)
         for radio in radios.unique().tolist():
@@ -194,7 +231,9 @@ class FieldPosterior(Posterior):
 
     def process_at(self, receiver: int) -> Process:
         field, process = self.fields[receiver], self.process
-        places = scaled(field.places, 1 / process.scale)  # of scale 1
+        # In place and frequency alone: whoever asks for the process knows no traits.
+        known = field.places if not self.has_traits else field.places[:, :3]
+        places = scaled(known, 1 / process.scale)  # of scale 1
         found = process.at(places, field.size(process).item() ** 2)
         return replace(found, is_part=len(places) >= LIMIT)
 
@@ -202,10 +241,13 @@ class FieldPosterior(Posterior):
         places = [len(field.places) for field in self.fields]  # type: ignore[arg-type]
         components = [len(field.components) for field in self.fields]  # type: ignore[arg-type]
         sizes = {"links": sum(places), "components": max(components)}
-        return {**self.process.facts(), **sizes}
+        facts = self.process.facts()
+        if self.has_traits:
+            facts["spectrum_scale_m"] = facts.pop("frequency_scale_m")
+        return {**facts, **sizes}
 
-    def _places(self, query: Query) -> Float[Tensor, "b d"]:
-        return coordinates(self.scene, query, self.process.scale)
+    def _places(self, query: Query, traits: Float[Tensor, "b c"] | None) -> Float[Tensor, "b d"]:
+        return coordinates(self.scene, query, self.process.scale, traits)
 
 
 def _like_loaded(buffer: Tensor, values: Tensor) -> Tensor:
@@ -214,7 +256,7 @@ def _like_loaded(buffer: Tensor, values: Tensor) -> Tensor:
 
 
 def principal_components(
-    residuals: Inexact[Tensor, "k m"], share: float = 5e-4, most: int = 256, exact: int = 512
+    residuals: Inexact[Tensor, "k m"], share: float = 5e-4, most: int = 512, exact: int = 512
 ) -> Inexact[Tensor, "q m"]:
     """The fewest principal components that leave out at most a share of the energy, each scaled to
     a maximum of 1.

@@ -34,7 +34,7 @@ class Hyperparameters(NamedTuple):
 
     length: float = math.nan  # correlation length of the kernel [m]
     nugget: float = math.nan  # variance of the noise over the signal's
-    scale: float = math.nan  # of frequencies, see ``coordinates`` [m]; NaN without a band
+    scale: float = math.nan  # of frequencies or traits, see ``coordinates`` [m]; NaN without
 
     def facts(self) -> dict[str, float]:
         """Entries of ``metrics.json``."""
@@ -63,6 +63,7 @@ class HeldOut(NamedTuple):
     around: Query  # links around each held-out link, one group after the other
     # Products of the residuals of each held-out link and of those around it.
     products: Float[Tensor, "b j+1 j+1"]
+    traits: Float[Tensor, "b j+1 c"] | None = None  # of each held-out link and of those around it
 
 
 def damping(
@@ -99,6 +100,7 @@ def fit_hyperparameters(
     most: int = 300,
     nuggets: tuple[float, float] = (1e-4, 1e2),
     edges: float = 8.0,
+    traits: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
 ) -> tuple[Hyperparameters, float]:
     """Hyperparameters with the largest likelihood, and ``negative_log_likelihood``; -inf if all
     residuals are 0.
@@ -112,9 +114,15 @@ def fit_hyperparameters(
             measured twice.
         edges: Longest correlation length, in longest edges of the box of places: beyond it the
             kernel is a line in the box.
+        traits: Function from indices of links to their traits, see ``coordinates``.
     """
-    lengths = scene.spacing, edges * (scene.upper - scene.lower).max().item()
+    longest = (scene.upper - scene.lower).max().item()
+    lengths = scene.spacing, edges * longest
     scales = [scale_bounds(scene)] if scene.has_band else []
+    if traits is not None:
+        # From a tenth of the next place's distance, which is no effect, to the longest edge.
+        spread = traits(links.split.known).var(0).sum().sqrt().clamp_min(1e-9).item()
+        scales = [(0.1 * scene.spacing / spread, longest / spread)]
     bounds = np.log([lengths, nuggets, *scales])
     middle = bounds.mean(1)
     scale = math.exp(middle[2]) if scene.has_band else math.nan
@@ -124,7 +132,7 @@ def fit_hyperparameters(
     each = max(1, most // len(known))
     held_out = []
     for index in known:
-        held = hold_out(scene, links, index, scale, residuals, each)
+        held = hold_out(scene, links, index, scale, residuals, each, traits=traits)
         held_out += [] if held is None else [held]
     if not held_out:
         return Hyperparameters(*np.exp(middle).tolist()), -math.inf
@@ -164,6 +172,7 @@ def hold_out(
     residuals: Callable[[Int[Tensor, " j"]], Float[Tensor, "j m"]],
     most: int,
     neighbours: int = 64,
+    traits: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
 ) -> HeldOut | None:
     """At most ``most`` held-out links of a receiver; None if their residuals are all 0 or no other
     place is known.
@@ -200,7 +209,10 @@ def hold_out(
         group = numbers[rows]  # (j + 1, m)
         products.append((group @ group.mH).real)
     means = torch.stack(products) / numbers.shape[1]
-    return HeldOut(query[asked], query[around.flatten()], means) if means.any() else None
+    if not means.any():
+        return None
+    of_groups = None if traits is None else traits(used)[place]
+    return HeldOut(query[asked], query[around.flatten()], means, of_groups)
 
 
 def negative_log_likelihood(
@@ -213,8 +225,12 @@ def negative_log_likelihood(
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """
-    asked = coordinates(scene, held.asked, scale)  # (b, d)
-    around = coordinates(scene, held.around, scale).unflatten(0, (len(asked), -1))  # (b, j, d)
+    own = others = None
+    if held.traits is not None:
+        own, others = held.traits[:, 0], held.traits[:, 1:].flatten(0, 1)
+    asked = coordinates(scene, held.asked, scale, own)  # (b, d)
+    around = coordinates(scene, held.around, scale, others)  # (b j, d)
+    around = around.unflatten(0, (len(asked), -1))  # (b, j, d)
     weights, variances = kriging_weights(asked, around, length, nugget)
     squares = held.products[:, 0, 0]  # (b,)
     cross = held.products[:, 0, 1:]  # (b, j)
