@@ -145,18 +145,33 @@ class Pose:
         return points @ pose.rotation.mT + pose.position
 
 
+def _rotation_sums() -> Float[Tensor, "16 9"]:
+    """Signs of the products ww, wx, ... zz of a quaternion in each entry of its rotation matrix."""
+    entries = (
+        "-yy-zz", "+xy-wz", "+xz+wy",
+        "+xy+wz", "-xx-zz", "+yz-wx",
+        "+xz-wy", "+yz+wx", "-xx-yy",
+    )  # fmt: skip
+    table = torch.zeros(4, 4, 9)
+    for entry, terms in enumerate(entries):
+        for sign, first, second in (terms[:3], terms[3:]):
+            table["wxyz".index(first), "wxyz".index(second), entry] = float(f"{sign}1")
+    return table.flatten(0, 1)
+
+
+ROTATION_SUMS = _rotation_sums()
+
+
 def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of quaternions (w, x, y, z) of any length; length 0 means no rotation."""
     quats = _of_moderate_length(quats)
-    w, x, y, z = quats.unbind(-1)
-    squares = (quats * quats).sum(-1)
+    squares = (quats * quats).sum(-1, keepdim=True)  # (..., 1)
     s = 2 / torch.where(squares == 0, 1, squares)
-    rows = (
-        1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
-        s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x),
-        s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y),
-    )  # fmt: skip
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    # R = 1 + s (sums of products of two components): few operations, as each costs the time of
+    # hundreds of Gaussians.
+    products = (quats[..., :, None] * quats[..., None, :]).flatten(-2)  # (..., 16)
+    sums = s * (products @ ROTATION_SUMS.to(quats))  # (..., 9)
+    return sums.unflatten(-1, (3, 3)) + torch.eye(3, dtype=quats.dtype, device=quats.device)
 
 
 def unit_quaternions(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:

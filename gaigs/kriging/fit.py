@@ -101,6 +101,7 @@ def fit_hyperparameters(
     nuggets: tuple[float, float] = (1e-4, 1e2),
     edges: float = 8.0,
     traits: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
+    length: float | None = None,
 ) -> tuple[Hyperparameters, float]:
     """Hyperparameters with the largest likelihood, and ``negative_log_likelihood``; -inf if all
     residuals are 0.
@@ -115,9 +116,12 @@ def fit_hyperparameters(
         edges: Longest correlation length, in longest edges of the box of places: beyond it the
             kernel is a line in the box.
         traits: Function from indices of links to their traits, see ``coordinates``.
+        length: A known correlation length; the others then have the least squared error of the
+            held-out labels in place of the largest likelihood. A trend has seen the training links:
+            variances by their residuals mislead.
     """
     longest = (scene.upper - scene.lower).max().item()
-    lengths = scene.spacing, edges * longest
+    lengths = (scene.spacing, edges * longest) if length is None else (length, length)
     scales = [scale_bounds(scene)] if scene.has_band else []
     if traits is not None:
         # From a tenth of the next place's distance, which is no effect, to the longest edge.
@@ -138,7 +142,12 @@ def fit_hyperparameters(
         return Hyperparameters(*np.exp(middle).tolist()), -math.inf
 
     def value(logarithms: Tensor) -> Tensor:
-        parts = (negative_log_likelihood(scene, held, *logarithms.exp()) for held in held_out)
+        hyperparameters = logarithms.exp()
+        scale = hyperparameters[2] if len(bounds) > 2 else math.nan
+        parts = (
+            negative_log_likelihood(scene, held, *hyperparameters[:2], scale, length is not None)
+            for held in held_out
+        )
         return sum(parts, torch.zeros(()))
 
     def cost(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
@@ -216,12 +225,18 @@ def hold_out(
 
 
 def negative_log_likelihood(
-    scene: Scene, held: HeldOut, length: Tensor, nugget: Tensor, scale: Tensor | float = math.nan
+    scene: Scene,
+    held: HeldOut,
+    length: Tensor,
+    nugget: Tensor,
+    scale: Tensor | float = math.nan,
+    by_errors: bool = False,
 ) -> Float[Tensor, ""]:
     """-2 log p(held-out labels | labels around them) but for a constant, a mean over the label's
     numbers.
 
-    The signal's variance is the receiver's most likely one.
+    The signal's variance is the receiver's most likely one. With ``by_errors`` all held-out labels
+    have one variance.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """
@@ -240,6 +255,8 @@ def negative_log_likelihood(
     errors = squares - 2 * (weights * cross).sum(1) + predicted
     # The difference of nearly equal numbers, rounded to float64's sixteen digits, may be negative.
     errors = errors.clamp_min(1e-12 * squares.mean())
+    if by_errors:
+        return len(asked) * errors.mean().log()
     return len(asked) * (errors / variances).mean().log() + variances.log().sum()
 
 
