@@ -154,8 +154,9 @@ def _rotation_sums() -> Float[Tensor, "16 9"]:
     )  # fmt: skip
     table = torch.zeros(4, 4, 9)
     for entry, terms in enumerate(entries):
-        for sign, first, second in (terms[:3], terms[3:]):
-            table["wxyz".index(first), "wxyz".index(second), entry] = float(f"{sign}1")
+        for term in (terms[:3], terms[3:]):
+            row, column = map("wxyz".index, term[1:])
+            table[row, column, entry] = float(f"{term[0]}1")
     return table.flatten(0, 1)
 
 

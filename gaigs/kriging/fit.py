@@ -142,10 +142,10 @@ def fit_hyperparameters(
         return Hyperparameters(*np.exp(middle).tolist()), -math.inf
 
     def value(logarithms: Tensor) -> Tensor:
-        hyperparameters = logarithms.exp()
-        scale = hyperparameters[2] if len(bounds) > 2 else math.nan
+        of_kernel = logarithms.exp()
+        by_errors = length is not None
         parts = (
-            negative_log_likelihood(scene, held, *hyperparameters[:2], scale, length is not None)
+            negative_log_likelihood(scene, held, *of_kernel, by_errors=by_errors)
             for held in held_out
         )
         return sum(parts, torch.zeros(()))
@@ -230,6 +230,7 @@ def negative_log_likelihood(
     length: Tensor,
     nugget: Tensor,
     scale: Tensor | float = math.nan,
+    *,
     by_errors: bool = False,
 ) -> Float[Tensor, ""]:
     """-2 log p(held-out labels | labels around them) but for a constant, a mean over the label's
@@ -240,11 +241,10 @@ def negative_log_likelihood(
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """
-    own = others = None
-    if held.traits is not None:
-        own, others = held.traits[:, 0], held.traits[:, 1:].flatten(0, 1)
-    asked = coordinates(scene, held.asked, scale, own)  # (b, d)
-    around = coordinates(scene, held.around, scale, others)  # (b j, d)
+    of_asked = None if held.traits is None else held.traits[:, 0]
+    of_around = None if held.traits is None else held.traits[:, 1:].flatten(0, 1)
+    asked = coordinates(scene, held.asked, scale, of_asked)  # (b, d)
+    around = coordinates(scene, held.around, scale, of_around)  # (b j, d)
     around = around.unflatten(0, (len(asked), -1))  # (b, j, d)
     weights, variances = kriging_weights(asked, around, length, nugget)
     squares = held.products[:, 0, 0]  # (b,)
