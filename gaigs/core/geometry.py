@@ -145,34 +145,18 @@ class Pose:
         return points @ pose.rotation.mT + pose.position
 
 
-def _rotation_sums() -> Float[Tensor, "16 9"]:
-    """Signs of the products ww, wx, ... zz of a quaternion in each entry of its rotation matrix."""
-    entries = (
-        "-yy-zz", "+xy-wz", "+xz+wy",
-        "+xy+wz", "-xx-zz", "+yz-wx",
-        "+xz-wy", "+yz+wx", "-xx-yy",
-    )  # fmt: skip
-    table = torch.zeros(4, 4, 9)
-    for entry, terms in enumerate(entries):
-        for term in (terms[:3], terms[3:]):
-            row, column = map("wxyz".index, term[1:])
-            table[row, column, entry] = float(f"{term[0]}1")
-    return table.flatten(0, 1)
-
-
-ROTATION_SUMS = _rotation_sums()
-
-
 def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of quaternions (w, x, y, z) of any length; length 0 means no rotation."""
     quats = _of_moderate_length(quats)
     squares = (quats * quats).sum(-1, keepdim=True)  # (..., 1)
     s = 2 / torch.where(squares == 0, 1, squares)
-    # R = 1 + s (sums of products of two components): few operations, as each costs the time of
-    # hundreds of Gaussians.
-    products = (quats[..., :, None] * quats[..., None, :]).flatten(-2)  # (..., 16)
-    sums = s * (products @ ROTATION_SUMS.to(quats))  # (..., 9)
-    return sums.unflatten(-1, (3, 3)) + torch.eye(3, dtype=quats.dtype, device=quats.device)
+    # R e = e + s (w u x e + u x (u x e)) with u = (x, y, z), for each axis e: few operations, since
+    # one costs the time of hundreds of Gaussians.
+    w, u = quats[..., :1, None], quats[..., None, 1:]  # (..., 1, 1) and (..., 1, 3)
+    axes = torch.eye(3, dtype=quats.dtype, device=quats.device)
+    turned = torch.linalg.cross(u, axes.expand(*quats.shape[:-1], 3, 3))
+    turned = w * turned + torch.linalg.cross(u.expand_as(turned), turned)
+    return (axes + s[..., None] * turned).mT
 
 
 def unit_quaternions(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
