@@ -40,21 +40,18 @@ class Mix(torch.autograd.Function):
         ctx.shapes = multivectors.shape, scalars.shape
         x = _components_first(multivectors)  # (k, n, c) for n tokens
         flat = scalars.flatten(0, -2)  # (n, s)
-        wedges = [x]
-        for wedge in null_wedges[1:]:
-            wedges.append((wedge @ x.flatten(1)).view_as(x))
-        # A matrix for each wedge and component.
-        matrices = weight.index_select(0, maps.flatten())
-        matrices = matrices.view(*maps.shape, *weight.shape[1:])  # (2**r, k, c, c_out)
-        result = torch.bmm(x, matrices[0])  # (k, n, c_out)
-        for wedge, matrix in zip(wedges[1:], matrices[1:], strict=True):
-            result.baddbmm_(wedge, matrix)
+        parts = [x, *((wedge @ x.flatten(1)).view_as(x) for wedge in null_wedges[1:])]
+        wedges = torch.cat(parts, -1)  # (k, n, 2**r c)
+        # A matrix for each component, from all wedges.
+        matrices = weight.index_select(0, maps.mT.flatten())
+        matrices = matrices.view(len(x), -1, weight.shape[2])  # (k, 2**r c, c_out)
+        result = torch.bmm(wedges, matrices)  # (k, n, c_out)
         # Scalars mix with the components 1, which are invariant too.
         result[0].addmm_(flat, from_weight.mT).add_(from_bias)
         seen = torch.cat((x[0], flat), -1)  # (n, c + s)
         mixed = torch.addmm(to_bias, seen, to_weight.mT)  # (n, s_out)
         ctx.save_for_backward(
-            seen, matrices, weight, from_weight, to_weight, maps, null_wedges, *wedges
+            seen, matrices, weight, from_weight, to_weight, maps, null_wedges, wedges
         )
         tokens = multivectors.shape[:-2]
         return result.unflatten(1, tokens).movedim(0, -1), mixed.unflatten(0, tokens)
@@ -62,19 +59,20 @@ class Mix(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, to_multivectors, to_scalars):
-        seen, matrices, weight, from_weight, to_weight, maps, null_wedges, *wedges = (
+        seen, matrices, weight, from_weight, to_weight, maps, null_wedges, wedges = (
             ctx.saved_tensors
         )
         shape, scalars_shape = ctx.shapes
         g = _components_first(to_multivectors)  # (k, n, c_out)
         flat = to_scalars.flatten(0, -2)  # (n, s_out)
-        x = torch.bmm(g, matrices[0].mT)  # (k, n, c)
-        for wedge, matrix in zip(null_wedges[1:], matrices[1:], strict=True):
-            x.flatten(1).addmm_(wedge.mT, torch.bmm(g, matrix.mT).flatten(1))
+        x, *others = torch.bmm(g, matrices.mT).split(shape[-2], -1)  # (k, n, c) each
+        x = x.contiguous()
+        for wedge, other in zip(null_wedges[1:], others, strict=True):
+            x.flatten(1).addmm_(wedge.mT, other.flatten(1))
         # Each matrix is a row of ``weight`` by ``maps``, so its gradient adds to that row's.
-        matrix_gradients = torch.cat([torch.bmm(wedge.mT, g) for wedge in wedges])
+        matrix_gradients = torch.bmm(wedges.mT, g).view(-1, *weight.shape[1:])
         weight_gradient = torch.zeros_like(weight)
-        weight_gradient.index_add_(0, maps.flatten(), matrix_gradients)
+        weight_gradient.index_add_(0, maps.mT.flatten(), matrix_gradients)
         # Gradients of the components 1 and of the scalars by way of the scalars' map.
         ones, scalars = (flat @ to_weight).split((shape[-2], scalars_shape[-1]), -1)
         x[0] += ones

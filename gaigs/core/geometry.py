@@ -148,15 +148,15 @@ class Pose:
 def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of quaternions (w, x, y, z) of any length; length 0 means no rotation."""
     quats = _of_moderate_length(quats)
-    w, x, y, z = quats.unbind(-1)
-    squares = (quats * quats).sum(-1)
+    squares = (quats * quats).sum(-1, keepdim=True)  # (..., 1)
     s = 2 / torch.where(squares == 0, 1, squares)
-    rows = (
-        1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y),
-        s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x),
-        s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y),
-    )  # fmt: skip
-    return torch.stack(rows, -1).unflatten(-1, (3, 3))
+    # R e = e + s (w u x e + u x (u x e)) with u = (x, y, z), for each axis e: few operations, since
+    # one costs the time of hundreds of Gaussians.
+    w, u = quats[..., :1, None], quats[..., None, 1:]  # (..., 1, 1) and (..., 1, 3)
+    axes = torch.eye(3, dtype=quats.dtype, device=quats.device)
+    turned = torch.linalg.cross(u, axes.expand(*quats.shape[:-1], 3, 3))
+    turned = w * turned + torch.linalg.cross(u.expand_as(turned), turned)
+    return (axes + s[..., None] * turned).mT
 
 
 def unit_quaternions(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:

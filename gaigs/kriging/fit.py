@@ -34,7 +34,7 @@ class Hyperparameters(NamedTuple):
 
     length: float = math.nan  # correlation length of the kernel [m]
     nugget: float = math.nan  # variance of the noise over the signal's
-    scale: float = math.nan  # of frequencies, see ``coordinates`` [m]; NaN without a band
+    scale: float = math.nan  # of frequencies or traits, see ``coordinates`` [m]; NaN without
 
     def facts(self) -> dict[str, float]:
         """Entries of ``metrics.json``."""
@@ -63,6 +63,7 @@ class HeldOut(NamedTuple):
     around: Query  # links around each held-out link, one group after the other
     # Products of the residuals of each held-out link and of those around it.
     products: Float[Tensor, "b j+1 j+1"]
+    traits: Float[Tensor, "b j+1 c"] | None = None  # of each held-out link and of those around it
 
 
 def damping(
@@ -99,6 +100,8 @@ def fit_hyperparameters(
     most: int = 300,
     nuggets: tuple[float, float] = (1e-4, 1e2),
     edges: float = 8.0,
+    traits: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
+    length: float | None = None,
 ) -> tuple[Hyperparameters, float]:
     """Hyperparameters with the largest likelihood, and their ``negative_log_likelihood`` summed
     over receivers, -inf if all residuals are 0.
@@ -112,9 +115,18 @@ def fit_hyperparameters(
             measured twice.
         edges: Longest correlation length, in longest edges of the box of places: beyond it the
             kernel is a line in the box.
+        traits: Function from indices of links to their traits, see ``coordinates``.
+        length: A known correlation length; the others then have the least squared error of the
+            held-out labels in place of the largest likelihood. A trend has seen the training links:
+            variances by their residuals mislead.
     """
-    lengths = scene.spacing, edges * (scene.upper - scene.lower).max().item()
+    longest = (scene.upper - scene.lower).max().item()
+    lengths = (scene.spacing, edges * longest) if length is None else (length, length)
     scales = [scale_bounds(scene)] if scene.has_band else []
+    if traits is not None:
+        # From a tenth of the next place's distance, which is no effect, to the longest edge.
+        spread = traits(links.split.known).var(0).sum().sqrt().clamp_min(1e-9).item()
+        scales = [(0.1 * scene.spacing / spread, longest / spread)]
     bounds = np.log([lengths, nuggets, *scales])
     middle = bounds.mean(1)
     scale = math.exp(middle[2]) if scene.has_band else math.nan
@@ -124,13 +136,18 @@ def fit_hyperparameters(
     each = max(1, most // len(known))
     held_out = []
     for index in known:
-        held = hold_out(scene, links, index, scale, residuals, each)
+        held = hold_out(scene, links, index, scale, residuals, each, traits=traits)
         held_out += [] if held is None else [held]
     if not held_out:
         return Hyperparameters(*np.exp(middle).tolist()), -math.inf
 
     def value(logarithms: Tensor) -> Tensor:
-        parts = (negative_log_likelihood(scene, held, *logarithms.exp()) for held in held_out)
+        of_kernel = logarithms.exp()
+        by_errors = length is not None
+        parts = (
+            negative_log_likelihood(scene, held, *of_kernel, by_errors=by_errors)
+            for held in held_out
+        )
         return sum(parts, torch.zeros(()))
 
     def cost(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
@@ -164,6 +181,7 @@ def hold_out(
     residuals: Callable[[Int[Tensor, " j"]], Float[Tensor, "j m"]],
     most: int,
     neighbours: int = 64,
+    traits: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
 ) -> HeldOut | None:
     """At most ``most`` held-out links of one receiver, and the known links that predict them.
 
@@ -200,21 +218,34 @@ def hold_out(
         group = numbers[rows]  # (j + 1, m)
         products.append((group @ group.mH).real)
     means = torch.stack(products) / numbers.shape[1]
-    return HeldOut(query[asked], query[around.flatten()], means) if means.any() else None
+    if not means.any():
+        return None
+    of_groups = None if traits is None else traits(used)[place]
+    return HeldOut(query[asked], query[around.flatten()], means, of_groups)
 
 
 def negative_log_likelihood(
-    scene: Scene, held: HeldOut, length: Tensor, nugget: Tensor, scale: Tensor | float = math.nan
+    scene: Scene,
+    held: HeldOut,
+    length: Tensor,
+    nugget: Tensor,
+    scale: Tensor | float = math.nan,
+    *,
+    by_errors: bool = False,
 ) -> Float[Tensor, ""]:
     """-2 log p(held-out labels | labels around them) without constants, a mean over a label's
     numbers.
 
-    The signal's variance is the receiver's most likely one.
+    The signal's variance is the receiver's most likely one. With ``by_errors`` all held-out labels
+    have one variance.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """
-    asked = coordinates(scene, held.asked, scale)  # (b, d)
-    around = coordinates(scene, held.around, scale).unflatten(0, (len(asked), -1))  # (b, j, d)
+    of_asked = None if held.traits is None else held.traits[:, 0]
+    of_around = None if held.traits is None else held.traits[:, 1:].flatten(0, 1)
+    asked = coordinates(scene, held.asked, scale, of_asked)  # (b, d)
+    around = coordinates(scene, held.around, scale, of_around)  # (b j, d)
+    around = around.unflatten(0, (len(asked), -1))  # (b, j, d)
     weights, variances = kriging_weights(asked, around, length, nugget)
     squares = held.products[:, 0, 0]  # (b,)
     cross = held.products[:, 0, 1:]  # (b, j)
@@ -224,6 +255,8 @@ def negative_log_likelihood(
     errors = squares - 2 * (weights * cross).sum(1) + predicted
     # The difference of nearly equal numbers, rounded to float64's sixteen digits, may be negative.
     errors = errors.clamp_min(1e-12 * squares.mean())
+    if by_errors:
+        return len(asked) * errors.mean().log()
     return len(asked) * (errors / variances).mean().log() + variances.log().sum()
 
 

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from scipy.spatial import cKDTree
 from torch import Tensor
+from torch.nn import functional
 
 from gaigs.core.geometry import Grid
 from gaigs.core.query import Batch, Query, evenly
@@ -85,20 +86,30 @@ def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]
     return index[last.sort().values]
 
 
-def coordinates(scene: Scene, query: Query, scale: float | Tensor) -> Float[Tensor, "b d"]:
+def coordinates(
+    scene: Scene, query: Query, scale: float | Tensor, traits: Float[Tensor, "b c"] | None = None
+) -> Float[Tensor, "b d"]:
     """Points whose Euclidean distance is the distance of links, d² = |dx|² + (scale d ln f)²;
     float64. Of ``one_radio`` |dx|² has both ends.
 
-    ``scale`` [m] has no effect unless the training links have several carriers.
+    ``scale`` [m] has no effect unless the training links have several carriers, or links have
+    ``traits``: then d² = |dx|² + (scale |d traits|)².
     """
     positions = query.transmitters.double()
     if scene.one_radio:
         positions = torch.cat((positions, scene.positions(positions)[query.receivers]), 1)  # (b, 6)
+    if traits is not None:
+        return torch.cat((positions, scale * traits), 1)
     if not scene.has_band:
         return positions
     half = (scene.frequencies[-1] / scene.frequencies[0]).double().log() / 2
     carriers = scene.band_positions(query).double()[:, None]  # (b, 1), from -1 to 1
     return torch.cat((positions, scale * half * carriers), 1)
+
+
+def coarse(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b c"]:
+    """Means of spectra over 3 x 8 parts, in double precision: an array resolves little more."""
+    return functional.adaptive_avg_pool2d(spectra[:, None], (3, 8)).flatten(1).double()
 
 
 def scaled(places: Float[Tensor, "k d"], scale: float) -> Float[Tensor, "k d"]:

@@ -25,6 +25,7 @@ class Posterior(nn.Module):
         start: Choices of a fit to nearly the same links, from which the next one starts; None: no
             fit before.
         seen: Links by which the fit has chosen; None: all.
+        has_traits: True if predictions need the trend's spectra at the asked links.
         is_lazy: True if few places will be asked for: many known links are then not all solved.
     """
 
@@ -33,6 +34,7 @@ class Posterior(nn.Module):
     start: Any = None
     seen: Tensor | None = None
     is_lazy = False
+    has_traits = False
 
     def cleaned(self, links: Links) -> Links:
         """The links without gross errors that would move the whole fit; by default all links."""

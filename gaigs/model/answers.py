@@ -15,9 +15,11 @@ from gaigs.calibration.conformal import usual_deviations
 from gaigs.calibration.held_out import Answers, calibrate
 from gaigs.calibration.new_receivers import NewReceivers
 from gaigs.core import stages
-from gaigs.core.query import Batch, evenly
+from gaigs.core.query import Batch, evenly, thin_labels
+from gaigs.core.task import Task
 from gaigs.data import Links
-from gaigs.kriging.links import single_readings
+from gaigs.kriging.blend import blend
+from gaigs.kriging.links import PART, single_readings
 from gaigs.model.base import Model
 from gaigs.registry import name_of
 
@@ -46,6 +48,32 @@ def predicted(
     size = batch_size(links, model)
     values = model.predict_batches(links.query[index], batch_size=size, frequencies=frequencies)
     return torch.cat([part.cpu() for part in values])
+
+
+def weighed_residuals(
+    links: Links, fallback: Model, values: Tensor, weights: Sequence[float]
+) -> dict[float, Tensor]:
+    """Residuals (k, m) of the known links for each weight of a trend, thinned by ``thin_labels``.
+
+    Args:
+        links: Links with a split.
+        fallback: Model of the other share.
+        values: The trend's predictions of the known links.
+        weights: Shares of the trend.
+    """
+    index, task = links.split.known, links.task
+    # Without an alignment each number stands alone, so labels may be thinned first.
+    is_turned = type(task).align is not Task.align
+    parts: dict[float, list[Tensor]] = {weight: [] for weight in weights}
+    for rows in torch.arange(len(index)).split(PART):
+        labels, trend = links.labels[index[rows]], values[rows]
+        other = predicted(fallback, links, index[rows])
+        if not is_turned:
+            labels, trend, other = map(thin_labels, (labels, trend, other))
+        for weight, residuals in parts.items():
+            mean = blend(task, trend, other, weight)
+            residuals.append(thin_labels(task.align(labels, mean) - mean))
+    return {weight: torch.cat(residuals) for weight, residuals in parts.items()}
 
 
 def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor) -> Tensor:

@@ -14,20 +14,19 @@ from torch import Tensor
 from gaigs.calibration.held_out import Unseen, validation_halves
 from gaigs.core import stages
 from gaigs.core.antenna import Receiver
-from gaigs.core.query import Batch, Query, drawn, evenly, thin_labels
+from gaigs.core.query import Batch, Query, drawn, evenly
 from gaigs.core.scene import Scene
-from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.kriging.blend import blend, is_surely_better, validation_scores
 from gaigs.kriging.field import FieldPosterior
 from gaigs.kriging.fit import FEWEST
 from gaigs.kriging.kernel import LIMIT, Process
-from gaigs.kriging.links import PART, limit_known, single_readings
+from gaigs.kriging.links import PART, coarse, limit_known, single_readings
 from gaigs.kriging.paths import PathPosterior
 from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar import ScalarPosterior
 from gaigs.model import LookUp, Model, Prediction, Wrapper
-from gaigs.model.answers import count_in_time, predicted
+from gaigs.model.answers import count_in_time, predicted, weighed_residuals
 from gaigs.registry import name_of, register, registry
 
 log = logging.getLogger(__name__)
@@ -246,8 +245,10 @@ class Kriging(Wrapper):
     ) -> "Kriging":
         """Fits trend weight and hyperparameters; returns a model of the training links alone."""
         split = links.split
-        candidates = self._candidates(links, values, weights)
-        self.trend_weight.fill_(self.posterior.fit(links, candidates))
+        candidates = weighed_residuals(links, self.fallback, values, weights)
+        # A trend that may have no weight tells no places apart either.
+        traits = self._traits(values) if any(weights) else ()
+        self.trend_weight.fill_(self.posterior.fit(links, candidates, *traits))
         training = replace(links, split=split.validating())
         model = Kriging(self.scene, self.trend, self.fallback_options)
         model._make_posterior(False)
@@ -277,24 +278,6 @@ class Kriging(Wrapper):
         self.laws = other.laws
         self.posterior.load_state_dict(other.posterior.state_dict())
 
-    def _candidates(
-        self, links: Links, values: Tensor, weights: Sequence[float]
-    ) -> dict[float, Tensor]:
-        """Residuals (k, m) of the known links for each trend weight, thinned by ``thin_labels``."""
-        index, task = links.split.known, links.task
-        # Without an alignment each number stands alone, so labels may be thinned first.
-        is_turned = type(task).align is not Task.align
-        parts: dict[float, list[Tensor]] = {weight: [] for weight in weights}
-        for rows in torch.arange(len(index)).split(PART):
-            labels, trend = links.labels[index[rows]], values[rows]
-            fallback = predicted(self.fallback, links, index[rows])
-            if not is_turned:
-                labels, trend, fallback = map(thin_labels, (labels, trend, fallback))
-            for weight, residuals in parts.items():
-                mean = blend(task, trend, fallback, weight)
-                residuals.append(thin_labels(task.align(labels, mean) - mean))
-        return {weight: torch.cat(residuals) for weight, residuals in parts.items()}
-
     def _solve(self, links: Links, values: Tensor) -> None:
         """Kriges the residuals of the known links."""
         index, weight, task = links.split.known, self.trend_weight.item(), links.task
@@ -310,8 +293,25 @@ class Kriging(Wrapper):
                 differences[part] = (task.align(labels, mean) - mean).to(differences)
             return differences
 
-        self.posterior.solve(links, residuals)
+        traits = self._traits(values) if self.posterior.has_traits else ()
+        self.posterior.solve(links, residuals, *traits)
         self.posterior.to(self.weight.device)
+
+    def _traits(self, spectra: Tensor) -> tuple[Tensor, ...]:
+        """``coarse`` spectra of a trend without paths, which stays at its receivers; or nothing."""
+        scene = self.scene
+        if scene.task.directions is None or scene.has_band or scene.one_radio:
+            return ()
+        return () if self.trend.has_margins else (coarse(spectra),)
+
+    def _traits_at(self, batch: Batch, trend: Tensor | None) -> tuple[Tensor, ...]:
+        """``_traits`` of a batch, whose trend may be known in its directions."""
+        if not self.posterior.has_traits:
+            return ()
+        directions = self.scene.task.directions
+        if trend is None or not directions.matches(batch.directions):
+            trend = self.trend(replace(batch, directions=directions)).value
+        return self._traits(trend)
 
     def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` by paths of the trend.
@@ -376,7 +376,7 @@ class Kriging(Wrapper):
         Processes of kriged paths have no noise, and treat paths as if the elements resolved them
         all.
         """
-        return self.posterior.deviations(batch)
+        return self.posterior.deviations(batch, *self._traits_at(batch, None))
 
     def _log(self) -> None:
         """Logs weights, hyperparameters and sizes."""
@@ -385,14 +385,14 @@ class Kriging(Wrapper):
 
     def forward(self, batch: Batch) -> Prediction:
         task, trend_weight, weight = self.scene.task, self.trend_weight.item(), self.weight.item()
-        # A part without weight is not evaluated: that would cost its time, and a NaN of it would
-        # count.
-        trend = self.trend(batch).value if trend_weight > 0 or weight < 1 else None
+        # A part without weight is not evaluated: it would cost time, and its NaN would count.
+        needs_trend = trend_weight > 0 or weight < 1 or self.posterior.has_traits
+        trend = self.trend(batch).value if needs_trend else None
         if weight == 0:
             return Prediction(trend, {})
         fallback = self.fallback(batch).value if trend_weight < 1 else None
         value = blend(task, trend, fallback, trend_weight)
-        value = value + self.posterior.mean(batch, value)
+        value = value + self.posterior.mean(batch, value, *self._traits_at(batch, trend))
         value = blend(task, value, trend, weight)
         is_new = ~self.posterior.knows(batch.query.receivers)
         if is_new.any():  # receivers without links, as ``at_receivers`` has them
@@ -477,7 +477,7 @@ class Kriging(Wrapper):
     @property
     def has_room(self) -> bool:  # type: ignore[override]
         """True if predictions have a part of the trend."""
-        return bool(self.trend_weight > 0 or self.weight < 1)
+        return bool(self.trend_weight > 0 or self.weight < 1 or self.posterior.has_traits)
 
     def learnt_room(self, links: Links | None = None) -> Any:
         return super().learnt_room(links) if self.has_room else None

@@ -98,8 +98,10 @@ def kriged(links, **options):
 def half(monkeypatch):
     """Fixes the hyperparameters, and the trend weight to 0.5, for tests of what follows from them."""
 
-    def fixed(scene, links, residuals, most=300):
+    def fixed(scene, links, residuals, most=300, traits=None, length=None):
         residuals(links.split.known)
+        if length is not None:  # traits do not help
+            return PROCESS, 0.0
         assert (most == 1000) == (len(costs) % 6 == 5), "the last fit looks at more links"
         costs.append(
             float(abs(len(costs) % 6 - 2))
@@ -396,6 +398,46 @@ def test_surveys_see_the_process_of_the_predictions(kind, carriers):
     with torch.device("meta"):  # all that is made must stand where the places are, as on a GPU
         expected = model.deviations(batch).square()
     torch.testing.assert_close(variances, expected.to(variances), rtol=1e-5, atol=0)
+
+
+# --- traits ---
+
+
+class Shadowed(Trained):
+    """Knows on which side of a shadow's edge a place is, and little else."""
+
+    def forward(self, batch):
+        sides = (batch.query.transmitters[:, 0] > BOX[0] / 2).float()[:, None, None]
+        return Prediction(at_directions((0.2 * self.weights * sides), batch, self.scene), {})
+
+
+def test_places_correlate_by_the_spectra_of_the_trend_too(monkeypatch):
+    """Labels of both sides of an edge are unlike, however near the places are."""
+    monkeypatch.setitem(registry("model")._registered, "trained", Shadowed)
+    links = make("spectrum", 200, smooth=0.7, noise=0.02)
+    is_beyond = links.query.transmitters[:, 0] > BOX[0] / 2
+    links.labels[is_beyond] += torch.randn(
+        links.task.shape, generator=torch.Generator().manual_seed(1)
+    )
+    model = Kriging(links.scene, Shadowed(links.scene))
+    model.fit(links)
+    assert model.posterior.has_traits
+    assert model.facts()["kriging"]["spectrum_scale_m"] > 0
+    assert model.has_room
+    query = links.query[links.split.test]
+    values = model.predict(query)
+    thin = Batch(query, links.task.directions.thin(slice(1, None, 2), slice(None, None, 3)))
+    torch.testing.assert_close(model(thin).value, values[:, 1::2, ::3])
+    loaded = Kriging(links.scene, {"name": "trained"})
+    loaded.load_state_dict(model.state_dict())
+    assert torch.equal(loaded.predict(query), values)
+
+    monkeypatch.setattr(Kriging, "_traits", lambda *_: ())
+    plain = Kriging(links.scene, Shadowed(links.scene))
+    plain.fit(links)
+    assert not plain.posterior.has_traits
+    labels = links.labels[links.split.test]
+    assert (values - labels).square().mean() < 0.8 * (plain.predict(query) - labels).square().mean()
 
 
 # --- components ---
