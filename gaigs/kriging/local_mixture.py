@@ -36,7 +36,7 @@ class MixtureOptions:
     ratios: tuple[float, ...] = (-1.5, 0.0, 1.5)
     scatter: float = 1.5
     degrees: float = 2.0
-    errors: float = 2.0
+    errors: float = 1.0
     size: int = 2048
 
 
