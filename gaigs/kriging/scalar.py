@@ -247,7 +247,7 @@ class ScalarProcess(nn.Module):
         near = self._near(*asked, options.neighbours, held)
         noises, degrees = (2 * self.logarithms[receivers, 2]).exp(), self._choice.degrees
         gains = local - log_density(values - near.means, near.variances, noises, degrees)
-        return gains.mean() > options.errors * gains.std() / len(gains) ** 0.5
+        return bool(gains.mean() > options.errors * gains.std() / len(gains) ** 0.5)
 
     def _choices(self) -> list[Choice]:
         """Kernels with normal noise, then with Student's t."""
