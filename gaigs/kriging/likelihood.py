@@ -12,11 +12,14 @@ from gaigs.kriging.neighbours import Around
 
 
 class Choice(NamedTuple):
-    """Smoothness of the kernel, degrees of freedom of the noise (inf: normal), scale [m] or NaN."""
+    """Smoothness of the kernel, degrees of freedom of the noise (inf: normal), scale [m] or NaN;
+    True if length and noise differ from place to place.
+    """
 
     smoothness: float = 0.5
     degrees: float = math.inf
     scale: float | Tensor = math.nan
+    is_local: bool = False
 
 
 class Conditional(NamedTuple):

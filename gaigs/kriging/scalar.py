@@ -3,19 +3,14 @@ data have them.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from gaigs.core import stages
-from gaigs.core.query import Batch
 from gaigs.core.scene import Scene
-from gaigs.data import Links
-from gaigs.kriging.gross_errors import without_gross_errors
 from gaigs.kriging.kernel import SMOOTHNESSES, Process, matern, resize
 from gaigs.kriging.likelihood import (
     Choice,
@@ -23,10 +18,11 @@ from gaigs.kriging.likelihood import (
     conditional,
     covariances,
     expected_factors,
+    log_density,
 )
-from gaigs.kriging.links import coordinates, distances, folds_of, scaled
+from gaigs.kriging.links import distances, scaled
+from gaigs.kriging.local_mixture import LocalMixtures
 from gaigs.kriging.neighbours import HeldOutReadings, Nearest, Readings
-from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar_fit import HeldOutCost, ScalarFit, ScalarOptions, maximise
 from gaigs.kriging.tiles import Merged, Tiles, merged
 
@@ -44,11 +40,14 @@ class ScalarProcess(nn.Module):
     each reading its own variance of the noise. So a reading that disagrees with all around it
     counts little.
 
+    If held-out readings are surely likelier that way, length and noise differ from place to place,
+    see ``LocalMixture``; then no readings are weighted beforehand.
+
     Attributes:
         options: Numbers of the fit and of predictions.
         logarithms: Logarithms of length, deviation of the signal and of the noise at each receiver
             (r, 3).
-        choice: Smoothness, degrees of freedom, and scale of carriers (3,).
+        choice: Smoothness, degrees of freedom, scale of carriers, and 1 for local mixtures (4,).
         places: Places of the known readings (k, d), see ``coordinates`` of scale 1.
         receivers, values: Receivers and residuals of the known readings (k,).
         variances: Variance of the noise of each known reading (k,).
@@ -91,6 +90,8 @@ class ScalarProcess(nn.Module):
         self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
         """Mean of z at some places."""
+        if self._choice.is_local:
+            return self._mixtures.at(places, receivers).mean
         if not self.is_solved:
             if len(places) * self.options.few < len(self.places):
                 means = torch.empty_like(places[:, 0])
@@ -134,6 +135,8 @@ class ScalarProcess(nn.Module):
         self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
         """Standard deviations of new readings: z given the known readings, plus noise."""
+        if self._choice.is_local:
+            return self._mixtures.at(places, receivers).variance.sqrt()
         variances = places.new_zeros(len(places))
         most = self.options.many if self.is_solved else 0
         is_many = self.receivers.bincount(minlength=len(self.logarithms)) > most
@@ -152,11 +155,15 @@ class ScalarProcess(nn.Module):
         return variances.sqrt()
 
     def _near(
-        self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"], count: int
+        self,
+        places: Float[Tensor, "b d"],
+        receivers: Int[Tensor, " b"],
+        count: int,
+        folds: tuple[Tensor, Tensor] | tuple[()] = (),
     ) -> Conditional:
-        """z at places given the ``count`` nearest readings."""
+        """z at places given the ``count`` nearest readings, of other ``folds`` than the places'."""
         readings = self._readings._replace(count=count)
-        around = readings.around(places, receivers, readings.nearest(places, receivers))
+        around = readings.around(places, receivers, readings.nearest(places, receivers, *folds))
         hyperparameters, choice = self.logarithms.exp(), self._choice
         between = covariances(around, hyperparameters, choice)  # (b, count + 1, count + 1)
         values, variances = self.values[around.rows], self.variances[around.rows]  # (b, count)
@@ -181,14 +188,15 @@ class ScalarProcess(nn.Module):
     def facts(self) -> dict[str, float]:
         """Medians over receivers of length and nugget; smoothness; degrees of freedom or 0."""
         length, signal, noise = self.logarithms.exp().unbind(1)
-        smoothness, degrees, scale = self.choice.tolist()
+        smoothness, degrees, scale, is_local = self.choice.tolist()
         facts = {
             "length_m": length.median().item(),
             "nugget": (noise / signal).square().median().item(),
             "smoothness": smoothness,
             "degrees_of_freedom": 0.0 if math.isinf(degrees) else degrees,
         }
-        return facts if math.isnan(scale) else {**facts, "frequency_scale_m": scale}
+        facts |= {} if math.isnan(scale) else {"frequency_scale_m": scale}
+        return facts | ({"local_mixtures": 1.0} if is_local else {})
 
     # --- fit ---
 
@@ -226,7 +234,21 @@ class ScalarProcess(nn.Module):
         held = self._readings.held_out(every, folds, most)
         self.asked = torch.cat((few.rows, held.rows))
         self._take(self._maximise(values, held, best.choice, best.logarithms, has_deviations=True))
+        self.solve(places, receivers, values, is_lazy=True)
+        self.choice[3] = self._is_local(folds)
         return index
+
+    def _is_local(self, folds: Int[Tensor, " k"]) -> bool:
+        """True if the held-out readings are surely likelier by local mixtures."""
+        rows, options = self.asked.unique(), self._mixtures.options
+        values, receivers = self.values[rows], self.receivers[rows]
+        asked = self.places[rows], receivers
+        held = folds[rows], folds
+        local = self._mixtures.at(*asked, *held).log_density(values)
+        near = self._near(*asked, options.neighbours, held)
+        noises, degrees = (2 * self.logarithms[receivers, 2]).exp(), self._choice.degrees
+        gains = local - log_density(values - near.means, near.variances, noises, degrees)
+        return bool(gains.mean() > options.errors * gains.std() / len(gains) ** 0.5)
 
     def _choices(self) -> list[Choice]:
         """Kernels with normal noise, then with Student's t."""
@@ -299,9 +321,10 @@ class ScalarProcess(nn.Module):
         """
         self.places, self.receivers, self.values = places, receivers, values.clone()
         self.variances = (2 * self.logarithms[receivers, 2]).exp()
-        self.is_solved = False
+        self.is_solved = self._choice.is_local
+        self.weights = torch.zeros_like(values)
         self.tiles.clear()  # of former readings
-        if not is_lazy:
+        if not is_lazy and not self.is_solved:
             self._solve()
 
     def _save_to_state_dict(self, *args):
@@ -314,7 +337,6 @@ class ScalarProcess(nn.Module):
         places, receivers, values = self.places, self.receivers, self.values
         self.is_solved = True
         self.variances = self.variances * self._factors(values)
-        self.weights = torch.zeros_like(values)
         for receiver in receivers.unique().tolist():
             known = (receivers == receiver).nonzero()[:, 0]
             readings = Merged(known, self.values[known], self.variances[known])
@@ -329,7 +351,7 @@ class ScalarProcess(nn.Module):
     def take(self, other: "ScalarProcess") -> None:
         """Takes another process's hyperparameters; for means call ``solve`` again."""
         ratios = (2 * (other.logarithms - self.logarithms)[self.receivers, 2]).exp()
-        is_alike = torch.equal(self.choice[:2], other.choice[:2])
+        is_alike = torch.equal(self.choice[:2], other.choice[:2]) or other._choice.is_local
         self.variances = self.variances * ratios
         self.logarithms, self.choice = other.logarithms, other.choice
         if not is_alike:  # readings that disagree count less with one noise than with another
@@ -338,7 +360,12 @@ class ScalarProcess(nn.Module):
 
     @property
     def _choice(self) -> Choice:
-        return Choice(*self.choice.tolist())
+        smoothness, degrees, scale, is_local = self.choice.tolist()
+        return Choice(smoothness, degrees, scale, is_local > 0)
+
+    @property
+    def _mixtures(self) -> LocalMixtures:
+        return LocalMixtures(self._readings, self.values, self.logarithms, self._choice)
 
     @property
     def _readings(self) -> Readings:
@@ -401,96 +428,14 @@ class ScalarProcess(nn.Module):
         self, a: Float[Tensor, "m d"], b: Float[Tensor, "n d"], receiver: int
     ) -> Float[Tensor, "m n"]:
         length, signal, _ = self.logarithms[receiver].exp()
-        smoothness, _, scale = self.choice.tolist()
+        smoothness, scale = self._choice.smoothness, self._choice.scale
         apart = distances(scaled(a, scale), scaled(b, scale))
         return signal**2 * matern(apart, length, smoothness)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
+        choice = f"{prefix}choice"
+        if choice in state_dict:  # checkpoints of before know no local mixtures
+            missing = len(self.choice) - len(state_dict[choice])
+            state_dict[choice] = torch.nn.functional.pad(state_dict[choice], (0, missing))
         resize(self, state_dict, prefix, "places", "receivers", "values", "variances", "weights")
         super()._load_from_state_dict(state_dict, prefix, *args)
-
-
-class ScalarPosterior(Posterior):
-    """Kriged residuals of labels of one number, with a ``ScalarProcess``.
-
-    The trend weight is the mean of its candidates, weighted by the likelihood that each gives to
-    the validation links, where all readings of a place count as one. Without validation links all
-    candidates count alike.
-    """
-
-    def __init__(self, scene: Scene):
-        super().__init__()
-        self.scene = scene
-        self.process = ScalarProcess(scene)
-
-    def cleaned(self, links: Links) -> Links:
-        return without_gross_errors(links)
-
-    def fit(self, links: Links, candidates: Mapping[float, Tensor]) -> float:
-        index = links.split.known
-        known = self._coordinates(links.query[index])
-        folds = folds_of(links, index)
-        weights = torch.tensor([*candidates], dtype=torch.float64)
-        residuals = [values.flatten().double() for values in candidates.values()]  # (k,) each
-        # Training links' own residuals are too small, as the trend was trained on them: validation
-        # links decide.
-        count = len(links.split.train)
-        held = torch.arange(count, len(index)) if len(links.split.validation) else None
-        process = self.process.cpu()
-        # A refit has two maximisations, or one without validation links.
-        refits = 1 if held is None else 2 * (len(weights) + (len(weights) > 1))
-        fits = process.fit_count(1) if self.start is None else 0
-        with stages.stage("kriging", fits + refits):
-            if self.start is None:
-                process.fit(*known, residuals[-1:], folds)
-                logarithms, choice = process.logarithms, process.choice
-            else:
-                logarithms, choice = self.start
-            groups = process.hold_out(*known, folds, held)
-            rows = [process.asked, *(group.rows for group in groups)]
-            self.seen = index[torch.cat(rows).unique()]
-
-            def refit(values: Tensor) -> float:
-                process.logarithms, process.choice = logarithms, choice
-                return process.refit(values, groups)
-
-            shares = torch.full((len(weights),), 1 / len(weights), dtype=torch.float64)
-            if held is not None and len(weights) > 1:
-                # Readings at one place err together: they count as one.
-                places = links.query[index[held]].place_keys.unique()
-                each = len(held) / len(places)
-                costs = torch.tensor([refit(values) for values in residuals], dtype=torch.float64)
-                # -inf if a trend explains all
-                shares = torch.softmax(-costs.clamp_min(-1e300) / each, 0)
-            refit(shares @ torch.stack(residuals))
-        return (shares @ weights).item()
-
-    def start_from(self, other: Any) -> None:
-        self.start = other.process.logarithms, other.process.choice
-
-    def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
-        index = links.split.known
-        values = residuals(torch.arange(len(index))).double()
-        is_lazy = self.is_lazy and len(values) > self.process.options.large
-        self.process.cpu().solve(*self._coordinates(links.query[index]), values, is_lazy)
-
-    def mean(self, batch: Batch, like: Tensor) -> Tensor:
-        return self.process(*self._coordinates(batch.query)).to(like)
-
-    def knows(self, receivers: Int[Tensor, " b"]) -> Bool[Tensor, " b"]:
-        return torch.isin(self.scene.radio_of(receivers), self.process.receivers)
-
-    def deviations(self, batch: Batch) -> Tensor:
-        return self.process.deviations(*self._coordinates(batch.query))
-
-    def process_at(self, receiver: int) -> Process:
-        return self.process.at(receiver)
-
-    def facts(self) -> Mapping[str, float]:
-        return {**self.process.facts(), "links": len(self.process.places)}
-
-    def take_hyperparameters(self, other: Any) -> None:
-        self.process.take(other.process)
-
-    def _coordinates(self, query: Any) -> tuple[Float[Tensor, "b d"], Int[Tensor, " b"]]:
-        return coordinates(self.scene, query, 1.0), self.scene.radio_of(query.receivers)

@@ -24,7 +24,7 @@ from gaigs.kriging.kernel import LIMIT, Process
 from gaigs.kriging.links import PART, coarse, limit_known, single_readings
 from gaigs.kriging.paths import PathPosterior
 from gaigs.kriging.posterior import Posterior
-from gaigs.kriging.scalar import ScalarPosterior
+from gaigs.kriging.scalar_posterior import ScalarPosterior
 from gaigs.model import LookUp, Model, Prediction, Wrapper
 from gaigs.model.answers import count_in_time, predicted, weighed_residuals
 from gaigs.registry import name_of, register, registry
