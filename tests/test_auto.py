@@ -100,6 +100,13 @@ def test_shares_are_those_of_least_squares():
     np.testing.assert_allclose(shares, [1, 0], atol=1e-12)
 
 
+def test_channels_of_zeros_have_no_say_in_shares():
+    labels = torch.tensor([1.0, 1j, 0.0, 0.0])
+    values = [labels + torch.tensor([0.1, 0.1, 9, 9]), labels - torch.tensor([1.0, 1.0, 0, 0])]
+    shares, _ = stack(labels, values, torch.arange(4), torch.arange(4))
+    assert shares[0] > 0.8
+
+
 def test_shares_without_a_fold_do_not_know_its_labels():
     labels = torch.zeros(4)
     values = [torch.tensor([0.0, 9, 9, 9]), torch.tensor([9.0, 0, 0, 0])]
