@@ -9,6 +9,7 @@ import pytest
 import torch
 
 import gaigs
+from gaigs.kriging.links import folds_of
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.runs import choice
@@ -68,7 +69,7 @@ def test_only_places_that_all_have_count():
     one, other = tried(one=[-1.0, -1.0, -9.0], other=[-2.0, -2.0])
     result = pick([one, other], task)
     assert result.chosen.label == "one"
-    assert "mean mae_db at 2 places: one 1, other 2" in result.reason
+    assert "mean mae_db over 2 places: one 1, other 2" in result.reason
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), -float("inf")])
@@ -99,6 +100,13 @@ def test_shares_are_those_of_least_squares():
     np.testing.assert_allclose(shares, [1, 0], atol=1e-12)
 
 
+def test_channels_of_zeros_have_no_say_in_shares():
+    labels = torch.tensor([1.0, 1j, 0.0, 0.0])
+    values = [labels + torch.tensor([0.1, 0.1, 9, 9]), labels - torch.tensor([1.0, 1.0, 0, 0])]
+    shares, _ = stack(labels, values, torch.arange(4), torch.arange(4))
+    assert shares[0] > 0.8
+
+
 def test_shares_without_a_fold_do_not_know_its_labels():
     labels = torch.zeros(4)
     values = [torch.tensor([0.0, 9, 9, 9]), torch.tensor([9.0, 0, 0, 0])]
@@ -110,9 +118,26 @@ def test_shares_without_a_fold_do_not_know_its_labels():
     assert (other[:, 1:] != crossed[:, 1:]).all()
 
 
+def test_a_blend_is_judged_by_folds(links, monkeypatch):
+    # Errors of the first and the second model, and the shares of the first, in ten folds.
+    one, other, crossed = torch.tensor(
+        [[1.0, 2.0, 0.0]] * 5 + [[1.0, 2.0, 1.0]] + [[2.5, 1.0, 1.0]] * 2 + [[2.5, 1.0, 0.0]] * 2
+    ).T
+    asked = links.split.known
+    folds = folds_of(links, asked)
+    shares = torch.stack((crossed, 1 - crossed))[:, folds]
+    monkeypatch.setattr(choice, "stack", lambda *_: (torch.tensor([0.5, 0.5]), shares))
+    two = [
+        choice._scored(candidate, links, asked, links.labels[asked] + errors[folds])
+        for candidate, errors in zip(tried(one=[], other=[]), (one, other), strict=True)
+    ]
+    # The blend is behind by 0.2 dB, more than a standard error over places, less than over folds.
+    assert choice.settle(two, links).chosen.weights == (0.5, 0.5)
+
+
 def level(monkeypatch, shares=(0.7, 0.3)):
     """Makes all candidates level, and their shares known."""
-    monkeypatch.setattr(choice, "pick", lambda tried, _: choice.ChosenModel(tried[0], "", tried))
+    monkeypatch.setattr(choice, "pick", lambda tried, *_: choice.ChosenModel(tried[0], "", tried))
     fixed = torch.tensor(shares, dtype=torch.float64)
     monkeypatch.setattr(
         choice, "stack", lambda labels, *_: (fixed, fixed[:, None].expand(-1, len(labels)))

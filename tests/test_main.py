@@ -191,6 +191,7 @@ HERE = ("hydra.run.dir=run", "trainer.enable_progress_bar=false")
         ("seed=-1", "seed must be in 0..4294967295, got -1"),
         ("+thread=3", "the configuration has no key 'thread' (did you mean 'threads'?)"),
         ("command=trian", "command must be one of train, agreement, describe, survey, place, locate, export, "),
+        ("command=describe folder=runs/a", "reads no folder; leave it out and use data=... and split=..."),
         ("command=exprt", "devices, got 'exprt' (did you mean 'export'?)"),
         ("command=report", "there is no command 'report'; python -m gaigs.report FOLDER makes its tables"),
         ("command=benchmark", "there is no command 'benchmark'; python benchmarks/step.py and others measure, in a"),

@@ -90,6 +90,9 @@ def _check_command(command: str) -> None:
 def _execute(config: dict, folder: Path, launcher: str | None) -> dict | None:
     """Executes the command of a configuration; its keys and the command's name are checked."""
     command = config["command"]
+    if config["folder"] is not None and command in ("train", "describe", "agreement"):
+        remedy = "hydra.run.dir=..." if command == "train" else "data=... and split=..."
+        raise ValueError(f"command={command} reads no folder; leave it out and use {remedy}")
     if command == "train":
         from gaigs import runs
 

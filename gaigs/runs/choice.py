@@ -44,7 +44,7 @@ class Tried(NamedTuple):
     label: str  # its name and options
     config: dict  # configuration of a run with it
     folder: Path  # folder of this run
-    # Mean score of the links at each place, higher ones better, by the place's key.
+    # Mean score of the links at each place or in each fold, higher ones better, by its key.
     gains: dict[int, float]
     seconds: float  # duration of fits, training and scores
     asked: Tensor | None = None  # links that it has not learnt from (k,)
@@ -242,13 +242,22 @@ def _validated(look_up: Tried, links: Links) -> Tried:
     return _scored(look_up._replace(unseen=model), links, asked, values)
 
 
-def _scored(one: Tried, links: Links, asked: Int[Tensor, " k"], values: Tensor) -> Tried:
-    """A candidate with predictions and its mean score at each place: errors there are alike."""
+def _scored(
+    one: Tried,
+    links: Links,
+    asked: Int[Tensor, " k"],
+    values: Tensor,
+    groups: Int[Tensor, " k"] | None = None,
+) -> Tried:
+    """A candidate with predictions and its mean score of each group, or at each place: errors
+    there are alike.
+    """
     task = links.task
     scores = task.scores(_labels(links, asked), values)[task.monitor].double()
-    keys, places = links.query[asked].place_keys.unique(return_inverse=True)
-    sums = scores.new_zeros(len(keys)).index_add(0, places, scores)
-    means = sums / places.bincount()  # (p,)
+    named = links.query[asked].place_keys if groups is None else groups
+    keys, which = named.unique(return_inverse=True)
+    sums = scores.new_zeros(len(keys)).index_add(0, which, scores)
+    means = sums / which.bincount()  # (g,)
     if not task.higher_is_better:
         means = -means
     gains = dict(zip(keys.tolist(), means.tolist(), strict=True))
@@ -275,11 +284,15 @@ def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
         asked = asked[torch.isin(asked, one.asked)]
     values: Any = [one.values[torch.isin(one.asked, asked)] for one in level]  # type: ignore
     places = links.query[asked].place_keys
-    shares, crossed = stack(_labels(links, asked), values, places, folds_of(links, asked))
+    folds = folds_of(links, asked)
+    shares, crossed = stack(_labels(links, asked), values, places, folds)
     if shares.max() > 0.85:  # a second model is worth more than a tenth
         return choice
     blend = _blended(level, shares.tolist())
-    judged = pick([_scored(blend, links, asked, _mean(values, crossed)), *level], links.task)
+    # Links of a fold have the same shares and err together: folds are compared, not places.
+    rivals = zip([blend, *level], [_mean(values, crossed), *values], strict=True)
+    scored = [_scored(one, links, asked, some, folds) for one, some in rivals]
+    judged = pick(scored, links.task, "folds")
     return judged._replace(chosen=blend) if judged.chosen.members else choice
 
 
@@ -305,7 +318,7 @@ def _mean(values: Sequence[Any], shares: Sequence[float] | Tensor) -> Tensor:
     return total
 
 
-def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
+def pick(tried: Sequence[Tried], task: Task, unit: str = "places") -> ChosenModel:
     """The first candidate that no other is ahead of by more than a standard error.
 
     A candidate whose scores are not finite is behind all others.
@@ -332,7 +345,7 @@ def pick(tried: Sequence[Tried], task: Task) -> ChosenModel:
     level = [one for one, beaten in zip(tried, is_beaten.tolist(), strict=True) if not beaten]
     signed = means if task.higher_is_better else -means
     texts = [f"{one.label} {mean:.3g}" for one, mean in zip(tried, signed.tolist(), strict=True)]
-    scores = f"mean {task.monitor} at {len(shared)} places: {', '.join(texts)}"
+    scores = f"mean {task.monitor} over {len(shared)} {unit}: {', '.join(texts)}"
     if chosen == best:
         return ChosenModel(tried[best], f"{tried[best].label} is the best, {scores}", level)
     lead = f"{leads[best, chosen].mean():.2g}, standard error {scatter[best, chosen]:.2g}"

@@ -30,7 +30,8 @@ def stack(
     """
     errors = torch.stack([thin_labels(labels - one) for one in values], 1)  # (k, c, m)
     if labels.is_complex():  # as in an SNR, relative to the channel
-        errors = errors / thin_labels(labels).abs().square().mean(1).sqrt()[:, None, None]
+        sizes = thin_labels(labels).abs().square().mean(1).sqrt()[:, None, None]  # (k, 1, 1)
+        errors = torch.where(sizes > 0, errors / sizes, 0)  # a channel of zeros has no SNR
     products = (errors @ errors.mH).real.double() / errors.shape[2]  # (k, c, c)
     crossed = products.new_zeros(len(values), len(labels))
     for fold in folds.unique():
