@@ -116,8 +116,8 @@ class Field(nn.Module):
 class FieldPosterior(Posterior):
     """Kriged residuals of labels of many numbers, a ``Field`` for each receiver.
 
-    Hyperparameters are the same for all receivers and numbers. The trend weight is the likeliest of
-    its candidates. Residuals of channels are limited, see ``damping``.
+    Hyperparameters are the same for all receivers and numbers. The trend's weight is the candidate
+    with the largest likelihood. Residuals of channels are limited, see ``damping``.
 
     Spectra have ``traits``, the trend's spectra by ``coarse``: places correlate the less, the more
     these differ, as where a shadow ends between them.

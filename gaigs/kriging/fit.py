@@ -113,8 +113,8 @@ def fit_hyperparameters(
         most: Held-out links of all receivers together; 300 take seconds at most.
         nuggets: Bounds of the nugget. The lower keeps matrices regular in float64 if places are
             measured twice.
-        edges: Longest correlation length, in longest edges of the box of places: beyond it the
-            kernel is a line in the box.
+        edges: Longest correlation length [longest edges of the box of places]. Beyond it the kernel
+            is nearly linear within the box, so the length no longer shows.
         traits: Function from indices of links to their traits, see ``coordinates``.
         length: A known correlation length; the others then have the least squared error of the
             held-out labels in place of the largest likelihood. A trend has seen the training links:
@@ -236,8 +236,8 @@ def negative_log_likelihood(
     """-2 log p(held-out labels | labels around them) without constants, a mean over a label's
     numbers.
 
-    The signal's variance is the receiver's most likely one. With ``by_errors`` all held-out labels
-    have one variance.
+    The signal's variance is the one with the largest likelihood at the receiver. With ``by_errors``
+    all held-out labels have one variance.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """

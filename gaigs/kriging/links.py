@@ -89,9 +89,9 @@ def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]
 def coordinates(
     scene: Scene, query: Query, scale: float | Tensor, traits: Float[Tensor, "b c"] | None = None
 ) -> Float[Tensor, "b d"]:
-    """Points whose Euclidean distance is the distance of links, d² = |dx|² + (scale d ln f)²;
-    float64. Of ``one_radio`` |dx|² has both ends.
+    """Points (float64) whose Euclidean distance is that of links: d² = |dx|² + (scale d ln f)².
 
+    dx is the transmitters' step [m], f the carrier. With ``one_radio`` |dx|² counts both ends.
     ``scale`` [m] has no effect unless the training links have several carriers, or links have
     ``traits``: then d² = |dx|² + (scale |d traits|)².
     """

@@ -22,11 +22,11 @@ class Posterior(nn.Module):
     Attributes:
         chooses_weight: True if validation links choose the weight of kriging, else 1.
         by_paths: True if strengths of paths are kriged, not labels.
-        start: Choices of a fit to nearly the same links, from which the next one starts; None: no
-            fit before.
-        seen: Links by which the fit has chosen; None: all.
+        start: Result of an earlier fit to nearly the same links, where the next starts; or None.
+        seen: Known links that the fit has held out to choose hyperparameters; None: all.
         has_traits: True if predictions need the trend's spectra at the asked links.
-        is_lazy: True if few places will be asked for: many known links are then not all solved.
+        is_lazy: True if predictions are wanted at few places. With many known links only those near
+            these places are then solved for.
     """
 
     chooses_weight = False

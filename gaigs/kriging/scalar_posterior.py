@@ -21,9 +21,9 @@ from gaigs.kriging.scalar import ScalarProcess
 class ScalarPosterior(Posterior):
     """Kriged residuals of labels of one number, with a ``ScalarProcess``.
 
-    The trend weight is the mean of its candidates, weighted by the likelihood that each gives to
-    the validation links, where all readings of a place count as one. Without validation links all
-    candidates count alike.
+    The trend's weight is the mean of its candidates, each weighted by the likelihood of the
+    validation links. All readings of a place count as one. Without validation links all count
+    alike.
     """
 
     def __init__(self, scene: Scene):

@@ -69,11 +69,11 @@ class Model(Movable):
         chunk: Largest number of pairs of a link and a direction evaluated at a time; None: whole
             labels. Training sees as many as ``training.thinning`` leaves.
         revisions: Fractions of the training after which ``revise`` is called.
-        settles: True if no revision to come lowers errors at once: a training whose errors would
-            stay above those of a law of distance may end.
+        settles: True if no coming revision will lower errors suddenly. A training may then be
+            stopped once its errors, continued, would stay above those of a law of distance.
         second_start: Options of a second training from another start; validation chooses. Empty
             for one training.
-        predicts_untrained: True if values before the training are worth a score.
+        predicts_untrained: True if predictions before the first step are scored, too.
         any_frequency, any_receiver: See ``Movable``.
         configuration: Options that a registered model was made with; ``save`` stores them.
         calibration: What intervals are made of; None if no validation links have measured the
