@@ -450,7 +450,13 @@ def test_the_links_that_calibrate_kriging_did_not_choose_its_weights(monkeypatch
     monkeypatch.setattr(
         Kriging, "krige", lambda *a, **k: chosen.append(a[1].split.validation) or krige(*a, **k)
     )
-    monkeypatch.setattr(answers, "predicted", lambda *a: predicted.append(a[2]) or predict(*a))
+
+    def record(model, links, index):
+        if isinstance(model, Kriging):
+            predicted.append(index)
+        return predict(model, links, index)
+
+    monkeypatch.setattr(answers, "predicted", record)
     monkeypatch.setattr(answers, "at_new_receivers", lambda *_: None)  # by the trend alone
     kriged = Kriging(links.scene, trend)
     calibration = answers.calibrated(kriged.krige(links), links)

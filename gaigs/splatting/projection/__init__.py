@@ -92,12 +92,6 @@ class Projection(ABC):
     def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
         """Derivative of ``coordinates`` [1/m]; finite everywhere but at the origin."""
 
-    def linearise(
-        self, points: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2 3"]]:
-        """``coordinates`` and ``jacobian``, which may share their steps."""
-        return self.coordinates(points), self.jacobian(points)
-
     @property
     @abstractmethod
     def period(self) -> float | None:
@@ -140,11 +134,10 @@ class Projection(ABC):
         points = torch.where(visible[..., None], points, stand_in)
         # EWA splatting: the footprint's covariance is J S J', with J the map's linearisation and S
         # the covariance in the receiver's frame, here by its factors (2, 3) a Gaussian.
-        coordinates, jacobian = self.linearise(points)
-        linearised = jacobian @ receiver.rotation.mT @ semi_axes  # (b, n, 2, 3)
+        linearised = self.jacobian(points) @ receiver.rotation.mT @ semi_axes  # (b, n, 2, 3)
         across, along = linearised.unbind(-2)
         factors = factor(across, along, self.pixel_variance)
-        return Splats(coordinates, factors, depths, visible)
+        return Splats(self.coordinates(points), factors, depths, visible)
 
 
 def project(

@@ -32,17 +32,14 @@ class Cylindrical(Projection):
         raise NotImplementedError
 
     def coordinates(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
-        return self.linearise(points)[0]
+        azimuths, elevations, _ = to_spherical(points)
+        v, _ = self.stretch(elevations.clamp(-self.limit, self.limit))
+        return torch.stack((azimuths, v), -1)
 
     def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
-        return self.linearise(points)[1]
-
-    def linearise(
-        self, points: Float[Tensor, "*batch 3"]
-    ) -> tuple[Float[Tensor, "*batch 2"], Float[Tensor, "*batch 2 3"]]:
         azimuths, elevations, distances = to_spherical(points)  # (...) each
         clamped = elevations.clamp(-self.limit, self.limit)
-        v, slope = self.stretch(clamped)
+        _, slope = self.stretch(clamped)
         # Unit vectors of growing azimuth and of growing elevation.
         sin, cos = torch.sin(azimuths), torch.cos(azimuths)
         east = torch.stack((-sin, cos, torch.zeros_like(sin)), -1)  # (..., 3)
@@ -50,8 +47,7 @@ class Cylindrical(Projection):
         north = torch.stack((-height * cos, -height * sin, horizontal), -1)  # (..., 3)
         # Changes of u and v along these [1/m]: du = east / (r cos el), dv = f'(el) north / r.
         rates = torch.stack((1 / torch.cos(clamped), slope), -1) / distances[..., None]  # (..., 2)
-        jacobian = rates[..., None] * torch.stack((east, north), -2)  # (..., 2, 3)
-        return torch.stack((azimuths, v), -1), jacobian
+        return rates[..., None] * torch.stack((east, north), -2)  # (..., 2, 3)
 
     def plane(self, directions: Directions) -> Plane:
         """Plane coordinates; u and v of a grid are separable."""
