@@ -76,6 +76,36 @@ def weighed_residuals(
     return {weight: torch.cat(residuals) for weight, residuals in parts.items()}
 
 
+def share_at_new(links: Links, held: Int[Tensor, " k"], one: Tensor, other: Model) -> float:
+    """Share w of predictions of levels beside another model's, with the least mean square error at
+    receivers that neither knows.
+
+    Few receivers tell little: a half counts as one more beside n of them. With the mean squares a
+    and b of the errors, the mean c of their products and m = (a + b) / 2, w minimises
+
+        a w² + 2 c w (1 - w) + b (1 - w)² + 2 m (w - ½)² / n
+
+    Args:
+        links: Links with levels as labels.
+        held: Links of such receivers; each receiver has one vote.
+        one: Predictions of these links [dBm].
+        other: Model of the other share.
+
+    Source: Stock and Watson, Combination forecasts of output growth, 2004, for shares drawn to
+    equal ones.
+    """
+    receivers = links.query.receivers[held]
+    _, numbers, counts = receivers.unique(return_inverse=True, return_counts=True)
+    votes = 1.0 / counts[numbers].double() / len(counts)  # (k,)
+    both = torch.stack((one, predicted(other, links, held))).double()  # (2, k)
+    errors = both - links.labels[held]
+    (a, c), (_, b) = ((votes * errors) @ errors.T).tolist()
+    draw = (a + b) / 2 / len(counts)
+    curvature = a + b - 2 * c + 2 * draw
+    # Without an error any share is right.
+    return min(1.0, max(0.0, (b - c + draw) / curvature)) if curvature > 0 else 0.5
+
+
 def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor) -> Tensor:
     """``Model.spread`` for the links of ``index``, on the CPU; ``values`` are their predictions."""
     directions, device = links.task.directions, model.device

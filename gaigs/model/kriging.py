@@ -4,7 +4,6 @@ import logging
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,7 +13,7 @@ from torch import Tensor
 from gaigs.calibration.held_out import Unseen, validation_halves
 from gaigs.core import stages
 from gaigs.core.antenna import Receiver
-from gaigs.core.query import Batch, Query, drawn, evenly
+from gaigs.core.query import Batch, drawn, evenly
 from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.kriging.blend import blend, is_surely_better, validation_scores
@@ -26,7 +25,7 @@ from gaigs.kriging.paths import PathPosterior
 from gaigs.kriging.posterior import Posterior
 from gaigs.kriging.scalar_posterior import ScalarPosterior
 from gaigs.model import LookUp, Model, Prediction, Wrapper
-from gaigs.model.answers import count_in_time, predicted, weighed_residuals
+from gaigs.model.answers import count_in_time, predicted, share_at_new, weighed_residuals
 from gaigs.registry import name_of, register, registry
 
 log = logging.getLogger(__name__)
@@ -69,6 +68,7 @@ class Kriging(Wrapper):
 
     trend_weight: Tensor
     weight: Tensor
+    new_weight: Tensor  # share of the trend at receivers without links; the fallback has the rest
     weights = (1.0, 0.75, 0.5, 0.25, 0.0)
     """Candidates of ``trend_weight`` and ``weight``; of equally good ones the first is taken."""
     laws: tuple[Model, Tensor] | None = None  # of ``law_scores``, and its training links
@@ -90,8 +90,8 @@ class Kriging(Wrapper):
             name = self.fallback_options["name"]
             raise ValueError(f"kriging_fallback cannot be {name}; take mean, path_loss or friis")
         self.chunk = self.trend.chunk
-        self.register_buffer("trend_weight", torch.tensor(1.0, dtype=torch.float64))
-        self.register_buffer("weight", torch.tensor(1.0, dtype=torch.float64))
+        for name in ("trend_weight", "weight", "new_weight"):
+            self.register_buffer(name, torch.tensor(1.0, dtype=torch.float64))
         self._make_posterior(self.trend.has_margins)
 
     def _make_posterior(self, by_paths: bool) -> None:
@@ -112,6 +112,7 @@ class Kriging(Wrapper):
             name = key.removeprefix(prefix)
             if name.startswith(("process.", "fields.", "hyperparameters")):
                 state_dict[f"{prefix}posterior.{name}"] = state_dict.pop(key)
+        state_dict.setdefault(f"{prefix}new_weight", torch.ones_like(self.new_weight))
         if self.scene.task.is_scalar:
             state_dict.pop(f"{prefix}posterior.hyperparameters", None)
         self._make_posterior(f"{prefix}posterior.fields.0.precisions" in state_dict)
@@ -203,6 +204,7 @@ class Kriging(Wrapper):
         split, is_scalar = links.split, self.scene.task.is_scalar
         held = drawn(split.validation) if is_scalar else split.validation
         is_unlearnt = False
+        at_held = None
         if len(held) and any(self.weights):
             at_held = predicted(self.trend, links, held) if values is None else values[-len(held) :]
             trend_scores = validation_scores(links, at_held, held)
@@ -223,6 +225,9 @@ class Kriging(Wrapper):
                 model = without
             # The second fit has replaced this model's choices: take the better model's.
             self._copy_choices(model)
+        if split.by_receivers and is_scalar and at_held is not None:
+            self.new_weight.fill_(share_at_new(links, held, at_held, model.fallback))
+            model.new_weight.copy_(self.new_weight)
         if is_final:
             self._solve(links, values)
             if is_unlearnt and self.laws is not None:
@@ -273,8 +278,10 @@ class Kriging(Wrapper):
 
     def _copy_choices(self, other: "Kriging") -> None:
         """Takes weights, hyperparameters and the law of another model."""
-        self.trend_weight.copy_(other.trend_weight)
-        self.weight.copy_(other.weight)
+        for mine, own in zip(
+            self.buffers(recurse=False), other.buffers(recurse=False), strict=True
+        ):
+            mine.copy_(own)
         self.laws = other.laws
         self.posterior.load_state_dict(other.posterior.state_dict())
 
@@ -362,11 +369,6 @@ class Kriging(Wrapper):
             self._log()
         return model.to(device)
 
-    @property
-    def by_paths(self) -> bool:
-        """True if strengths of paths are kriged, not labels."""
-        return self.posterior.by_paths
-
     def process_at(self, receiver: int) -> Process | None:
         return self.posterior.process_at(receiver)
 
@@ -396,7 +398,7 @@ class Kriging(Wrapper):
         value = blend(task, value, trend, weight)
         is_new = ~self.posterior.knows(batch.query.receivers)
         if is_new.any():  # receivers without links, as ``at_receivers`` has them
-            value[is_new] = self._alone(replace(batch, query=batch.query[is_new])).value
+            value[is_new] = self._at_new(replace(batch, query=batch.query[is_new])).value
         return Prediction(value, {})
 
     @property
@@ -414,14 +416,14 @@ class Kriging(Wrapper):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """The trend, or the fallback if the trend has no weight, at other receivers.
+        """Trend and fallback at other receivers, by ``new_weight``.
 
         Nothing is kriged there, as no residuals are known. Where receivers are places of one radio,
         labels are kriged over these places, too: then the whole model moves with its process.
         """
-        if self.scene.one_radio and not self.by_paths:
+        if self.scene.one_radio and not self.posterior.by_paths:
             return super().at_receivers(receivers)
-        alone = self._alone.at_receivers(receivers, known)
+        alone = self._at_new.at_receivers(receivers, known)
         alone.take_calibration(self)
         return alone
 
@@ -455,7 +457,7 @@ class Kriging(Wrapper):
                 # A half of so many would choose the same weight as all of them.
                 kriged.weights = (self.trend_weight.item(),)
             half = replace(links, split=links.split.choosing(chooses))
-            kriged = kriged.krige(half, is_final=False, by_paths=self.by_paths)
+            kriged = kriged.krige(half, is_final=False, by_paths=self.posterior.by_paths)
             asked = single_readings(links, asked)
             if links.task.is_scalar:
                 asked = evenly(asked, most)
@@ -467,8 +469,17 @@ class Kriging(Wrapper):
 
     @property
     def _alone(self) -> Model:
-        """The trend without kriging, or the fallback if the trend has no weight."""
+        """The trend, or the fallback if the trend has no weight."""
         return self.trend if self.trend_weight > 0 else self.fallback
+
+    @property
+    def _at_new(self) -> Model:
+        """The model of receivers without links."""
+        weight = self.new_weight.item()
+        if weight == 1 or self.trend_weight == 0:
+            return self._alone
+        mean_of = registry("model").get("ensemble")
+        return mean_of(self.scene, [self.trend, self.fallback], [weight, 1 - weight]).eval()
 
     @property
     def underlying(self) -> Model:
@@ -479,22 +490,10 @@ class Kriging(Wrapper):
         """True if predictions have a part of the trend."""
         return bool(self.trend_weight > 0 or self.weight < 1 or self.posterior.has_traits)
 
-    def learnt_room(self, links: Links | None = None) -> Any:
-        return super().learnt_room(links) if self.has_room else None
-
-    def learnt_paths(self, query: Query) -> list:
-        return super().learnt_paths(query) if self.has_room else []
-
-    @property
-    def primitives(self) -> Any:  # type: ignore[override]
-        return super().primitives if self.has_room else None
-
-    def export(self, folder: Path) -> None:
-        if self.has_room:
-            super().export(folder)
-
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
         weights = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
+        if self.new_weight < 1:
+            weights["new_weight"] = self.new_weight.item()
         room = {} if self.has_room else {"room": False}
         return self.trend.facts() | {"kriging": weights | room | dict(self.posterior.facts())}

@@ -28,19 +28,20 @@ class Wrapper(Model):
 
     @property
     def primitives(self) -> Gaussians | None:  # type: ignore[override]
-        return self.underlying.primitives
+        return self.underlying.primitives if self.has_room else None
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
         return self.underlying.rendering(batch)
 
     def learnt_room(self, links: Links | None = None) -> Any:
-        return self.underlying.learnt_room(links)
+        return self.underlying.learnt_room(links) if self.has_room else None
 
     def learnt_paths(self, query: Query) -> list:
-        return self.underlying.learnt_paths(query)
+        return self.underlying.learnt_paths(query) if self.has_room else []
 
     def export(self, folder: Path) -> None:
-        self.underlying.export(folder)
+        if self.has_room:
+            self.underlying.export(folder)
 
 
 def build_trend(trend: str | Mapping | Model, scene: Scene) -> Model:

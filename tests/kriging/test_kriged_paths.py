@@ -217,4 +217,4 @@ def test_halves_of_the_validation_links_keep_what_all_of_them_chose(by_paths, mo
     model.krige(links, by_paths=by_paths)
     # Each half would choose the other.
     monkeypatch.setattr("gaigs.model.kriging.is_surely_better", lambda *_, **__: by_paths)
-    assert [one.by_paths for one, *_ in model.unseen(links)] == [by_paths] * 2
+    assert [one.posterior.by_paths for one, *_ in model.unseen(links)] == [by_paths] * 2

@@ -9,11 +9,13 @@ import torch
 import gaigs
 from gaigs.core.antenna import Receiver
 from gaigs.core.geometry import Pose
+from gaigs.model.answers import predicted, share_at_new
 from gaigs.model.friis import Friis
 from gaigs.model.knn import KNearestNeighbours
 from gaigs.model.mirrored import MirroredSplatting
 from gaigs.model.path_loss import PathLoss
 from gaigs.planes.box_search import BoxSearch, Cuboid
+from gaigs.registry import registry
 
 PLACES = torch.tensor([[1.0, 2.0, 1.5], [2.0, 1.0, 1.5]])
 
@@ -255,3 +257,36 @@ def test_levels_at_known_receivers_have_no_boxes():
     model.fit(links)
     assert model.shadowed is None
     assert model._place_boxes() == ""
+
+
+def test_kriged_levels_at_new_receivers_are_a_mean_with_path_loss(tmp_path):
+    links = gaigs.links("synthetic_rssi", transmitters=60, receivers=6, split="receivers")
+    options = {"max_steps": 2, "val_check_interval": 1, "enable_progress_bar": False}
+    model = gaigs.train("mirrored", links, "kriging=true", folder=tmp_path, **options)
+    share = model.new_weight.item()
+    assert 0 < share < 1
+    fallback = registry("model").build({"name": "path_loss"}, scene=links.scene)
+    fallback.fit(replace(links, split=links.split.validating()))
+    held = links.split.validation
+    one, other = (predicted(part, links, held) for part in (model.trend, fallback))
+    assert share_at_new(links, held, one, fallback) == pytest.approx(share)
+    # The least of the mean square error over receivers, and of one receiver more for a half.
+    receivers = links.query.receivers[held]
+    tried = torch.linspace(0, 1, 1001, dtype=torch.float64)
+    errors = tried[:, None] * (one - other).double() + (other - links.labels[held]).double()
+    squares = [errors[:, receivers == number].square().mean(1) for number in receivers.unique()]
+    mean = torch.stack(squares).mean(0)
+    cost = mean + (mean[0] + mean[-1]) * (tried - 0.5) ** 2 / len(squares)
+    assert tried[cost.argmin()] == pytest.approx(share, abs=1e-3)
+    # Known and new receivers.
+    new = model.predict(PLACES, receiver=Receiver("new", links.receivers[0].pose))
+    parts = [
+        part.predict(PLACES, receiver=Receiver("new", links.receivers[0].pose))
+        for part in (model.trend, model.fallback)
+    ]
+    torch.testing.assert_close(new, share * parts[0] + (1 - share) * parts[1])
+    test = links.split.test
+    asked = links.query[test[links.query.receivers[test] == links.query.receivers[test[0]]][:3]]
+    parts = [part.predict(asked) for part in (model.trend, model.fallback)]
+    torch.testing.assert_close(model.predict(asked), share * parts[0] + (1 - share) * parts[1])
+    torch.testing.assert_close(gaigs.load(tmp_path).predict(asked), model.predict(asked))
