@@ -129,7 +129,7 @@ class LocalMixtures(NamedTuple):
         options = self.options
         # Receivers that hear the same places share matrices, as candidates' lengths are the same.
         _, which = keys.unique_consecutive(return_inverse=True)
-        first = torch.searchsorted(which, torch.arange(int(which[-1]) + 1))
+        first = torch.searchsorted(which, which.unique())
         near = Nearest(nearest.rows[first], nearest.exists[first])
         around = self.readings.around(places[first], receivers[first], near)
         apart = separations(around, self.choice)  # (u, i, i)

@@ -476,8 +476,8 @@ class Kriging(Wrapper):
     def _at_new(self) -> Model:
         """The model of receivers without links."""
         weight = self.new_weight.item()
-        if weight == 1 or self.trend_weight == 0:
-            return self._alone
+        if weight in (0, 1) or self.trend_weight == 0:
+            return self._alone if weight else self.fallback
         mean_of = registry("model").get("ensemble")
         return mean_of(self.scene, [self.trend, self.fallback], [weight, 1 - weight]).eval()
 

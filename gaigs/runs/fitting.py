@@ -1,6 +1,7 @@
 """Fit, gradient descent, kriging and calibration of one model."""
 
 import logging
+import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -169,10 +170,11 @@ def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float
 def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> Start:
     """The trained model, or one from its second start if that validates better.
 
-    A limit in time is for one training, so the second one is left out.
+    A limit in time is for one training, so the second one is left out. So are several processes,
+    of which the further ones have ended.
     """
     own = Start(model, config, 0.0)
-    is_limited = config["trainer"].get("max_time") is not None
+    is_limited = config["trainer"].get("max_time") is not None or "WORLD_SIZE" in os.environ
     if is_limited or not model.second_start or not len(links.split.validation):
         return own
     second = config | {"model": config["model"] | model.second_start}
@@ -189,7 +191,8 @@ def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, fold
     other.known_places = model.known_places
     content = checkpoint.read(place / "best.ckpt")
     scores = []
-    for trained in (checkpoint.read(folder / "best.ckpt"), content):
+    # A resumed run may find the second start in best.ckpt already.
+    for trained in (checkpoint.read(folder / "last.ckpt"), content):
         scores.append(trained["callbacks"][KeepBest.__name__]["best"])
     log.info("validation: %.4f from the first start, %.4f from %s", *scores, model.second_start)
     if scores[1] <= scores[0]:
