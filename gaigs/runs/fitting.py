@@ -1,7 +1,6 @@
 """Fit, gradient descent, kriging and calibration of one model."""
 
 import logging
-import os
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -174,7 +173,7 @@ def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, fold
     of which the further ones have ended.
     """
     own = Start(model, config, 0.0)
-    is_limited = config["trainer"].get("max_time") is not None or "WORLD_SIZE" in os.environ
+    is_limited = config["trainer"].get("max_time") is not None or torch.distributed.is_initialized()
     if is_limited or not model.second_start or not len(links.split.validation):
         return own
     second = config | {"model": config["model"] | model.second_start}
