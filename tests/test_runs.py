@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from unittest.mock import Mock
 
+import lightning
 import numpy as np
 import pytest
 import torch
@@ -660,15 +661,32 @@ def test_channels_of_mirrored_gaussians_end_no_lower_than_free_space(tmp_path, m
     assert gaigs.load(tmp_path / "best.ckpt").predict([[1.0, 2.0, 1.5]]).abs().max() > 0
 
 
-@pytest.mark.parametrize("scores", [(0.9, 0.5), (0.5, 0.9)])
-def test_validation_chooses_the_start_of_mirrored_gaussians(tmp_path, monkeypatch, scores):
-    options = (
-        "+experiment=mirrored", "data.transmitters=20", "data.order=0", "kriging=false", "baselines=[mean]",
-        "placement.planes=6", "placement.order=1", "placement.obstacles=1", "trainer.max_steps=2",
-        "trainer.val_check_interval=1", "trainer.enable_progress_bar=false", "model.search=null",
-    )  # fmt: skip
+STARTS = (
+    "+experiment=mirrored", "data.transmitters=20", "data.order=0", "kriging=false", "baselines=[mean]",
+    "placement.planes=6", "placement.order=1", "placement.obstacles=1", "trainer.max_steps=2",
+    "trainer.val_check_interval=1", "trainer.enable_progress_bar=false", "model.search=null",
+)  # fmt: skip
+
+
+@pytest.fixture
+def two_starts(monkeypatch):
+    """A search that finds the ceiling at once, so that spectra have a second start."""
     monkeypatch.setattr(runs, "radio_map", Mock())  # which takes long
     monkeypatch.setattr(LagSearch, "run", lambda *_: torch.tensor([[0.0, 0.0, 1.0, 2.7]]))
+
+
+@pytest.mark.usefixtures("two_starts")
+def test_several_processes_have_one_start(tmp_path, monkeypatch):
+    """The further ones end with the first training."""
+    monkeypatch.setattr(lightning.Trainer, "world_size", 2)
+    runs.run(gaigs.compose(*STARTS), tmp_path)
+    assert (tmp_path / "best.ckpt").is_file()
+    assert not (tmp_path / "second_start").exists()
+
+
+@pytest.mark.usefixtures("two_starts")
+@pytest.mark.parametrize("scores", [(0.9, 0.5), (0.5, 0.9)])
+def test_validation_chooses_the_start_of_mirrored_gaussians(tmp_path, monkeypatch, scores):
     given = {tmp_path: scores[0], tmp_path / "second_start": scores[1]}
 
     def descend(model, loss, links, config, folder, *rest, **named):
@@ -680,7 +698,7 @@ def test_validation_chooses_the_start_of_mirrored_gaussians(tmp_path, monkeypatc
         return trained
 
     monkeypatch.setattr("gaigs.runs.fitting.descend", descend)
-    runs.run(gaigs.compose(*options), tmp_path)
+    runs.run(gaigs.compose(*STARTS), tmp_path)
     second = gaigs.load(tmp_path / "second_start" / "best.ckpt")
     model = gaigs.load(tmp_path)
     is_second = scores[0] < scores[1]

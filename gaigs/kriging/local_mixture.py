@@ -1,7 +1,6 @@
 """Processes whose length and noise differ from place to place: averages over candidates."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,7 +9,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gaigs.kriging.kernel import matern
-from gaigs.kriging.likelihood import Choice, separations
+from gaigs.kriging.likelihood import Choice
+from gaigs.kriging.links import distances, scaled
 from gaigs.kriging.neighbours import Nearest, Readings
 
 
@@ -97,42 +97,48 @@ class LocalMixtures(NamedTuple):
     ) -> LocalMixture:
         """Mixtures at places, without the readings of their ``own`` fold."""
         readings = self.readings._replace(count=self.options.neighbours)
-        nearest = readings.nearest(places, receivers, own, folds)
-        keys = torch.cat([*self._keys(places, nearest)])  # (m,)
-        order = keys.argsort()
+        nearest, sets = self._in_order(readings.nearest(places, receivers, own, folds))
+        order = sets.argsort()
         parts = []
         for part in order.split(self.options.size):
             near = Nearest(nearest.rows[part], nearest.exists[part])
-            parts.append(self._mixture(places[part], receivers[part], near, keys[part]))
+            parts.append(self._mixture(places[part], receivers[part], near, sets[part]))
         back = order.argsort()
         return LocalMixture(*(torch.cat(field)[back] for field in zip(*parts, strict=True)))
 
-    def _keys(self, places: Tensor, nearest: Nearest) -> Iterator[Float[Tensor, " j"]]:
-        """A number of each place with the places around, the same for receivers that hear the same
-        places: random weights make different places differ.
+    def _in_order(self, nearest: Nearest) -> tuple[Nearest, Int[Tensor, " m"]]:
+        """The readings around each place in an order that does not depend on the place, and a
+        number of their set of places: receivers that hear the same places have the same sets.
         """
-        generator = torch.Generator().manual_seed(0)
-        shape = nearest.rows.shape[1] + 1, places.shape[1]
-        weights = torch.rand(shape, generator=generator, dtype=torch.float64)
-        for part in torch.arange(len(places)).split(self.options.size):
-            around = self.readings.places[nearest.rows[part]] * nearest.exists[part, :, None]
-            points = torch.cat((around, places[part, None]), 1)  # (j, i, d)
-            yield (points * weights).sum((1, 2)) + nearest.exists[part].sum(1) / math.pi
+        bits = self.readings.places.contiguous().view(torch.int64)  # (k, d)
+        # A hash of each reading's place; past 64 bits it wraps.
+        codes = torch.zeros_like(bits[:, 0])
+        for column in bits.unbind(1):
+            codes = (codes ^ column ^ (column >> 29)) * 0x5851F42D4C957F2D
+        rows, exists = nearest
+        of_rows = codes[rows].masked_fill(~exists, torch.iinfo(torch.int64).max)  # (m, j)
+        order = of_rows.argsort(1)
+        ordered = Nearest(rows.gather(1, order), exists.gather(1, order))
+        return ordered, (codes[rows] * exists).sum(1)
 
     def _mixture(
         self,
         places: Float[Tensor, "m d"],
         receivers: Int[Tensor, " m"],
         nearest: Nearest,
-        keys: Float[Tensor, " m"],
+        sets: Int[Tensor, " m"],
     ) -> LocalMixture:
-        options = self.options
-        # Receivers that hear the same places share matrices, as candidates' lengths are the same.
-        _, which = keys.unique_consecutive(return_inverse=True)
+        options, scale = self.options, self.choice.scale
+        points = scaled(self.readings.places, scale)[nearest.rows]  # (m, j, d)
+        near = (points - scaled(places, scale)[:, None]).norm(dim=2)  # (m, j)
+        # What does not exist correlates with nothing, not even with itself.
+        near = near.where(nearest.exists, 1e15)
+        # Places with the same readings around share matrices, as the candidates' lengths are the
+        # same at all receivers.
+        _, which = sets.unique_consecutive(return_inverse=True)
         first = torch.searchsorted(which, which.unique())
-        near = Nearest(nearest.rows[first], nearest.exists[first])
-        around = self.readings.around(places[first], receivers[first], near)
-        apart = separations(around, self.choice)  # (u, i, i)
+        pairs = nearest.exists[first, :, None] & nearest.exists[first, None]
+        apart = distances(points[first], points[first]).where(pairs, 1e15)  # (u, j, j)
         values = self.values[nearest.rows].where(nearest.exists, 0)  # (m, j)
         counts = nearest.exists.sum(1)
         lengths, signals, noises = self.logarithms[receivers].unbind(1)
@@ -143,9 +149,11 @@ class LocalMixtures(NamedTuple):
             correlations = matern(apart, (middle + step).exp(), self.choice.smoothness)
             # With eigenvalues e and vectors U of the correlations, U diag(e + ratio) U' are the
             # covariances of all ratios.
-            sizes, vectors = torch.linalg.eigh(correlations[:, :-1, :-1])
-            towards = (vectors.mT @ correlations[:, :-1, -1:])[which, :, 0]  # (m, j)
-            rotated = (vectors.mT[which] @ values[..., None])[..., 0]  # (m, j)
+            sizes, vectors = torch.linalg.eigh(correlations)
+            vectors = vectors.mT[which]  # (m, j, j)
+            at_place = matern(near, (middle + step).exp(), self.choice.smoothness)
+            towards = (vectors @ at_place[..., None])[..., 0]  # (m, j)
+            rotated = (vectors @ values[..., None])[..., 0]  # (m, j)
             prior = ((middle + step - lengths) / options.scatter).square() / 2
             for change in options.ratios:
                 ratios = (2 * (noises - signals) + change).exp()
@@ -153,8 +161,8 @@ class LocalMixtures(NamedTuple):
                 # The receiver's variance of readings divides into signal and noise.
                 own = options.degrees * total / (1 + ratios)
                 energy = own + (rotated.square() / covariances).sum(1)
-                # Readings that do not exist are 0 and correlate with none.
-                lacking = (values.shape[1] - counts) * ratios.log1p()
+                # Readings that do not exist have an eigenvalue of 0 each.
+                lacking = (values.shape[1] - counts) * ratios.log()
                 determinant = covariances.log().sum(1) - lacking
                 likelihood = options.degrees * own.log() - determinant
                 likelihood = likelihood - (options.degrees + counts) * energy.log()

@@ -64,6 +64,8 @@ def descend(
     context = {"callbacks": callbacks, "logger": _loggers(folder, config["tensorboard"])}
     trainer = make_trainer(options, default_root_dir=folder, **context)
     _check_processes(trainer, config)
+    if trainer.world_size > 1:  # further processes end with this training
+        model.second_start = {}
     steps = ENDLESS if trainer.max_steps == -1 else trainer.max_steps
     batches = Batches(links, links.split.train, module.batch_size, seed, steps)
     validation = None

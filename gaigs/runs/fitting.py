@@ -169,11 +169,10 @@ def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float
 def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> Start:
     """The trained model, or one from its second start if that validates better.
 
-    A limit in time is for one training, so the second one is left out. So are several processes,
-    of which the further ones have ended.
+    A limit in time is for one training, so the second one is left out.
     """
     own = Start(model, config, 0.0)
-    is_limited = config["trainer"].get("max_time") is not None or torch.distributed.is_initialized()
+    is_limited = config["trainer"].get("max_time") is not None
     if is_limited or not model.second_start or not len(links.split.validation):
         return own
     second = config | {"model": config["model"] | model.second_start}

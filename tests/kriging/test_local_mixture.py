@@ -70,6 +70,19 @@ def test_the_likelier_length_has_the_weight():
     assert shares[::2].mean() > 0.9 > 0.3 > shares[1::2].mean()
 
 
+def test_readings_that_do_not_exist_have_no_say():
+    """40 readings of each receiver are all of them, with or without room for 20 more."""
+    places, which = asked(), torch.arange(7) % 2
+    exact, more = (mixtures(MixtureOptions(count)).at(places, which) for count in (40, 60))
+    for one, other in zip(exact, more, strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_no_places_have_no_mixtures():
+    none = mixtures(MixtureOptions(12)).at(torch.zeros(0, 3).double(), torch.zeros(0).long())
+    assert none.mean.shape == none.variance.shape == (0,)
+
+
 def test_receivers_share_matrices_without_a_difference():
     all_of = mixtures(MixtureOptions(12))
     places, which = asked().repeat(2, 1), torch.arange(2).repeat_interleave(7)
