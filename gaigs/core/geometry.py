@@ -150,8 +150,8 @@ def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, 
     quats = _of_moderate_length(quats)
     squares = (quats * quats).sum(-1, keepdim=True)  # (..., 1)
     s = 2 / torch.where(squares == 0, 1, squares)
-    # R e = e + s (w u x e + u x (u x e)) with u = (x, y, z), for each axis e: few operations, since
-    # one costs the time of hundreds of Gaussians.
+    # The column of each axis e is R e = e + s (w u x e + u x (u x e)), with u = (x, y, z). That
+    # takes few operations, each of which costs as much as hundreds of Gaussians.
     w, u = quats[..., :1, None], quats[..., None, 1:]  # (..., 1, 1) and (..., 1, 3)
     axes = torch.eye(3, dtype=quats.dtype, device=quats.device)
     turned = torch.linalg.cross(u, axes.expand(*quats.shape[:-1], 3, 3))

@@ -119,8 +119,9 @@ class FieldPosterior(Posterior):
     Hyperparameters are the same for all receivers and numbers. The trend's weight is the candidate
     with the largest likelihood. Residuals of channels are limited, see ``damping``.
 
-    Spectra have ``traits``, the trend's spectra by ``coarse``: places correlate the less, the more
-    these differ, as where a shadow ends between them.
+    Spectra have ``features``, the trend's spectra by ``coarse``: places correlate the less, the
+    more these differ, as where a shadow ends between them. Source: Wilson et al., Deep kernel
+    learning, 2016.
     """
 
     chooses_weight = True
@@ -141,20 +142,20 @@ class FieldPosterior(Posterior):
         return Hyperparameters(*self.hyperparameters.tolist())
 
     @property
-    def has_traits(self) -> bool:  # type: ignore[override]
+    def has_features(self) -> bool:  # type: ignore[override]
         return not self.scene.has_band and not math.isnan(self.process.scale)
 
     def fit(
         self,
         links: Links,
         candidates: Mapping[float, Tensor],
-        traits: Float[Tensor, "k c"] | None = None,
+        features: Float[Tensor, "k c"] | None = None,
     ) -> float:
         index = links.split.known
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
 
         def fitted(
-            weight: float, most: int = 300, has_traits: bool = False, length: float | None = None
+            weight: float, most: int = 300, has_features: bool = False, length: float | None = None
         ) -> tuple[Hyperparameters, float]:
             residuals = candidates[weight]
             if residuals.is_complex():
@@ -167,7 +168,7 @@ class FieldPosterior(Posterior):
                 links,
                 lambda part: residuals[rows[part]],
                 most=most,
-                traits=(lambda part: traits[rows[part]]) if has_traits else None,
+                features=(lambda part: features[rows[part]]) if has_features else None,
                 length=length,
             )
 
@@ -176,7 +177,7 @@ class FieldPosterior(Posterior):
         process, _ = fits[best]
         if best:  # residuals of a good trend correlate weakly with position: few links overfit
             process, _ = fitted(best, most=1000)
-        if traits is not None:
+        if features is not None:
             lengths = {weight: fit.length for weight, (fit, _) in fits.items()}
             fits = {weight: fitted(weight, 300, True, lengths[weight]) for weight in candidates}
             weight = min(candidates, key=lambda weight: fits[weight][1])
@@ -191,7 +192,7 @@ class FieldPosterior(Posterior):
         self,
         links: Links,
         residuals: Callable[[Int[Tensor, " j"]], Tensor],
-        traits: Float[Tensor, "k c"] | None = None,
+        features: Float[Tensor, "k c"] | None = None,
     ) -> None:
         index = links.split.known
         query, process = links.query[index], self.process
@@ -204,12 +205,12 @@ class FieldPosterior(Posterior):
             if values.is_complex():
                 labels = links.labels[index[rows]]
                 values = values * damping(values, labels, radios[rows])[:, None, None]
-            field.solve(self._places(query, traits)[rows], values, process, self.share)
+            field.solve(self._places(query, features)[rows], values, process, self.share)
 
     def mean(
-        self, batch: Batch, like: Tensor, traits: Float[Tensor, "b c"] | None = None
+        self, batch: Batch, like: Tensor, features: Float[Tensor, "b c"] | None = None
     ) -> Tensor:
-        all_places = self._places(batch.query, traits)
+        all_places = self._places(batch.query, features)
         mean = torch.zeros_like(like)
         radios = self.scene.radio_of(batch.query.receivers)
         for radio in radios.unique().tolist():
@@ -218,9 +219,9 @@ class FieldPosterior(Posterior):
             mean[is_asked] = field(all_places[is_asked], self.process.length, batch).to(mean)
         return mean
 
-    def deviations(self, batch: Batch, traits: Float[Tensor, "b c"] | None = None) -> Tensor:
+    def deviations(self, batch: Batch, features: Float[Tensor, "b c"] | None = None) -> Tensor:
         query, process = batch.query, self.process
-        places = self._places(query, traits)
+        places = self._places(query, features)
         squares = places.new_zeros(len(query))
         radios = self.scene.radio_of(query.receivers)
         for radio in radios.unique().tolist():
@@ -233,8 +234,8 @@ class FieldPosterior(Posterior):
 
     def process_at(self, receiver: int) -> Process:
         field, process = self.fields[receiver], self.process
-        # In place and frequency alone: whoever asks for the process knows no traits.
-        known = field.places if not self.has_traits else field.places[:, :3]
+        # Over places and carriers alone: callers have no predicted spectra.
+        known = field.places if not self.has_features else field.places[:, :3]
         places = scaled(known, 1 / process.scale)  # of scale 1
         found = process.at(places, field.size(process).item() ** 2)
         return replace(found, is_part=len(places) >= LIMIT)
@@ -244,12 +245,12 @@ class FieldPosterior(Posterior):
         components = [len(field.components) for field in self.fields]  # type: ignore[arg-type]
         sizes = {"links": sum(places), "components": max(components)}
         facts = self.process.facts()
-        if self.has_traits:
+        if self.has_features:
             facts["spectrum_scale_m"] = facts.pop("frequency_scale_m")
         return {**facts, **sizes}
 
-    def _places(self, query: Query, traits: Float[Tensor, "b c"] | None) -> Float[Tensor, "b d"]:
-        return coordinates(self.scene, query, self.process.scale, traits)
+    def _places(self, query: Query, features: Float[Tensor, "b c"] | None) -> Float[Tensor, "b d"]:
+        return coordinates(self.scene, query, self.process.scale, features)
 
 
 def _like_loaded(buffer: Tensor, values: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ class Hyperparameters(NamedTuple):
 
     length: float = math.nan  # correlation length of the kernel [m]
     nugget: float = math.nan  # variance of the noise over the signal's
-    scale: float = math.nan  # of frequencies or traits, see ``coordinates`` [m]; NaN without
+    scale: float = math.nan  # of frequencies or features, see ``coordinates`` [m]; NaN without
 
     def facts(self) -> dict[str, float]:
         """Entries of ``metrics.json``."""
@@ -63,7 +63,7 @@ class HeldOut(NamedTuple):
     around: Query  # links around each held-out link, one group after the other
     # Products of the residuals of each held-out link and of those around it.
     products: Float[Tensor, "b j+1 j+1"]
-    traits: Float[Tensor, "b j+1 c"] | None = None  # of each held-out link and of those around it
+    features: Float[Tensor, "b j+1 c"] | None = None  # of each held-out link and of those around it
 
 
 def damping(
@@ -76,7 +76,7 @@ def damping(
 
     They limit the norm of a residual to ``most`` times the median norm of the known channels of its
     receiver. Places within decimetres of a receiver pass the limit, and so do readings with a gross
-    error, one of which would spoil the predictions of the whole room.
+    error: a single one would spoil all predictions of the room.
     """
     sizes, levels = norms(residuals), norms(labels)
     factors = torch.ones_like(sizes)
@@ -100,7 +100,7 @@ def fit_hyperparameters(
     most: int = 300,
     nuggets: tuple[float, float] = (1e-4, 1e2),
     edges: float = 8.0,
-    traits: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
+    features: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
     length: float | None = None,
 ) -> tuple[Hyperparameters, float]:
     """Hyperparameters with the largest likelihood, and their ``negative_log_likelihood`` summed
@@ -115,7 +115,7 @@ def fit_hyperparameters(
             measured twice.
         edges: Longest correlation length [longest edges of the box of places]. Beyond it the kernel
             is nearly linear within the box, so the length no longer shows.
-        traits: Function from indices of links to their traits, see ``coordinates``.
+        features: Function from indices of links to their features, see ``coordinates``.
         length: A known correlation length; the others then have the least squared error of the
             held-out labels in place of the largest likelihood. A trend has seen the training links:
             variances by their residuals mislead.
@@ -123,9 +123,9 @@ def fit_hyperparameters(
     longest = (scene.upper - scene.lower).max().item()
     lengths = (scene.spacing, edges * longest) if length is None else (length, length)
     scales = [scale_bounds(scene)] if scene.has_band else []
-    if traits is not None:
+    if features is not None:
         # From a tenth of the next place's distance, which is no effect, to the longest edge.
-        spread = traits(links.split.known).var(0).sum().sqrt().clamp_min(1e-9).item()
+        spread = features(links.split.known).var(0).sum().sqrt().clamp_min(1e-9).item()
         scales = [(0.1 * scene.spacing / spread, longest / spread)]
     bounds = np.log([lengths, nuggets, *scales])
     middle = bounds.mean(1)
@@ -136,7 +136,7 @@ def fit_hyperparameters(
     each = max(1, most // len(known))
     held_out = []
     for index in known:
-        held = hold_out(scene, links, index, scale, residuals, each, traits=traits)
+        held = hold_out(scene, links, index, scale, residuals, each, features=features)
         held_out += [] if held is None else [held]
     if not held_out:
         return Hyperparameters(*np.exp(middle).tolist()), -math.inf
@@ -181,7 +181,7 @@ def hold_out(
     residuals: Callable[[Int[Tensor, " j"]], Float[Tensor, "j m"]],
     most: int,
     neighbours: int = 64,
-    traits: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
+    features: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
 ) -> HeldOut | None:
     """At most ``most`` held-out links of one receiver, and the known links that predict them.
 
@@ -220,7 +220,7 @@ def hold_out(
     means = torch.stack(products) / numbers.shape[1]
     if not means.any():
         return None
-    of_groups = None if traits is None else traits(used)[place]
+    of_groups = None if features is None else features(used)[place]
     return HeldOut(query[asked], query[around.flatten()], means, of_groups)
 
 
@@ -241,8 +241,8 @@ def negative_log_likelihood(
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """
-    of_asked = None if held.traits is None else held.traits[:, 0]
-    of_around = None if held.traits is None else held.traits[:, 1:].flatten(0, 1)
+    of_asked = None if held.features is None else held.features[:, 0]
+    of_around = None if held.features is None else held.features[:, 1:].flatten(0, 1)
     asked = coordinates(scene, held.asked, scale, of_asked)  # (b, d)
     around = coordinates(scene, held.around, scale, of_around)  # (b j, d)
     around = around.unflatten(0, (len(asked), -1))  # (b, j, d)

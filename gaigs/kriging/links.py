@@ -87,19 +87,19 @@ def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]
 
 
 def coordinates(
-    scene: Scene, query: Query, scale: float | Tensor, traits: Float[Tensor, "b c"] | None = None
+    scene: Scene, query: Query, scale: float | Tensor, features: Float[Tensor, "b c"] | None = None
 ) -> Float[Tensor, "b d"]:
     """Points (float64) whose Euclidean distance is that of links: d² = |dx|² + (scale d ln f)².
 
     dx is the transmitters' step [m], f the carrier. With ``one_radio`` |dx|² counts both ends.
     ``scale`` [m] has no effect unless the training links have several carriers, or links have
-    ``traits``: then d² = |dx|² + (scale |d traits|)².
+    ``features``: then d² = |dx|² + (scale |d features|)².
     """
     positions = query.transmitters.double()
     if scene.one_radio:
         positions = torch.cat((positions, scene.positions(positions)[query.receivers]), 1)  # (b, 6)
-    if traits is not None:
-        return torch.cat((positions, scale * traits), 1)
+    if features is not None:
+        return torch.cat((positions, scale * features), 1)
     if not scene.has_band:
         return positions
     half = (scene.frequencies[-1] / scene.frequencies[0]).double().log() / 2

@@ -24,7 +24,7 @@ class Posterior(nn.Module):
         by_paths: True if strengths of paths are kriged, not labels.
         start: Result of an earlier fit to nearly the same links, where the next starts; or None.
         seen: Known links that the fit has held out to choose hyperparameters; None: all.
-        has_traits: True if predictions need the trend's spectra at the asked links.
+        has_features: True if predictions need the trend's spectra at the asked links.
         is_lazy: True if predictions are wanted at few places. With many known links only those near
             these places are then solved for.
     """
@@ -34,7 +34,7 @@ class Posterior(nn.Module):
     start: Any = None
     seen: Tensor | None = None
     is_lazy = False
-    has_traits = False
+    has_features = False
 
     def cleaned(self, links: Links) -> Links:
         """The links without gross errors that would move the whole fit; by default all links."""

@@ -252,8 +252,8 @@ class Kriging(Wrapper):
         split = links.split
         candidates = weighed_residuals(links, self.fallback, values, weights)
         # A trend that may have no weight tells no places apart either.
-        traits = self._traits(values) if any(weights) else ()
-        self.trend_weight.fill_(self.posterior.fit(links, candidates, *traits))
+        features = self._features(values) if any(weights) else ()
+        self.trend_weight.fill_(self.posterior.fit(links, candidates, *features))
         training = replace(links, split=split.validating())
         model = Kriging(self.scene, self.trend, self.fallback_options)
         model._make_posterior(False)
@@ -300,25 +300,25 @@ class Kriging(Wrapper):
                 differences[part] = (task.align(labels, mean) - mean).to(differences)
             return differences
 
-        traits = self._traits(values) if self.posterior.has_traits else ()
-        self.posterior.solve(links, residuals, *traits)
+        features = self._features(values) if self.posterior.has_features else ()
+        self.posterior.solve(links, residuals, *features)
         self.posterior.to(self.weight.device)
 
-    def _traits(self, spectra: Tensor) -> tuple[Tensor, ...]:
+    def _features(self, spectra: Tensor) -> tuple[Tensor, ...]:
         """``coarse`` spectra of a trend without paths, which stays at its receivers; or nothing."""
         scene = self.scene
         if scene.task.directions is None or scene.has_band or scene.one_radio:
             return ()
         return () if self.trend.has_margins else (coarse(spectra),)
 
-    def _traits_at(self, batch: Batch, trend: Tensor | None) -> tuple[Tensor, ...]:
-        """``_traits`` of a batch, whose trend may be known in its directions."""
-        if not self.posterior.has_traits:
+    def _features_at(self, batch: Batch, trend: Tensor | None) -> tuple[Tensor, ...]:
+        """``_features`` of a batch, whose trend may be known in its directions."""
+        if not self.posterior.has_features:
             return ()
         directions = self.scene.task.directions
         if trend is None or not directions.matches(batch.directions):
             trend = self.trend(replace(batch, directions=directions)).value
-        return self._traits(trend)
+        return self._features(trend)
 
     def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` by paths of the trend.
@@ -378,7 +378,7 @@ class Kriging(Wrapper):
         Processes of kriged paths have no noise, and treat paths as if the elements resolved them
         all.
         """
-        return self.posterior.deviations(batch, *self._traits_at(batch, None))
+        return self.posterior.deviations(batch, *self._features_at(batch, None))
 
     def _log(self) -> None:
         """Logs weights, hyperparameters and sizes."""
@@ -388,13 +388,13 @@ class Kriging(Wrapper):
     def forward(self, batch: Batch) -> Prediction:
         task, trend_weight, weight = self.scene.task, self.trend_weight.item(), self.weight.item()
         # A part without weight is not evaluated: it would cost time, and its NaN would count.
-        needs_trend = trend_weight > 0 or weight < 1 or self.posterior.has_traits
+        needs_trend = trend_weight > 0 or weight < 1 or self.posterior.has_features
         trend = self.trend(batch).value if needs_trend else None
         if weight == 0:
             return Prediction(trend, {})
         fallback = self.fallback(batch).value if trend_weight < 1 else None
         value = blend(task, trend, fallback, trend_weight)
-        value = value + self.posterior.mean(batch, value, *self._traits_at(batch, trend))
+        value = value + self.posterior.mean(batch, value, *self._features_at(batch, trend))
         value = blend(task, value, trend, weight)
         is_new = ~self.posterior.knows(batch.query.receivers)
         if is_new.any():  # receivers without links, as ``at_receivers`` has them
@@ -488,12 +488,12 @@ class Kriging(Wrapper):
     @property
     def has_room(self) -> bool:  # type: ignore[override]
         """True if predictions have a part of the trend."""
-        return bool(self.trend_weight > 0 or self.weight < 1 or self.posterior.has_traits)
+        return bool(self.trend_weight > 0 or self.weight < 1 or self.posterior.has_features)
 
     def facts(self) -> dict[str, Any]:
         """The trend's facts, and as ``kriging`` the weights, hyperparameters and sizes."""
         weights = {"weight": self.weight.item(), "trend_weight": self.trend_weight.item()}
-        if self.new_weight < 1:
+        if self.trend_weight > 0 and self.new_weight < 1:
             weights["new_weight"] = self.new_weight.item()
         room = {} if self.has_room else {"room": False}
         return self.trend.facts() | {"kriging": weights | room | dict(self.posterior.facts())}

@@ -290,7 +290,7 @@ class MirroredSplatting(GaussianSplatting):
         Planes that a search has found do not move.
         """
         boxes = ""
-        # Boxes need the planes' strengths: those of levels are learnt from powers.
+        # Boxes need the strengths of the planes, which levels teach before phases count.
         if number == 2 and isinstance(self.pooling, PathRssi):
             boxes = self._place_boxes()
         return self._revise_planes(number, train, validation, loss) + boxes

@@ -226,7 +226,7 @@ class Placed(NamedTuple):
         lengths: Length of each Gaussian's path from transmitter to receiver (b, n) [m]; None if
             unknown.
         quats, scales, opacities, signal: As in ``Gaussians``; scales (1 or b, n, 3) [m], signal (n,
-            c, 1) or (b, n, c, 1). None: those of ``Gaussians``.
+            c, 1) or (b, n, c, 1). None: the values of ``Gaussians``.
         gains: Complex factor of the signal, phase included (b, n). None: 1.
         coherences: Share of each path's field with a known phase, in [0, 1] (n,). The rest adds as
             power. None: 1.

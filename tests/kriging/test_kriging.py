@@ -98,9 +98,9 @@ def kriged(links, **options):
 def half(monkeypatch):
     """Fixes the hyperparameters, and the trend weight to 0.5, for tests of what follows from them."""
 
-    def fixed(scene, links, residuals, most=300, traits=None, length=None):
+    def fixed(scene, links, residuals, most=300, features=None, length=None):
         residuals(links.split.known)
-        if length is not None:  # traits do not help
+        if length is not None:  # features do not help
             return PROCESS, 0.0
         assert (most == 1000) == (len(costs) % 6 == 5), "the last fit looks at more links"
         costs.append(
@@ -400,7 +400,7 @@ def test_surveys_see_the_process_of_the_predictions(kind, carriers):
     torch.testing.assert_close(variances, expected.to(variances), rtol=1e-5, atol=0)
 
 
-# --- traits ---
+# --- features ---
 
 
 class Shadowed(Trained):
@@ -421,7 +421,7 @@ def test_places_correlate_by_the_spectra_of_the_trend_too(monkeypatch):
     )
     model = Kriging(links.scene, Shadowed(links.scene))
     model.fit(links)
-    assert model.posterior.has_traits
+    assert model.posterior.has_features
     assert model.facts()["kriging"]["spectrum_scale_m"] > 0
     assert model.has_room
     query = links.query[links.split.test]
@@ -432,10 +432,10 @@ def test_places_correlate_by_the_spectra_of_the_trend_too(monkeypatch):
     loaded.load_state_dict(model.state_dict())
     assert torch.equal(loaded.predict(query), values)
 
-    monkeypatch.setattr(Kriging, "_traits", lambda *_: ())
+    monkeypatch.setattr(Kriging, "_features", lambda *_: ())
     plain = Kriging(links.scene, Shadowed(links.scene))
     plain.fit(links)
-    assert not plain.posterior.has_traits
+    assert not plain.posterior.has_features
     labels = links.labels[links.split.test]
     assert (values - labels).square().mean() < 0.8 * (plain.predict(query) - labels).square().mean()
 
