@@ -35,7 +35,7 @@ from gaigs.planes.channel_search import ChannelSearch
 from gaigs.planes.lag_search import LagSearch
 from gaigs.processes import Stopped, stopping
 from gaigs.registry import registry
-from gaigs.report.training_log import read_curves
+from gaigs.report.training_log import read_curves, read_log
 from gaigs.runs import descent, evaluation
 from gaigs.runs.folder import claim
 from gaigs.testing import example_links
@@ -703,6 +703,9 @@ def test_validation_chooses_the_start_of_mirrored_gaussians(tmp_path, monkeypatc
     model = gaigs.load(tmp_path)
     is_second = scores[0] < scores[1]
     assert model.search is (False if is_second else None)
+    curves, other = read_log(tmp_path), read_log(tmp_path / "second_start")
+    of_second = [np.array_equal(curves[name], curve) for name, curve in other.items()]
+    assert all(of_second) == is_second
     places = [[1.0, 2.0, 1.5]]
     assert torch.equal(model.predict(places), second.predict(places)) == is_second
 

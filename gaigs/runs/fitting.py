@@ -1,6 +1,7 @@
 """Fit, gradient descent, kriging and calibration of one model."""
 
 import logging
+import shutil
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -196,6 +197,9 @@ def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, fold
     if scores[1] <= scores[0]:
         return own._replace(seconds=seconds)
     checkpoint.write(content, folder / "best.ckpt")
+    # Curves are those of the latest log.
+    for part in (place / "log").iterdir():
+        shutil.copytree(part, folder / "log" / f"second_start_{part.name}", dirs_exist_ok=True)
     return Start(other, second, seconds)
 
 
