@@ -50,8 +50,8 @@ class Calibration:
     # Calibration of receivers without links, by errors at each receiver of models that have the
     # mean of the others in its place; None if there are too few.
     elsewhere: "Calibration | None" = None
-    # Variances of the errors between receivers and within them, for labels of one number.
-    scatter: Float[Tensor, "2"] | None = None
+    # ``RandomEffects`` of receivers without links, for labels of one number.
+    scatter: Float[Tensor, " n"] | None = None
 
     @classmethod
     def of(
@@ -126,11 +126,6 @@ class Calibration:
         """
         new = self.elsewhere
         return None if new is None else replace(new, widths=widths, elsewhere=new)
-
-    @property
-    def is_adapted(self) -> bool:
-        """True if readings at receivers without links have made their intervals narrower."""
-        return self.widths is not None and bool(((self.widths > 0) & (self.widths < 1)).any())
 
     def estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
         """The interval of predictions at one level.

@@ -244,6 +244,63 @@ def last_fifth(transmitters: int, rows: Int[Tensor, " n"]) -> Parts:
     return (rows < training).nonzero()[:, 0], (rows >= training).nonzero()[:, 0]
 
 
+def wall_poses(
+    outline: Callable[[float], Float[Tensor, "w 2"]],
+    is_free: Callable[[Float[Tensor, "k 3"]], Bool[Tensor, " k"]],
+    count: int,
+) -> tuple[Pose, ...]:
+    """Poses along the walls, 0.1 m off them and outside furniture, that face the room's middle.
+
+    They divide the walls evenly. Their heights fill 1.2 to 2.6 m evenly, in steps of the golden
+    ratio modulo 1, so that neighbours differ.
+
+    Args:
+        outline: From a height, the corners of the walls there, counterclockwise (float64) [m].
+        is_free: True for points outside furniture.
+    """
+    if count < 1:
+        raise ValueError(f"receivers must be at least 1, got {count}")
+    poses = []
+    for number in range(count):
+        share = (number + 0.5) / count  # of the way around the room
+        height = 1.2 + 1.4 * (0.618034 * number % 1)
+        walls = outline(height)
+        corners = _inset(walls, 0.1)
+        sides = (corners.roll(-1, 0) - corners).norm(dim=1)
+        ends = sides.cumsum(0)
+        while True:  # furniture moves a receiver along its wall
+            along = share % 1 * ends[-1]
+            side = int(torch.searchsorted(ends, along))
+            along_side = 1 - (ends[side] - along) / sides[side]
+            place = torch.lerp(corners[side], corners[(side + 1) % len(corners)], along_side)
+            position = torch.cat((place, place.new_tensor([height])))
+            if is_free(position[None]).all():
+                break
+            share += 0.005
+        middle = torch.cat((_centroid(walls), torch.ones(1, dtype=torch.float64)))
+        normal = torch.nn.functional.normalize(middle - position, dim=0)
+        across = torch.linalg.cross(normal.new_tensor([0.0, 0.0, 1.0]), normal)
+        across = torch.nn.functional.normalize(across, dim=0)
+        axes = torch.stack((across, torch.linalg.cross(normal, across), normal), 1)  # (3, 3)
+        poses.append(Pose(position.float(), axes.float()))
+    return tuple(poses)
+
+
+def _inset(corners: Float[Tensor, "w 2"], gap: float) -> Float[Tensor, "w 2"]:
+    """Corners of a counterclockwise polygon whose sides have moved inwards by a gap [m]."""
+    sides = torch.nn.functional.normalize(corners.roll(-1, 0) - corners, dim=1)
+    after = torch.stack((-sides[:, 1], sides[:, 0]), 1)  # inward normals
+    before = after.roll(1, 0)
+    return corners + gap * (before + after) / (1 + (before * after).sum(1, keepdim=True))
+
+
+def _centroid(corners: Float[Tensor, "w 2"]) -> Float[Tensor, "2"]:
+    """Centroid of a polygon's area [m]."""
+    after = corners.roll(-1, 0)
+    areas = corners[:, 0] * after[:, 1] - corners[:, 1] * after[:, 0]  # twice those of triangles
+    return areas @ (corners + after) / (3 * areas.sum())
+
+
 def draw_places(
     lower: Float[Tensor, "3"],
     upper: Float[Tensor, "3"],

@@ -14,6 +14,7 @@ from gaigs.calibration import Calibration
 from gaigs.calibration.conformal import usual_deviations
 from gaigs.calibration.held_out import Answers, calibrate
 from gaigs.calibration.new_receivers import NewReceivers
+from gaigs.calibration.random_effects import fit_random_effects
 from gaigs.core import stages
 from gaigs.core.query import Batch, evenly, thin_labels
 from gaigs.core.task import Task
@@ -197,22 +198,8 @@ def at_new_receivers(
     errors = [
         (links.labels[part] - value).double() for part, value in zip(rows, values, strict=True)
     ]
-    return replace(calibration, scatter=random_effects(errors))
-
-
-def random_effects(errors: Sequence[Tensor]) -> Float[Tensor, "2"]:
-    """Variances of errors between receivers and within one receiver (2,) [label's unit squared].
-
-    Args:
-        errors: Errors of each receiver's links.
-    """
-    squares = torch.stack([(part - part.mean()).square().sum() for part in errors])
-    counts = torch.tensor([*map(len, errors)]).to(squares)
-    within = squares.sum() / (counts - 1).sum().clamp_min(1)
-    # Means of receivers scatter by within / count even where receivers do not differ.
-    means = torch.stack([part.mean() for part in errors])
-    between = means.square().mean() - (within / counts).mean()
-    return torch.stack((between.clamp_min(0), within))
+    places = [links.query.transmitters[part] for part in rows]
+    return replace(calibration, scatter=fit_random_effects(errors, places))
 
 
 def count_in_time(model: Model, links: Links, most: int) -> int:

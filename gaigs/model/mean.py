@@ -20,7 +20,6 @@ class Mean(Model):
 
     any_receiver = True
     of_receivers = ("means",)
-    of_level = "means"
 
     def __init__(self, scene: Scene):
         super().__init__(scene)

@@ -13,7 +13,7 @@ from gaigs.core.antenna import Receiver
 from gaigs.core.propagation import common_gain
 from gaigs.core.scene import Scene
 from gaigs.data import Links
-from gaigs.registry import name_of
+from gaigs.registry import name_of, registry
 
 
 class Movable(nn.Module):
@@ -24,8 +24,7 @@ class Movable(nn.Module):
             ``scene.task.frequencies``.
         any_receiver: True if the model predicts for receivers without links. A module of the model
             names in ``of_receivers`` its buffers with a row for each receiver: a new receiver gets
-            the mean row. What else has to change, ``take_receivers`` changes. ``of_level`` names
-            the buffer that ``adapt`` moves.
+            the mean row. What else has to change, ``take_receivers`` changes.
     """
 
     scene: Scene
@@ -108,20 +107,17 @@ class Movable(nn.Module):
 
     @torch.no_grad()
     def adapt(self, links: Links) -> Any:
-        """A copy at new receivers, whose levels a few links correct; the room stays.
+        """A copy at new receivers, which a few links correct; the room stays.
 
-        With n places of mean error e, the level of a receiver moves by e s / (s + w / n). Here s is
-        the variance of errors between receivers, and w the variance within them. Repeated readings
-        of a place count as one. Intervals shrink accordingly.
+        Errors at a receiver are a level, a field over places and noise, whose variances come from
+        receivers that are predicted as new ones. See ``gaigs.model.adapted``.
 
         Args:
             links: Readings at one or several receivers without training links; a split is not used.
 
         Raises:
-            ValueError: The labels are no levels, too few receivers have calibrated how levels
+            ValueError: The labels are no levels, too few receivers have calibrated how receivers
                 differ, or the model is an adapted one.
-
-        Source: Robinson, That BLUP is a good thing: the estimation of random effects, 1991.
 
         Example:
             >>> levels = gaigs.links("synthetic_rssi", transmitters=100)
@@ -132,11 +128,6 @@ class Movable(nn.Module):
             >>> model.adapt(gaigs.links(task="rssi", **few)).predict([1.0, 1.0, 1.0]).shape
             torch.Size([1])
         """
-        if self.calibration is not None and self.calibration.is_adapted:
-            raise ValueError(
-                "adapt takes a model without readings at new receivers; give the trained model all "
-                "readings together"
-            )
         if self.scene.one_radio:
             raise ValueError(
                 "adapt learns the level of a new receiver, and the model's receivers are places of "
@@ -144,26 +135,16 @@ class Movable(nn.Module):
             )
         moved = self.at_receivers(links.receivers)
         new = moved.calibration
-        parts = [part for part in moved.modules() if hasattr(part, "of_level")]
-        if new is None or new.scatter is None or not parts:
+        if new is None or new.scatter is None:
             raise ValueError(
                 "adapt takes a model of levels, calibrated with links of three receivers or more, "
                 "such as path_loss or mirrored"
             )
-        between, within = new.scatter.clamp_min(1e-9)  # both are 0 if levels are constant
-        receivers = links.query.receivers
-        errors = (links.labels - moved.predict(links.query).cpu()).double()
-        votes = links.query.votes  # (n,)
-        none = votes.new_zeros(len(links.receivers))
-        counts = none.index_add(0, receivers, votes)  # (r,), of places
-        sums = none.index_add(0, receivers, votes * errors)
-        variances = 1 / (1 / between + counts / within)  # of the levels after the readings
-        for part in parts:
-            level = getattr(part, part.of_level)
-            level += (variances * sums / within).to(level)
-        widths = ((variances + within) / (between + within)).sqrt()
-        moved.calibration = new.at_receivers(widths.float())
-        return moved
+        adapted = registry("model").get("adapted")(moved.scene, moved).eval()
+        adapted.take(links, new.scatter)
+        # Its deviations are over those without readings.
+        adapted.calibration = replace(new, widths=None, elsewhere=None)
+        return adapted
 
     def take_calibration(self, other: "Movable") -> None:
         """Takes another model's calibration for receivers without links.

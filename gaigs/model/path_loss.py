@@ -35,7 +35,6 @@ class PathLoss(Model):
 
     any_receiver = True
     of_receivers = ("levels", "exponents")
-    of_level = "levels"
     regions: Tensor
 
     def __init__(self, scene: Scene):

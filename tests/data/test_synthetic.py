@@ -122,9 +122,9 @@ def test_the_documented_room_is_simulated_and_written(tmp_path, monkeypatch):
 
 
 def test_so_many_receivers_hang_on_the_walls():
-    from gaigs.data.synthetic import ROOM, wall_poses
+    from gaigs.data.synthetic import ROOM, default_room
 
-    poses = wall_poses(ROOM, 12)
+    poses = default_room(0, 12).poses
     places = torch.stack([pose.position for pose in poses])
     size = torch.tensor(ROOM.size)
     to_wall = torch.minimum(places, size - places)[:, :2].amin(1)

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 import gaigs
+from gaigs.calibration.random_effects import fit_random_effects
 from gaigs.core.antenna import Receiver
 from gaigs.core.geometry import Pose
 from gaigs.model.answers import predicted, share_at_new
@@ -219,18 +220,74 @@ def test_readings_at_a_new_receiver_correct_its_level():
     assert errors[0] > errors[1] > errors[2] > errors[3]
     wide, narrow = (one.predict(PLACES, 0, interval=0.9) for one in (before, moved))
     assert (narrow.upper - narrow.lower < wide.upper - wide.lower).all()
-    between, within = before.calibration.scatter.tolist()
-    error = (far.labels - before.predict(far.query)).double().mean().item()
-    shift = (moved.levels - before.levels).item()
-    assert shift == pytest.approx(error * between / (between + within / 60), rel=1e-4)
     repeated = readings(far, 0, torch.zeros(30, dtype=torch.long))
-    torch.testing.assert_close(
-        model.adapt(repeated).levels, model.adapt(readings(far, 0, torch.arange(1))).levels
-    )
+    once = model.adapt(readings(far, 0, torch.arange(1))).predict(PLACES)
+    torch.testing.assert_close(model.adapt(repeated).predict(PLACES), once)
     with pytest.raises(ValueError, match="all readings together"):
         moved.adapt(far)
     with pytest.raises(ValueError, match="adapt takes a model of levels"):
         gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0)).adapt(far)
+
+
+def drawn_errors(count, generator):
+    """Errors of receivers with a level of 3 dB, a field of 4 dB and 2 m, and noise of 2 dB."""
+    errors, places = [], []
+    for _ in range(count):
+        place = 10 * torch.rand(80, 3, generator=generator, dtype=torch.float64)
+        field = 16 * (-torch.cdist(place, place) / 2).exp()
+        factor = torch.linalg.cholesky(9 + field + 4 * torch.eye(80))
+        errors.append(factor @ torch.randn(80, generator=generator, dtype=torch.float64))
+        places.append(place)
+    return errors, places
+
+
+def test_the_law_of_errors_is_found_again():
+    generator = torch.Generator().manual_seed(0)
+    level, noise, field, length = fit_random_effects(*drawn_errors(40, generator)).tolist()
+    assert level == pytest.approx(9, rel=0.5)
+    assert noise + field == pytest.approx(20, rel=0.2)
+    assert length == pytest.approx(2, rel=0.5)
+    nothing = fit_random_effects([torch.zeros(4)] * 3, [torch.zeros(4, 3)] * 3)
+    assert nothing.isfinite().all()
+
+
+@pytest.fixture(scope="module")
+def law():
+    """A model that is asked for receivers without links, and these links."""
+    links = gaigs.links("synthetic_rssi", transmitters=80, receivers=9, split="receivers")
+    return gaigs.train("path_loss", links, progress=False), links
+
+
+def test_readings_correct_places_near_them(law, tmp_path):
+    model, links = law
+    model.calibration.elsewhere.scatter.copy_(torch.tensor([9.0, 4.0, 16.0, 2.0]))
+    few = readings(links, 0, torch.tensor([0]))
+    few = replace(few, receivers=(Receiver("door", Pose.at([3.0, 2.0, 2.0])),))
+    place = few.query.transmitters
+    asked = torch.cat((place, PLACES, place + torch.tensor([8.0, 0.0, 0.0])))
+    before = model.at_receivers(few.receivers).predict(asked)[:, 0]
+    few.labels.copy_(before[:1] + 10)
+    moved = model.adapt(few)
+    shares = (9 + 16 * (-(asked - place).norm(dim=1) / 2).exp()) / 29
+    torch.testing.assert_close(moved.predict(asked, receiver="door") - before, 10 * shares)
+    moved.save(tmp_path / "door.ckpt")
+    again = gaigs.load(tmp_path / "door.ckpt")
+    found = again.predict(asked, receiver="door", interval=0.9)
+    left = (1 - shares**2).sqrt()
+    torch.testing.assert_close(found.std / found.std[-1], left / left[-1])
+    other = [1.0, 1.0, 2.0]
+    assert torch.equal(again.predict(PLACES, receiver=other), model.predict(PLACES, receiver=other))
+
+
+def test_laws_of_older_checkpoints_have_a_level_and_noise(law):
+    model, links = law
+    older = replace(model.calibration.elsewhere, scatter=torch.tensor([9.0, 27.0]))
+    model.calibration = replace(model.calibration, elsewhere=older)
+    few = readings(links, 0, torch.tensor([0, 9]))
+    before = model.at_receivers(few.receivers).predict(PLACES)
+    few.labels.copy_(model.at_receivers(few.receivers).predict(few.query) + 10)
+    moved = model.adapt(few).predict(PLACES)
+    torch.testing.assert_close(moved - before, torch.full((2, 1), 10 * 9 / (9 + 27 / 2)))
 
 
 @torch.no_grad()

@@ -116,7 +116,7 @@ def test_damaged_scenes_are_named(scene, text, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"receiver": None}, r"data\.receiver must be x, y, z of each receiver"),
+        ({"receiver": None}, r"data\.receivers must be x, y, z of each receiver"),
         (
             {"receiver": [300, 300, 2500]},
             "receivers must stand in the scene, whose surfaces lie from",

@@ -19,6 +19,7 @@ from gaigs.data.simulation import (
     simulate_spectra,
     spectrum_offsets,
     to_spectra,
+    wall_poses,
 )
 from gaigs.data.synthetic.image_source import Box, Room, frequency_offsets, is_free, respond, trace
 from gaigs.io.meshes import Mesh
@@ -79,7 +80,8 @@ def furnished_room(
         bandwidth: Width of the band around each carrier [Hz].
         order: Largest number of reflections of a path.
         seed: Seed of the places.
-        receivers: Arrays on the walls, see ``wall_poses``; None: one in a corner.
+        receivers: Arrays on the walls, see ``gaigs.data.simulation.wall_poses``; None: one in a
+            corner.
 
     Raises:
         TypeError: A frequency is no number.
@@ -101,7 +103,9 @@ def default_room(order: int, receivers: int | None = None) -> SimulatedRoom:
     poses: tuple[Pose, ...] = (POSE,)
     gateways = [gateway(name, position) for name, position in GATEWAYS.items()]
     if receivers is not None:
-        poses = wall_poses(ROOM, receivers)
+        size = torch.tensor(ROOM.size[:2], dtype=torch.float64)
+        corners = size * torch.tensor([[0, 0], [1, 0], [1, 1], [0, 1]])
+        poses = wall_poses(lambda height: corners, partial(is_free, ROOM), receivers)
         gateways = [gateway(f"gateway{k}", pose.position) for k, pose in enumerate(poses, 1)]
     return SimulatedRoom(
         poses=poses,
@@ -111,42 +115,6 @@ def default_room(order: int, receivers: int | None = None) -> SimulatedRoom:
         frequency_offsets=lambda bandwidth: frequency_offsets(ROOM, bandwidth, order),
         respond=partial(respond_in_parts, ROOM, order=order),
     )
-
-
-def wall_poses(room: Room, count: int) -> tuple[Pose, ...]:
-    """Poses along the walls, 0.1 m off them and outside furniture, that face the room's middle.
-
-    They divide the walls evenly. Their heights fill 1.2 to 2.6 m evenly, in steps of the golden
-    ratio modulo 1, so that neighbours differ.
-    """
-    if count < 1:
-        raise ValueError(f"receivers must be at least 1, got {count}")
-    size = torch.tensor(room.size, dtype=torch.float64)
-    gap = 0.1  # [m]
-    corners = torch.tensor([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]], dtype=torch.float64)
-    corners = gap + corners * (size[:2] - 2 * gap)  # (4, 2) [m]
-    sides = (corners.roll(-1, 0) - corners).norm(dim=1)
-    ends = sides.cumsum(0)
-    middle = torch.cat((size[:2] / 2, torch.ones(1, dtype=torch.float64)))
-    poses = []
-    for number in range(count):
-        share = (number + 0.5) / count  # of the way around the room
-        height = 1.2 + 1.4 * (0.618034 * number % 1)
-        while True:  # furniture moves a receiver along its wall
-            along = share % 1 * ends[-1]
-            side = int(torch.searchsorted(ends, along))
-            along_side = 1 - (ends[side] - along) / sides[side]
-            place = torch.lerp(corners[side], corners[(side + 1) % 4], along_side)
-            position = torch.cat((place, place.new_tensor([height])))
-            if is_free(room, position[None]).all():
-                break
-            share += 0.005
-        normal = torch.nn.functional.normalize(middle - position, dim=0)
-        across = torch.linalg.cross(normal.new_tensor([0.0, 0.0, 1.0]), normal)
-        across = torch.nn.functional.normalize(across, dim=0)
-        axes = torch.stack((across, torch.linalg.cross(normal, across), normal), 1)  # (3, 3)
-        poses.append(Pose(position.float(), axes.float()))
-    return tuple(poses)
 
 
 def respond_in_parts(

@@ -134,13 +134,8 @@ class MeshRoom:
 
     def is_free(self, points: Float[Tensor, "k 3"]) -> Bool[Tensor, " k"]:
         """True for points [m] inside, with the margins from walls and furniture."""
-        share = points[:, 2:] / self.height
-        outline = torch.lerp(
-            points.new_tensor(self.floor), points.new_tensor(self.ceiling), share[..., None]
-        )
-        # Ends of each wall, at the height of each point.
-        start = outline  # (k, walls, 2)
-        end = outline.roll(-1, 1)
+        start = self.outline(points[:, 2:, None])  # ends of each wall, at each point's height
+        end = start.roll(-1, 1)  # (k, walls, 2)
         along = end - start
         to = points[:, None, :2] - start
         # Even-odd rule: the number of walls that a ray along x meets.
@@ -151,9 +146,18 @@ class MeshRoom:
         nearest = ((to * along).sum(-1) / along.square().sum(-1)).clamp(0, 1)
         distances = (to - nearest[..., None] * along).norm(dim=-1).amin(1)
         free = (meets.sum(1) % 2 == 1) & (distances >= WALL_MARGIN)
-        for cuboid in self.furniture:
-            free &= ~cuboid.contains(points, FURNITURE_MARGIN)
-        return free
+        return free & ~self.is_furnished(points)
+
+    def outline(self, heights: float | Tensor) -> Float[Tensor, "*k walls 2"]:
+        """Corners of the walls at heights (*k, 1, 1) [m], counterclockwise [m]."""
+        dtype = heights.dtype if isinstance(heights, Tensor) else torch.float64
+        ends = [torch.tensor(corners, dtype=dtype) for corners in (self.floor, self.ceiling)]
+        return torch.lerp(*ends, heights / self.height)
+
+    def is_furnished(self, points: Float[Tensor, "k 3"]) -> Bool[Tensor, " k"]:
+        """True for points [m] in furniture, or less than a margin from it."""
+        inside = [cuboid.contains(points, FURNITURE_MARGIN) for cuboid in self.furniture]
+        return torch.stack(inside).any(0)
 
 
 def facing(position: Sequence[float], target: Sequence[float], turn: float = 0.0) -> Pose:

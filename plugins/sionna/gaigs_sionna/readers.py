@@ -21,6 +21,7 @@ def traced_room(
     facing: Sequence[float] | None = None,
     heights: Sequence[float] | None = None,
     diffraction: bool = True,
+    receivers: int | Sequence[Sequence[float]] | None = None,
 ) -> Links:
     """Spectra of transmitters at random places in a room.
 
@@ -31,11 +32,13 @@ def traced_room(
         room: ``l_shape``, ``slanted`` or ``furnished``.
         scene: File of one's own surfaces, as ``sionna.rt.load_scene`` loads it (Mitsuba XML); None
             for the room.
-        receiver: Position of the array in the scene [m].
-        facing: Point in the scene that the array faces [m]; None for the middle of all surfaces.
+        receiver: Position of a single array in the scene [m].
+        facing: Point in the scene that arrays face [m]; None for the middle of all surfaces.
         heights: Lowest and highest z of transmitters in the scene [m]; None for 0.3 to 2 m above
             the lowest surface.
         diffraction: False if edges bend no waves, the default of Sionna RT itself.
+        receivers: Number of arrays along the room's walls, as of ``synthetic``, or their positions
+            in the scene [m]; None: one in a corner, or ``receiver``.
 
     Raises:
         FileNotFoundError: There is no such scene.
@@ -43,8 +46,8 @@ def traced_room(
         RuntimeError: There is no libLLVM that it can use.
         ValueError: An option is out of range, or the scene cannot be loaded.
     """
-    receivers = None if receiver is None else [receiver]
-    simulated = find_room(room, scene, "receiver", receivers, facing, heights, diffraction)
+    positions = _receivers(receiver, receivers)
+    simulated = find_room(room, scene, *positions, facing, heights, diffraction)
     return simulate_spectra(simulated, spectrum, transmitters, frequency, bandwidth, seed)
 
 
@@ -63,19 +66,20 @@ def traced_room_csi(
     facing: Sequence[float] | None = None,
     heights: Sequence[float] | None = None,
     diffraction: bool = True,
+    receivers: int | Sequence[Sequence[float]] | None = None,
 ) -> Links:
     """Channels of transmitters at random places in a room, at each element of its 4 x 4 array.
 
     A wideband receiver estimates them.
 
     Args:
-        room, transmitters, scene, receiver, facing, heights, diffraction: See ``sionna``, which
-            raises the same errors.
+        room, transmitters, scene, receiver, facing, heights, diffraction, receivers: See
+            ``sionna``, which raises the same errors.
         frequency, bandwidth, subcarriers, seed, phase, band_train, band_test: See
             ``synthetic_csi``.
     """
-    receivers = None if receiver is None else [receiver]
-    simulated = find_room(room, scene, "receiver", receivers, facing, heights, diffraction)
+    positions = _receivers(receiver, receivers)
+    simulated = find_room(room, scene, *positions, facing, heights, diffraction)
     links = simulate_channels(
         simulated, transmitters, frequency, bandwidth, subcarriers, seed, phase
     )
@@ -89,7 +93,7 @@ def traced_room_rssi(
     sensitivity: float = -95.0,
     seed: int = 0,
     scene: str | None = None,
-    receivers: Sequence[Sequence[float]] | None = None,
+    receivers: int | Sequence[Sequence[float]] | None = None,
     heights: Sequence[float] | None = None,
     diffraction: bool = True,
 ) -> Links:
@@ -101,7 +105,19 @@ def traced_room_rssi(
         room, transmitters, scene, heights, diffraction: See ``sionna``, which raises the same
             errors.
         noise, sensitivity, seed: See ``synthetic_rssi``.
-        receivers: Positions of the gateways in the scene [m].
+        receivers: Number of gateways along the room's walls, as of ``synthetic``, or their
+            positions in the scene [m]; None: the room's four.
     """
     simulated = find_room(room, scene, "receivers", receivers, None, heights, diffraction)
     return simulate_readings(simulated, transmitters, noise, sensitivity, seed)
+
+
+def _receivers(
+    receiver: Sequence[float] | None, receivers: int | Sequence[Sequence[float]] | None
+) -> tuple[str, int | Sequence[Sequence[float]] | None]:
+    """Name and value of the option that has the receivers."""
+    if receiver is None:
+        return "receivers", receivers
+    if receivers is not None:
+        raise ValueError("give data.receiver or data.receivers, got both")
+    return "receiver", [receiver]

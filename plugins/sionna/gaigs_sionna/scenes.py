@@ -218,8 +218,9 @@ class FreeSpace:
         return torch.from_numpy(free & clear.all(1))
 
 
-def check_points(name: str, points: Sequence[Sequence[float]] | None) -> Float[Tensor, "k 3"]:
+def check_points(name: str, points: int | Sequence[Sequence[float]] | None) -> Float[Tensor, "k 3"]:
     """Positions of an option [m]; a ``ValueError`` without three coordinates of each."""
-    if not points or not all(isinstance(point, Sequence) and len(point) == 3 for point in points):
+    rows = points if isinstance(points, Sequence) else []
+    if not rows or not all(isinstance(row, Sequence) and len(row) == 3 for row in rows):
         raise ValueError(f"{name} must be x, y, z of each receiver in the scene [m], got {points}")
-    return as_positions(name, [[*point] for point in points])
+    return as_positions(name, [[*row] for row in rows])

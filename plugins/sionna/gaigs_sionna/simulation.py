@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gaigs.core.antenna import Receiver
+from gaigs.core.geometry import Pose
 from gaigs.data.readings import gateway
-from gaigs.data.simulation import PLACES_AT_A_TIME, SimulatedRoom, draw_places
+from gaigs.data.simulation import PLACES_AT_A_TIME, SimulatedRoom, draw_places, wall_poses
 from gaigs.data.synthetic.image_source import respond
 
 from .cache import find_paths
@@ -28,7 +29,7 @@ def find_room(
     name: str,
     scene: str | None = None,
     option: str = "receivers",
-    receivers: Sequence[Sequence[float]] | None = None,
+    receivers: int | Sequence[Sequence[float]] | None = None,
     facing: Sequence[float] | None = None,
     heights: Sequence[float] | None = None,
     diffraction: bool = True,
@@ -37,22 +38,33 @@ def find_room(
 
     Args:
         option: Name of the option that has the receivers in a scene, for errors.
+        receivers: Positions in a scene [m]; of a room the number along its walls, None for its own.
 
     Raises:
         ValueError: The name is unknown, or the scene or an option of it has a defect.
     """
     if scene is not None:
         return _find_scene(scene, option, receivers, facing, heights, diffraction)
-    for key, value in ((option, receivers), ("facing", facing), ("heights", heights)):
+    is_number = isinstance(receivers, int)
+    positions = None if is_number else receivers
+    for key, value in ((option, positions), ("facing", facing), ("heights", heights)):
         if value:
-            raise ValueError(f"data.{key} is an option of data.scene; rooms have their own")
+            raise ValueError(
+                f"data.{key} is an option of data.scene; rooms have their own, "
+                "or a number of data.receivers"
+            )
     if name not in ROOMS:
         raise ValueError(f"room must be one of {', '.join(ROOMS)}, got {name!r}")
     room = ROOMS[name]
+    poses: tuple[Pose, ...] = (room.pose(),)
+    gateways = [gateway(name, position) for name, position in room.gateways.items()]
+    if is_number:
+        poses = wall_poses(room.outline, lambda points: ~room.is_furnished(points), receivers)
+        gateways = [gateway(f"gateway{k}", pose.position) for k, pose in enumerate(poses, 1)]
 
     return SimulatedRoom(
-        poses=(room.pose(),),
-        gateways=tuple(gateway(name, position) for name, position in room.gateways.items()),
+        poses=poses,
+        gateways=tuple(gateways),
         edges=edges(room.meshes()),
         place=lambda count, seed: place(room, count, seed),
         frequency_offsets=lambda bandwidth: frequency_offsets(room.meshes(), bandwidth),
@@ -63,7 +75,7 @@ def find_room(
 def _find_scene(
     file: str,
     option: str,
-    receivers: Sequence[Sequence[float]] | None,
+    receivers: int | Sequence[Sequence[float]] | None,
     target: Sequence[float] | None,
     heights: Sequence[float] | None,
     diffraction: bool,
@@ -82,7 +94,7 @@ def _find_scene(
     diagonal = float(np.linalg.norm(space.upper - space.lower))
 
     return SimulatedRoom(
-        poses=(facing(positions[0].tolist(), faced),),
+        poses=tuple(facing(position, faced) for position in positions.tolist()),
         gateways=tuple(gateway(f"rx{k}", position) for k, position in enumerate(positions)),
         edges=room.edges(),
         place=room.place,

@@ -1,0 +1,114 @@
+"""A model at receivers without links, corrected by a few readings there."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+from gaigs.core.antenna import Receiver
+from gaigs.core.query import Batch, Query, evenly
+from gaigs.core.scene import Scene
+from gaigs.data import Links
+from gaigs.kriging.kernel import Process, kernel, resize
+from gaigs.model import Model, Prediction, Wrapper
+from gaigs.registry import register, registry
+
+
+@register("model", "adapted")
+class Adapted(Wrapper):
+    """y(x) + c(x)' (C + N)^-1 e: the best linear prediction of a receiver's errors from a few.
+
+    y is the model at receivers without links, and e are its errors at the readings. C are the
+    covariances of ``gaigs.calibration.random_effects`` among the readings of a receiver, c those
+    with the place x, and N is the noise, of which repeated readings of a place have one draw.
+    ``Model.adapt`` makes it.
+
+    Args:
+        base: The model at these receivers, or its configuration if a state is to be loaded.
+
+    Source: Robinson, That BLUP is a good thing: the estimation of random effects, 1991.
+    """
+
+    effects: Tensor  # level, noise, field and length (4,)
+    places: Tensor  # transmitters of the readings [m], and numbers of their receivers (k, 4)
+    noises: Tensor  # variances (k,)
+    errors: Tensor  # (k,)
+
+    def __init__(self, scene: Scene, base: dict | Model):
+        super().__init__(scene)
+        is_built = isinstance(base, Model)
+        self.base: Model = base if is_built else registry("model").build(base, scene=scene)
+        self.chunk = self.base.chunk
+        shapes = {"effects": (4,), "places": (0, 4), "noises": (0,), "errors": (0,)}
+        for name, shape in shapes.items():
+            self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
+
+    @torch.no_grad()
+    def take(self, links: Links, effects: Float[Tensor, " n"], most: int = 2000) -> None:
+        """Takes readings, at most ``most``, and the law of errors."""
+        # Checkpoints of earlier versions have level and noise alone.
+        effects = functional.pad(effects.double(), (0, 4 - len(effects))).clamp_min(1e-9)
+        rows = evenly(torch.arange(len(links)), most)
+        query = links.query[rows]
+        self.effects, self.places = effects, _coordinates(query)
+        self.noises = effects[1] / links.query.votes[rows]
+        self.errors = (links.labels[rows] - self.base.predict(query).cpu()).double()
+        self.to(self.base.device)
+
+    def forward(self, batch: Batch) -> Prediction:
+        towards, factor = self._process.whitened(_coordinates(batch.query))  # (k, b), (k, k)
+        white = torch.linalg.solve_triangular(factor, self.errors[:, None], upper=False)
+        value = self.base(batch).value
+        return Prediction(value + (towards.T @ white)[:, 0].to(value), {})
+
+    def deviations(self, batch: Batch) -> Float[Tensor, " b"]:
+        """Deviations of the errors over those without readings."""
+        towards, _ = self._process.whitened(_coordinates(batch.query))
+        total = self.effects[:3].sum()
+        return (1 - towards.square().sum(0) / total).sqrt().float()
+
+    @property
+    def _process(self) -> Process:
+        level, noise, field, length = self.effects
+
+        def covariances(a: Float[Tensor, "m 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "m n"]:
+            is_same = a[:, None, 3] == b[:, 3]
+            return is_same * (level + field * kernel(a[:, :3], b[:, :3], length))
+
+        return Process(covariances, self.places, self.noises, noise.item())
+
+    @property
+    def any_receiver(self) -> bool:  # type: ignore[override]
+        return self.base.any_receiver
+
+    def at_receivers(
+        self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
+    ) -> Model:
+        """The base at other receivers, of which the readings say nothing."""
+        return self.base.at_receivers(receivers, known)
+
+    def adapt(self, links: Links) -> Any:
+        """Refuses: errors of all readings are solved together."""
+        raise ValueError(
+            "adapt takes a model without readings at new receivers; give the trained model all "
+            "readings together"
+        )
+
+    @property
+    def underlying(self) -> Model:
+        return self.base
+
+    def facts(self) -> dict[str, Any]:
+        return self.base.facts()
+
+    def _load_from_state_dict(self, state_dict, prefix, *args):
+        resize(self, state_dict, prefix, "places", "noises", "errors")
+        super()._load_from_state_dict(state_dict, prefix, *args)
+
+
+def _coordinates(query: Query) -> Float[Tensor, "b 4"]:
+    """Places of transmitters [m], with the number of the receiver behind."""
+    return torch.cat((query.transmitters, query.receivers[:, None]), 1).double()
