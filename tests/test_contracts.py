@@ -60,13 +60,14 @@ SIMULATED = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "syntheti
 MADE_FOR = {
     "loss": {"l1_ssim": ["spectrum"], "relative_error": ["csi"], "log_relative_error": ["csi"]}
     | dict.fromkeys(("absolute", "squared", "huber"), ("spectrum", "rssi")),
-    # The last four are made from trained models, a regressor and a map.
+    # The last five are made from trained models, a regressor and a map.
     "model": {
         "path_loss": ["rssi"],
         "shaped_path_loss": ["rssi"],
         "friis": ["csi"],
         "kriging": [],
         "ensemble": [],
+        "adapted": [],
         "sklearn": [],
         "site": [],
     },

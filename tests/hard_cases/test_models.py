@@ -23,6 +23,7 @@ CARRIER = 5e9
 WITHOUT_SETTINGS = {
     "kriging": "is made of a trained model",
     "ensemble": "is made of trained models",
+    "adapted": "is made of a trained model",
     "sklearn": "is made of a regressor",
     "site": "needs a file of buildings",
     "ray_tracing": "needs a mesh of the room",

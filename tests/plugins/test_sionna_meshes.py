@@ -9,9 +9,12 @@ import pytest
 import torch
 from gaigs_sionna.meshes import FURNITURE_MARGIN, WALL_MARGIN, Cuboid, edges
 from gaigs_sionna.rooms import ROOMS
+from gaigs_sionna.simulation import find_room
 from matplotlib.path import Path
 from scipy.spatial import ConvexHull, Delaunay
 
+import gaigs
+from gaigs.data.synthetic.image_source import Paths
 from gaigs.io.meshes import parse_obj, wavefront_obj
 
 TURNED = Cuboid("desk", "wood", (1.0, 2.0, 0.5), (3.0, 2.6, 0.9), 30.0)
@@ -100,6 +103,48 @@ def test_furniture_and_receivers_stand_in_the_room(room):
     assert inside(positions[:, :2].double().numpy()).all()
     assert not any(cuboid.contains(positions, 0.01).any() for cuboid in room.furniture)
     assert inside([room.antenna[1][:2]]).all()
+
+
+@every_room
+def test_so_many_receivers_hang_on_the_walls(room):
+    name = next(name for name in ROOMS if ROOMS[name] is room)
+    simulated = find_room(name, receivers=12)
+    places = torch.stack([pose.position for pose in simulated.poses]).double()
+    assert not room.is_furnished(places).any()
+    for place, pose in zip(places, simulated.poses, strict=True):
+        outline = room.outline(place[2].item())
+        assert Path(outline.numpy(), closed=False).contains_point(place[:2].numpy())
+        along = outline.roll(-1, 0) - outline
+        share = ((place[:2] - outline) * along).sum(1) / along.square().sum(1)
+        nearest = outline + share.clamp(0, 1)[:, None] * along
+        assert (place[:2] - nearest).norm(dim=1).min().item() == pytest.approx(0.1, abs=1e-5)
+        ahead = place + 0.5 * pose.rotation[:, 2]
+        assert Path(outline.numpy()).contains_point(ahead[:2].numpy()), "it faces the room"
+    apart = torch.cdist(places, places) + 10 * torch.eye(12)
+    assert apart.min() > 0.4
+    assert [receiver.name for receiver in simulated.gateways][:2] == ["gateway1", "gateway2"]
+
+
+def test_spectra_and_channels_have_so_many_arrays(monkeypatch):
+    def direct(room, receiver, transmitters, frequency, diffraction):
+        return Paths(transmitters.double()[:, None], torch.ones(len(transmitters), 1).cdouble())
+
+    monkeypatch.setattr("gaigs_sionna.simulation.find_paths", direct)
+    options = {"room": "slanted", "transmitters": 4, "receivers": 3}
+    channels = gaigs.links("sionna_csi", subcarriers=3, **options)
+    assert channels.query.receivers.tolist() == 4 * [0, 1, 2]
+    assert len({receiver.pose for receiver in channels.receivers}) == 3
+    assert len(gaigs.links("sionna", **options)) == 12
+    levels = gaigs.links("sionna_rssi", **options)
+    assert len(levels.receivers) == 3
+    for own, other in zip(levels.receivers, channels.receivers, strict=True):
+        assert torch.equal(own.pose.position, other.pose.position)
+    with pytest.raises(ValueError, match=r"or a number of data\.receivers"):
+        gaigs.links("sionna_rssi", **options | {"receivers": [[1.0, 1.0, 1.0]]})
+    with pytest.raises(ValueError, match="receivers must be at least 1"):
+        gaigs.links("sionna", **options | {"receivers": 0})
+    with pytest.raises(ValueError, match="got both"):
+        gaigs.links("sionna", receiver=[1.0, 1.0, 1.0], **options)
 
 
 # --- outlines and files ---
