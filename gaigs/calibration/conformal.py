@@ -50,7 +50,7 @@ class Calibration:
     # Calibration of receivers without links, by errors at each receiver of models that have the
     # mean of the others in its place; None if there are too few.
     elsewhere: "Calibration | None" = None
-    # ``RandomEffects`` of receivers without links, for labels of one number.
+    # Law of the errors of levels, see ``gaigs.model.adapted``.
     scatter: Float[Tensor, " n"] | None = None
 
     @classmethod
@@ -119,13 +119,10 @@ class Calibration:
             lowest,
         )
 
-    def at_receivers(self, widths: Float[Tensor, " w"]) -> "Calibration | None":
-        """The calibration for receivers without links; ``widths``: factor of the intervals at each.
-
-        None if too few receivers have calibrated it.
-        """
+    def at_receivers(self, count: int) -> "Calibration | None":
+        """The calibration for receivers without links; None if too few have calibrated it."""
         new = self.elsewhere
-        return None if new is None else replace(new, widths=widths, elsewhere=new)
+        return None if new is None else replace(new, widths=torch.ones(count), elsewhere=new)
 
     def estimate(self, value: Tensor, deviations: Tensor, query: Query, level: float) -> Estimate:
         """The interval of predictions at one level.

@@ -1,11 +1,21 @@
-"""A model at receivers without links, corrected by a few readings there."""
+"""A model at receivers without links, corrected by a few readings there.
+
+Errors of a model at two places of a receiver without links have the covariance
+
+    level + field exp(-distance / length) + [same place] noise
+
+Four numbers hold this law: level, noise, field [label's unit squared] and length [m].
+"""
 
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from scipy.optimize import minimize
 from torch import Tensor
+from torch.distributions import MultivariateNormal
 from torch.nn import functional
 
 from gaigs.core.antenna import Receiver
@@ -13,6 +23,7 @@ from gaigs.core.query import Batch, Query, evenly
 from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.kriging.kernel import Process, kernel, resize
+from gaigs.kriging.links import distances
 from gaigs.model import Model, Prediction, Wrapper
 from gaigs.registry import register, registry
 
@@ -22,9 +33,8 @@ class Adapted(Wrapper):
     """y(x) + c(x)' (C + N)^-1 e: the best linear prediction of a receiver's errors from a few.
 
     y is the model at receivers without links, and e are its errors at the readings. C are the
-    covariances of ``gaigs.calibration.random_effects`` among the readings of a receiver, c those
-    with the place x, and N is the noise, of which repeated readings of a place have one draw.
-    ``Model.adapt`` makes it.
+    covariances among the readings of a receiver, c those with the place x, and N is the noise, of
+    which repeated readings of a place have one draw. ``Model.adapt`` makes it.
 
     Args:
         base: The model at these receivers, or its configuration if a state is to be loaded.
@@ -32,7 +42,7 @@ class Adapted(Wrapper):
     Source: Robinson, That BLUP is a good thing: the estimation of random effects, 1991.
     """
 
-    effects: Tensor  # level, noise, field and length (4,)
+    law: Tensor  # (4,)
     places: Tensor  # transmitters of the readings [m], and numbers of their receivers (k, 4)
     noises: Tensor  # variances (k,)
     errors: Tensor  # (k,)
@@ -42,19 +52,19 @@ class Adapted(Wrapper):
         is_built = isinstance(base, Model)
         self.base: Model = base if is_built else registry("model").build(base, scene=scene)
         self.chunk = self.base.chunk
-        shapes = {"effects": (4,), "places": (0, 4), "noises": (0,), "errors": (0,)}
+        shapes = {"law": (4,), "places": (0, 4), "noises": (0,), "errors": (0,)}
         for name, shape in shapes.items():
             self.register_buffer(name, torch.zeros(shape, dtype=torch.float64))
 
     @torch.no_grad()
-    def take(self, links: Links, effects: Float[Tensor, " n"], most: int = 2000) -> None:
+    def take(self, links: Links, law: Float[Tensor, " n"], most: int = 2000) -> None:
         """Takes readings, at most ``most``, and the law of errors."""
         # Checkpoints of earlier versions have level and noise alone.
-        effects = functional.pad(effects.double(), (0, 4 - len(effects))).clamp_min(1e-9)
+        self.law = functional.pad(law.double(), (0, 4 - len(law))).clamp_min(1e-9)
         rows = evenly(torch.arange(len(links)), most)
         query = links.query[rows]
-        self.effects, self.places = effects, _coordinates(query)
-        self.noises = effects[1] / links.query.votes[rows]
+        self.places = _coordinates(query)
+        self.noises = self.law[1] / links.query.votes[rows]
         self.errors = (links.labels[rows] - self.base.predict(query).cpu()).double()
         self.to(self.base.device)
 
@@ -67,12 +77,12 @@ class Adapted(Wrapper):
     def deviations(self, batch: Batch) -> Float[Tensor, " b"]:
         """Deviations of the errors over those without readings."""
         towards, _ = self._process.whitened(_coordinates(batch.query))
-        total = self.effects[:3].sum()
+        total = self.law[:3].sum()
         return (1 - towards.square().sum(0) / total).sqrt().float()
 
     @property
     def _process(self) -> Process:
-        level, noise, field, length = self.effects
+        level, noise, field, length = self.law
 
         def covariances(a: Float[Tensor, "m 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "m n"]:
             is_same = a[:, None, 3] == b[:, 3]
@@ -87,11 +97,9 @@ class Adapted(Wrapper):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """The base at other receivers, of which the readings say nothing."""
-        return self.base.at_receivers(receivers, known)
+        return self.base.at_receivers(receivers, known)  # readings say nothing of others
 
     def adapt(self, links: Links) -> Any:
-        """Refuses: errors of all readings are solved together."""
         raise ValueError(
             "adapt takes a model without readings at new receivers; give the trained model all "
             "readings together"
@@ -112,3 +120,36 @@ class Adapted(Wrapper):
 def _coordinates(query: Query) -> Float[Tensor, "b 4"]:
     """Places of transmitters [m], with the number of the receiver behind."""
     return torch.cat((query.transmitters, query.receivers[:, None]), 1).double()
+
+
+def fit_law(
+    errors: Sequence[Float[Tensor, " k"]], places: Sequence[Float[Tensor, "k 3"]], most: int = 100
+) -> Float[Tensor, "4"]:
+    """The most likely law of errors at receivers, each of which a model predicted as new.
+
+    Args:
+        errors: Errors of each receiver's links.
+        places: Their transmitters [m].
+        most: Largest number of links of a receiver.
+    """
+    parts = []
+    for own, there in zip(errors, places, strict=True):
+        rows = evenly(torch.arange(len(own)), most)
+        parts.append((own[rows].double(), distances(there[rows].double(), there[rows].double())))
+    mean = torch.cat([own for own, _ in parts]).square().mean().clamp_min(1e-9)
+    size = torch.stack([apart.max() for _, apart in parts]).median().clamp_min(1e-6)
+    units = torch.stack((mean, mean, mean, size))
+
+    def cost(logarithms: np.ndarray) -> float:
+        """Negative log likelihood."""
+        level, noise, field, length = torch.from_numpy(logarithms).exp() * units
+        total = 0.0
+        for own, apart in parts:
+            covariances = level + field * (-apart / length).exp() + noise * torch.eye(len(own))
+            total -= MultivariateNormal(torch.zeros_like(own), covariances).log_prob(own).item()
+        return total / sum(len(own) for own, _ in parts)
+
+    # Variances from 1e-4 to 20 mean squares, lengths from 0.1 % to 3 sizes of the site.
+    bounds = [(-9.0, 3.0)] * 3 + [(-7.0, 1.0)]
+    found = minimize(cost, np.log([0.25, 0.3, 0.3, 0.05]), method="L-BFGS-B", bounds=bounds)
+    return torch.from_numpy(np.exp(found.x)) * units

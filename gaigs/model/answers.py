@@ -14,13 +14,13 @@ from gaigs.calibration import Calibration
 from gaigs.calibration.conformal import usual_deviations
 from gaigs.calibration.held_out import Answers, calibrate
 from gaigs.calibration.new_receivers import NewReceivers
-from gaigs.calibration.random_effects import fit_random_effects
 from gaigs.core import stages
 from gaigs.core.query import Batch, evenly, thin_labels
 from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.kriging.blend import blend
 from gaigs.kriging.links import PART, single_readings
+from gaigs.model.adapted import fit_law
 from gaigs.model.base import Model
 from gaigs.registry import name_of
 
@@ -199,7 +199,7 @@ def at_new_receivers(
         (links.labels[part] - value).double() for part, value in zip(rows, values, strict=True)
     ]
     places = [links.query.transmitters[part] for part in rows]
-    return replace(calibration, scatter=fit_random_effects(errors, places))
+    return replace(calibration, scatter=fit_law(errors, places))
 
 
 def count_in_time(model: Model, links: Links, most: int) -> int:

@@ -153,5 +153,4 @@ class Movable(nn.Module):
         """
         self.calibration = other.calibration
         if other.calibration is not None and not self.scene.one_radio:
-            widths = torch.ones(len(self.scene.receivers))
-            self.calibration = other.calibration.at_receivers(widths)
+            self.calibration = other.calibration.at_receivers(len(self.scene.receivers))

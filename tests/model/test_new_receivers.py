@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import gaigs
-from gaigs.calibration.random_effects import fit_random_effects
 from gaigs.core.antenna import Receiver
 from gaigs.core.geometry import Pose
+from gaigs.model.adapted import fit_law
 from gaigs.model.answers import predicted, share_at_new
 from gaigs.model.friis import Friis
 from gaigs.model.knn import KNearestNeighbours
@@ -243,11 +243,11 @@ def drawn_errors(count, generator):
 
 def test_the_law_of_errors_is_found_again():
     generator = torch.Generator().manual_seed(0)
-    level, noise, field, length = fit_random_effects(*drawn_errors(40, generator)).tolist()
+    level, noise, field, length = fit_law(*drawn_errors(40, generator)).tolist()
     assert level == pytest.approx(9, rel=0.5)
     assert noise + field == pytest.approx(20, rel=0.2)
     assert length == pytest.approx(2, rel=0.5)
-    nothing = fit_random_effects([torch.zeros(4)] * 3, [torch.zeros(4, 3)] * 3)
+    nothing = fit_law([torch.zeros(4)] * 3, [torch.zeros(4, 3)] * 3)
     assert nothing.isfinite().all()
 
 
