@@ -1,14 +1,19 @@
 """Bounds of errors at receivers without links, each of which errs as a whole."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from scipy.optimize import minimize
 from scipy.special import stdtrit
 from torch import Tensor
+from torch.distributions import MultivariateNormal
 
 from gaigs.core.geometry import FAINTEST
+from gaigs.core.query import evenly
 
 
 class NewReceivers(NamedTuple):
@@ -90,3 +95,37 @@ def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float
     """The smallest of n sorted numbers at or below which a share ``levels`` of them lies."""
     ranks = (levels * len(numbers) - 1e-9).ceil().long()
     return numbers[(ranks - 1).clamp(0, len(numbers) - 1)]
+
+
+def fit_law(
+    errors: Sequence[Float[Tensor, " k"]], places: Sequence[Float[Tensor, "k 3"]], most: int = 100
+) -> Float[Tensor, "4"]:
+    """The most likely law of ``gaigs.model.adapted`` for receivers, each predicted as a new one.
+
+    Args:
+        errors: Errors of each receiver's links.
+        places: Their transmitters [m].
+        most: Largest number of links of a receiver.
+    """
+    parts = []
+    for own, there in zip(errors, places, strict=True):
+        rows = evenly(torch.arange(len(own)), most)
+        ways = there[rows, None].double() - there[rows].double()  # (k, k, 3)
+        parts.append((own[rows].double(), ways.norm(dim=-1)))
+    mean = torch.cat([own for own, _ in parts]).square().mean().clamp_min(1e-9)
+    size = torch.stack([apart.max() for _, apart in parts]).median().clamp_min(1e-6)
+    units = torch.stack((mean, mean, mean, size))
+
+    def cost(logarithms: np.ndarray) -> float:
+        """Negative log likelihood."""
+        level, noise, field, length = torch.from_numpy(logarithms).exp() * units
+        total = 0.0
+        for own, apart in parts:
+            covariances = level + field * (-apart / length).exp() + noise * torch.eye(len(own))
+            total -= MultivariateNormal(torch.zeros_like(own), covariances).log_prob(own).item()
+        return total / sum(len(own) for own, _ in parts)
+
+    # Variances from 1e-4 to 20 mean squares, lengths from 0.1 % to 3 sizes of the site.
+    bounds = [(-9.0, 3.0)] * 3 + [(-7.0, 1.0)]
+    found = minimize(cost, np.log([0.25, 0.3, 0.3, 0.05]), method="L-BFGS-B", bounds=bounds)
+    return torch.from_numpy(np.exp(found.x)) * units

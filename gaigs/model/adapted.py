@@ -4,18 +4,16 @@ Errors of a model at two places of a receiver without links have the covariance
 
     level + field exp(-distance / length) + [same place] noise
 
-Four numbers hold this law: level, noise, field [label's unit squared] and length [m].
+Four numbers hold this law: level, noise, field [label's unit squared] and length [m], by
+``gaigs.calibration.new_receivers.fit_law``.
 """
 
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Float, Int
-from scipy.optimize import minimize
 from torch import Tensor
-from torch.distributions import MultivariateNormal
 from torch.nn import functional
 
 from gaigs.core.antenna import Receiver
@@ -23,7 +21,6 @@ from gaigs.core.query import Batch, Query, evenly
 from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.kriging.kernel import Process, kernel, resize
-from gaigs.kriging.links import distances
 from gaigs.model import Model, Prediction, Wrapper
 from gaigs.registry import register, registry
 
@@ -120,36 +117,3 @@ class Adapted(Wrapper):
 def _coordinates(query: Query) -> Float[Tensor, "b 4"]:
     """Places of transmitters [m], with the number of the receiver behind."""
     return torch.cat((query.transmitters, query.receivers[:, None]), 1).double()
-
-
-def fit_law(
-    errors: Sequence[Float[Tensor, " k"]], places: Sequence[Float[Tensor, "k 3"]], most: int = 100
-) -> Float[Tensor, "4"]:
-    """The most likely law of errors at receivers, each of which a model predicted as new.
-
-    Args:
-        errors: Errors of each receiver's links.
-        places: Their transmitters [m].
-        most: Largest number of links of a receiver.
-    """
-    parts = []
-    for own, there in zip(errors, places, strict=True):
-        rows = evenly(torch.arange(len(own)), most)
-        parts.append((own[rows].double(), distances(there[rows].double(), there[rows].double())))
-    mean = torch.cat([own for own, _ in parts]).square().mean().clamp_min(1e-9)
-    size = torch.stack([apart.max() for _, apart in parts]).median().clamp_min(1e-6)
-    units = torch.stack((mean, mean, mean, size))
-
-    def cost(logarithms: np.ndarray) -> float:
-        """Negative log likelihood."""
-        level, noise, field, length = torch.from_numpy(logarithms).exp() * units
-        total = 0.0
-        for own, apart in parts:
-            covariances = level + field * (-apart / length).exp() + noise * torch.eye(len(own))
-            total -= MultivariateNormal(torch.zeros_like(own), covariances).log_prob(own).item()
-        return total / sum(len(own) for own, _ in parts)
-
-    # Variances from 1e-4 to 20 mean squares, lengths from 0.1 % to 3 sizes of the site.
-    bounds = [(-9.0, 3.0)] * 3 + [(-7.0, 1.0)]
-    found = minimize(cost, np.log([0.25, 0.3, 0.3, 0.05]), method="L-BFGS-B", bounds=bounds)
-    return torch.from_numpy(np.exp(found.x)) * units

@@ -13,14 +13,13 @@ from torch import Tensor
 from gaigs.calibration import Calibration
 from gaigs.calibration.conformal import usual_deviations
 from gaigs.calibration.held_out import Answers, calibrate
-from gaigs.calibration.new_receivers import NewReceivers
+from gaigs.calibration.new_receivers import NewReceivers, fit_law
 from gaigs.core import stages
 from gaigs.core.query import Batch, evenly, thin_labels
 from gaigs.core.task import Task
 from gaigs.data import Links
 from gaigs.kriging.blend import blend
 from gaigs.kriging.links import PART, single_readings
-from gaigs.model.adapted import fit_law
 from gaigs.model.base import Model
 from gaigs.registry import name_of
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 
 import gaigs
+from gaigs.calibration.new_receivers import fit_law
 from gaigs.core.antenna import Receiver
 from gaigs.core.geometry import Pose
-from gaigs.model.adapted import fit_law
 from gaigs.model.answers import predicted, share_at_new
 from gaigs.model.friis import Friis
 from gaigs.model.knn import KNearestNeighbours
