@@ -59,8 +59,8 @@ class MirroredSplatting(GaussianSplatting):
     Args:
         search: Start with spectra: True for planes of ``LagSearch``, False for the faces of the
             box, None for both, of which validation chooses.
-        boxes: Search boxes in levels of a known carrier: True for a room at whose walls receivers
-            are planned, None with held-out receivers alone.
+        boxes: Search boxes in levels of a known carrier. True: paths have no gains of their own,
+            which suits planned receivers best; False: none. None: with held-out receivers alone.
 
     Source: ours; docs/methods.md.
     """
@@ -124,6 +124,8 @@ class MirroredSplatting(GaussianSplatting):
         is_shared = wants_boxes and not self.scene.one_radio
         if is_known and is_shared and not self.is_wide and isinstance(self.pooling, PathRssi):
             self._prepare_boxes(links)
+            # Gains of single paths learn the shadows at the known receivers in place of boxes.
+            self.placement.path_gains.requires_grad_(not self.boxes)
         # Without phases powers add to the end, and no later revision locates a plane.
         has_phases = is_known and not self.is_wide and not self.scene.one_radio
         self.settles = isinstance(self.pooling, PathRssi) and not has_phases

@@ -261,6 +261,7 @@ def test_levels_at_known_receivers_have_boxes_on_demand():
     model = MirroredSplatting(links.scene, placement=placement, boxes=True)
     model.fit(links)
     assert len(model.shadowed.labels) == len(links.split.train)
+    assert not model.placement.path_gains.requires_grad
 
 
 def test_kriged_levels_at_new_receivers_are_a_mean_with_path_loss(tmp_path):
