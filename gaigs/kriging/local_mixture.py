@@ -37,7 +37,7 @@ class MixtureOptions:
     scatter: float = 1.5
     degrees: float = 2.0
     errors: float = 1.0
-    size: int = 2048
+    size: int = 256
 
 
 class LocalMixture(NamedTuple):
@@ -144,31 +144,32 @@ class LocalMixtures(NamedTuple):
         lengths, signals, noises = self.logarithms[receivers].unbind(1)
         total = (2 * signals).exp() + (2 * noises).exp()
         middle = self.logarithms[:, 0].mean()
+        every_ratio = 2 * (self.logarithms[:, 2] - self.logarithms[:, 1])
         logarithms, means, squares = [], [], []
         for step in options.lengths:
             correlations = matern(apart, (middle + step).exp(), self.choice.smoothness)
-            # With eigenvalues e and vectors U of the correlations, U diag(e + ratio) U' are the
-            # covariances of all ratios.
-            sizes, vectors = torch.linalg.eigh(correlations)
-            vectors = vectors.mT[which]  # (m, j, j)
             at_place = matern(near, (middle + step).exp(), self.choice.smoothness)
-            towards = (vectors @ at_place[..., None])[..., 0]  # (m, j)
-            rotated = (vectors @ values[..., None])[..., 0]  # (m, j)
+            both = torch.stack((at_place, values), 2)  # (m, j, 2)
             prior = ((middle + step - lengths) / options.scatter).square() / 2
             for change in options.ratios:
-                ratios = (2 * (noises - signals) + change).exp()
-                covariances = sizes.clamp_min(0)[which] + ratios[:, None]
+                logarithm = every_ratio.mean() + change
+                ratio = logarithm.exp()
+                noise = ratio * torch.eye(values.shape[1]).to(values)
+                factor = torch.linalg.cholesky(correlations + noise)  # (u, j, j)
+                white = torch.linalg.solve_triangular(factor[which], both, upper=False)
+                towards, rotated = white.unbind(2)  # (m, j)
                 # The receiver's variance of readings divides into signal and noise.
-                own = options.degrees * total / (1 + ratios)
-                energy = own + (rotated.square() / covariances).sum(1)
-                # Readings that do not exist have an eigenvalue of 0 each.
-                lacking = (values.shape[1] - counts) * ratios.log()
-                determinant = covariances.log().sum(1) - lacking
+                own = options.degrees * total / (1 + ratio)
+                energy = own + rotated.square().sum(1)
+                determinant = 2 * factor.diagonal(dim1=1, dim2=2).log().sum(1)[which]
+                # Readings that do not exist have a factor of the noise alone.
+                determinant = determinant - (values.shape[1] - counts) * logarithm
                 likelihood = options.degrees * own.log() - determinant
                 likelihood = likelihood - (options.degrees + counts) * energy.log()
-                logarithms.append(likelihood / 2 - prior - change**2 / 2)
-                means.append((towards * rotated / covariances).sum(1))
-                left = 1 + ratios - (towards.square() / covariances).sum(1)
+                off = logarithm - 2 * (noises - signals)
+                logarithms.append(likelihood / 2 - prior - off.square() / 2)
+                means.append((towards * rotated).sum(1))
+                left = 1 + ratio - towards.square().sum(1)
                 squares.append(left * energy / (options.degrees + counts))
         weights = torch.stack(logarithms, 1).log_softmax(1)
         degrees = (options.degrees + counts)[:, None]

@@ -26,7 +26,7 @@ def mixtures(options, count=40, receivers=2):
     numbers = torch.arange(receivers).repeat_interleave(count)
     readings = Readings(example_links("rssi").scene, places, numbers, 8)
     values = torch.from_numpy(rng.standard_normal(len(places)))
-    logarithms = torch.tensor([[1.5, 2.0, 0.7], [1.5, 1.0, 0.9]]).double().log()
+    logarithms = torch.tensor([[1.5, 2.0, 1.0], [1.5, 1.0, 0.5]]).double().log()
     return LocalMixtures(readings, values, logarithms, Choice(0.5), options)
 
 
