@@ -22,8 +22,8 @@ class MixtureOptions:
         neighbours: Readings around a place that weight its candidates. Fewer say little on a
             length, more are no longer near.
         lengths: Logarithms of the candidates' lengths over the mean length of the receivers.
-        ratios: Logarithms of their ratios of noise to signal over the receiver's ratio, with a
-            prior deviation of 1.
+        ratios: Logarithms of their ratios of noise to signal over the mean ratio of the receivers.
+            The prior deviation about the receiver's ratio is 1.
         scatter: Prior deviation of the logarithm of the length about the receiver's length.
         degrees: Readings that the receiver's own variance counts as, beside those around.
         errors: Least gain of the held-out log likelihood over one process everywhere
@@ -143,8 +143,10 @@ class LocalMixtures(NamedTuple):
         counts = nearest.exists.sum(1)
         lengths, signals, noises = self.logarithms[receivers].unbind(1)
         total = (2 * signals).exp() + (2 * noises).exp()
+        # The candidates are the same at all receivers, which so share matrices and factors.
         middle = self.logarithms[:, 0].mean()
-        every_ratio = 2 * (self.logarithms[:, 2] - self.logarithms[:, 1])
+        own_ratios = 2 * (noises - signals)  # logarithms
+        middle_ratio = 2 * (self.logarithms[:, 2] - self.logarithms[:, 1]).mean()
         logarithms, means, squares = [], [], []
         for step in options.lengths:
             correlations = matern(apart, (middle + step).exp(), self.choice.smoothness)
@@ -152,7 +154,7 @@ class LocalMixtures(NamedTuple):
             both = torch.stack((at_place, values), 2)  # (m, j, 2)
             prior = ((middle + step - lengths) / options.scatter).square() / 2
             for change in options.ratios:
-                logarithm = every_ratio.mean() + change
+                logarithm = middle_ratio + change
                 ratio = logarithm.exp()
                 noise = ratio * torch.eye(values.shape[1]).to(values)
                 factor = torch.linalg.cholesky(correlations + noise)  # (u, j, j)
@@ -166,8 +168,8 @@ class LocalMixtures(NamedTuple):
                 determinant = determinant - (values.shape[1] - counts) * logarithm
                 likelihood = options.degrees * own.log() - determinant
                 likelihood = likelihood - (options.degrees + counts) * energy.log()
-                off = logarithm - 2 * (noises - signals)
-                logarithms.append(likelihood / 2 - prior - off.square() / 2)
+                off = (logarithm - own_ratios).square() / 2
+                logarithms.append(likelihood / 2 - prior - off)
                 means.append((towards * rotated).sum(1))
                 left = 1 + ratio - towards.square().sum(1)
                 squares.append(left * energy / (options.degrees + counts))
