@@ -685,6 +685,15 @@ def test_several_processes_have_one_start(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("two_starts")
+def test_a_given_model_is_trained_in_place_from_one_start(tmp_path):
+    links = gaigs.links("synthetic", transmitters=20, order=0)
+    options = {"max_steps": 1, "enable_progress_bar": False, "planes": 6, "order": 1}
+    model = gaigs.train("mirrored", links, kriging=False, **options)
+    assert gaigs.train(model, links, "trainer.max_steps=1", kriging=False, folder=tmp_path) is model
+    assert not (tmp_path / "second_start").exists()
+
+
+@pytest.mark.usefixtures("two_starts")
 @pytest.mark.parametrize("scores", [(0.9, 0.5), (0.5, 0.9)])
 def test_validation_chooses_the_start_of_mirrored_gaussians(tmp_path, monkeypatch, scores):
     given = {tmp_path: scores[0], tmp_path / "second_start": scores[1]}

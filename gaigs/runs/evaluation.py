@@ -280,13 +280,7 @@ def score(
         has_enough = calibration is not None and calibration.gives(0.9)
         is_main = key == next(iter(models), None)
         if states_intervals and is_main and not has_enough:
-            count = 0 if calibration is None else int(calibration.counts.min())
-            log.warning(
-                "%s has no intervals: %d links calibrate them, and %d are needed",
-                key,
-                count,
-                fewest(0.9),
-            )
+            log.warning("%s has no intervals: %s", key, _lack(calibration))
         if states_intervals and calibration is not None and has_enough:
             with stages.timed("intervals"):
                 deviations = spreads(model, links, test.index, values)
@@ -302,6 +296,14 @@ def score(
         with atomic_write(folder / "predictions.npz") as part_file:
             np.savez_compressed(part_file, **test.content)
     return test.scores
+
+
+def _lack(calibration: Calibration | None) -> str:
+    """What a model lacks for intervals of 90 %."""
+    count = 0 if calibration is None else int(calibration.counts.min())
+    if count >= fewest(0.9):
+        return "at new receivers three others with links must calibrate them"
+    return f"{count} links calibrate them, and {fewest(0.9)} are needed"
 
 
 def able_look_ups(look_ups: Mapping[str, Model], links: Links) -> dict[str, Model]:

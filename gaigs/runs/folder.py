@@ -32,7 +32,8 @@ def claim(folder: Path, config: dict) -> None:
     there = [name for name in names if (folder / name).exists()]
     if there and not is_configuration(file):
         raise ValueError(f"{folder} holds {', '.join(there)} of something else\n{ANOTHER}")
-    for place in (folder, folder / "figures", *folder.glob("members/*")):
+    trainings = (folder, folder / "second_start", *folder.glob("members/*"))
+    for place in (folder / "figures", *trainings):
         remove_parts(place)  # a killed run leaves temporary files
     # Without a checkpoint or scores there is nothing to resume: the run starts anew.
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():

@@ -36,8 +36,8 @@ def train(
 
     Args:
         model: Name of a registered model, or ``"auto"``, the default, which tries several and takes
-            the best by the validation links; or a model, which is trained in place. Of a kriged
-            model a copy of the trend is trained.
+            the best by the validation links; or a model, which is trained in place, from one start.
+            Of a kriged model a copy of the trend is trained.
         links: Links to learn from; validation links choose the best step. Test links are not used.
         overrides: Command-line words, e.g. ``"variant=ga"`` or ``"trainer.max_steps=300"``.
         folder: Gets the configuration, the log and the checkpoints; the same call resumes a stopped
@@ -100,6 +100,7 @@ def _made(model: str | Model) -> Model | None:
     if isinstance(model, str):
         return None
     made = copy.deepcopy(model.trend) if isinstance(model, Kriging) else model
+    made.second_start = {}  # a better second start would be another object
     if isinstance(made, Ensemble):
         members = "members" if made is model else "trend.members"
         raise ValueError(
