@@ -133,7 +133,7 @@ class LocalMixtures(NamedTuple):
         near = (points - scaled(places, scale)[:, None]).norm(dim=2)  # (m, j)
         # What does not exist correlates with nothing, not even with itself.
         near = near.where(nearest.exists, 1e15)
-        # Places with the same readings around share matrices, as the candidates' lengths are the
+        # Places with the same readings around share matrices and factors, as the candidates are the
         # same at all receivers.
         _, which = sets.unique_consecutive(return_inverse=True)
         first = torch.searchsorted(which, which.unique())
@@ -143,7 +143,6 @@ class LocalMixtures(NamedTuple):
         counts = nearest.exists.sum(1)
         lengths, signals, noises = self.logarithms[receivers].unbind(1)
         total = (2 * signals).exp() + (2 * noises).exp()
-        # The candidates are the same at all receivers, which so share matrices and factors.
         middle = self.logarithms[:, 0].mean()
         own_ratios = 2 * (noises - signals)  # logarithms
         middle_ratio = 2 * (self.logarithms[:, 2] - self.logarithms[:, 1]).mean()
