@@ -2,6 +2,7 @@
 
     python benchmarks/field_bound.py FILE.npz --box -1.5 -1.5 0 1.5 1.5 2.5    a box room: its two corners [m]
     python benchmarks/field_bound.py built-in --frequency 2.4e9                the built-in room, one antenna
+    python benchmarks/field_bound.py built-in --isotropic --empty              no pattern, no furniture
 
 ``FILE`` is as for ``data=csi_npz``, phases known. The second command also writes the field into
 ``runs/field.npz``. Strengths are fitted to training and validation links of the default split. Prints a
@@ -21,20 +22,28 @@ import torch
 
 from gaigs.data import Links, load
 from gaigs.data.simulation import simulate_channels
-from gaigs.data.synthetic import ROOM, default_room
+from gaigs.data.synthetic import ROOM, default_room, respond_in_parts
 from gaigs.planes.channel_links import SLABS, ChannelData, ChannelOptions
 from gaigs.planes.field_room import FieldFit, FieldRoom, Variation
 from gaigs.report.table import markdown
 
 
-def write_built_in(frequency: float, file: Path) -> None:
-    """Channels of the built-in room at one antenna of its array."""
+def write_built_in(frequency: float, pattern: str, is_empty: bool, file: Path) -> None:
+    """Channels of the built-in room at one antenna of its array, whose pattern no file tells.
+
+    The places are those of the furnished room, also with ``is_empty``.
+    """
     links = simulate_channels(default_room(2), 500, frequency, 1e6, 1, 0)
     receiver = links.receivers[0]
+    antenna = replace(receiver, array=replace(receiver.array, pattern=pattern))
+    room = replace(ROOM, furniture=()) if is_empty else ROOM
+    offsets = torch.zeros(1, dtype=torch.float64)
+    parts = respond_in_parts(room, links.query.transmitters, antenna, frequency, offsets, 2)
+    channels = torch.cat([*parts]).to(links.labels)
     file.parent.mkdir(exist_ok=True)
     np.savez(
         file,
-        h=links.labels[:, 5:6].numpy(),
+        h=channels[:, 5:6].numpy(),
         tx=links.query.transmitters.numpy(),
         rx=receiver.pose.world(receiver.array.elements)[5:6].numpy(),
         frequencies=np.array([frequency]),
@@ -141,12 +150,15 @@ def main() -> None:
     parser.add_argument("file")
     parser.add_argument("--box", type=float, nargs=6)
     parser.add_argument("--frequency", type=float, default=2.4e9)
+    parser.add_argument("--isotropic", action="store_true", help="the built-in room's antenna")
+    parser.add_argument("--empty", action="store_true", help="the built-in room without furniture")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     file, box = Path(arguments.file), arguments.box
     if arguments.file == "built-in":
         file, box = Path("runs/field.npz"), [0.0, 0.0, 0.0, *ROOM.size]
-        write_built_in(arguments.frequency, file)
+        pattern = "isotropic" if arguments.isotropic else "cosine"
+        write_built_in(arguments.frequency, pattern, arguments.empty, file)
     links = load_field(file)
     rows = [("order", "strength a path", "shared gains", "varying over places")]
     rows += [scores(links, walls_of(box), order) for order in (1, 2, 3)]

@@ -88,7 +88,7 @@ def main():
     if options.mirrored:
         models["mirrored"] = gaigs.load(options.mirrored)
     else:
-        models["mirrored"] = gaigs.train("mirrored", links)
+        models["mirrored"] = gaigs.train("mirrored", links, boxes=True)
     cases = [("coverage", threshold) for threshold in options.thresholds]
     cases += [("mean", 0.0), ("locate", 0.0)]
     names = [*models, "true levels"]

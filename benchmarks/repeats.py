@@ -5,6 +5,9 @@ An oracle takes the mean of all other readings of the receiver within a radius, 
 too. With few of them it errs more than with many: times the root of n / (n + 1) for as many as one
 likes, if they scatter alike. Beside it is the Gaussian process of the known readings, at the same
 test readings, and by the distance to the nearest known one. Split ``random``, seed 0.
+
+Last come differences of readings near each other, of rows of the survey that follow one another,
+so of one pass, and of rows far apart. Over the root of 2 they are errors of the mean of very many.
 """
 
 import argparse
@@ -42,6 +45,27 @@ def neighbours(links, within):
     return counts, means, apart
 
 
+def between_passes(links, nearest, farthest, follow=3, apart=50):
+    """Mean differences over the root of 2 [dB] of readings of a receiver at places so far from each
+    other [m], and their numbers: of rows at most ``follow`` from each other, and more than
+    ``apart``.
+    """
+    receivers = links.query.receivers.numpy()
+    found = []
+    for receiver in range(len(links.receivers)):
+        own = np.flatnonzero(receivers == receiver)
+        places = links.query.transmitters[own].numpy()
+        pairs = cKDTree(places).query_pairs(farthest, output_type="ndarray")
+        steps = np.linalg.norm(places[pairs[:, 0]] - places[pairs[:, 1]], axis=1)
+        one, other = own[pairs[steps >= nearest].T]
+        rows = (links.rows[one] - links.rows[other]).abs().numpy()
+        levels = (links.labels[one] - links.labels[other]).abs().double().numpy()
+        found.append((rows, levels))
+    rows, levels = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    differences = [levels[rows <= follow], levels[rows > apart]]
+    return [(len(part), part.mean() / 2**0.5) for part in differences if len(part)]
+
+
 def main():
     shape = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=shape)
@@ -69,6 +93,10 @@ def main():
         part = (apart >= low) & (apart < high)
         if part.any():
             print(f"{low} to {high} m: {part.sum()} readings, {errors[part].mean():.2f} dB")
+    for low, high in ((0, 2), (4, 8), (8, 16)):
+        parts = between_passes(links, low, high)
+        texts = [f"{difference:.2f} dB of {count} pairs" for count, difference in parts]
+        print(f"{low} to {high} m from each other, one pass and another: {', '.join(texts)}")
 
 
 if __name__ == "__main__":

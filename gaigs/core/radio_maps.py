@@ -147,7 +147,7 @@ def radio_map(
         model: A fitted or loaded model of a task whose label is one real number, e.g. RSSI.
         pitch: Distance between neighbouring points [m]. The points are its multiples, so maps of
             one pitch share them. None: 0.1, more in a room with a side above 12.8 m; doubled until
-            the map of a slow model takes a minute.
+            the map of a slow model takes 20 s.
         height: Height of the transmitters [m]; None: half-way between the lowest and the highest of
             training, or the floor with most training places.
         margin: Widening of the box on each side [m].
@@ -308,7 +308,7 @@ def _affordable_pitch(
     lower: ndarray,
     upper: ndarray,
     height: float,
-    seconds: float = 60.0,
+    seconds: float = 20.0,
     points: int = 128,
     fewest: int = 200,
     predictions: int = 150_000,

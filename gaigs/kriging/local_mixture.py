@@ -22,8 +22,8 @@ class MixtureOptions:
         neighbours: Readings around a place that weight its candidates. Fewer say little on a
             length, more are no longer near.
         lengths: Logarithms of the candidates' lengths over the mean length of the receivers.
-        ratios: Logarithms of their ratios of noise to signal over the receiver's ratio, with a
-            prior deviation of 1.
+        ratios: Logarithms of their ratios of noise to signal over the mean ratio of the receivers.
+            The prior deviation about the receiver's ratio is 1.
         scatter: Prior deviation of the logarithm of the length about the receiver's length.
         degrees: Readings that the receiver's own variance counts as, beside those around.
         errors: Least gain of the held-out log likelihood over one process everywhere
@@ -37,7 +37,7 @@ class MixtureOptions:
     scatter: float = 1.5
     degrees: float = 2.0
     errors: float = 1.0
-    size: int = 2048
+    size: int = 256
 
 
 class LocalMixture(NamedTuple):
@@ -133,7 +133,7 @@ class LocalMixtures(NamedTuple):
         near = (points - scaled(places, scale)[:, None]).norm(dim=2)  # (m, j)
         # What does not exist correlates with nothing, not even with itself.
         near = near.where(nearest.exists, 1e15)
-        # Places with the same readings around share matrices, as the candidates' lengths are the
+        # Places with the same readings around share matrices and factors, as the candidates are the
         # same at all receivers.
         _, which = sets.unique_consecutive(return_inverse=True)
         first = torch.searchsorted(which, which.unique())
@@ -144,31 +144,33 @@ class LocalMixtures(NamedTuple):
         lengths, signals, noises = self.logarithms[receivers].unbind(1)
         total = (2 * signals).exp() + (2 * noises).exp()
         middle = self.logarithms[:, 0].mean()
+        own_ratios = 2 * (noises - signals)  # logarithms
+        middle_ratio = 2 * (self.logarithms[:, 2] - self.logarithms[:, 1]).mean()
         logarithms, means, squares = [], [], []
         for step in options.lengths:
             correlations = matern(apart, (middle + step).exp(), self.choice.smoothness)
-            # With eigenvalues e and vectors U of the correlations, U diag(e + ratio) U' are the
-            # covariances of all ratios.
-            sizes, vectors = torch.linalg.eigh(correlations)
-            vectors = vectors.mT[which]  # (m, j, j)
             at_place = matern(near, (middle + step).exp(), self.choice.smoothness)
-            towards = (vectors @ at_place[..., None])[..., 0]  # (m, j)
-            rotated = (vectors @ values[..., None])[..., 0]  # (m, j)
+            both = torch.stack((at_place, values), 2)  # (m, j, 2)
             prior = ((middle + step - lengths) / options.scatter).square() / 2
             for change in options.ratios:
-                ratios = (2 * (noises - signals) + change).exp()
-                covariances = sizes.clamp_min(0)[which] + ratios[:, None]
+                logarithm = middle_ratio + change
+                ratio = logarithm.exp()
+                noise = ratio * torch.eye(values.shape[1]).to(values)
+                factor = torch.linalg.cholesky(correlations + noise)  # (u, j, j)
+                white = torch.linalg.solve_triangular(factor[which], both, upper=False)
+                towards, rotated = white.unbind(2)  # (m, j)
                 # The receiver's variance of readings divides into signal and noise.
-                own = options.degrees * total / (1 + ratios)
-                energy = own + (rotated.square() / covariances).sum(1)
-                # Readings that do not exist have an eigenvalue of 0 each.
-                lacking = (values.shape[1] - counts) * ratios.log()
-                determinant = covariances.log().sum(1) - lacking
+                own = options.degrees * total / (1 + ratio)
+                energy = own + rotated.square().sum(1)
+                determinant = 2 * factor.diagonal(dim1=1, dim2=2).log().sum(1)[which]
+                # Readings that do not exist have a factor of the noise alone.
+                determinant = determinant - (values.shape[1] - counts) * logarithm
                 likelihood = options.degrees * own.log() - determinant
                 likelihood = likelihood - (options.degrees + counts) * energy.log()
-                logarithms.append(likelihood / 2 - prior - change**2 / 2)
-                means.append((towards * rotated / covariances).sum(1))
-                left = 1 + ratios - (towards.square() / covariances).sum(1)
+                off = (logarithm - own_ratios).square() / 2
+                logarithms.append(likelihood / 2 - prior - off)
+                means.append((towards * rotated).sum(1))
+                left = 1 + ratio - towards.square().sum(1)
                 squares.append(left * energy / (options.degrees + counts))
         weights = torch.stack(logarithms, 1).log_softmax(1)
         degrees = (options.degrees + counts)[:, None]

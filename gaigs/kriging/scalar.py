@@ -2,6 +2,7 @@
 data have them.
 """
 
+import hashlib
 import math
 from collections.abc import Sequence
 from functools import partial
@@ -56,6 +57,7 @@ class ScalarProcess(nn.Module):
         tiles: Parts of the readings of receivers with more places than ``options.together``.
         asked: Rows of the readings that the last ``fit`` held out.
         is_solved: False before the readings of a lazy ``solve`` are weighted.
+        kept: Means and variances of local mixtures, by a digest of their places and receivers.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2 and
     5.4.2; Lange, Little and Taylor, Robust statistical modeling using the t distribution, 1989.
@@ -83,6 +85,7 @@ class ScalarProcess(nn.Module):
             self.register_buffer(name, empty.clone())
         self.tiles = Tiles()
         self.asked = empty.long()
+        self.kept: dict[bytes, tuple[Tensor, Tensor]] = {}
 
     # --- predictions ---
 
@@ -91,7 +94,7 @@ class ScalarProcess(nn.Module):
     ) -> Float[Tensor, " b"]:
         """Mean of z at some places."""
         if self._choice.is_local:
-            return self._mixtures.at(places, receivers).mean
+            return self._moments(places, receivers)[0]
         if not self.is_solved:
             if len(places) * self.options.few < len(self.places):
                 means = torch.empty_like(places[:, 0])
@@ -123,6 +126,23 @@ class ScalarProcess(nn.Module):
                 means[asked] = towards @ (signal**2 * self.weights[known])
         return means
 
+    def _moments(
+        self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"], most: int = 128
+    ) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
+        """Means and variances of local mixtures at places.
+
+        Those of the last ``most`` calls are kept, as deviations of a batch follow its means.
+        """
+        content = [part.cpu().numpy().tobytes() for part in (places, receivers)]
+        key = hashlib.sha256(b"".join(content)).digest()
+        if key not in self.kept:
+            mixture = self._mixtures.at(places, receivers)
+            self.kept[key] = mixture.mean, mixture.variance
+            if len(self.kept) > most:
+                del self.kept[next(iter(self.kept))]
+        mean, variance = self.kept[key]
+        return mean.to(places), variance.to(places)
+
     def _solved(self, readings: Merged, receiver: int) -> Float[Tensor, " j"]:
         """Values over the covariances of some readings of a receiver."""
         places = self.places[readings.rows]
@@ -136,7 +156,7 @@ class ScalarProcess(nn.Module):
     ) -> Float[Tensor, " b"]:
         """Standard deviations of new readings: z given the known readings, plus noise."""
         if self._choice.is_local:
-            return self._mixtures.at(places, receivers).variance.sqrt()
+            return self._moments(places, receivers)[1].sqrt()
         variances = places.new_zeros(len(places))
         most = self.options.many if self.is_solved else 0
         is_many = self.receivers.bincount(minlength=len(self.logarithms)) > most
@@ -324,6 +344,7 @@ class ScalarProcess(nn.Module):
         self.is_solved = self._choice.is_local
         self.weights = torch.zeros_like(values)
         self.tiles.clear()  # of former readings
+        self.kept.clear()
         if not is_lazy and not self.is_solved:
             self._solve()
 
@@ -354,6 +375,7 @@ class ScalarProcess(nn.Module):
         is_alike = torch.equal(self.choice[:2], other.choice[:2]) or other._choice.is_local
         self.variances = self.variances * ratios
         self.logarithms, self.choice = other.logarithms, other.choice
+        self.kept.clear()
         if not is_alike:  # readings that disagree count less with one noise than with another
             noises = (2 * self.logarithms[self.receivers, 2]).exp()
             self.variances = noises * self._factors(self.values)
@@ -437,5 +459,6 @@ class ScalarProcess(nn.Module):
         if choice in state_dict:  # checkpoints of before know no local mixtures
             missing = len(self.choice) - len(state_dict[choice])
             state_dict[choice] = torch.nn.functional.pad(state_dict[choice], (0, missing))
+        self.kept.clear()
         resize(self, state_dict, prefix, "places", "receivers", "values", "variances", "weights")
         super()._load_from_state_dict(state_dict, prefix, *args)

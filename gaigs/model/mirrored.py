@@ -59,6 +59,8 @@ class MirroredSplatting(GaussianSplatting):
     Args:
         search: Start with spectra: True for planes of ``LagSearch``, False for the faces of the
             box, None for both, of which validation chooses.
+        boxes: Search boxes in levels of a known carrier. True: paths have no gains of their own,
+            which suits planned receivers best; False: none. None: with held-out receivers alone.
 
     Source: ours; docs/methods.md.
     """
@@ -88,8 +90,10 @@ class MirroredSplatting(GaussianSplatting):
         gaussians: Mapping | None = None,
         trend: str | Mapping | Model | None = None,
         search: bool | None = None,
+        boxes: bool | None = None,
     ):
         self.search = search
+        self.boxes = boxes
         image = projection, rasterizer, pooling
         super().__init__(scene, placement, tokenizer, deformation, *image, gaussians, trend)
 
@@ -116,9 +120,12 @@ class MirroredSplatting(GaussianSplatting):
                 self._prepare_levels(links)
         # Levels at known receivers are learnt as well without boxes. Without a carrier, as of
         # Bluetooth beacons, boxes explained what single receivers have of their own.
-        is_shared = links.split.by_receivers and not self.scene.one_radio
+        wants_boxes = links.split.by_receivers if self.boxes is None else self.boxes
+        is_shared = wants_boxes and not self.scene.one_radio
         if is_known and is_shared and not self.is_wide and isinstance(self.pooling, PathRssi):
             self._prepare_boxes(links)
+            # Gains of single paths learn the shadows at the known receivers in place of boxes.
+            self.placement.path_gains.requires_grad_(not self.boxes)
         # Without phases powers add to the end, and no later revision locates a plane.
         has_phases = is_known and not self.is_wide and not self.scene.one_radio
         self.settles = isinstance(self.pooling, PathRssi) and not has_phases

@@ -1,6 +1,8 @@
 """Search for boxes that explain shadows: tomography with few, sharp obstacles."""
 
 import contextlib
+import math
+from functools import cached_property
 from typing import NamedTuple
 
 import torch
@@ -72,6 +74,16 @@ class Cuboid(NamedTuple):
     loss: float  # [Np]
 
 
+class Segments(NamedTuple):
+    """Segments of paths through a cuboid."""
+
+    low: Float[Tensor, "3"]  # least coordinates of the cuboid [m]
+    high: Float[Tensor, "3"]
+    start: Float[Tensor, "s 3"]
+    end: Float[Tensor, "s 3"]
+    path: Int[Tensor, " s"]  # number among the paths of all links
+
+
 class BoxSearch:
     """Boxes, each shared by all paths of all receivers, that lower the errors of links.
 
@@ -122,6 +134,8 @@ class BoxSearch:
         self.cell = float((upper - lower).norm()) / 45  # 0.2 m in a room of 7 by 5 m
         self.lower = lower - 2 * self.cell
         self.upper = upper + 2 * self.cell
+        nowhere = self.lower + math.inf
+        self.near = Segments(nowhere, nowhere, self.start, self.end, self.path)
         self.common = 0.0  # depth of all paths, while gains are not yet right [Np]
         self.boxes: list[Cuboid] = []
 
@@ -165,17 +179,29 @@ class BoxSearch:
         return 0.0
 
     def _depth(self, box: Cuboid) -> Float[Tensor, "b n"]:
-        """Depths of all paths by a box [Np].
+        """Depths of all paths by a box [Np]."""
+        hit = self._hit(box)
+        losses = self.free.new_full((len(hit),), box.loss)
+        return self.free.flatten().index_add(0, hit, losses).view_as(self.free)
+
+    def _hit(self, box: Cuboid) -> Int[Tensor, " h"]:
+        """Paths of the segments through a box.
 
         Raises:
             TimeoutError: The time is up.
         """
         if stages.is_up():
             raise TimeoutError
-        hit = passes_box(self.start, self.end, box.corners).nonzero()[:, 0]
-        depths = self.free
-        losses = depths.new_full((len(hit),), box.loss)
-        return depths.flatten().index_add(0, self.path[hit], losses).view_as(depths)
+        if (self.near.low > box.corners[0]).any() or (self.near.high < box.corners[1]).any():
+            self.near = self._segments_near(box)
+        return self.near.path[passes_box(self.near.start, self.near.end, box.corners)]
+
+    def _segments_near(self, box: Cuboid) -> Segments:
+        """The segments through a box or its neighbours: a search tries many of these in turn."""
+        margin = 3 * self.cell
+        low, high = box.corners[0] - margin, box.corners[1] + margin
+        rows = passes_box(self.start, self.end, torch.stack((low, high))).nonzero()[:, 0]
+        return Segments(low, high, self.start[rows], self.end[rows], self.path[rows])
 
     def _depths(self, boxes: list[Cuboid]) -> Float[Tensor, "b n"]:
         """Depths of all paths by boxes and in common [Np]."""
@@ -186,18 +212,28 @@ class BoxSearch:
         """Mean error with boxes added."""
         return self.errors(depths + self._depths(boxes) - self.common).mean().item()
 
-    def _seeds(self, depths: Float[Tensor, "b n"]) -> list[Cuboid]:
-        """Cells, two apart, that lower the errors most clearly."""
-        before = self.errors(depths)
+    @cached_property
+    def cells(self) -> list[tuple[Cuboid, Int[Tensor, " h"]]]:
+        """Free cells, two apart, with the paths of the segments through each."""
         axes = [
             torch.arange(*ends, 2 * self.cell) for ends in zip(self.lower, self.upper, strict=True)
         ]
-        rated = []
-        for corner in torch.cartesian_prod(*axes).to(depths):
+        cells = []
+        for corner in torch.cartesian_prod(*axes).to(self.free):
             box = Cuboid(torch.stack((corner, corner + self.cell)), 1.5)
             if self._is_free(box):
-                fall = before - self.errors(depths + self._depth(box))
-                rated.append((fall.mean() / (fall.std() + FAINTEST), box))
+                cells.append((box, self._hit(box)))
+        return cells
+
+    def _seeds(self, depths: Float[Tensor, "b n"]) -> list[Cuboid]:
+        """Cells, two apart, that lower the errors most clearly."""
+        before = self.errors(depths)
+        rated = []
+        for box, hit in self.cells:
+            losses = depths.new_full((len(hit),), box.loss)
+            dimmed = depths.flatten().index_add(0, hit, losses).view_as(depths)
+            fall = before - self.errors(dimmed)
+            rated.append((fall.mean() / (fall.std() + FAINTEST), box))
         rated.sort(key=lambda pair: -pair[0])
         return [box for _, box in rated[: self.seeds]]
 

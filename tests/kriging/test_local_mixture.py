@@ -26,7 +26,7 @@ def mixtures(options, count=40, receivers=2):
     numbers = torch.arange(receivers).repeat_interleave(count)
     readings = Readings(example_links("rssi").scene, places, numbers, 8)
     values = torch.from_numpy(rng.standard_normal(len(places)))
-    logarithms = torch.tensor([[1.5, 2.0, 0.7], [1.5, 1.0, 0.9]]).double().log()
+    logarithms = torch.tensor([[1.5, 2.0, 1.0], [1.5, 1.0, 0.5]]).double().log()
     return LocalMixtures(readings, values, logarithms, Choice(0.5), options)
 
 
@@ -68,6 +68,15 @@ def test_the_likelier_length_has_the_weight():
     found = all_of._replace(values=values).at(asked(40), torch.arange(40) % 2)
     shares = found.logarithms.exp()[:, 1]  # of the long length
     assert shares[::2].mean() > 0.9 > 0.3 > shares[1::2].mean()
+
+
+def test_candidates_near_a_receivers_own_noise_weigh_more():
+    all_of = mixtures(MixtureOptions(8, lengths=(0.0,), ratios=(-1.0, 1.0)))
+    logarithms = torch.tensor([[1.5, 2.0, 0.5], [1.5, 2.0, 2.0]]).double().log()
+    alike = all_of._replace(values=all_of.values[:40].repeat(2), logarithms=logarithms)
+    found = alike.at(asked().repeat(2, 1), torch.arange(2).repeat_interleave(7))
+    quiet, noisy = found.logarithms[:, 1].split(7)
+    assert (noisy > quiet).all()
 
 
 def test_readings_that_do_not_exist_have_no_say():
@@ -142,6 +151,21 @@ def test_lengths_that_differ_by_place_are_found():
     copy.load_state_dict(model.state_dict())
     query = links.query[links.split.test]
     torch.testing.assert_close(copy.predict(query), model.predict(query))
+
+
+def test_deviations_take_the_mixtures_of_the_means_until_hyperparameters_change(monkeypatch):
+    links = drawn(20.0)
+    process = errors(links)[1].scalar
+    places, which = links.query.transmitters[:9].double(), links.query.receivers[:9]
+    asked_for, at = [], LocalMixtures.at
+    monkeypatch.setattr(LocalMixtures, "at", lambda *args: asked_for.append(1) or at(*args))
+    process(places, which)
+    before = process.deviations(places, which)
+    assert len(asked_for) == 1
+    other = ScalarProcess(links.scene)
+    other.logarithms, other.choice = process.logarithms + 1, process.choice
+    process.take(other)
+    assert not torch.isclose(process.deviations(places, which), before).any()
 
 
 def test_one_length_everywhere_costs_little():

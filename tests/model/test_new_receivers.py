@@ -308,12 +308,17 @@ def test_boxes_of_levels_need_receivers_that_confirm_them(monkeypatch, loss):
     assert ("do not confirm" in outcome) == (loss > 2)
 
 
-def test_levels_at_known_receivers_have_no_boxes():
+def test_levels_at_known_receivers_have_boxes_on_demand():
     links = gaigs.links("synthetic_rssi", transmitters=30, receivers=6)
-    model = MirroredSplatting(links.scene, placement={"name": "mirrored", "order": 1})
+    placement = {"name": "mirrored", "order": 1}
+    model = MirroredSplatting(links.scene, placement=placement)
     model.fit(links)
     assert model.shadowed is None
     assert model._place_boxes() == ""
+    model = MirroredSplatting(links.scene, placement=placement, boxes=True)
+    model.fit(links)
+    assert len(model.shadowed.labels) == len(links.split.train)
+    assert not model.placement.path_gains.requires_grad
 
 
 def test_kriged_levels_at_new_receivers_are_a_mean_with_path_loss(tmp_path):
