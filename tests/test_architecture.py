@@ -23,11 +23,7 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-<<<<<<< HEAD
     "lines of gaigs/": 49_634,
-=======
-    "lines of gaigs/": 49_634,
->>>>>>> main
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
     "module constants": 100,
