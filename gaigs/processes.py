@@ -27,7 +27,7 @@ if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.S
 
 
 def _limit_forked_threads() -> None:
-    """A forked process lacks the threads of torch, and would wait for them for ever."""
+    """Limits a forked process to one thread: it lacks torch's threads, and would wait forever."""
     if "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
 
@@ -48,11 +48,11 @@ class Stopped(KeyboardInterrupt):
 
 
 def keep_memory() -> None:
-    """Makes this process faster and its memory larger.
+    """Makes this process faster, at the cost of memory.
 
-    Freed arrays stay with the process: with glibc each step would map their pages anew. Imports
-    make half a million objects that stay: the search for cycles among them becomes rarer, and is
-    left out at the end.
+    Freed arrays stay with the process; otherwise glibc would map their pages again in each step.
+    Imports create half a million permanent objects, so garbage collection becomes rarer, and is
+    skipped at the end.
     """
     gc.set_threshold(50_000)
     atexit.register(gc.freeze)
@@ -67,8 +67,8 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
     """Limits the threads of torch and PoCL; PoCL keeps the limit of its first use.
 
     Args:
-        count: Number of threads; None: no limit for one job, an equal share of the processors for
-            several.
+        count: Number of threads. None: no limit for one job; for several jobs an equal part of the
+            processors.
         jobs: Number of jobs that run at a time on this machine; -1: one for each processor.
     """
     if count is None and jobs in (0, 1):
@@ -101,7 +101,7 @@ def limited_threads(count: int | None, jobs: int = 1) -> Iterator[None]:
 
 
 def lacks_memory(error: BaseException | None) -> bool:
-    """True if an error, or its cause, is a lack of memory of the processor or of a GPU."""
+    """True if an error, or its cause, is a lack of CPU or GPU memory."""
     messages = (
         "allocate memory",
         "unable to allocate",
@@ -128,7 +128,7 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
     Args:
         error: The error of a run.
         folder: The run folder.
-        goes_on: How to resume the run.
+        goes_on: Words on how to resume the run.
     """
     if lacks_memory(error):
         cause = " ".join(str(error).split()) or type(error).__name__
@@ -148,9 +148,9 @@ def advice(error: Exception, folder: Path, goes_on: str) -> str | None:
 
 
 def fault_of_plug_in(error: Exception) -> str:
-    """File and line in a plug-in at which an error arose; empty if the plug-in itself raised it.
+    """File and line in a plug-in at which an error occurred; empty if the plug-in raised it.
 
-    Files of gaigs and installed packages are no plug-ins.
+    Files of gaigs and of installed packages do not count as plug-ins.
     """
     here = str(Path(__file__).parent) + os.sep
     trace = traceback.extract_tb(error.__traceback__)
@@ -173,7 +173,7 @@ def _is_library(file: str) -> bool:
 
 
 def is_first() -> bool:
-    """True in the first of the processes that train together; only this one writes files."""
+    """True in the first of the processes of a training, the only one that writes files."""
     from lightning.pytorch.utilities import rank_zero_only  # slow to import
 
     # Without torchrun and SLURM, Lightning's rank is that within a machine.
@@ -186,10 +186,11 @@ def is_first() -> bool:
 def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
     """Locks a folder, at most until this process ends.
 
-    The file ``.lock`` in the folder is removed at the end. A killed process leaves it, unlocked.
+    The file ``.lock`` in the folder is removed at the end. A killed process leaves the file,
+    without the lock.
 
     Args:
-        waits: True to wait for another process that holds the folder.
+        waits: True to wait for another process that has the lock.
     """
     folder.stat()  # raises an error for a missing folder, which FileLock would make
     lock = FileLock(folder / LOCK)
@@ -203,7 +204,7 @@ def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
         yield
     finally:
         # Before the release: a process that opens the file meanwhile sees that it has no name.
-        # Windows removes no open file; in a folder made anew the file is another process's.
+        # Windows removes no open file. If the folder was made again, another process has the file.
         with contextlib.suppress(OSError):
             if os.path.samestat(held, (folder / LOCK).stat()):
                 (folder / LOCK).unlink()
@@ -211,9 +212,9 @@ def only_run(folder: Path, waits: bool = False) -> Iterator[None]:
 
 
 def hang_up(number: int) -> None:
-    """At SIGHUP drops the output to the closed terminal, and ignores any further SIGHUP.
+    """At SIGHUP discards the output to the closed terminal, and ignores any further SIGHUP.
 
-    The terminal and then the shell each send one, so two are usual.
+    Terminal and shell each send one, so two are common.
     """
     if number != getattr(signal, "SIGHUP", None):
         return
@@ -226,10 +227,9 @@ def hang_up(number: int) -> None:
 
 
 class _Repeater:
-    """Handler of a stopping signal, whose error stops the run.
+    """Handler of a stopping signal, which raises an error to stop the run.
 
-    Python ignores the error if it is raised while an object is destroyed; the signal is then sent
-    again.
+    Python ignores the error while it destroys an object; the signal is then sent again.
     """
 
     def __init__(self, delay: float = 0.05):
@@ -238,7 +238,7 @@ class _Repeater:
         self.hook = sys.unraisablehook
 
     def stop(self, number: int, _) -> None:
-        """Raises ``Stopped``; there is no second signal while the run stops."""
+        """Raises ``Stopped``; a second signal is not sent while the run stops."""
         self.cancel()
         hang_up(number)
         raise Stopped("stopped", number)
@@ -257,24 +257,24 @@ class _Repeater:
         timer.start()
 
     def raise_pending(self) -> None:
-        """Raises ``Stopped`` if a repeated signal has not come yet."""
+        """Raises ``Stopped`` if a repeated signal is still pending."""
         for timer in self.timers:
             if not timer.finished.is_set():
                 raise Stopped("stopped", timer.args[1])
 
     def cancel(self) -> None:
-        """Stops repeated signals that have not come yet."""
+        """Cancels repeated signals that are still pending."""
         for timer in self.timers:
             timer.cancel()
 
 
 @contextlib.contextmanager
 def stopping(waits: bool = False) -> Iterator[None]:
-    """Lets the signals ``STOPPING`` stop a run as Ctrl-C does, and restores the handlers.
+    """Makes the signals ``STOPPING`` stop a run as Ctrl-C does, and finally restores the handlers.
 
     Args:
-        waits: True for a process that waits for another run afterwards. While it waits, signals
-            are noted and stop its next run: if the process ended, its launcher would hang.
+        waits: True for a process that waits for another run afterwards. A signal during this wait
+            stops its next run. If the process ended, its launcher would hang.
     """
     # Other threads may not set handlers.
     if threading.current_thread() is not threading.main_thread():

@@ -22,7 +22,7 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     Args:
         model: Name of a registered model.
-        receivers: Positions of the receivers, as for arrays of ``gaigs.links``; None: estimated
+        receivers: Positions of the receivers, as for arrays in ``gaigs.links``; None: estimated
             from the training links.
         height: Height of positions x, y [m].
         seed: Seed of the training and of the choice of validation links.
@@ -68,7 +68,7 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Trains on levels at places.
 
         Args:
-            X: Positions (n, 3) [m], or (n, 2) of one height.
+            X: Positions (n, 3) [m], or (n, 2) with a common height.
             y: Levels (n,) or (n, receivers) [dBm]; NaN where nothing was received.
 
         Raises:
@@ -99,8 +99,8 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """Levels (n,) or (n, receivers) [dBm], and with ``return_std`` their deviations [dB].
 
         Raises:
-            ValueError: The number of coordinates is another one, or the model had too few places
-                for deviations.
+            ValueError: The number of coordinates differs from ``fit``, or the model had too few
+                places for deviations.
         """
         check_is_fitted(self)
         X = validate_data(self, X, reset=False)
@@ -110,13 +110,13 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return (levels, self._arranged(estimate[1])) if return_std else levels
 
     def _arranged(self, values: Any) -> np.ndarray:
-        """Values of the model's receivers in the shape of the training's levels, else NaN."""
+        """Values of the model's receivers in the shape of the training's levels; NaN for others."""
         levels = np.full((len(values), *(self.shape_ or (1,))), np.nan)
         levels[:, self.columns_] = values.double().numpy()
         return levels if self.shape_ else levels[:, 0]
 
     def score(self, X: Any, y: Any, sample_weight: Any = None) -> float:
-        """Mean coefficient of determination of the receivers, over the levels that they received.
+        """Mean coefficient of determination over the receivers, each over its received levels.
 
         Raises:
             ValueError: No receiver has two levels.
@@ -136,7 +136,7 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
 
 def _names_of(receivers: Any) -> list[str]:
-    """Names of receivers if they are given with names; empty for positions and for None."""
+    """Names of receivers if given; empty for positions and for None."""
     if isinstance(receivers, Mapping):
         return [*receivers]
     entries = [receivers] if isinstance(receivers, Receiver) else receivers

@@ -15,17 +15,17 @@ from torch import Tensor
 class Algebra:
     """The Clifford algebra G(p, q, r).
 
-    Of n = p + q + r basis vectors p square to +1, q to -1 and r to 0. A multivector is the last
-    axis of a tensor: ``k = 2**n`` components, one for each basis blade. The order of basis vectors
-    is null, positive, negative; blades are sorted by grade, then by their vectors. Vectors count
-    from e0 if there is a null vector, else from e1:
+    Of n = p + q + r basis vectors p have the square +1, q the square -1 and r the square 0. A
+    multivector is the last axis of a tensor: ``k = 2**n`` components, one for each basis blade.
+    Basis vectors are ordered null, positive, negative. Blades are sorted by grade, then by their
+    vectors. Vectors are numbered from e0 if there is a null vector, otherwise from e1:
 
     - G(3,0,1), ``PROJECTIVE``: e0² = 0, e1² = e2² = e3² = 1, components
       ``1, e0, e1, e2, e3, e01, e02, e03, e12, e13, e23, e012, e013, e023, e123, e0123``;
     - G(3,1,0), ``SPACETIME``: e1² = e2² = e3² = 1, e4² = -1, components
       ``1, e1, e2, e3, e4, e12, e13, e14, e23, e24, e34, e123, e124, e134, e234, e1234``.
 
-    Every operation takes any leading axes, device and dtype, and is differentiable.
+    Every operation accepts any leading axes, device and dtype, and is differentiable.
 
     Args:
         p, q, r: The signature.
@@ -82,7 +82,7 @@ class Algebra:
 
     @property
     def homogeneous(self) -> int:
-        """Index of the blade of all vectors that are not null, e123: a point's weight."""
+        """Index of the blade of all non-null vectors: e123, the weight of a point."""
         return _vectors(self.dimension).index(tuple(range(self.r, self.dimension)))
 
     def product(
@@ -94,15 +94,15 @@ class Algebra:
     def wedge(
         self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
     ) -> Float[Tensor, "*batch k"]:
-        """Outer product x ∧ y; in the projective algebra the intersection, as of two planes."""
+        """Outer product x ∧ y; in the projective algebra the intersection, e.g. of two planes."""
         return self._multiply("wedge", x, y)
 
     def join(
         self, x: Float[Tensor, "*#batch k"], y: Float[Tensor, "*#batch k"]
     ) -> Float[Tensor, "*batch k"]:
-        """Regressive product x ∨ y, the dual of the duals' wedge.
+        """Regressive product x ∨ y: the dual of the wedge of both duals.
 
-        The join of two projective points is the line through both. Under a mirror u it also changes
+        The join of two projective points is the line through both. A mirror u also changes its
         sign: join(ux, uy) = -u join(x, y), as for every odd versor.
         """
         return self._multiply("join", x, y)
@@ -137,8 +137,11 @@ class Algebra:
     ) -> Float[Tensor, "*batch k"]:
         """Motion of x by a versor u: u x u⁻¹ for an even u, u involute(x) u⁻¹ for an odd one.
 
-        A vector u mirrors at the hyperplane orthogonal to it; products of vectors rotate and
-        translate. A u without an inverse is a ``ValueError``.
+        A vector u reflects in the hyperplane orthogonal to it. Products of vectors rotate and
+        translate.
+
+        Raises:
+            ValueError: u has no inverse.
 
         Source: GAI-GS, eq. (6) and (7).
         """
@@ -243,7 +246,7 @@ def _square(algebra: Algebra, vectors: Iterable[int]) -> float:
 
 
 def _products(algebra: Algebra) -> tuple[Tensor, Tensor]:
-    """Products of all pairs of blades (k, k, k), and 1 for pairs without a common vector."""
+    """Products of all pairs of blades (k, k, k), and 1 for pairs that share no vector."""
     blades = _vectors(algebra.dimension)
     position = {frozenset(blade): index for index, blade in enumerate(blades)}
     size = algebra.size
@@ -263,8 +266,8 @@ def _products(algebra: Algebra) -> tuple[Tensor, Tensor]:
 def _number_maps(algebra: Algebra, null_blades: list[int]) -> Tensor:
     """Numbers of the equivariant linear maps by blade of null vectors and component (2**r, k).
 
-    Motions leave null vectors unchanged, so a wedge with one of their blades, 1 included, is an
-    equivariant map of a grade. Maps are numbered by blade, then by grade.
+    Motions leave null vectors unchanged. So the wedge with a blade of null vectors, including 1, is
+    an equivariant map of each grade. Maps are numbered by blade, then by grade.
     """
     grades = torch.tensor(algebra.grades)
     first = 0

@@ -1,8 +1,8 @@
 """Points and planes of the projective algebra G(3,0,1), and events of space-time, as multivectors.
 
-``PROJECTIVE.sandwich`` moves points and planes by any product of planes. Multiples of a multivector
-are the same point or plane; a mirrored point has a factor of -1, which ``extract_point`` divides
-away.
+``PROJECTIVE.sandwich`` moves points and planes by any product of planes. A multivector and its
+multiples are the same point or plane. A reflected point has a factor of -1, which ``extract_point``
+removes.
 
 Source: Brehmer et al., Geometric Algebra Transformer, 2023, table 1.
 """
@@ -16,7 +16,7 @@ from gaigs.algebra import PROJECTIVE
 
 
 def _embed(**components: Tensor) -> Tensor:
-    """Multivectors with these components, and 0 elsewhere."""
+    """Multivectors with the given components, and 0 elsewhere."""
     zero = torch.zeros_like(next(iter(components.values())))
     return torch.stack([components.get(blade, zero) for blade in PROJECTIVE.blades], -1)
 
@@ -24,7 +24,7 @@ def _embed(**components: Tensor) -> Tensor:
 def embed_point(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
     """Points [m] as trivectors e123 - x e023 + y e013 - z e012.
 
-    They are where the planes of the points' coordinates meet.
+    A point is the intersection of its three coordinate planes.
 
     Example:
         >>> from gaigs.algebra.embedding import embed_point, extract_point
@@ -49,7 +49,7 @@ def embed_plane(
 
     Args:
         normals: Normals of any length.
-        offsets: Offsets [m] where the normals are of unit length.
+        offsets: Offsets [m] for normals of unit length; scaled like the normals otherwise.
     """
     x, y, z = normals.unbind(-1)
     return _embed(e1=x, e2=y, e3=z, e0=-offsets)
@@ -58,6 +58,6 @@ def embed_plane(
 def embed_event(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]:
     """Points [m] as events at time zero, vectors x e1 + y e2 + z e3 of space-time, G(3,1,0).
 
-    Its motions are rotations, boosts and mirrors about the origin, without translations.
+    Motions of space-time are rotations, boosts and mirrors about the origin, without translations.
     """
     return functional.pad(points, (1, 12))

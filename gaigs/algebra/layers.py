@@ -1,9 +1,9 @@
 """Layers of the Geometric Algebra Transformer (GATr), for any signature.
 
-Tokens carry two kinds of channels, ``multivectors`` (b, tokens, channels, k) and ``scalars`` (b,
-tokens, channels). A layer f is equivariant: f(u x) = u f(x) where u acts by ``Algebra.sandwich``,
-for rotations, translations and mirrors, or the Lorentz group in space-time; scalars stay as they
-are. Nothing depends on the order of the tokens.
+Tokens have two kinds of channels, ``multivectors`` (b, tokens, channels, k) and ``scalars`` (b,
+tokens, channels). A layer f is equivariant: f(u x) = u f(x), where u acts by ``Algebra.sandwich``.
+u is a rotation, translation or mirror, in space-time a Lorentz transformation. Scalars are
+invariant. The order of the tokens has no effect.
 
 Source: Brehmer et al., Geometric Algebra Transformer, 2023; Spinner et al., Lorentz-Equivariant
 Geometric Algebra Transformers, 2024, for signatures with negative squares.
@@ -25,8 +25,9 @@ class EquivariantLinear(nn.Module):
     """The most general equivariant linear map, learnt for every pair of channels (in, out).
 
     It is a sum of basis maps: the projection to each of the n + 1 grades and, with a null vector
-    e0, e0 times each grade but the highest. Multiplication by the pseudoscalar is excluded, because
-    a mirror changes its sign. Scalars mix with the multivectors' component 1; both have a bias.
+    e0, e0 times each grade except the highest. Multiplication by the pseudoscalar is excluded,
+    since a mirror changes its sign. Scalars mix with the multivectors' component 1. Both have a
+    bias.
 
     Args:
         algebra: The algebra.
@@ -72,11 +73,11 @@ class EquivariantLinear(nn.Module):
 
 
 class GeometricBilinear(nn.Module):
-    """Products of learnt pairs of channels: the geometric product and the join of each.
+    """Geometric products and joins of learnt pairs of channels.
 
-    A mirror changes a join's sign, so joins are multiplied by the e123 component of a reference,
-    whose sign it also changes. Without a null vector products alone reach every grade, so there are
-    twice as many products and no joins.
+    A mirror changes a join's sign. Joins are therefore multiplied by the e123 component of a
+    reference, whose sign changes, too. Without a null vector products reach every grade, so there
+    are twice as many products and no joins.
 
     Raises:
         ValueError: The number of multivectors is odd, and there is a null vector.
@@ -113,22 +114,21 @@ class GeometricAttention(nn.Module):
     """Multi-head attention of all tokens to all tokens, by invariants, eq. (8) of GAI-GS.
 
     The logit of a query and a key is their inner product plus the product of their scalars. The
-    inner product ignores components with e0, and with them the positions of projective points. So
-    in that algebra minus the squared distance of two points is added: for trivectors (x, g) and
-    (y, h), with g and h the components of e123, it is -w(g) w(h) |g y - h x|² with w(h) = h / (h² +
-    floor).
+    inner product ignores components with e0, and so the positions of projective points. In that
+    algebra minus the squared distance of two points is added. For trivectors (x, g) and (y, h),
+    with the components g and h of e123, it is -w(g) w(h) |g y - h x|² with w(h) = h / (h² + floor).
 
     Args:
         multivectors, scalars: Channels, multiples of ``heads``.
-        heads: Attention maps, each of an equal share of the channels.
+        heads: Attention maps; each has an equal part of the channels.
 
     Attributes:
-        floor: Added to h² in w, as h is 0 for a direction; GATr's value.
+        floor: Number added to h² in w, since h is 0 for a direction; GATr's value.
 
     Raises:
-        ValueError: A number of channels is no multiple of ``heads``.
+        ValueError: A number of channels is not a multiple of ``heads``.
 
-    Source: GAI-GS, eq. (8); GATr, "Geometric attention" and, for the distances, appendix
+    Source: GAI-GS, eq. (8); GATr, "Geometric attention"; for the distances GATr, appendix
     "Distance-aware dot-product attention".
     """
 
@@ -187,8 +187,8 @@ class GeometricAttention(nn.Module):
     ) -> tuple[Multivectors, Scalars]:
         """Attention of one token, once for each of ``count`` alternatives, such as transmitters.
 
-        The first ``count`` tokens are the alternatives, and the next token is the one that attends.
-        Result i attends to alternative i, to the token itself and to all tokens behind. There are
+        The first ``count`` tokens are the alternatives, and the next token attends. Result i
+        attends to alternative i, to the attending token and to all later tokens. There are
         ``count`` results.
         """
         query, key, value = self._project(multivectors, scalars)  # (*batch, heads, tokens, f)
@@ -206,7 +206,7 @@ class GeometricAttention(nn.Module):
     def _project(
         self, multivectors: Multivectors, scalars: Scalars
     ) -> list[Float[Tensor, "*batch heads tokens f"]]:
-        """Query, key and value, each a row of numbers for a head and token."""
+        """Query, key and value, each with a row of numbers for each head and token."""
         multivectors, scalars = self.project(multivectors, scalars)
         # Query, key and value first, then heads before tokens.
         multivectors = multivectors.unflatten(-2, (3, self.heads, -1))
@@ -233,14 +233,14 @@ def equivariant_norm(
 ) -> tuple[Multivectors, Scalars]:
     """Layer normalisation: multivectors by their mean size, scalars by mean and variance.
 
-    The squared size of a multivector is the sum over its grades of |inner(x, x)|: invariant, and
-    without cancellation between grades in a signature of both signs.
+    The squared size of a multivector is the sum over its grades of |inner(x, x)|. It is invariant,
+    and grades do not cancel in a signature of both signs.
 
     Args:
         algebra: The algebra.
         multivectors, scalars: Tokens.
-        floor: Added to the squared size, which may be zero for large tokens with e0 or light-like
-            ones; GATr's value.
+        floor: Number added to the squared size, which may be zero for large tokens with e0 and for
+            light-like tokens; GATr's value.
 
     Source: GATr, "Layer normalization"; de Haan, Cohen & Brehmer, Euclidean, Projective, Conformal,
     2023.
@@ -257,7 +257,7 @@ def equivariant_norm(
 
 
 def gated_gelu(multivectors: Multivectors, scalars: Scalars) -> tuple[Multivectors, Scalars]:
-    """Every multivector times the GELU of its component 1; scalars through a plain GELU.
+    """Every multivector times the GELU of its component 1; the plain GELU of scalars.
 
     Source: GATr, "Scalar-gated nonlinearities".
     """
@@ -267,7 +267,7 @@ def gated_gelu(multivectors: Multivectors, scalars: Scalars) -> tuple[Multivecto
 class GATrBlock(nn.Module):
     """A transformer block: attention, then products and a gated GELU.
 
-    Each takes normalised tokens, and is added to them.
+    Both halves normalise their tokens and have a residual connection.
 
     Source: GATr, figure 1.
     """
@@ -308,7 +308,7 @@ class GATrBlock(nn.Module):
     def transform(
         self, multivectors: Multivectors, scalars: Scalars, reference: Float[Tensor, "... k"]
     ) -> tuple[Multivectors, Scalars]:
-        """The block's second half, for each token alone."""
+        """The second half of the block, for each token separately."""
         normal = equivariant_norm(self.algebra, multivectors, scalars)
         products = self.bilinear(*normal, reference)
         made, made_scalars = self.linear(*gated_gelu(*products))

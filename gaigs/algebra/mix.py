@@ -1,4 +1,4 @@
-"""The function of ``layers.EquivariantLinear`` with its gradient by hand."""
+"""The function of ``layers.EquivariantLinear``, with a gradient written by hand."""
 
 import torch
 from torch import Tensor
@@ -10,18 +10,18 @@ class Mix(torch.autograd.Function):
 
         result_k = sum_w (e_w ^ x)_k W[maps[w, k]]
 
-    is component k, with x the multivectors, e_w each blade of the algebra's null vectors (the first
-    is 1), and W a matrix over channels for each equivariant map. Component 1 mixes with scalars,
-    too. The tensors are small: autograd's own calls would take most of a training step.
+    is component k. x are the multivectors. e_w is each blade of the algebra's null vectors; the
+    first is 1. W is a matrix over channels for each equivariant map. Component 1 also mixes with
+    scalars. The tensors are small, so autograd's calls would take most of a training step.
 
     Args:
         multivectors: (*tokens, c, k), c channels of k components.
         scalars: (*tokens, s).
         weight: A matrix for each equivariant map (maps, c, c_out).
-        from_weight, from_bias: Linear map from scalars to components 1.
-        to_weight, to_bias: Linear map from components 1 and scalars to scalars.
+        from_weight, from_bias: Linear map from scalars to component 1.
+        to_weight, to_bias: Linear map from component 1 and scalars to scalars.
         maps: Row of ``weight`` for each blade w and component (2**r, k), with r null vectors.
-        null_wedges: Matrix that maps x to e_w ^ x, for each w, the identity first (2**r, k, k).
+        null_wedges: Matrix that maps x to e_w ^ x for each w (2**r, k, k), the identity first.
     """
 
     @staticmethod

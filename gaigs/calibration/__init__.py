@@ -1,4 +1,4 @@
-"""Intervals of predictions, calibrated at links that the predicting model has not seen."""
+"""Intervals of predictions, calibrated at links outside the training."""
 
 from gaigs.calibration.conformal import Calibration, Estimate, fewest
 

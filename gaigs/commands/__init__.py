@@ -18,24 +18,24 @@ COMMANDS = ("agreement", "describe", "survey", "place", "locate", "export", "vie
 def run(configuration: Mapping, folder: str | Path, launcher: str | None = None) -> dict | None:
     """Executes the command of a configuration, as ``python -m gaigs`` does.
 
-    A run that was stopped is resumed.
+    An interrupted run in the same folder is resumed.
 
     Args:
         configuration: The result of ``gaigs.compose``.
-        folder: Gets the results; with ``command=train`` the run folder of docs/start.md.
-        launcher: Class name of Hydra's launcher in a job of a multirun; None elsewhere.
+        folder: Folder of the results; with ``command=train`` the run folder of docs/start.md.
+        launcher: Class name of Hydra's launcher in a job of a multirun; None otherwise.
 
     Returns:
-        With ``command=train`` the contents of ``metrics.json``, or None in all but the first of
-        several processes. None with the other commands.
+        With ``command=train`` the contents of ``metrics.json``; None in all other commands, and in
+        all but the first of several processes.
 
     Raises:
         TypeError, ValueError: The configuration does not fit the data, or the folder holds another
             run.
         ImportError: A component needs a package that is not installed.
         OSError: A file cannot be read or written; no partial file is left.
-        KeyboardInterrupt: Ctrl-C; ``gaigs.processes.Stopped`` for it, SIGTERM and SIGHUP within a
-            training.
+        KeyboardInterrupt: Ctrl-C. Within a training Ctrl-C, SIGTERM and SIGHUP raise its subclass
+            ``gaigs.processes.Stopped``.
 
     Example:
         >>> words = "model=knn", "data.transmitters=40", "data.order=0"
@@ -88,7 +88,7 @@ def _check_command(command: str) -> None:
 
 @usual_modes()
 def _execute(config: dict, folder: Path, launcher: str | None) -> dict | None:
-    """Executes the command of a configuration; its keys and the command's name are checked."""
+    """Executes the command of a configuration after a check of its keys and the command's name."""
     command = config["command"]
     if config["folder"] is not None and command in ("train", "describe", "agreement"):
         remedy = "hydra.run.dir=..." if command == "train" else "data=... and split=..."

@@ -26,7 +26,7 @@ log = logging.getLogger("gaigs")
 
 
 class Job(NamedTuple):
-    """What Hydra knows of a job."""
+    """Facts of a job from Hydra."""
 
     folder: Path  # the run folder
     is_sweep: bool  # True for a job of a multirun
@@ -37,9 +37,9 @@ class Job(NamedTuple):
 def run(config: DictConfig) -> float | None:
     """One job: ``gaigs.run`` in Hydra's run folder; returns the validation score for sweepers.
 
-    An error that a user can correct becomes one message; ``hydra.verbose=true`` prints the
-    traceback first. A signal ends the process with 128 and the signal's number, as in shells.
-    Without a result there is no folder.
+    An error that a user can correct is printed as one message. ``hydra.verbose=true`` prints the
+    traceback first. A signal ends the process with code 128 plus the signal's number, as in shells.
+    A run folder without a result is removed.
     """
     settings = HydraConfig.get()
     job = describe_job(settings, config.get("command"))
@@ -77,7 +77,7 @@ def describe_job(settings: DictConfig, command: str | None) -> Job:
 
 
 def end_stopped(job: Job, stop: KeyboardInterrupt) -> NoReturn:
-    """Ends a job after a signal: the process, or within a launcher's process this job alone."""
+    """Ends a job after a signal: the process, or within a launcher's process only this job."""
     message = f"gaigs: {str(stop) or 'stopped'}; {job.goes_on}"
     number = getattr(stop, "number", signal.SIGINT)
     if job.is_sweep and job.launcher != "BasicLauncher":
@@ -94,7 +94,7 @@ def end_stopped(job: Job, stop: KeyboardInterrupt) -> NoReturn:
 def end_failed(job: Job, error: Exception, is_verbose: bool) -> NoReturn:
     """Ends a job after an error, with one message or else the traceback.
 
-    A single run ends the process; a job of a sweep raises, so that Hydra goes on with the others.
+    A single run ends the process. A job of a sweep raises, so that Hydra continues with other jobs.
     """
     message = processes.advice(error, job.folder, job.goes_on)
     if is_verbose or (message is None and not job.is_sweep):
@@ -113,7 +113,7 @@ def end_failed(job: Job, error: Exception, is_verbose: bool) -> NoReturn:
 
 
 def note_task(words: list[str], config: dict) -> None:
-    """Logs a warning if the experiment's name is of another task than the data's labels."""
+    """Logs a warning if the experiment's name is of another task than the labels."""
     parts = [config.get(key) for key in ("task", "data")]
     if not all(isinstance(part, dict) and "name" in part for part in parts):
         return  # the check of the configuration says what is wrong
@@ -127,9 +127,9 @@ def note_task(words: list[str], config: dict) -> None:
 
 
 def remove_without_result(folder: Path) -> None:
-    """Removes a run folder without a result, unless a run is at work there.
+    """Removes a run folder without a result, unless a run is using it.
 
-    Such a folder has only what Hydra and the start of a run write.
+    Such a folder holds only files of Hydra and of the start of a run.
     """
     begun = {".hydra", "gaigs.log", "config.yaml", "software.json", LOCK}
     with contextlib.suppress(OSError, ValueError), processes.only_run(folder):
@@ -140,7 +140,7 @@ def remove_without_result(folder: Path) -> None:
 
 
 def wrong_flag() -> str | None:
-    """The message for a flag on the command line that Hydra does not have; None if it has all."""
+    """The message for a command-line flag unknown to Hydra; None if all are known."""
     _, unknown = get_args_parser().parse_known_args()
     for word in unknown:
         if word.startswith("-"):
@@ -187,7 +187,7 @@ def main() -> None:
     signals = []
 
     def stop(number: int, _) -> None:
-        """Jobs in other processes save and end; this one waits for them."""
+        """Lets jobs in other processes save and end, and waits for them."""
         signals.append(number)
         processes.hang_up(number)
         processes.forward_to_children(number)

@@ -1,4 +1,4 @@
-"""A first look at links: what was read, what was left out, and what is suspicious."""
+"""A first look at links: extent, readings left out, and suspected faults."""
 
 import math
 from dataclasses import dataclass
@@ -25,10 +25,10 @@ from gaigs.report import style
 
 @dataclass(frozen=True)
 class Description:
-    """What ``describe`` finds; its text is one screen.
+    """Facts and suspected faults of a data set, as text of one screen.
 
     Attributes:
-        read: Sentences on the links, places, labels and receivers, and on readings left out.
+        read: Sentences on the links, places, labels and receivers, and on excluded readings.
         findings: What is probably wrong, and how to correct it.
 
     Example:
@@ -55,7 +55,7 @@ class Description:
 
 @torch.no_grad()
 def describe(links: Links) -> Description:
-    """A first look at links of any task: extent, levels, receivers, and what is suspicious.
+    """A first look at links of any task: extent, levels, receivers, and suspected faults.
 
     Args:
         links: With or without a split.
@@ -88,7 +88,7 @@ class Levels:
 
     @classmethod
     def of(cls, links: Links, most: int = 2000) -> "Levels":
-        """Levels of all links; of up to ``most``, evenly spread, where labels are arrays."""
+        """Levels of all links; for arrays of up to ``most`` links, evenly spread."""
         task = links.task
         index = torch.arange(len(links))
         if task.shape:
@@ -184,8 +184,8 @@ def figure(links: Links) -> Figure:
 def draw_places(axis: Axes, links: Links, levels: Levels) -> None:
     """Draws places and receivers from above.
 
-    Colours show how many receivers receive a place. If this number is the same everywhere, they
-    show the level at the first receiver.
+    Colours show the number of receivers that receive each place. If this number is the same
+    everywhere, colours show the level at the first receiver.
     """
     query = links.query
     pairs = torch.cat((query.transmitters, query.receivers[:, None].float()), 1).unique(dim=0)
@@ -214,9 +214,9 @@ def draw_places(axis: Axes, links: Links, levels: Levels) -> None:
 
 
 def draw_histogram(axis: Axes, levels: Levels, is_noisy: bool, bins: int = 40) -> None:
-    """Draws how many links have each level.
+    """Draws a histogram of the links' levels.
 
-    Noisy levels are often whole numbers: their bins hold equally many of these.
+    Noisy levels are often whole numbers, so each bin spans the same number of whole numbers.
     """
     edges: int | np.ndarray = bins
     low = math.floor(levels.values.min().item())

@@ -1,4 +1,4 @@
-"""Configurations: the files that Hydra joins, the check of the result, and messages of errors."""
+"""Configurations: the files that Hydra joins, the check of the result, and error messages."""
 
 from gaigs.configuration import hydra_plugins
 from gaigs.configuration.composing import compose, composed, preset, resolve

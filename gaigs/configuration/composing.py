@@ -26,15 +26,15 @@ READ_BY_LINKS = ("data", "split", "task")
 
 
 def compose(*overrides: str, **options) -> dict:
-    """The configuration of a run, as the command line makes it.
+    """The configuration of a run, in the form that the command line makes.
 
-    Overrides change the presets, and options change both.
+    Overrides change the presets. Options change presets and overrides.
 
     Args:
         overrides: Command-line words, e.g. ``"+experiment=mirrored"`` or
             ``"trainer.max_steps=300"``.
-        options: Values by their keys, ``**{"trainer.max_steps": 300}``, or by an option's name
-            alone if only one part has it, ``max_steps=300``. A part is chosen by its name,
+        options: Values by their keys, ``**{"trainer.max_steps": 300}``, or by the option's name,
+            ``max_steps=300``, if only one part has it. A part is chosen by its name,
             ``tokenizer="ga"``, by a mapping with a name and options, or by an object.
 
     Returns:
@@ -54,7 +54,7 @@ def compose(*overrides: str, **options) -> dict:
 
 
 def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str] = ()) -> dict:
-    """Like ``compose``; with sections, options are looked up in these sections only."""
+    """Like ``compose``; with ``sections`` options are searched only in these sections."""
     choices, values = _choices(options)
     with _composing:
         running = GlobalHydra.instance()
@@ -94,7 +94,7 @@ def preset(model: str, task: str) -> list[str]:
 def resolve(config: DictConfig) -> dict:
     """A composed configuration in plain dictionaries, unchecked.
 
-    A baseline that is a name alone becomes a mapping with that name.
+    A baseline given as a name becomes a mapping with this name.
     """
     try:
         plain: Any = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -111,7 +111,7 @@ def resolve(config: DictConfig) -> dict:
 
 
 def _missing_value(key: str, model: str) -> str:
-    """The message for a mandatory value that is not given."""
+    """The message for a missing mandatory value."""
     words = {"model.trend": "kriging=true", "model.members": "ensemble=5"}
     if key in words and model in ("kriging", "ensemble"):
         return f"model {model!r} is made from trained models; set {words[key]}, with any model"
@@ -126,7 +126,7 @@ def _missing_value(key: str, model: str) -> str:
 
 
 def _choices(options: Mapping) -> tuple[list[str], dict]:
-    """Command-line words that choose parts, and the other options with plain values."""
+    """Command-line words that choose parts, and all other options as plain values."""
     choices, values = [], {}
     for key, value in options.items():
         value = storable(value, key)
@@ -148,7 +148,8 @@ def _choices(options: Mapping) -> tuple[list[str], dict]:
 def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
     """The full key of an option.
 
-    A name with dots or of a top-level key is the key itself; other names are options of one part.
+    A name with dots, or of a top-level key, is already the key. Other names are options of one
+    part.
     """
     is_new = name.startswith("+")
     name = name.removeprefix("+")
@@ -174,7 +175,7 @@ def _path(config: DictConfig, name: str, sections: Sequence[str]) -> str:
 
 
 def _check_parent(config: DictConfig, key: str, is_new: bool) -> None:
-    """Raises a ``ValueError`` for a key that its mapping does not have, unless it is new."""
+    """Raises a ``ValueError`` for a key that its mapping does not have, unless the key is new."""
     place, _, last = key.rpartition(".")
     parent = OmegaConf.select(config, place) if place else config
     known = sorted(map(str, parent)) if isinstance(parent, DictConfig) else []
@@ -187,7 +188,7 @@ def _unknown_option(config: dict, name: str, sections: Sequence[str], names: set
     """The message for an option that no part has.
 
     Args:
-        sections: Keys of the parts that were searched; all without any.
+        sections: Keys of the parts that were searched; empty for all parts.
         names: Options that the parts have.
     """
     if sections:

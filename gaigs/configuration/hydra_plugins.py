@@ -34,8 +34,8 @@ class PluginConfigurations(SearchPathPlugin):
 class Constructors(ConfigSource):
     """The configuration of a component: ``name``, and its constructor's options with defaults.
 
-    For a data reader it also chooses the task and the split that ``gaigs.register`` notes. A YAML
-    file of the same name replaces it; such a file includes the options from
+    The configuration of a data reader also selects task and split, as given to ``gaigs.register``.
+    A YAML file of the same name replaces it. Such a file includes the options from
     ``constructors/<kind>/<name>``.
     """
 
@@ -92,7 +92,7 @@ class Constructors(ConfigSource):
 
 
 def run_folder(overrides: str) -> str:
-    """The folder name of a job from its overrides, of 200 bytes: most file systems allow 255."""
+    """The folder name of a job from its overrides, at most 200 bytes: file systems allow 255."""
     name = overrides.replace("/", "_") or "defaults"
     if name == overrides and len(name.encode()) <= 200:
         return name
@@ -110,7 +110,7 @@ def installed(*names: str) -> str:
 
 
 def known(kind: str, name: str, otherwise: str) -> str:
-    """``name`` if a configuration file or a component of the kind has it, else ``otherwise``."""
+    """``name`` if the kind has a configuration file or component of it, else ``otherwise``."""
     return name if files_of(kind, name) or name in registry(kind).names() else otherwise
 
 
@@ -131,7 +131,7 @@ def launcher(name: str) -> str:
 def install() -> None:
     """Registers the extensions with Hydra and OmegaConf.
 
-    It is called at import, since the workers of a launcher need them, too.
+    The function is called at import, since the workers of a launcher also need them.
     """
     for resolver in (run_folder, known, by_task, launcher):
         OmegaConf.register_new_resolver(resolver.__name__, resolver, replace=True)

@@ -42,7 +42,7 @@ KEYS = {
 def differences(there: Mapping, here: Mapping, prefix: str = "") -> dict[str, tuple]:
     """Values of two configurations at the keys in which they differ, without ``HARMLESS`` keys.
 
-    Keys are joined by dots and sorted. Where a part has another name, only its names are compared.
+    Keys are joined by dots and sorted. If the name of a part differs, only the names are compared.
     """
     pairs: dict[str, tuple] = {}
     for key in sorted(there.keys() | here.keys()):
@@ -95,7 +95,7 @@ def _check_task(task: dict) -> None:
 def option_keys(config: Mapping, parts: Iterable[str], prefix: str = "") -> Iterator[str]:
     """Full keys of the options below some keys of a configuration, joined by dots.
 
-    Options that refer to another part by ``${...}`` are left out.
+    Options that refer to another part with ``${...}`` are left out.
 
     Args:
         parts: Keys of ``config``.

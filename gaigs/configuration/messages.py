@@ -1,4 +1,4 @@
-"""Messages of errors in configurations."""
+"""Error messages of configurations."""
 
 import sys
 import traceback
@@ -87,7 +87,7 @@ def is_multirun() -> bool:
 
 
 def nearest(word: str, config: Mapping) -> str:
-    """Full keys of the options with the name most similar to a word, joined by or; may be empty."""
+    """Full keys of the options with the most similar name, joined by "or"; may be empty."""
     parts = config.keys() - {"hydra", "survey", "place", "locate", "export", "view"}
     names = {key: key.rpartition(".")[2] for key in (*parts, *option_keys(config, parts))}
     near = similar(word, {*names.values()} - {"name"})

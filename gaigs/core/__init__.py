@@ -1,1 +1,1 @@
-"""Geometry, antennas, queries, tasks and laws of propagation, which all other parts share."""
+"""Geometry, antennas, queries, tasks and laws of propagation, used by all other parts."""

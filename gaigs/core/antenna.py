@@ -25,8 +25,8 @@ class Array:
 
     Attributes:
         elements: Positions in the array's own frame (e, 3) [m].
-        pattern: Field pattern of each element, ``isotropic``, or ``cosine``, of the angle to the
-            array's normal and 0 behind it.
+        pattern: Field pattern of each element: ``isotropic``, or ``cosine``. A cosine pattern is
+            the cosine of the angle to the array's normal, and 0 behind the array.
 
     Example:
         >>> len(gaigs.Array.planar(4, 4, pitch=0.16)), len(gaigs.Array.single())
@@ -57,8 +57,8 @@ class Array:
 
         Args:
             rows, columns: Numbers of elements along y and along x.
-            pitch: Distance of neighbouring elements [m].
-            pattern: As the attribute.
+            pitch: Distance between neighbouring elements [m].
+            pattern: Field pattern of each element, ``isotropic`` or ``cosine``.
         """
         if rows < 1 or columns < 1 or not 0 < pitch < math.inf:
             raise ValueError(
@@ -82,9 +82,11 @@ class Array:
 
     @functools.cached_property
     def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"], Float[Tensor, " l"]]:
-        """Distinct vectors between elements [m], each pair's vector by number, and pairs of each.
+        """Distinct vectors between elements [m], the number of each pair's vector, and pairs per
+        vector.
 
-        A field's covariance depends on these vectors alone; a 4 x 4 array has 49. All in float64.
+        The covariance of a field depends on these vectors alone. A 4 x 4 array has 49 of them.
+        Tensors are float64.
         """
         # Cached tensors of inference mode could not be saved for a later backward pass.
         with torch.inference_mode(False):
@@ -108,11 +110,11 @@ class Array:
 
 @dataclass(frozen=True)
 class Receiver:
-    """An antenna array or gateway: its name in files and tables, its pose in the room, its antenna.
+    """An antenna array or gateway: its name in files and tables, its pose and its antenna.
 
     Attributes:
-        band: Lowest frequency that it receives, and the end of its band, not included [Hz]. Its
-            channels are 0 at other subcarriers. By default it receives all.
+        band: Lowest and highest frequency that the antenna receives [Hz], the highest excluded.
+            Channels are 0 at subcarriers outside the band. By default the band is unlimited.
 
     Example:
         >>> pose = gaigs.Pose.from_xyzw([1.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0])
@@ -154,9 +156,10 @@ def lacking(
     count: int,
     frequencies: Float[Tensor, " s"],
 ) -> Bool[Tensor, "b e s"]:
-    """True where a number of a channel (b, e, s) does not exist at the link's receiver.
+    """True where a link's receiver has no element or no subcarrier of a channel (b, e, s).
 
-    Its array has only the first few of the ``count`` elements, or its band excludes the subcarrier.
+    A receiver's array may have fewer than ``count`` elements; the last ones are then missing. A
+    receiver's band may exclude subcarriers.
     """
     sizes = torch.tensor([len(receiver.array) for receiver in receivers])
     hears = torch.stack([receiver.hears(frequencies.cpu()) for receiver in receivers])  # (r, s)

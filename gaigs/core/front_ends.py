@@ -1,4 +1,4 @@
-"""Responses of front ends: factors of elements and subcarriers that a receiver's links share."""
+"""Responses of front ends: factors of elements and subcarriers, common to a receiver's links."""
 
 import math
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class FrontEnd(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """A front end with its shape, and mean scores of free space at places left out of the fit."""
+    """A front end with its shape, and mean scores of free space at places outside the fit."""
 
     front_end: FrontEnd
     shape: Shape
@@ -47,9 +47,9 @@ class Chosen(NamedTuple):
 
 @dataclass(frozen=True)
 class FrontEndOptions:
-    """When a receiver gets a response."""
+    """Conditions under which a receiver gets a response."""
 
-    fewest_places: int = 12  # fewer places tell nothing beside their own reflections
+    fewest_places: int = 12  # at fewer places reflections do not average out
     # Least gain of free space's mean score at places left out [dB]; without a front end it is
     # within 0.02 dB in the built-in room.
     least_gain: float = 0.2
@@ -63,19 +63,22 @@ class FrontEndOptions:
 
 
 class FrontEndFit:
-    """Fit of a response to the links of one receiver, by what it adds to free space.
+    """Fit of a front end's response to the links of one receiver, judged by its gain over free
+    space.
 
-    A link is h = g R w exp(j (phi + 2 pi f tau)) + error, with the response R, the direct wave w
-    and a positive gain g; phi and tau are 0 unless the task says that they are unknown. Reflections
-    are errors, whose mean over places vanishes. The likelihood is maximised in turns: phi, tau and
-    g of each link, then R, the mean of h / w weighted by the inverse errors of the links.
+    A link is h = g R w exp(j (phi + 2 pi f tau)) + error. R is the response, w the direct wave, and
+    g a positive gain. The phase phi and the delay tau are 0 if the task's phase is known.
+    Reflections are part of the error; their mean over places vanishes.
+
+    The likelihood is maximised in turns. The first turn fits phi, tau and g of each link. The
+    second turn fits R as the mean of h / w, with links weighted by their inverse errors.
 
     Args:
         labels: Channels of the links.
         waves: ``direct_waves`` of the same links.
-        task: Of the labels; ``gaigs.core.task.csi.Csi``.
+        task: The task of the labels, a ``gaigs.core.task.csi.Csi``.
 
-    Source: ours; the turns are Gerchberg and Saxton's (1972) for unknown phases.
+    Source: ours; the turns are by Gerchberg and Saxton (1972), for unknown phases.
     """
 
     def __init__(
@@ -95,7 +98,7 @@ class FrontEndFit:
         return FrontEndFit(self.labels[index], self.waves[index], self.task, self.options)
 
     def start(self, shape: Shape) -> FrontEnd:
-        """The best of several starts: the mean over links, or single links of unknown phase."""
+        """The best fit of several starts: the mean over links, or single links of unknown phase."""
         strengths = self.waves.abs()
         relative = self.labels * self.waves.conj() / torch.where(strengths > 0, strengths, 1)
         starts = [relative.mean(0)]
@@ -106,7 +109,7 @@ class FrontEndFit:
         return max(front_ends, key=lambda front_end: front_end.explained)
 
     def run(self, shape: Shape, response: Complex[Tensor, "e s"]) -> FrontEnd:
-        """The front end after turns of alignment and weighted mean, which begin at a response."""
+        """The front end after turns of alignment and weighted mean, starting at ``response``."""
         response = self._normal(self._smooth(response, shape))
         for _ in range(self.options.rounds):
             model = response * self.waves  # (n, e, s)
@@ -130,15 +133,15 @@ class FrontEndFit:
         return FrontEnd(response, scatter, (1 - errors).mean().item())
 
     def likeness(self) -> float:
-        """Share of a few links' power that a free response and the direct wave explain."""
+        """Fraction of a few links' power that a free response and the direct wave explain."""
         thinned = self.at(evenly(torch.arange(len(self.labels)), 64))
         return thinned.start(Shape(max(self.options.counts), True)).explained
 
     def choose(self, places: Int[Tensor, " n"]) -> Chosen | None:
-        """The front end of the shape that scores best at places left out of its fit.
+        """The front end of the shape with the best score at places left out of its fit.
 
-        ``places`` are the numbers of the links' places. None if no shape improves free space by
-        ``least_gain``.
+        ``places`` are the numbers of the links' places. The result is None if every shape gains
+        less than ``least_gain`` over free space.
         """
         options = self.options
         has_array = self.labels.shape[1] > 1
@@ -173,9 +176,9 @@ class FrontEndFit:
     def left_out(
         self, places: Int[Tensor, " n"], shape: Shape | None, start: Complex[Tensor, "e s"]
     ) -> Float[Tensor, " p"]:
-        """Mean score of free space at each place, with a response of this shape.
+        """Mean score at each place of free space times a response of this shape.
 
-        The response is fitted to links of places in other folds; shape None: no response.
+        The response is fitted to links in other folds of places. Without a shape the response is 1.
         """
         groups, number = places.unique(return_inverse=True)
         order = torch.randperm(len(groups), generator=torch.Generator().manual_seed(0))
@@ -189,7 +192,7 @@ class FrontEndFit:
                 response = rest.run(shape, start).response
             gain = fit_gain(rest.labels, response * rest.waves)
             values = gain * response * self.waves[asked]
-            # The task's elements are those of the largest array; smaller ones have zeros.
+            # The task has the elements of the largest array; smaller arrays have zeros.
             padding = (0, 0, 0, self.task.elements - values.shape[1])
             labels = torch.nn.functional.pad(self.labels[asked], padding)
             values = torch.nn.functional.pad(values, padding)
@@ -198,7 +201,7 @@ class FrontEndFit:
         return totals / number.bincount()
 
     def _most(self, numbers: int) -> int:
-        """Number of links that have so many numbers together; 64 at least."""
+        """Number of links with ``numbers`` values together; at least 64."""
         return max(64, numbers // self.labels[0].numel())
 
     def _smooth(self, response: Complex[Tensor, "e s"], shape: Shape) -> Complex[Tensor, "e s"]:
@@ -220,7 +223,7 @@ class FrontEndFit:
         return basis
 
     def _normal(self, response: Complex[Tensor, "e s"]) -> Complex[Tensor, "e s"]:
-        """The response scaled to a mean power of 1, without its delay if links' are unknown."""
+        """The response scaled to a mean power of 1; without its delay if links' are unknown."""
         if self.task.phase == "per_link_and_delay":
             ones = torch.ones_like(response)
             response = response * alignment(response, ones, self.task.frequencies)
@@ -228,9 +231,9 @@ class FrontEndFit:
 
 
 def _polynomials(frequencies: Float[Tensor, " s"], count: int) -> Float[Tensor, "s k"]:
-    """Orthonormal polynomials over the band, k = ``count`` of degrees from 0.
+    """Orthonormal polynomials of degrees 0 to ``count`` - 1 over the band.
 
-    They come from Chebyshev's polynomials, cos(n arccos x).
+    A QR decomposition makes Chebyshev polynomials, cos(n arccos x), orthonormal at the subcarriers.
     """
     middle = (frequencies.min() + frequencies.max()) / 2
     half = (frequencies.max() - middle).clamp_min(1)

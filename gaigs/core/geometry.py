@@ -25,8 +25,8 @@ class Frame:
     """Place of the world frame on a map: its origin (x, y) [m] in a projected system (EPSG code).
 
     Raises:
-        ValueError: There is no such system, its unit is not the metre, or the origin is outside of
-            the system. Without pyproj systems other than UTM are not checked.
+        ValueError: The system does not exist, its unit is not the metre, or the origin is outside
+            the system. Without pyproj only UTM systems are checked.
 
     Example:
         >>> places = [[10.0, 20.0, 1.5], [30.0, 5.0, 1.5], [0.0, 9.0, 1.5]]
@@ -208,7 +208,7 @@ def from_spherical(
 def polar(
     amplitudes: Float[Tensor, "*batch"], phases: Float[Tensor, "*batch"]
 ) -> Complex[Tensor, "*batch"]:
-    """``torch.polar`` with value and gradient 0 below ``FAINTEST``, where torch's is NaN."""
+    """``torch.polar``, but with value and gradient 0 below ``FAINTEST``, where torch has NaN."""
     return torch.polar(amplitudes.masked_fill(amplitudes < FAINTEST, 0), phases)
 
 
@@ -245,12 +245,12 @@ def sinc(values: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
 def spherical_harmonics(
     vectors: Float[Tensor, "*batch 3"], degree: int
 ) -> Float[Tensor, "*batch k"]:
-    """The k = (degree + 1)² real spherical harmonics of degree n up to ``degree``.
+    """The k = (degree + 1)² real spherical harmonics up to ``degree``.
 
-    Number n² + n + m is sqrt(2) N P_n^|m|(z) times cos(m az) for m > 0, sin(|m| az) for m < 0, and
-    N P_n(z) for m = 0. P has the factor (-1)^m, and N makes the mean square over the sphere 1 / 4
-    pi, as in .ply viewers. The recurrence over n runs on N P_n^m / sin^m, a polynomial in z, so
-    values and gradients are finite at the poles.
+    Harmonic number n² + n + m, of degree n and order m, is sqrt(2) N P_n^|m|(z) cos(m az) for m >
+    0, sqrt(2) N P_n^|m|(z) sin(|m| az) for m < 0, and N P_n(z) for m = 0. P has the factor (-1)^m.
+    N makes the mean square over the sphere 1 / 4 pi, as in .ply viewers. The recurrence computes N
+    P_n^m / sin^m, a polynomial in z, so values and gradients are finite at the poles.
 
     Source: Holmes and Featherstone, A unified approach to the Clenshaw summation, 2002, section 3.
     """
@@ -359,9 +359,9 @@ class Grid:
 
     @property
     def solid_angles(self) -> Float[Tensor, "rows columns"]:
-        """Shares of the pixels in the grid's solid angle.
+        """Solid angle of each pixel as a fraction of the grid's solid angle.
 
-        Rows meet where the sine of the elevation is halfway between theirs.
+        Two rows meet at the mean of the sines of their elevations.
         """
         if len(self.elevations) < 2:
             raise ValueError(
@@ -409,8 +409,8 @@ def even_places(
 ) -> Float[Tensor, "g 3"]:
     """About ``count`` evenly spaced places in a box [m].
 
-    An edge shorter than their distance has one row of places, in its middle. With heights of
-    ``floors`` [m] places stand at these alone.
+    An edge shorter than the spacing has one row of places, at its middle. With heights of
+    ``floors`` [m] places are at these heights only.
     """
     if len(floors):
         each = max(1, count // len(floors))

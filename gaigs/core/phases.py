@@ -1,4 +1,4 @@
-"""Phases of measured channels: their sign, alignment to waves, and what links have in common."""
+"""Phases of measured channels: their sign, alignment to waves, and parts common to links."""
 
 import math
 from typing import NamedTuple
@@ -15,7 +15,7 @@ MANY = 30
 
 
 class StrangeParts(NamedTuple):
-    """Parts of a receiver whose fixed phases or strengths geometry does not explain."""
+    """Parts of a receiver with fixed phases or gains beyond the geometry."""
 
     elements: bool
     subcarriers: bool
@@ -30,16 +30,16 @@ def phase_sign(
 ) -> int:
     """Sign with which the phases of channels follow the direct distance, -1 or 1; 0 for neither.
 
-    Channels divided by free space of the right sign have a common part at all links of a receiver,
-    the direct path. So the mean over links keeps a share of the power; by chance it keeps about 1 /
-    links. The sign with the larger share wins if this exceeds ``least_share`` plus four times the
-    share by chance: never with fewer than ``TELLING`` links a receiver.
+    A channel divided by free space of the right sign has a constant part: the direct path. The mean
+    over the links of a receiver keeps this part of the power. Random phases would keep about 1 /
+    links of the power. The sign that keeps more power wins if its fraction exceeds ``least_share``
+    plus four times the random fraction. Fewer than ``TELLING`` links a receiver always give 0.
 
     Args:
         channels: Channels of the links.
         waves: ``direct_waves`` of the links with the sign -1.
         receivers: Receiver of each link.
-        least_share: Least share of the power.
+        least_share: Smallest fraction of the power that the mean keeps.
     """
     received = max(1, int((channels.abs().amax((1, 2)) > 0).sum()))  # links with a signal
     shares = {}
@@ -60,10 +60,10 @@ def common_responses(
     receivers: Int[Tensor, " k"],
     sign: int,
 ) -> dict[int, Complex[Tensor, "e s"]]:
-    """Mean over links of channels divided by free space, for each receiver by its number.
+    """Mean over links of channels divided by free space, by the number of the receiver.
 
-    All elements and subcarriers of a receiver have the same mean if their places and frequencies
-    are true. Arguments are as for ``phase_sign``.
+    The mean is the same at all elements and subcarriers if the given elements and frequencies are
+    right. Arguments are as for ``phase_sign``.
     """
     still = _without_phases_of(waves, _relative(channels, waves), sign)
     responses = {}
@@ -81,18 +81,18 @@ def strange_parts(
     common_share: float = 0.7,
     least_share: float = 0.01,
 ) -> dict[int, StrangeParts]:
-    """Receivers at which geometry does not explain fixed phases or strengths of the direct wave.
+    """Receivers whose elements or subcarriers have fixed phases or gains beyond the geometry.
 
-    Receivers with fewer than ``MANY`` links, or without a direct wave, are left out. Elements are
-    strange only if they resolve the directions of the waves: with one direction, reflections would
-    look the same.
+    Receivers with fewer than ``MANY`` links, or without a direct wave, are left out. Elements count
+    only if the directions of the direct waves differ from link to link: with one direction,
+    reflections would look the same.
 
     Args:
         channels, waves, receivers, least_share: As for ``phase_sign``.
         frequencies: Subcarriers [Hz].
         sign: Sign of the channels' phases.
-        common_share: Share of a response's power that elements or subcarriers have in common, below
-            which they are strange; calibrated arrays have 0.99.
+        common_share: Smallest fraction of a response's power in its mean over elements, or over
+            subcarriers. Calibrated arrays reach 0.99.
     """
     strange = {}
     for receiver, response in common_responses(channels, waves, receivers, sign).items():
@@ -140,7 +140,8 @@ def array_sign(
 
     Each link may have a random phase and, with ``frequencies`` [Hz], a random delay. Channels
     divided by free space of the right sign keep more power in the mean over elements and
-    subcarriers; the sign is -1 if both keep the same. Other arguments are as for ``phase_sign``.
+    subcarriers. The sign is -1 if both signs keep the same power. Other arguments are as for
+    ``phase_sign``.
     """
     relative = _relative(channels, waves)
     powers = []
@@ -156,11 +157,11 @@ def alignment(
     waves: Complex[Tensor, "*#k e s"],
     frequencies: Float[Tensor, " s"] | None = None,
 ) -> Complex[Tensor, "*k 1 s"]:
-    """Factors of magnitude 1 that turn channels onto waves by the best common phase.
+    """Factors of magnitude 1 that rotate channels onto waves by the best common phase.
 
-    With ``frequencies`` [Hz] the factors are exp(j (phi + 2 pi f tau)), with the best delay tau.
-    Delays repeat with one over the median spacing of the subcarriers; tau is within half of that
-    period. The result is complex128 and has no gradient.
+    With ``frequencies`` [Hz] the factors are exp(j (phi + 2 pi f tau)) with the best delay tau. A
+    delay is ambiguous by one over the median spacing of the subcarriers; tau is the one nearest to
+    0. The result is complex128 and has no gradient.
     """
     with torch.no_grad():
         cross = (channels.to(torch.complex128) * waves.to(torch.complex128).conj()).sum(-2)
@@ -203,12 +204,13 @@ def unknown_phase(
     frequencies: Float[Tensor, " s"],
     declared: str = "known",
 ) -> str | None:
-    """The ``data.phase`` of channels whose links have unknown phases, if they show it.
+    """The ``data.phase`` that channels show if the phases of their links are random, else None.
 
-    A link's likeness is the share of its power that the direct wave explains after the best phase;
-    by chance it is one over the numbers of a channel. The result is ``per_link`` if the mean
-    likeness is at least a half, 3 dB, and the phases of a receiver's links are as random as by
-    chance. It is ``per_link_and_delay`` if that holds after the best phase and delay.
+    The likeness of a link is the fraction of its power that the direct wave explains after the best
+    phase. Random channels have a likeness of one over elements times subcarriers. The result is
+    ``per_link`` if the mean likeness is at least a half (3 dB) and the phases of a receiver's links
+    are random. The result is ``per_link_and_delay`` if the same holds after the best phase and
+    delay.
 
     Args:
         channels, waves, receivers: As for ``phase_sign``.
@@ -216,8 +218,8 @@ def unknown_phase(
         declared: The phase that the user declares; a likeness of a quarter confirms it.
 
     Returns:
-        The phase. None if phases agree, if the declared one is confirmed, if the direct wave
-        explains too little, or with fewer than ``MANY`` links a receiver.
+        The phase. None if phases are not random, if the declared phase is confirmed, if the direct
+        wave explains too little, or with fewer than ``MANY`` links a receiver.
     """
     chance = len(receivers.unique()) / max(len(receivers), 1)
     if chance > 1 / MANY:
@@ -254,7 +256,7 @@ def unknown_phase(
 def _without_phases_of(
     waves: Complex[Tensor, "k e s"], channels: Complex[Tensor, "k e s"], sign: int
 ) -> Complex[Tensor, "k e s"]:
-    """Channels less the phases of waves.
+    """Channels with the phases of waves removed.
 
     The waves have the sign -1, the channels' phases have ``sign``.
     """
@@ -271,6 +273,6 @@ def _relative(
 
 
 def _normalised(channels: Complex[Tensor, "k e s"]) -> Complex[Tensor, "k e s"]:
-    """Channels of a mean power of 1 each; channels of 0 stay 0."""
+    """Channels scaled to a mean power of 1 each; channels of 0 stay 0."""
     powers = channels.abs().square().mean((1, 2), keepdim=True)
     return channels / torch.where(powers > 0, powers, 1).sqrt()

@@ -40,9 +40,9 @@ def bartlett(
 ) -> Float[Tensor, "..."]:
     """Amplitudes of the conventional (Bartlett) beamformer, root mean square over frequencies.
 
-    At one frequency it is |sum_n y_n exp(-j 2 pi / lambda (r_n . u))| for element n at r_n and the
-    direction u. Its square depends on the y_n through sums over pairs of elements a lag apart: a 4
-    x 4 array has 49 lags, 256 pairs.
+    At one frequency the amplitude is |sum_n y_n exp(-j 2 pi / lambda (r_n . u))| for elements n at
+    r_n and the direction u. Its square is a sum over the distinct vectors between elements: 49 for
+    a 4 x 4 array, in place of 256 pairs.
 
     Args:
         responses: Linear amplitudes of the array's elements at each frequency (..., e, f), for the
@@ -52,7 +52,7 @@ def bartlett(
         frequency: Carrier of the weights [Hz].
 
     Returns:
-        (..., rows, columns), or (..., k) of rays; differentiable, with a gradient of 0 where the
+        Amplitudes (..., rows, columns), or (..., k) for ``Rays``. The gradient is 0 where the
         amplitude is 0.
 
     Source: Bartlett, Smoothing periodograms from time series with continuous spectra, 1948; the
@@ -101,7 +101,10 @@ def min_max(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b rows c
 def fresnel(
     permittivity: complex | Complex[Tensor, "*#batch"], cosines: Float[Tensor, "*#batch"]
 ) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
-    """Fresnel reflection coefficients of a half-space: field across (TE) and in (TM) its plane.
+    """Fresnel reflection coefficients of a half-space.
+
+    The first is for the electric field across the plane of incidence (TE), the second for the field
+    in this plane (TM).
 
     Args:
         permittivity: Complex relative permittivity, for the time dependence exp(+j omega t).
@@ -120,9 +123,9 @@ def slab(
     cosines: Float[Tensor, "*#batch"],
     thickness: float | Float[Tensor, "*#batch"],
 ) -> tuple[Complex[Tensor, "*batch"], Complex[Tensor, "*batch"]]:
-    """Reflection coefficients TE and TM of a slab in air, as ``fresnel``.
+    """Reflection coefficients TE and TM of a slab in air, in the form of ``fresnel``.
 
-    ``thickness`` is in wavelengths of air. A thick slab with losses reflects as a half-space.
+    ``thickness`` is in wavelengths in air. A thick lossy slab reflects like a half-space.
 
     Source: ITU-R P.2040-3, section 2.2.2.2.
     """
@@ -138,9 +141,9 @@ def fit_gain(
 ) -> Complex[Tensor, ""]:
     """The complex gain, complex128, of measured channels h over waves w of gain 1.
 
-    Its magnitude is the median over the links of |h| / |w|. Its phase is the phase of the sum of w*
-    h / (|w| |h|), in which weak links count as much as strong ones. Links with h = 0 or w = 0 do
-    not count; the gain is 0 if there are no others.
+    Its magnitude is the median over links of |h| / |w|. Its phase is the phase of the sum of w* h /
+    (|w| |h|), where weak links count as much as strong ones. Links with h = 0 or w = 0 do not
+    count; without other links the gain is 0.
     """
     h = channels.to(torch.complex128).flatten(1)  # (k, numbers)
     w = waves.to(torch.complex128).flatten(1)
@@ -156,8 +159,8 @@ def fit_gain(
 def common_gain(gains: Inexact[Tensor, " r *shape"]) -> Inexact[Tensor, " *shape"]:
     """Gain expected of an unknown receiver: the mean over receivers.
 
-    For complex gains it is the root mean square with the phase of the mean: phases of cables
-    differ, so a mean would cancel.
+    Complex gains give their root mean square with the phase of their mean. Phases of cables differ,
+    so a plain mean would cancel.
     """
     if not gains.is_complex():
         return gains.mean(0)

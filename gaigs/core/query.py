@@ -22,7 +22,7 @@ ROUNDING = 1e-6
 
 
 def unit_hint(number: float) -> str:
-    """End of an error, such as ``; in MHz?``, if a number is a carrier in that unit; else empty."""
+    """End of an error, such as ``; in MHz?``, if a number is a carrier in another unit."""
     low, high = CARRIERS
     for unit, size in {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}.items():
         if low / size <= number <= high / size:
@@ -31,7 +31,7 @@ def unit_hint(number: float) -> str:
 
 
 def check_carrier(name: str, frequencies: float | Tensor) -> None:
-    """Raises a ``ValueError`` unless every value of the option of that name is a carrier [Hz]."""
+    """Raises a ``ValueError`` unless all values of the option ``name`` are carriers [Hz]."""
     low, high = CARRIERS
     values = torch.as_tensor(frequencies, dtype=torch.float64).flatten()
     for wrong in values[~((values >= low) & (values <= high))][:1].tolist():
@@ -47,9 +47,10 @@ def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
 
 
 def drawn(index: Int[Tensor, " k"], most: int = 10_000) -> Int[Tensor, " j"]:
-    """At most ``most`` of the links, drawn at random: an even step may meet few of the receivers.
+    """At most ``most`` of the links, drawn at random.
 
-    Of 10,000 errors of 3 dB the mean is known to 0.02 dB.
+    Every n-th link could belong to a few receivers only. The mean of 10,000 errors of 3 dB is known
+    to 0.02 dB.
     """
     if len(index) <= most:
         return index
@@ -70,7 +71,7 @@ def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped
 
 
 def as_tensor(name: str, values: object, expected: str) -> Tensor:
-    """Numbers of any kind as a tensor of their own type; a ``ValueError`` for anything else."""
+    """Numbers of any type as a tensor of their own dtype; a ``ValueError`` for anything else."""
     if isinstance(values, Tensor):
         if values.is_meta or values.layout is not torch.strided:
             kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
@@ -100,7 +101,7 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
 
 
 def as_numbers(name: str, values: object, expected: str) -> Tensor:
-    """Real numbers of any kind as a float32 tensor; raises a ``ValueError`` for anything else."""
+    """Real numbers of any type as a float32 tensor; a ``ValueError`` for anything else."""
     expected = f"{expected} in real numbers"
     tensor = as_tensor(name, values, expected)
     if tensor.is_complex() or tensor.dtype == torch.bool:
@@ -109,7 +110,7 @@ def as_numbers(name: str, values: object, expected: str) -> Tensor:
 
 
 def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
-    """Positions of any kind as a float32 tensor [m], checked for shape and range."""
+    """Positions of any type as a float32 tensor [m], checked for shape and range."""
     positions = as_numbers(name, values, "(..., 3) positions [m]")
     if positions.shape == (0,):  # an empty list
         positions = positions.reshape(0, 3)
@@ -126,7 +127,7 @@ def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
 
 
 def as_receivers(values: Any, names: Sequence[str]) -> Int[Tensor, "*points"]:
-    """Indices of receivers, given by names or indices; a ``ValueError`` for an unknown one."""
+    """Indices of receivers, from names or indices; a ``ValueError`` for an unknown one."""
     expected = f"one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
     if isinstance(values, KeysView | ValuesView) or hasattr(values, "to_numpy"):
         values = [*values]
@@ -158,7 +159,7 @@ def _is_text(values: object) -> bool:
 
 
 def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, "*points"] | None:
-    """Carriers that a user asks for, checked [Hz]; for None the only known one, if there is one."""
+    """Carriers of a request, checked [Hz]; for None the only known one, if there is one."""
     if values is None:
         if len(known) > 1:
             span = f"{known[0]:.7g} to {known[-1]:.7g} Hz"
@@ -180,7 +181,7 @@ def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, 
 
 
 def as_subcarriers(values: object) -> Float[Tensor, " s"]:
-    """Different subcarriers that a user asks for [Hz], one or several, in float64 and checked."""
+    """Distinct subcarriers of a request [Hz], one or several, checked, in float64."""
     expected = "different subcarriers (s,) in Hz"
     as_numbers("frequencies", values, expected)
     exact = as_tensor("frequencies", values, expected).detach().cpu()
@@ -199,7 +200,7 @@ def as_subcarriers(values: object) -> Float[Tensor, " s"]:
 
 
 def as_directions(directions: Directions | None, own: Grid | None, task: str) -> Directions | None:
-    """Directions that a user asks for, checked and in float32; for None the label's own."""
+    """Directions of a request, checked, in float32; for None the label's directions."""
     if directions is None:
         return own
     if own is None:
@@ -256,20 +257,20 @@ class Query:
         names: Sequence[str],
         known: Float[Tensor, " f"],
     ) -> tuple["Query", tuple[int, ...]]:
-        """Links from transmitters at a user's positions; every number is checked here alone.
+        """Links from transmitters at a user's positions; every number is checked here.
 
         Args:
-            positions: Positions (..., 3) [m], anything that becomes a float tensor; or a whole
-                query.
+            positions: Positions (..., 3) [m], of any type that converts to a float tensor; or a
+                ``Query``.
             receiver: Name or index of the receiver, or a list with one for each position; None:
                 all receivers.
-            frequency: Carrier, one for all or one for each position [Hz]; None is the known one.
+            frequency: Carrier, one for all or one for each position [Hz]; None: the known one.
             names: Names of the scene's receivers.
-            known: Different carriers of the training links, ascending [Hz]; empty if unknown.
+            known: Distinct carriers of the training links, ascending [Hz]; empty if unknown.
 
         Returns:
-            The links in the order of ``positions.reshape(-1, 3)``, and their axes: the leading ones
-            of the positions, and a last one of all receivers if none is given.
+            The links in the order of ``positions.reshape(-1, 3)``, and the shape of the result: the
+            leading axes of the positions, and a last axis for all receivers if none is given.
         """
         if isinstance(positions, Query):
             if frequency is not None or receiver is not None:
@@ -328,15 +329,15 @@ class Query:
 
     @property
     def votes(self) -> Float[Tensor, " b"]:
-        """Weights with which repeated readings of a place, receiver and carrier have one vote."""
+        """Weights such that repeated readings of a place, receiver and carrier count as one."""
         _, which = self.unique(with_receivers=True)
         return which.bincount().double().reciprocal()[which]
 
     def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, " b"]]:
-        """The different links, sorted by position, frequency and receiver, and each link's index.
+        """The distinct links, sorted by position, frequency and receiver, and each link's number
+        among them.
 
-        Without receivers, links that differ in the receiver alone are equal; the result has one of
-        them.
+        Without ``with_receivers`` links that differ only in the receiver are equal.
         """
         others = [self.frequencies] if self.frequencies is not None else []
         others += [self.receivers] if with_receivers else []
@@ -363,8 +364,8 @@ class Batch:
     Attributes:
         directions: Directions to predict, the same for all links; None if labels have none.
         labels: Measured values (b, ...), of the task's shape; None when predicting.
-        shares: Weights of this batch's mean over links, and of its mean over places. The mean of
-            all processes that train together is then the mean over all their links, or places.
+        shares: Weights of this batch's mean over links and of its mean over places. They make the
+            average over training processes equal to the mean over all links, or all places.
     """
 
     query: Query

@@ -1,4 +1,4 @@
-"""Results as plots and data sets, by libraries that are imported when they are asked for."""
+"""Results as plots and data sets; the libraries are imported on request."""
 
 import importlib
 from types import ModuleType
@@ -24,7 +24,7 @@ def plot(result: Any, /, ax: Any = None, **options: Any) -> Any:
 
     Args:
         result: A result of the table.
-        ax: Axes of matplotlib to draw on; None: a figure of pyplot, with all panels.
+        ax: Matplotlib axes to draw on; None: a new pyplot figure with all panels.
         options: See the table.
 
     Returns:
@@ -32,7 +32,7 @@ def plot(result: Any, /, ax: Any = None, **options: Any) -> Any:
 
     Raises:
         TypeError: The result has no plot.
-        ValueError: An option is unknown, or ``ax`` is one for several panels.
+        ValueError: An option is unknown, or the result has several panels and ``ax`` is given.
         ImportError: Matplotlib is not installed.
 
     Example:
@@ -70,7 +70,7 @@ def plot(result: Any, /, ax: Any = None, **options: Any) -> Any:
 
 
 def library(name: str, purpose: str) -> ModuleType:
-    """A library that ``purpose`` needs; an ``ImportError`` that says how to install it."""
+    """A library for a ``purpose``; an ``ImportError`` with the command to install it."""
     try:
         return importlib.import_module(name)
     except ImportError as error:

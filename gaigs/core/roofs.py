@@ -1,4 +1,4 @@
-"""Buildings between the ends of a link: how they block the direct path, and the loss over roofs."""
+"""Buildings between the ends of a link: blocking of the direct path, and the loss over roofs."""
 
 import math
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ def rasterize_roofs(
     most: float = 4e6,  # cells; 16 MB of a checkpoint
     nothing: float = -1e4,  # [m], without a building; a checkpoint takes finite numbers alone
 ) -> Roofs:
-    """The roofs within a box; cells grow where there would be more than ``most``."""
+    """The roofs within a box; cells are enlarged if there would be more than ``most``."""
     size = upper - lower
     cell = max(cell, math.sqrt(size.prod() / most))
     columns, rows = np.ceil(size / cell).astype(int) + 1
@@ -62,12 +62,13 @@ def obstruct(
 ) -> Float[Tensor, "b 4"]:
     """Obstruction of the direct paths from ``starts`` to ``ends`` [m] by roofs.
 
-    Paths are sampled about once a cell. Samples within 1.5 cells of an end do not count: an antenna
-    at a wall may be in the building's cell. The knife-edge loss depends on the ``wavelength`` [m].
+    Paths are sampled about once a cell. Samples within 1.5 cells of an end do not count, since the
+    cell of an antenna at a wall may belong to the building. The knife-edge loss depends on the
+    ``wavelength`` [m].
 
     Returns:
-        Four numbers of each path: 1 if a roof is above it, else 0; its length inside buildings [m];
-        the number of walls that it crosses; knife-edge loss over the roofs [dB].
+        Four numbers for each path: 1 if a roof is above it, else 0; its length inside buildings
+        [m]; the number of walls that it crosses; its knife-edge loss over the roofs [dB].
     """
     plan = (ends - starts)[:, :2].norm(dim=1, keepdim=True).clamp_min(1e-3)  # (b, 1)
     count = max(2, math.ceil(plan.max().item() / roofs.cell)) if len(plan) else 2
@@ -100,17 +101,17 @@ def _bullington(
     plan: Float[Tensor, "b 1"],
     wavelength: float,
 ) -> Float[Tensor, " b"]:
-    """v of ``knife_edge`` for all roofs along each path together.
+    """Parameter v of ``knife_edge`` for each path, with all its roofs as one edge.
 
-    If roofs block the path, they count as one edge where the steepest lines from both ends meet;
-    else the roof with the largest v counts.
+    If roofs block the path, the edge is where the steepest lines from both ends meet. Otherwise it
+    is the roof with the largest v.
 
     Args:
         roof: Heights at the samples of the path [m], -inf without a roof.
         start, end: Heights of the ends [m].
         before: Horizontal distance of each sample from the start [m].
-        plan: Horizontal distance of the ends [m].
-        wavelength: [m].
+        plan: Horizontal distance between the ends [m].
+        wavelength: Wavelength [m].
 
     Source: ITU-R P.526-15, section 4.5.1, over a flat earth.
     """
@@ -129,8 +130,8 @@ def _bullington(
 def knife_edge(v: Tensor) -> Tensor:
     """J(v) = 6.9 + 20 log10(sqrt((v - 0.1)² + 1) + v - 0.1) [dB], 0 below v = -0.78.
 
-    v is the height of an edge over the direct path in units of the wavelength and the distances of
-    the ends, h sqrt(2 / lambda (1 / d1 + 1 / d2)).
+    v = h sqrt(2 / lambda (1 / d1 + 1 / d2)), with h the height of the edge above the direct path
+    and d1, d2 its distances from the ends.
 
     Source: ITU-R P.526-15, equations (29) and (31).
     """

@@ -1,4 +1,4 @@
-"""Stages of a run: a bar with the time left of each, and the time limit of the whole run."""
+"""Stages of a run: a progress bar for each, and the time limit of the whole run."""
 
 import contextlib
 import functools
@@ -24,11 +24,11 @@ class Timekeeper:
 
     Args:
         limit: Time limit of the run [s].
-        shown: True if its stages have bars.
+        shown: True if its stages have progress bars.
 
     Attributes:
-        seconds: Time of each ``timed`` part without the parts inside it [s].
-        ends: Function that is true when what now runs has to end, such as a training; or None.
+        seconds: Time of each ``timed`` part [s], without the parts inside it.
+        ends: Function that is true when the current part, such as a training, has to end; or None.
     """
 
     def __init__(self, limit: float = math.inf, shown: bool = True):
@@ -43,7 +43,7 @@ class Timekeeper:
         self.lock = threading.RLock()  # bars appear in a thread of their own
 
     def left(self, share: float = 1.0) -> float:
-        """Time until a share of the limit [s]."""
+        """Time until a fraction of the limit [s]."""
         return self.began + share * self.limit - time.monotonic()
 
 
@@ -87,7 +87,7 @@ class Stage:
             )
 
     def close(self) -> None:
-        """Takes the bar away."""
+        """Removes the bar."""
         with self.keeper.lock:
             self.keeper.stages.remove(self)
             bars = self.keeper.bars
@@ -102,7 +102,7 @@ _keeper: ContextVar[Timekeeper | None] = ContextVar("keeper", default=None)
 
 
 def current() -> Timekeeper:
-    """The run that is at work; outside of runs one without a limit."""
+    """The present run; outside of runs one without a limit."""
     keeper = _keeper.get()
     if keeper is None:
         keeper = Timekeeper()
@@ -127,11 +127,11 @@ def stage(
     """A stage of the current run.
 
     Args:
-        name: Text before the bar, which a terminal shows after a second; empty: no bar.
+        name: Text before the bar. The terminal shows the bar after a second; no bar without a name.
         total: Number of its steps.
-        until: Share of the run's limit at which it has to end.
-        is_fixed: True if it cannot end early; after its first step the log says if the time does
-            not suffice.
+        until: Fraction of the run's time limit at which the stage has to end.
+        is_fixed: True if the stage cannot end early. After its first step a log line says if it
+            will exceed the limit.
     """
     opened = Stage(current(), name, total, until, is_fixed)
     timer = threading.Timer(1.0, opened.show)
@@ -149,7 +149,7 @@ def stage(
 
 
 def portion(share: float) -> contextlib.AbstractContextManager[Stage]:
-    """A stage that has to end after a share of the time that is left."""
+    """A stage that has to end after a fraction of the time that is left."""
     keeper = current()
     if math.isinf(keeper.limit):
         return stage()
@@ -158,7 +158,7 @@ def portion(share: float) -> contextlib.AbstractContextManager[Stage]:
 
 @contextlib.contextmanager
 def timed(name: str) -> Iterator[None]:
-    """A part of the current run whose time counts under a name, without parts inside it."""
+    """A part of the current run whose time is recorded under a name, without inner parts."""
     seconds = current().seconds
     inside = sum(seconds.values())
     began = time.monotonic()
@@ -172,7 +172,7 @@ def timed(name: str) -> Iterator[None]:
 def track(
     items: Iterable, name: str = "", total: int | None = None, is_fixed: bool = False
 ) -> Iterator[Any]:
-    """Yields items, each a step of a stage; ``total`` is needed if they have no length."""
+    """Yields items, each as a step of a stage; ``total`` is needed if they have no length."""
     if total is None:
         total = len(items) if isinstance(items, Sized) else 1
     with stage(name, total, is_fixed=is_fixed) as opened:
@@ -194,25 +194,25 @@ def left() -> float:
 
 
 def is_up() -> bool:
-    """True if an open stage, or what now runs, has to end now."""
+    """True if an open stage, or the current part of the run, has to end now."""
     ends = current().ends
     return left() <= 0 or (ends is not None and ends())
 
 
 def end_in_time(_: object) -> None:
-    """A callback of ``scipy.optimize.minimize`` that ends it with the stage."""
+    """A callback of ``scipy.optimize.minimize`` that ends it when the stage has to end."""
     if is_up():
         raise StopIteration
 
 
 def leave_out(what: str) -> None:
-    """Remembers and logs what has no time."""
+    """Records and logs a part that is skipped for lack of time."""
     current().left_out.append(what)
     log.warning("max_time: %s", what)
 
 
 def with_progress(function: Callable) -> Callable:
-    """Hides the bars of calls with ``progress=False``, a keyword that the function declares."""
+    """A decorator: calls with ``progress=False``, a keyword of the function, hide their bars."""
 
     @functools.wraps(function)
     def shown(*arguments, **options):
@@ -228,7 +228,7 @@ def with_progress(function: Callable) -> Callable:
 
 
 class NotebookBars(Progress):
-    """Bars in a notebook: a text that is replaced twice a second, without a widget."""
+    """Progress bars in a notebook: a text that is replaced twice a second, without a widget."""
 
     def start(self) -> None:
         if not self.disable:
@@ -253,7 +253,7 @@ class NotebookBars(Progress):
 
 
 def make_bars(**options: Any) -> Progress:
-    """Bars with description, count, time left and scores in a line each."""
+    """Progress bars with description, count, time left and scores, each in a line."""
     count, scores = "{task.fields[count]}", "{task.fields[scores]}"
     columns = "{task.description}", BarColumn(None), count, TimeRemainingColumn(), scores
     kind = NotebookBars if rich.get_console().is_jupyter else Progress

@@ -34,11 +34,11 @@ Parts = tuple[Int[Tensor, " train"], Int[Tensor, " test"]]
 
 @dataclass(frozen=True)
 class Split:
-    """Links to train, validate and test on; ``name`` is the protocol with its numbers.
+    """Links for training, validation and test. ``name`` states the protocol with its numbers.
 
     ``groups`` has the group of each of the n links, such as its row, run or cube. A group is never
-    divided, in cross-validation either; None: the groups are the places. ``by_receivers`` is true
-    if whole receivers are held out: models then predict for receivers without training links.
+    divided, even in cross-validation. None: a group is a place. ``by_receivers`` is true if whole
+    receivers are held out. Models then predict for receivers without training links.
     """
 
     name: str
@@ -58,11 +58,11 @@ class Split:
         return torch.cat((self.train, self.validation))
 
     def validating(self) -> "Split":
-        """The split that tests on the validation links, for models that have not seen them."""
+        """The split that tests on the validation links, for models trained without them."""
         return replace(self, validation=self.validation[:0], test=self.validation)
 
     def only(self, train: Int[Tensor, " k"]) -> "Split":
-        """The split with these training links, and nothing to validate."""
+        """The split with these training links, without validation links."""
         return replace(self, train=train, validation=self.validation[:0])
 
     def choosing(self, validation: Int[Tensor, " v"]) -> "Split":
@@ -76,31 +76,32 @@ class Links:
 
     Attributes:
         query: Transmitter positions (float32), receivers and frequencies.
-        receivers: Receivers that the query points to.
-        labels: Tensor, or object that reads labels from files; an index (k,) gives labels (k,
+        receivers: The scene's receivers; ``query.receivers`` holds their numbers.
+        labels: Tensor, or object that reads labels from files. An index (k,) gives labels (k,
             *task.shape).
         task: Task of the labels.
         rows: Row of each link in the order of measurement, from 0 (n,). Links of one transmission
             to several receivers, or at several frequencies, share a row. None: each link has its
             own.
-        official: Reads the training and test links that came with the data, for the official split
-            only; or None.
+        official: Function that reads the training and test links that came with the data, for the
+            official split; or None.
         split: Train, validation and test links; None until a split is chosen, see ``load``.
-        bandwidth: Band around each carrier that a label's power is averaged over, 0 for a carrier
-            alone [Hz]; None if unknown.
+        bandwidth: Band around each carrier over which a label's power is averaged [Hz]. 0: a single
+            carrier; None: unknown.
         held_out: The same links at held-out subcarriers, with the labels of the test; None if
             all subcarriers are trained.
         frame: Place of the world frame on a map; None if unknown.
-        uncertainties: Standard deviation of each receiver's place (r,) [m]: 0 if given, infinite
-            until ``divide`` estimates it from the training links. None: all are given, and
-            receivers without training links stay.
-        noises: Standard deviation of each label (n,), in its unit, by the scatter of repeated
-            readings; lower for a mean of several. None without repetitions.
+        uncertainties: Standard deviation of each receiver's place (r,) [m]: 0 for a given place,
+            infinite until ``divide`` estimates the place from the training links. None: all places
+            are given, and receivers without training links stay.
+        noises: Standard deviation of each label (n,), in its unit, from the scatter of repeated
+            readings. The deviation of a mean of several readings is lower. None without
+            repetitions.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
-        one_radio: True if the receivers are places of one radio that moves, or of radios alike,
-            with one gain; otherwise each has its own.
+        one_radio: True if the receivers are places of one moving radio, or identical radios, with
+            one gain. Otherwise each receiver has its own gain.
         front_ends: Responses of the receivers' front ends; None if none is learnt.
-        remarks: Counts of links read and left out, with the reason.
+        remarks: Counts of links that were read and excluded, with the reason.
         origin: Configurations of ``data`` and ``split``; empty for arrays in memory.
 
     Example:
@@ -156,16 +157,16 @@ class Links:
         return Batch(self.query[index], self.task.directions, labels)
 
     def known(self, receiver: int) -> Int[Tensor, " k"]:
-        """Training and validation links to a receiver; look-ups use them all."""
+        """Training and validation links to a receiver, the links that look-ups use."""
         index = self.split.known
         return index[self.query.receivers[index] == receiver]
 
     @property
     def scene(self) -> Scene:
-        """The scene that a model is built from.
+        """The scene from which a model is built.
 
         Raises:
-            ValueError: All training transmitters stand at one point.
+            ValueError: All training transmitters are at one point.
         """
         training = self.query[self.split.train]
         # A place has a link to each receiver. Keys find one of these ten times faster than unique.
@@ -196,17 +197,17 @@ class Links:
 
 
 def median_spacing(places: Float[Tensor, "n 3"]) -> float:
-    """Median distance from a place to the nearest other one [m]; takes two places or more."""
+    """Median distance from a place to its nearest neighbour [m]; needs two places or more."""
     points = places.double().numpy()
     distances, _ = cKDTree(points).query(points, k=2)
     return float(np.median(distances[:, 1]))
 
 
 def floors_of(places: Float[Tensor, "n 3"]) -> Float[Tensor, " k"]:
-    """Heights of separate floors [m], most places first; empty if there is one floor.
+    """Heights of separate floors [m], the floor with most places first; empty for a single floor.
 
-    A floor has 5 places or more. The gap between floors is more than 2 m, and at least twice the
-    range of heights on any floor.
+    A floor has 5 places or more. The gap between two floors is more than 2 m, and at least twice
+    the range of heights on any floor.
     """
     heights = places[:, 2].sort().values
     gaps = heights.diff()
@@ -220,7 +221,7 @@ def floors_of(places: Float[Tensor, "n 3"]) -> Float[Tensor, " k"]:
 
 
 def load(data: Mapping, split: Mapping, task: str | None = None, is_checked: bool = True) -> Links:
-    """A data set with its split, by the configurations of both.
+    """A data set with its split, from the configurations of both.
 
     ``task`` names the expected task; None for any. ``is_checked`` is as for ``divide``.
 
@@ -245,13 +246,14 @@ def load(data: Mapping, split: Mapping, task: str | None = None, is_checked: boo
 def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
     """Links with the split of a configuration, learnt front ends and estimated places.
 
-    Channels lose constant subcarriers. In links with ``uncertainties``, receivers without a
-    training link are left out, and receivers without a place get an estimate of it from the
-    training links. The remarks say so.
+    Constant subcarriers of channels are removed. In links with ``uncertainties`` receivers without
+    a training link are removed, and unknown places of receivers are estimated from the training
+    links. The remarks state each change.
 
     Args:
         split: Configuration of the split.
-        is_checked: True to search faults such as random phases by ``data.checks``, for the remarks.
+        is_checked: True to look for faults, such as random phases, with ``data.checks``, for the
+            remarks.
     """
     if links.task.is_channel and isinstance(links.labels, Tensor):
         check_elements(links)
@@ -285,7 +287,7 @@ def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
 
 
 def _check_split(split: Split, count: int) -> None:
-    """Raises a ``ValueError`` unless the parts are lists of different links."""
+    """Raises a ``ValueError`` unless the parts are disjoint lists of links."""
     given = [*split.parts().values()]
     if not all(part.dtype == torch.long for part in given):
         raise ValueError(
@@ -307,7 +309,7 @@ def _check_split(split: Split, count: int) -> None:
 def check_elements(links: Links) -> None:
     """Raises a ``ValueError`` if channels do not have the elements of their receivers' arrays.
 
-    Channels are 0 at elements that an array lacks, and outside a receiver's band.
+    Channels must be 0 at missing elements of an array, and outside a receiver's band.
     """
     count = links.task.shape[0]
     sizes = [len(receiver.array) for receiver in links.receivers]
@@ -334,8 +336,8 @@ def check_elements(links: Links) -> None:
 def without_constant(links: Links) -> Links:
     """Channels without constant subcarriers, which are guards or nulls; remarks count them.
 
-    Links at held-out subcarriers lose theirs, too. Links that are 0 at all other subcarriers are
-    left out. If all subcarriers are constant, the links stay as they are.
+    Links at held-out subcarriers lose their constant subcarriers, too. Links that are 0 at all
+    other subcarriers are removed. If all subcarriers are constant, the links are unchanged.
     """
     both = []  # the links, and the same links at held-out subcarriers
     remarks = [links.remarks]
@@ -368,7 +370,7 @@ def without_constant(links: Links) -> Links:
 
 
 def kept_links(links: Links, kept: Bool[Tensor, " n"]) -> Links:
-    """The links where ``kept`` is true, numbered anew, before a split; all receivers stay."""
+    """The links where ``kept`` is true, renumbered, before a split; all receivers stay."""
     number = kept.cumsum(0) - 1  # new number of each kept link
     read_parts: Any = links.official
 
@@ -428,7 +430,7 @@ def only_trained(links: Links) -> Links:
 
 
 def with_places(links: Links) -> Links:
-    """Links whose receivers without a place have an estimate; a remark says how certain it is."""
+    """Links with estimated places of receivers without a place; a remark states the uncertainty."""
     if links.uncertainties.isfinite().all():
         return links
     receivers = [*links.receivers]

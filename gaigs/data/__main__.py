@@ -83,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _geometry(data: str, options: dict[str, Any]) -> list[Mesh]:
-    """The surfaces of a simulated room; empty for a scene file, which the user has."""
+    """The surfaces of a simulated room; empty for a scene file of the user."""
     if data.startswith("synthetic"):
         return synthetic.meshes(synthetic.ROOM)
     if options.get("scene") is not None:

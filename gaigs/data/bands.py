@@ -1,4 +1,4 @@
-"""Bands of channels: several ones, and subcarriers held out for the test."""
+"""Bands of channels: several bands, and subcarriers held out for the test."""
 
 import itertools
 import math
@@ -25,11 +25,11 @@ def hold_out_band(
     Args:
         band_train: Lowest and highest subcarrier to train and validate on [Hz]. None: all
             subcarriers, and nothing is held out.
-        band_test: Lowest and highest subcarrier to test on [Hz]; subcarriers of ``band_train`` are
-            left out. None: all others.
+        band_test: Lowest and highest subcarrier to test on [Hz], without the subcarriers of
+            ``band_train``. None: all other subcarriers.
 
     Raises:
-        ValueError: A band is not two carriers in ascending order, or has no subcarrier.
+        ValueError: A band is not two frequencies in ascending order, or has no subcarrier.
     """
     if band_train is None:
         if band_test is not None:
@@ -57,17 +57,18 @@ def hold_out_band(
 
 
 def in_bands(parts: Sequence[Links], gap: float = 1.2) -> Links:
-    """Channels of several bands, in which each receiver counts as one radio for each band.
+    """Channels of several bands, where each receiver counts as one radio for each band.
 
-    A band ends where a frequency is more than ``gap`` times the one below. The evenly spaced
-    subcarriers of a part, four or more, are never cut. Links of one place share a row.
+    A band ends where the next frequency is more than ``gap`` times higher. Four or more evenly
+    spaced subcarriers of a part are never divided. Links of one place share a row.
 
     Args:
-        parts: Channels of one site, such as of one band each; receivers at one place are the same.
+        parts: Channels of one site, for example one part for each band. Receivers at one place are
+            the same receiver.
         gap: Largest ratio of neighbouring frequencies within a band.
 
     Raises:
-        ValueError: Parts have different phases, or other subcarriers or arrays in one band.
+        ValueError: Parts have different phases, or different subcarriers or arrays within a band.
     """
     frequencies = torch.cat([part.task.frequencies for part in parts]).unique()  # ascending (s,)
     is_end = frequencies[1:] > gap * frequencies[:-1]  # (s - 1,)
@@ -178,7 +179,7 @@ def _has_signal(links: Links, subcarriers: Bool[Tensor, " s"]) -> Bool[Tensor, "
 
 
 def _at(links: Links, subcarriers: Bool[Tensor, " s"]) -> Links:
-    """Links with the labels of some subcarriers."""
+    """Links with labels at some subcarriers."""
     task: Csi = links.task
     part = Csi(task.elements, task.frequencies[subcarriers], task.phase)
     return replace(links, labels=links.labels[..., subcarriers], task=part)

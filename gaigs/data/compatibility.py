@@ -1,4 +1,4 @@
-"""Links that fit the scene of a model: the same labels and receivers."""
+"""Checks that links fit the scene of a model: the same labels and receivers."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from gaigs.data import Links
 
 
 def check_fit(links: Links, scene: Scene | None = None) -> None:
-    """Raises a ``ValueError`` unless links have a split and a scene's receivers and labels."""
+    """Raises a ``ValueError`` unless links have a split, and a scene's receivers and labels."""
     if links.split is None:
         raise ValueError("links must have a split; gaigs.links(..., split='random') gives one")
     if scene is None:
@@ -33,7 +33,7 @@ def check_fit(links: Links, scene: Scene | None = None) -> None:
 
 
 def _antennas(receivers: tuple[Receiver, ...]) -> list[tuple]:
-    """What decides a receiver's labels: pose, elements and pattern, without its name."""
+    """Properties of receivers that labels depend on: pose, elements and pattern."""
     antennas = []
     for receiver in receivers:
         pose = receiver.pose

@@ -1,4 +1,4 @@
-"""Places of gateways that no file gives, estimated from the levels that they read."""
+"""Places of gateways without a given place, estimated from the levels that they receive."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from gaigs.core.query import evenly
 
 @dataclass(frozen=True)
 class Prior:
-    """What is known of a gateway before any reading, and how its place is searched."""
+    """Prior of a gateway's place, and options of the search."""
 
     readings: int = 100  # most readings that count, evenly spread
     rounds: int = 3  # number of grids, each finer than the last
@@ -46,17 +46,17 @@ class Laws(NamedTuple):
 def estimate_place(
     places: Float[Tensor, "n 3"], levels: Float[Tensor, " n"], prior: Prior | None = None
 ) -> tuple[Float[Tensor, "3"], float]:
-    """Place of a gateway [m] from the levels [dBm] that it reads, and its expected error [m].
+    """Place of a gateway [m] from the levels [dBm] that it receives, and the expected error [m].
 
-    The transmitters of these readings are at ``places``. Levels follow a + b log10(distance) with
-    shadowing, whose correlation makes many readings at one spot count as few. Before any reading,
-    all places in the readings' box, widened by half its extent, are equally likely; the result is
-    the mean of the posterior. Readings over three deviations from the law at the best place are
-    moved to three. Places that do not hear the gateway are not used.
+    The transmitters are at ``places``. Levels follow a + b log10(distance) with correlated
+    shadowing, so many readings at one spot count as few. The prior is uniform in the box of the
+    readings, widened by half its extent. The result is the mean of the posterior. Readings beyond
+    three deviations from the law at the best place are clipped to three. Places without a reading
+    are not used.
 
-    Source: Gudmundson, Correlation model for shadow fading in mobile radio systems, 1991; the
-    marginal likelihood is that of Rasmussen and Williams, Gaussian Processes for Machine Learning,
-    2006, section 2.7.
+    Source: Gudmundson, Correlation model for shadow fading in mobile radio systems, 1991; marginal
+    likelihood by Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section
+    2.7.
     """
     prior = prior or Prior()
     index = evenly(torch.arange(len(places)), prior.readings)
@@ -105,14 +105,14 @@ def _fit_laws(
     levels: Float[Tensor, " n"],
     prior: Prior,
 ) -> Laws:
-    """Laws of each candidate under each correlation, with their log likelihood.
+    """Laws of each candidate for each correlation, with their log likelihood.
 
-    The likelihood is integrated over all laws and variances; the prior of the slope acts as one
+    The likelihood is integrated over all laws and variances. The prior of the slope enters as one
     more observation.
 
     Args:
         factors: Cholesky factors of c correlations of the shadowing at n places.
-        decades: Decimal logarithms of the distances from these places to g candidates.
+        decades: Decimal logarithms of the distances between these places and g candidates.
         levels: Readings at the places [dBm].
     """
     columns = torch.cat((torch.ones_like(levels)[:, None], levels[:, None], decades), 1)

@@ -19,11 +19,11 @@ Rings = list[Float[ndarray, "_ d"]]
 
 
 def read_polygons(file: Path, frame: Frame | None, mend: str) -> list[tuple[Rings, dict]]:
-    """The polygons of a file, positions (k, 3) in the world frame [m], with their properties.
+    """The polygons of a file, with corners (k, 3) in the world frame [m] and their properties.
 
-    Positions are longitude and latitude, or easting and northing, if there is a frame; else metres
-    of the world frame. A height that the file does not give is NaN. ``mend`` says in errors what to
-    do, such as "draw buildings".
+    With a frame, positions are longitude and latitude, or easting and northing; otherwise metres of
+    the world frame. Missing heights are NaN. ``mend`` is the advice in errors, such as "draw
+    buildings".
 
     Source: RFC 7946.
     """
@@ -45,13 +45,13 @@ def read_polygons(file: Path, frame: Frame | None, mend: str) -> list[tuple[Ring
 def read_buildings(
     file: str | Path, frame: Frame | None, height: float | None = None
 ) -> list[Building]:
-    """Buildings of a file, each polygon with its property ``height`` [m].
+    """Buildings of a file: each polygon with its property ``height`` [m].
 
-    A roof is its height above the polygon's property ``ground`` [m] or, without one, above 0 of the
-    world frame.
+    The roof is ``height`` above the property ``ground`` [m]. Without ``ground`` it is above 0 of
+    the world frame.
 
     Args:
-        height: Height of buildings without one [m].
+        height: Height of buildings without this property [m].
     """
     file = find_file(file, "buildings", "buildings")
     buildings = []
@@ -70,7 +70,7 @@ def read_buildings(
 
 
 def _number(value: object, missing: float | None) -> float | None:
-    """A finite number, also as text, such as '12.5' or '12 m'; else ``missing``."""
+    """A finite number, also as text, such as '12.5' or '12 m'; otherwise ``missing``."""
     try:
         number = float(str(value).removesuffix("m"))
     except ValueError:
@@ -105,7 +105,8 @@ def _in_metres(
 ) -> Float[ndarray, "k 3"]:
     """Positions in the world frame [m]; a missing height is NaN.
 
-    Positions with a frame are longitude and latitude if they can be, else easting and northing.
+    With a frame, positions in the range of longitudes and latitudes are degrees; others are easting
+    and northing.
     """
     if ring.ndim != 2 or ring.shape[1] not in (2, 3) or not np.isfinite(ring).all():
         raise ValueError(f"{file}: a position must be two or three finite numbers")

@@ -19,11 +19,11 @@ def to_channels(
 ) -> Complex[np.ndarray, "n e s"]:
     """Channels sum_p g_p exp(-j 2 pi f t_p), complex64.
 
-    Gains at the carrier include its phase.
+    Gains include the phase at the carrier.
 
     Args:
-        gains: Baseband-equivalent gain of each path at each element; 0 for no path.
-        delays: Delay of each path, shared by all elements (d = 1) or for each (d = e) [s].
+        gains: Baseband-equivalent gain of each path at each element; 0 for a missing path.
+        delays: Delay of each path [s], common to all elements (d = 1) or for each element (d = e).
         offsets: Subcarriers relative to the carrier [Hz].
 
     Example:
@@ -52,13 +52,13 @@ def lacks_carrier(
 ) -> bool:
     """True if the gains ``fields`` of lines of sight lack the phase of their delay at the carrier.
 
-    Some ray tracers give such gains, and all phases are then alike. With fewer than ten lines of
-    sight the answer is ``otherwise``.
+    Gains of some ray tracers lack it, and all their phases are then similar. With fewer than ten
+    lines of sight the result is ``otherwise``.
     """
     if len(fields) < 10:
         return otherwise
     units = fields / np.abs(fields)
-    # Lengths of the mean phasors, as they are and without the carrier's phase: 1 if all are alike.
+    # Magnitudes of the mean phasors, as given and without the carrier's phase; 1 for equal phases.
     alike = abs(units.mean())
     included = abs((units * np.exp(2j * np.pi * frequency * delays)).mean())
     return bool(alike > max(0.9, included))
@@ -80,15 +80,15 @@ def from_sionna(
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Arrays of ``gaigs.data.csi_npz`` from impulse responses of Sionna RT, and remarks.
 
-    ``sionna.rt.Paths.cir`` gives them. Gains of ``sionna.rt.Paths.a`` lack the carrier's phase over
-    the delay, which is then added; ``lacks_carrier`` recognises them by the links in line of sight,
-    whose first delay is the distance over the speed of light. A channel is the same both ways, so
-    the end with fewer places becomes the fixed one, in a tie the receivers.
+    ``sionna.rt.Paths.cir`` gives these responses. Gains of ``sionna.rt.Paths.a`` lack the phase of
+    the delay at the carrier; it is then added. ``lacks_carrier`` recognises such gains by the links
+    in line of sight, whose first delay is the distance over the speed of light. By reciprocity the
+    end with fewer places becomes the fixed end; in a tie the receivers.
 
     Args:
-        arrays: ``a`` (k, e, n, m, p, 1) and ``tau`` (k, n, p) or (k, e, n, m, p), of k receivers
-            ``rx`` with e antennas and n transmitters ``tx`` with m; ``carrier`` [Hz];
-            ``frequencies``, absolute or relative to it [Hz].
+        arrays: ``a`` (k, e, n, m, p, 1) and ``tau`` (k, n, p) or (k, e, n, m, p), for k receivers
+            ``rx`` with e antennas each and n transmitters ``tx`` with m antennas each; ``carrier``
+            [Hz]; ``frequencies``, absolute or relative to the carrier [Hz].
         needs_delays: True if delays must count from the transmission.
     """
     carrier = _read_carrier(arrays)
@@ -103,7 +103,7 @@ def from_sionna(
     frequencies = subcarriers + (carrier if is_relative else 0.0)
     distances = np.linalg.norm(tx[:, None] - rx, axis=2).reshape(-1)  # (links,)
 
-    # Distances count from the receiver's position: its nearest element stands for the array.
+    # Distances are from the receiver's position, so its nearest element represents the array.
     near = 0
     if "elements" in arrays and arrays["elements"].ndim == 2:
         near = int(np.linalg.norm(arrays["elements"], axis=1).argmin())
@@ -131,7 +131,7 @@ def from_sionna(
 
 
 def _read_carrier(arrays: Mapping[str, np.ndarray]) -> float:
-    """The carrier [Hz]; a ``ValueError`` also for other arrays that are not real."""
+    """The carrier [Hz]; a ``ValueError`` if it, or another array that must be real, is not real."""
     for name, array in arrays.items():
         if name != "a" and array.dtype.kind not in "iuf":
             raise ValueError(f"{name}: expected real numbers, got {array.dtype}")
@@ -168,7 +168,7 @@ def _to_responses(arrays: Mapping[str, np.ndarray]) -> Responses:
 
 
 def _without_missing_delays(responses: Responses, needs_delays: bool) -> Responses:
-    """Responses with delays of 0 where a path is missing; a ``ValueError`` for wrong delays."""
+    """Responses with delays of 0 for missing paths; a ``ValueError`` for wrong delays."""
     gains = responses.gains
     exists = gains != 0
     delays = np.where(exists, responses.delays, 0)
@@ -186,7 +186,7 @@ def _without_missing_delays(responses: Responses, needs_delays: bool) -> Respons
 
 
 def _with_fixed_end(responses: Responses) -> Responses:
-    """Responses whose receivers are the end with fewer places.
+    """Responses with the end of fewer places as receivers.
 
     Raises:
         ValueError: The other end has several antennas at a place.

@@ -21,14 +21,14 @@ def links(source: Any = None, /, **options: Any) -> Links:
             ``"rssi_csv"``; a data frame of levels [dBm], or a mapping of its columns; ``Paths`` or
             a ``RadioMap`` of Sionna RT; None for arrays.
         options: Options of reader and split by their names, and ``split``, the name of a registered
-            split. For a data frame such as ``x``, ``y``, ``z`` and ``receivers``, see
-            ``gaigs.data.frames.from_frame``. For Sionna RT such as ``frequencies``, see
-            ``gaigs.data.sionna_rt.from_sionna_rt``. For arrays such as ``task``, ``transmitters``
-            (n, 3) [m], ``receivers`` and ``labels``, see ``gaigs.data.arrays.from_arrays``.
+            split. Options for a data frame, such as ``x``, ``y``, ``z`` and ``receivers``:
+            ``gaigs.data.frames.from_frame``. For Sionna RT, such as ``frequencies``:
+            ``gaigs.data.sionna_rt.from_sionna_rt``. For arrays, such as ``task``, ``transmitters``
+            (n, 3) [m], ``receivers`` and ``labels``: ``gaigs.data.arrays.from_arrays``.
 
     Raises:
         FileNotFoundError: The reader finds no data.
-        ImportError: A data frame takes a package that is not installed.
+        ImportError: A package for the data frame is not installed.
         TypeError: The source or an option has a wrong type.
         ValueError: A name is unknown, or files, arrays or the split do not fit.
 

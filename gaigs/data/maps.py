@@ -1,4 +1,4 @@
-"""Coordinates of maps in metres of UTM; other systems take pyproj."""
+"""Coordinates of maps in metres of UTM; other systems need pyproj."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from gaigs.core.geometry import is_utm
 
 
 def find_pyproj() -> Any:
-    """The module pyproj; an ``ImportError`` with the command to install it where it is missing."""
+    """The module pyproj; if missing, an ``ImportError`` with the command to install it."""
     try:
         import pyproj
     except ImportError:
@@ -19,11 +19,11 @@ def find_pyproj() -> Any:
 
 
 def metres_of(epsg: int) -> float | None:
-    """Metres in a unit of a system's coordinates; None for degrees.
+    """Length of a system's unit of coordinates [m]; None for degrees.
 
     Raises:
         ImportError: pyproj is needed and not installed.
-        ValueError: There is no such system.
+        ValueError: The system does not exist.
 
     Example:
         >>> from gaigs.data.maps import metres_of
@@ -42,10 +42,10 @@ def metres_of(epsg: int) -> float | None:
 
 
 def are_degrees(points: Float[ndarray, "n d"]) -> bool:
-    """True if x and y [m] are probably longitude and latitude, in either order.
+    """True if x and y, read as metres, are probably longitude and latitude, in either order.
 
-    They then span less than 0.3 and less than a hundredth of their distance from the origin, and
-    have five decimals or more. A grid in metres has no such decimals.
+    Degrees span less than 0.3 and less than a hundredth of their distance from the origin, and have
+    five decimals or more. Coordinates of a measured grid in metres rarely have so many decimals.
     """
     if len(points) < 2:
         return False
@@ -62,7 +62,7 @@ def check_metres(
     points: Float[ndarray, "n d"],
     mend: str = "convert them, as gaigs.data.maps.to_utm(points, 4326) does, longitude first",
 ) -> None:
-    """Raises a ``ValueError`` if coordinates are degrees; ``mend`` says how to read them."""
+    """Raises a ``ValueError`` if coordinates are degrees; ``mend`` is its advice."""
     if are_degrees(points):
         x, y = points[0, :2].tolist()
         raise ValueError(
@@ -74,11 +74,11 @@ def check_metres(
 def to_utm(points: Float[ndarray, "n 2"], epsg: int) -> tuple[Float[ndarray, "n 2"], int]:
     """Eastings and northings [m] in the UTM zone of the first point, and its EPSG code.
 
-    Points of UTM stay as they are. Degrees are longitude before latitude.
+    Points in UTM are unchanged. In degrees, longitude comes first.
 
     Raises:
         ImportError: pyproj is needed and not installed.
-        ValueError: There is no such system, or a point is outside of it.
+        ValueError: The system does not exist, or a point is outside the system.
 
     Example:
         >>> from gaigs.data.maps import to_utm

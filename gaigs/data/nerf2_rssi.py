@@ -33,8 +33,8 @@ NOT_HEARD = -100.0
 def read(root: str | Path, frequency: float | None = None) -> Links:
     """A data set from its folder: one link for each reading that a gateway received.
 
-    Readings of -100 dBm were not received. They, and gateways that received nothing, are
-    left out and counted in the remarks. Gateways look along the world's axes. The readings of one
+    A reading of -100 dBm means "not received". Such readings, and gateways without other readings,
+    are left out; the remarks count them. Gateways look along the world's axes. The readings of one
     measurement share a row.
 
     Args:
@@ -125,7 +125,7 @@ def _read_readings(file: Path, gateways: Sequence[str]) -> tuple[list[str], list
 def _read_official(
     root: Path, received: Bool[Tensor, "rows gateways"], names: Sequence[str]
 ) -> Parts:
-    """Training and test links of the index files, which list rows, or pairs of row and gateway."""
+    """Training and test links from index files, which list rows, or pairs of row and gateway."""
     columns = {name: k for k, name in enumerate(names)}
     # A gateway has its column's number as a second name, unless names are numbers.
     if not any(name.isdecimal() for name in names):

@@ -36,28 +36,28 @@ def read(
     frequency: float | None = 920e6,
     bandwidth: float | None = None,
 ) -> Links:
-    """A data set from its folder; images are decoded when requested, and all else is checked here.
+    """A data set from its folder. Images are decoded on request; all other files are checked here.
 
-    With a carrier for each link, the links of one position share a row.
+    If each link has its own carrier, the links of one position share a row.
 
     Args:
         root: Folder with ``tx_pos.csv``, ``gateway_info.yml``, ``spectrum/``, for the official
             split ``train_index.txt`` and ``test_index.txt``, and optionally ``freq.txt``, the
             carrier of each link.
-        elements: Rows and columns of the receiver's planar array, half a wavelength of the highest
-            carrier apart; None if unknown.
-        frequency: Carrier of all links without ``freq.txt`` [Hz]; None if unknown. An array of
-            unknown elements or carrier counts as a single antenna.
-        bandwidth: Width of the band around each carrier that powers were averaged over, 0 for a
-            carrier alone [Hz]; None if unknown.
+        elements: Rows and columns of the receiver's planar array, with a pitch of half a wavelength
+            of the highest carrier; None if unknown.
+        frequency: Carrier of all links without ``freq.txt`` [Hz]; None if unknown. Without elements
+            or carrier the array counts as a single antenna.
+        bandwidth: Width of the band around each carrier over which powers were averaged [Hz]. 0: a
+            single carrier; None: unknown.
 
     Raises:
         FileNotFoundError: The folder does not exist.
         ValueError: An option is out of range, or a file has a defect; the message names file, line
             and value.
 
-    Source: NeRF², https://github.com/XPengZhao/NeRF2; its spectra s23 are of a 4 x 4 array at about
-    920 MHz.
+    Source: NeRF², https://github.com/XPengZhao/NeRF2. Its spectra s23 were measured by a 4 x 4
+    array at about 920 MHz.
     """
     if bandwidth is not None and not 0 <= bandwidth < math.inf:
         raise ValueError(
@@ -105,8 +105,8 @@ def read(
 def write(folder: str | Path, links: Links) -> None:
     """Writes a data set of spectra in the layout that ``read`` reads; labels are rounded to 8 bits.
 
-    The index files hold the split's training and validation links together, and its test links.
-    ``freq.txt`` holds known carriers; the layout has no place for the array.
+    One index file holds the training and validation links, the other the test links. ``freq.txt``
+    holds known carriers. The layout cannot store the array.
     """
     folder = Path(folder)
     tables.check_empty(folder)
@@ -152,7 +152,7 @@ def _check_elements(elements: object) -> None:
 
 
 def _read_receiver(file: Path) -> Receiver:
-    """The one gateway of a file, with a single antenna; a ``ValueError`` for none or several."""
+    """The only gateway of a file, with a single antenna; a ``ValueError`` for another number."""
     expected = "one gateway with position [m] and orientation (quaternion x, y, z, w)"
     entries = read_mapping(file, expected).items()
     gateways = [(name, pose) for name, pose in entries if isinstance(pose, dict)]

@@ -1,4 +1,4 @@
-"""Real and imaginary parts of channels, and amplitudes and phases in their place."""
+"""Real and imaginary parts of channels, and detection of amplitudes and phases."""
 
 import math
 
@@ -7,11 +7,11 @@ from numpy import ndarray
 
 
 def join(arrays: list[ndarray], axis: str | None) -> ndarray:
-    """Channels from two real arrays, or from one with both parts along an axis.
+    """Channels from two real arrays, or from one array with both parts along an axis.
 
     Args:
-        axis: ``first`` or ``last``, with both parts. Without it a single array stays as it is: real
-            numbers may be amplitudes of two antennas.
+        axis: ``first`` or ``last`` axis, with both parts. Without it a single real array is
+            unchanged: its numbers may be amplitudes of two antennas.
 
     Raises:
         ValueError: Parts are not real, have different shapes, or are not along an axis of 2.
@@ -46,8 +46,8 @@ def join(arrays: list[ndarray], axis: str | None) -> ndarray:
 def check_parts(name: str, channels: ndarray) -> None:
     """Raises a ``ValueError`` if 100 or more complex numbers are amplitudes and phases.
 
-    One part then is positive or below -20, as in dB, and the other fills a turn in radians or
-    degrees evenly.
+    Amplitudes are all positive, or below -20 as in dB. Phases cover a full turn evenly, in radians
+    or degrees.
     """
     if channels.size < 100:
         return
@@ -69,7 +69,7 @@ def check_parts(name: str, channels: ndarray) -> None:
 
 
 def _fills_turn(angles: ndarray, turn: float) -> bool:
-    """True if numbers spread evenly over a turn, from 0 or from minus half of it."""
+    """True if numbers are evenly spread over a full turn, from 0 or from minus half a turn."""
     low = angles.min()
     high = angles.max()
     start = 0 if low >= 0 else -turn / 2

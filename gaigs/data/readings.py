@@ -22,22 +22,23 @@ QUIETEST, LOUDEST = -150.0, 30.0
 
 
 def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiver:
-    """A receiver without orientation at a position [m]: its axes are the world's."""
+    """A receiver at a position [m] with the world's axes."""
     return Receiver(name, Pose(torch.as_tensor(position), torch.eye(3)))
 
 
 def are_one_radio(places: int, links: int, sent: int, given: bool | None = None) -> bool:
-    """True if the receivers are places of one radio that moves, or of radios alike.
+    """True if the receivers are places of one moving radio, or identical radios.
 
-    One radio has 12 places or more, with less than 12 links each on average. Its transmitters have
-    less than two links each on average, or are few beacons: four or more places to each. In a
-    survey of access points a transmitter's place has several links: one to each access point heard.
+    One radio has at least 12 places with fewer than 12 links each on average. Its transmitters have
+    fewer than two links each on average, or are a few beacons: at least four receiver places for
+    each transmitter place. In a survey of access points, by contrast, each transmitter place has a
+    link to every access point in range.
 
     Args:
         places: Number of places of receivers.
         links: Number of links.
         sent: Number of places of transmitters.
-        given: The user's answer, which counts; None without one.
+        given: The user's answer, which is returned; None without an answer.
     """
     if given is not None:
         return given
@@ -54,9 +55,9 @@ def to_dbm(
     not_heard: Sequence[float],
     mend: str,
 ) -> list[list[float]]:
-    """Cells of a table as readings [dBm], each ``not_heard`` or from ``lowest`` on.
+    """Cells of a table as readings [dBm], each a value of ``not_heard`` or at least ``lowest``.
 
-    A ``ValueError`` for any other cell; ``mend`` says in it what to do with other values that mean
+    Raises a ``ValueError`` for any other cell. ``mend`` is its advice on other values that mean
     "not heard".
     """
     cells = {}
@@ -88,7 +89,7 @@ def marks_given(not_heard: float | Sequence[float]) -> list[float]:
 def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
     """The known name for each name: the same, or the only one with the same letters and digits.
 
-    Names without a match are left out.
+    Names without a match are dropped.
     """
 
     def plain(name):
@@ -107,7 +108,7 @@ def match_names(names: Iterable[str], known: Sequence[str]) -> dict[str, str]:
 
 
 def suggested(name: str, others: Iterable[str]) -> str:
-    """A name in quotes, with the most similar other name of the same digits, if there is one."""
+    """A name in quotes, with the most similar other name with the same digits, if any."""
     digits = re.findall(r"\d+", name)
     return suggest(name, [other for other in others if re.findall(r"\d+", other) == digits])
 
@@ -119,18 +120,20 @@ def and_list(numbers: Iterable[float]) -> str:
 
 
 def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
-    """Values among readings [dBm] that mean "not heard", a gateway a column; NaN for an empty cell.
+    """Values among readings [dBm] that mean "not heard" (marks), with a gateway in each column.
 
-    Values outside the range of levels are such marks if they are repeated or usual, as 100. Values
-    within the range are
+    Empty cells are NaN. A value outside the range of levels is a mark if it is repeated, or a usual
+    mark such as 100. A value within the range is a mark in these cases:
 
-    - 0 and repeated values from -1 up, three at most, more than 10 dB above all others;
-    - of columns with two values or more, a usual value from -105 down, 5 dB below all others, or 10
-      dB if it is not repeated; -100, if it is repeated and more than 10 dB below them; and the
-      lowest or a usual value with 5 % of the readings, five times those of each value within 5 dB,
-      in two columns or the only one;
-    - the lowest values, three at most, more than 10 dB below all others, each of them three times
-      and in two columns that have higher levels.
+    - it is 0, or repeated and -1 or more; at most three such values are more than 10 dB above all
+      others;
+    - it is a usual mark of -105 or less, in columns with two values or more; it is 5 dB below all
+      others, or 10 dB if not repeated;
+    - it is -100, repeated, and more than 10 dB below all others;
+    - it is the lowest value, or a usual mark; it has 5 % of the readings, and five times the count
+      of each value within 5 dB, in two columns or the only one;
+    - it is one of at most three values more than 10 dB below all others; it occurs three times, in
+      two columns with higher levels.
     """
     values, counts = np.unique(levels[np.isfinite(levels)], return_counts=True)
     outside = (values < QUIETEST) | (values > LOUDEST)
@@ -144,13 +147,13 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
     lowest = float(values.min(initial=0))
     inside = np.where((levels >= QUIETEST) & (levels <= LOUDEST), levels, np.nan)
     has_several = [len(np.unique(column[~np.isnan(column)])) > 1 for column in inside.T]
-    inside = inside[:, has_several]  # a column of one value tells nothing
+    inside = inside[:, has_several]  # a column of one value is no evidence
     marks += _usual_marks(inside, lowest)
     return marks + _lowest_marks(inside, marks)
 
 
 def _usual_marks(levels: Float[ndarray, "n k"], lowest: float) -> list[float]:
-    """Marks among usual values and the ``lowest`` one: far from other levels, or more frequent."""
+    """Marks among usual values and the ``lowest`` one: isolated, or much more frequent."""
     usual = (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)  # marks of "not heard" [dBm]
     values, counts = np.unique(levels[~np.isnan(levels)], return_counts=True)
     marks = []
@@ -171,7 +174,7 @@ def _usual_marks(levels: Float[ndarray, "n k"], lowest: float) -> list[float]:
 
 
 def _lowest_marks(levels: Float[ndarray, "n k"], marks: Sequence[float]) -> list[float]:
-    """The lowest values, at most three, that stand more than 10 dB below all others."""
+    """The lowest values, at most three, if more than 10 dB below all others."""
     values = np.unique(levels[~np.isnan(levels)])
     gaps = np.flatnonzero(np.diff(values[:4]) > 10)
     if not len(gaps):
@@ -179,7 +182,7 @@ def _lowest_marks(levels: Float[ndarray, "n k"], marks: Sequence[float]) -> list
     last = gaps[-1]
     lowest = []
     for value in values[: last + 1].tolist():
-        # A mark stands beside true levels in several columns. A column of low values alone is a
+        # A mark occurs with true levels in several columns. A column of only low values is a
         # weak receiver's.
         mixed = (levels == value).any(0) & (levels > values[last]).any(0)  # (k,)
         if value not in marks and (levels == value).sum() >= 3 and mixed.sum() >= 2:
@@ -194,7 +197,7 @@ def remark_on_zeros(levels: Iterable[float]) -> str:
 
 
 def carriers_of(frequency: float | None, count: int) -> Float[Tensor, " n"] | None:
-    """The carrier of ``count`` readings [Hz]; None if it is unknown."""
+    """The carrier of ``count`` readings [Hz]; None if unknown."""
     if frequency is None:
         return None
     check_carrier("frequency", frequency)

@@ -39,27 +39,26 @@ def read(
     frequency: float | None = None,
     one_radio: bool | None = None,
 ) -> Links:
-    """A data set from a table with a heading, one reading a line: one link for each reading that
-    was received.
+    """A data set from a table with a heading and a reading a line: one link for each received
+    reading.
 
-    The places of the fixed end become the receivers, ``rx1`` ... or ``tx1`` ... in the order of
-    their first appearance, and look along the world's axes. The places of the moving end become the
-    transmitters: by reciprocity a channel attenuates alike either way. The readings of one such
-    place share a row. Readings of ``not_heard``, and fixed places without others, are left out and
-    counted in the remarks. There is no official split.
+    Places of the fixed end become the receivers, ``rx1`` ... or ``tx1`` ... in the order of their
+    first appearance. They look along the world's axes. Places of the moving end become the
+    transmitters; by reciprocity the attenuation is equal in both directions. The readings of a
+    transmitter place share a row. Readings of ``not_heard``, and fixed places with no other
+    readings, are left out; the remarks count them. There is no official split.
 
     Args:
         file: Table with the columns ``tx_x``, ``tx_y``, ``tx_z``, ``rx_x``, ``rx_y``, ``rx_z`` [m]
-            and ``rss_dbm`` in any order and in any case; the remarks name other columns.
+            and ``rss_dbm`` in any order, in upper or lower case; the remarks name other columns.
         layout: File of wall vertices x,y [m], as ``layout.csv`` of ``nerf2_rssi``; None for no
             walls.
-        fixed: End that stands still, ``tx`` or ``rx``; None for the end with fewer places, the
-            receiver in a tie.
-        not_heard: Value, or values, of readings that were not received [dBm]; all others lie in
+        fixed: Fixed end, ``tx`` or ``rx``. None: the end with fewer places; in a tie the receiver.
+        not_heard: Value, or values, of readings that were not received [dBm]; all others are within
             [-200, 30].
         frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
-        one_radio: True if both ends move: all fixed places have one gain. None: see
-            ``are_one_radio``.
+        one_radio: True if all fixed places are of one radio, with one gain. None: ``are_one_radio``
+            decides.
 
     Raises:
         FileNotFoundError: The file does not exist.
@@ -130,7 +129,7 @@ def write(folder: str | Path, links: Links) -> None:
 
 
 def _read_table(file: Path, marks: list[float]) -> tuple[dict[str, list], list[float], list[str]]:
-    """Positions of either end [m], readings [dBm], and the names of other columns."""
+    """Positions of both ends [m], readings [dBm], and the names of other columns."""
     lines = tables.read_lines(file, f"a heading with {','.join(COLUMNS)}")
     delimiter = tables.find_delimiter(lines)
     written = tables.split_cells(lines[0], delimiter)

@@ -22,19 +22,20 @@ def furnished_room_csi(
     band_test: Sequence[float] | None = None,
     receivers: int | None = None,
 ) -> Links:
-    """Channels of transmitters at random places in the default room, at its array of 4 x 4.
+    """Channels of transmitters at random places in the default room, at its 4 x 4 array.
 
-    ``synthetic`` describes places, array and other options, and
-    ``gaigs.data.simulation.simulate_channels`` unit and time dependence. The official split tests
-    on the last fifth of the places.
+    ``synthetic`` describes places, array and other options.
+    ``gaigs.data.simulation.simulate_channels`` describes unit and time dependence. The official
+    split tests on the last fifth of the places.
 
     Args:
-        bandwidth: From the lowest subcarrier to the highest, about the carrier [Hz].
-        subcarriers: Evenly over the band; a single one is the carrier.
-        phase: See ``gaigs.core.task.csi.Csi``; other than ``known``, links get random phases.
+        bandwidth: Difference of the highest and the lowest subcarrier, centred on the carrier [Hz].
+        subcarriers: Number of subcarriers, evenly spaced over the band; a single one is the
+            carrier.
+        phase: See ``gaigs.core.task.csi.Csi``. Links get random phases unless it is ``known``.
         band_train, band_test: Subcarriers to train and to test on, as for
             ``gaigs.data.bands.hold_out_band`` [Hz].
-        receivers: Arrays on the walls, as of ``synthetic``; None: one in a corner.
+        receivers: Number of arrays on the walls, as for ``synthetic``; None: one array in a corner.
 
     Raises:
         ValueError: An option is out of range.

@@ -17,16 +17,17 @@ def furnished_room_rssi(
 ) -> Links:
     """Signal strength of transmitters of 0 dBm at random places in the default room.
 
-    Four gateways receive. Antennas are isotropic. Links of one place share a row. The official
+    There are four gateways with isotropic antennas. Links of one place share a row. The official
     split tests on the last fifth of the places.
 
     Args:
         noise: Standard deviation of the Gaussian error of each reading [dB].
-        sensitivity: Readings below it are not received, and left out [dBm].
-        receivers: Gateways along the walls, as of ``synthetic``; None: the four.
+        sensitivity: Readings below this level [dBm] are not received, and left out.
+        receivers: Number of gateways along the walls, as for ``synthetic``; None: the four
+            gateways.
 
     Raises:
-        ValueError: An option is out of range, or a gateway hears nothing.
+        ValueError: An option is out of range, or a gateway receives nothing.
     """
     room = default_room(order, receivers)
     return simulate_readings(room, transmitters, noise, sensitivity, seed)

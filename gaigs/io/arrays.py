@@ -28,7 +28,7 @@ class ArrayFormat(NamedTuple):
 
 
 def array_format(file: Path) -> ArrayFormat:
-    """The format of a file, by its first bytes or else its name."""
+    """The format of a file, from its first bytes or otherwise its name."""
     signature = b"\x89HDF\r\n\x1a\n"
     with file.open("rb") as stream:
         start = stream.read(520)
@@ -42,7 +42,7 @@ def array_format(file: Path) -> ArrayFormat:
 
 @contextlib.contextmanager
 def _open_npz(file: Path) -> Iterator[ArrayFile]:
-    """An .npz file; a ``ValueError`` if it is a single array, or when a damaged array is read."""
+    """An .npz file; a ``ValueError`` for a single array, or on reading a damaged array."""
     # Opened here, since numpy leaves a damaged file open; it warns of headers written by Python 2.
     with file.open("rb") as stream, warnings.catch_warnings(action="ignore"):
         content = np.load(stream, allow_pickle=False)

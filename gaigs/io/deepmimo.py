@@ -30,8 +30,8 @@ def write_scenario(
 ) -> None:
     """Writes traced paths as a scenario of DeepMIMO v4.
 
-    DeepMIMO loads it by name from ``deepmimo_scenarios`` in the working folder, if the name has no
-    capitals. By default it loads the strongest 25 paths of a user.
+    DeepMIMO loads the scenario by name from ``deepmimo_scenarios`` in the working folder; the name
+    must be in lower case. By default DeepMIMO loads the strongest 25 paths of a user.
 
     Args:
         folder: An existing folder.
@@ -127,8 +127,8 @@ def _set_parameters(number: int, name: str, points: int, active: int) -> dict:
 def _matrices(users: Float[np.ndarray, "n 3"], station: Station) -> dict[str, np.ndarray]:
     """The arrays of one base station by DeepMIMO's names, strongest paths first.
 
-    ``power`` [dB], ``phase`` [deg], ``delay`` [s], angles [deg] and ``inter`` are (n, p);
-    ``inter_pos`` [m] is (n, p, k, 3). They are NaN where there is no path.
+    ``power`` [dB], ``phase`` [deg], ``delay`` [s], angles [deg] and ``inter`` are (n, p).
+    ``inter_pos`` [m] is (n, p, k, 3). Missing paths are NaN.
     """
     order = np.argsort(-np.abs(station.fields), axis=1, kind="stable")  # (n, p)
     fields = np.take_along_axis(station.fields, order, 1)

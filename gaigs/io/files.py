@@ -13,10 +13,11 @@ LOCK = ".lock"
 
 @contextlib.contextmanager
 def atomic_write(path: str | Path) -> Iterator[Path]:
-    """Yields a temporary path with the same ending, which replaces the file once it is on the disk.
+    """Yields a temporary path with the same suffix, which finally replaces the file.
 
-    Several writers do not disturb each other; the last one to end replaces the file. If writing
-    fails or is interrupted, the temporary file is removed and the old file stays.
+    The file is replaced after the temporary file is on the disk. Several writers do not disturb
+    each other; the last one to end wins. If writing fails or is interrupted, the temporary file is
+    removed and the old file stays.
     """
     path = Path(path)
     part = path.with_name(f"{path.stem}.gaigs-{secrets.token_hex(4)}.part{path.suffix}")
@@ -54,7 +55,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def file_message(error: OSError, folder: Path) -> str:
-    """The message for an ``OSError``: gaigs's own, or file, cause and remedy of a system error."""
+    """The message for an ``OSError``: from gaigs, or file, cause and remedy of a system error."""
     if error.errno is None or error.strerror != os.strerror(error.errno):
         return str(error.strerror or error)
     path = error.filename or f"a file in {folder}"

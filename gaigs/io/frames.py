@@ -28,14 +28,14 @@ def _is_exchanged(value: object) -> bool:
 
 
 def read_frame(frame: Any, name: str = "data frame") -> Table:
-    """A data frame as a table; named levels of an index are columns, too.
+    """A data frame as a table; named levels of an index become columns.
 
     Args:
         name: Word for the frame in messages.
 
     Raises:
-        ImportError: The frame's library is read by pyarrow, which is not installed.
-        ValueError: The frame has no rows, columns of one name, or columns of different lengths.
+        ImportError: The frame's library needs pyarrow, which is not installed.
+        ValueError: The frame has no rows, two columns of one name, or columns of different lengths.
     """
     names, columns = _read_columns(frame, name)
     for text in names:
@@ -82,7 +82,7 @@ def _read_columns(frame: Any, name: str) -> tuple[list[str], list[ndarray]]:
 
 
 def _keys(frame: Any) -> list:
-    """Keys of a frame's columns, text or not; empty if the frame lists none."""
+    """Keys of a frame's columns, of any type; empty if the frame has no list of them."""
     if isinstance(frame, Mapping):
         return [*frame]
     if hasattr(frame, "column_names") and not callable(frame.column_names):
@@ -105,7 +105,7 @@ def _by_pyarrow(frame: Any) -> Any:
 
 
 def _numbers(column: ndarray) -> Float[ndarray, " n"]:
-    """Numbers of a column, NaN for a missing one and infinity for a text."""
+    """Numbers of a column, NaN for a missing number and infinity for a text."""
     if column.dtype.kind in "iuf":
         numbers = column.astype(np.float64)
         numbers[numbers == -np.inf] = np.nan  # the level of no power

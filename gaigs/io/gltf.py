@@ -9,7 +9,8 @@ from gaigs.io.meshes import Mesh
 
 
 def write_gltf(file: Path, meshes: Sequence[Mesh], extras: Sequence[Mapping[str, float]]) -> None:
-    """Writes meshes as ``.glb``, or as ``.gltf`` with its buffers within: a node each, with extras.
+    """Writes meshes as ``.glb``, or as ``.gltf`` with embedded buffers: a node for each, with
+    extras.
 
     Args:
         extras: Numbers of each node by name, such as ``loss_db``.

@@ -13,10 +13,10 @@ from torch import Tensor
 
 
 class GreyImages:
-    """PNGs of grey values (rows, columns), decoded when first requested and then kept.
+    """PNGs of grey values (rows, columns), decoded at the first request and then cached.
 
-    A pixel takes one or two bytes; white is 255 in 8-bit images and 65535 in 16-bit ones. Colour
-    images have equal channels, and no pixel is transparent.
+    A pixel takes one or two bytes. White is 255 in 8-bit images and 65535 in 16-bit ones. Colour
+    images must have equal channels, and no pixel may be transparent.
     """
 
     def __init__(self, files: Sequence[Path], shape: tuple[int, int]):
@@ -80,7 +80,7 @@ def _grey(file: Path, image: Image.Image) -> UInt[np.ndarray, "rows columns"]:
 
 @contextmanager
 def _opened(file: Path) -> Iterator[Image.Image]:
-    """A PNG file with its header read; a ``ValueError`` if it is damaged or Pillow warns of it."""
+    """A PNG file after reading its header; a ``ValueError`` if damaged or if Pillow warns."""
     try:
         with warnings.catch_warnings(action="error"), Image.open(file, formats=["PNG"]) as image:
             yield image

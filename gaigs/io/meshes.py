@@ -36,7 +36,7 @@ class Mesh:
         return triangles(self.faces)
 
     def compact(self) -> "Mesh":
-        """The mesh without corners that no face has."""
+        """The mesh without corners that belong to no face."""
         used = sorted(set(itertools.chain(*self.faces)))
         number = {corner: k for k, corner in enumerate(used)}
         vertices = tuple(self.vertices[corner] for corner in used)
@@ -47,11 +47,11 @@ class Mesh:
 def wavefront_obj(
     meshes: Sequence[Mesh], heading: Sequence[str] = (), notes: Sequence[Sequence[str]] = ()
 ) -> str:
-    """Meshes as a Wavefront OBJ file [m]: one object a mesh, with its material.
+    """Meshes as a Wavefront OBJ file [m]: one object for each mesh, with its material.
 
     Args:
         heading: Comments at the start of the file.
-        notes: Comments in front of each mesh; empty without any.
+        notes: Comments before each mesh; empty without comments.
     """
     # trimesh writes triangles alone, and a material only by a second file and with a texture.
     lines = [f"# {comment}" for comment in heading]
@@ -69,12 +69,12 @@ def wavefront_obj(
 
 
 def read_obj(file: Path) -> tuple[Float[np.ndarray, "v 3"], Groups]:
-    """Vertices [m] and faces of a Wavefront OBJ file, as by ``parse_obj``."""
+    """Vertices [m] and faces of a Wavefront OBJ file, by ``parse_obj``."""
     return parse_obj(read_lines(file, "a mesh of 'v x y z' and 'f i j k'"), str(file))
 
 
 def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3"], Groups]:
-    """Vertices [m] and faces of the lines of a Wavefront OBJ file; errors name source and line."""
+    """Vertices [m] and faces from lines of a Wavefront OBJ file; errors name source and line."""
     # trimesh's reader cuts polygons, loses materials without an .mtl file, counts negative numbers
     # from the end of the file, and leaves defects without their line.
     vertices: list[list[float]] = []
@@ -102,7 +102,7 @@ def parse_obj(lines: Iterable[str], source: str) -> tuple[Float[np.ndarray, "v 3
 def _joined(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]]:
     """Numbers and texts of lines; a line that ends in a backslash is joined with the next one.
 
-    A joined line has the number of its last part, from 1.
+    A joined line has the number of its last part, counted from 1.
     """
     begun = ""
     number = 0
@@ -119,7 +119,7 @@ def _joined(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]]:
 
 
 def _vertex(words: Sequence[str]) -> list[float]:
-    """The position [m] of a line ``v x y z``; a ``ValueError`` says what was expected."""
+    """The position [m] in a line ``v x y z``; a ``ValueError`` states the expected form."""
     if len(words) < 3 or not all(map(NUMBER.fullmatch, words[:3])):
         raise ValueError("numbers x y z")
     point = [float(word) for word in words[:3]]
@@ -129,9 +129,9 @@ def _vertex(words: Sequence[str]) -> list[float]:
 
 
 def _face(words: Sequence[str], count: int) -> Face:
-    """Vertices, from 0, of a line ``f i j k`` with ``count`` vertices before it.
+    """Vertices, from 0, of a line ``f i j k`` after ``count`` vertices.
 
-    A ``ValueError`` says what was expected.
+    Raises a ``ValueError`` with the expected form.
     """
     try:
         numbers = [int(word.split("/")[0]) for word in words]
@@ -164,7 +164,7 @@ def read_ply(file: Path) -> tuple[np.ndarray, list[Face]]:
 
 
 def positions(vertices: np.ndarray) -> Float[np.ndarray, "v 3"]:
-    """Positions [m] of vertices as ``read_ply`` gives them."""
+    """Positions [m] of vertices from ``read_ply``."""
     return np.stack([vertices[axis] for axis in "xyz"], -1)
 
 

@@ -14,7 +14,7 @@ from gaigs.io.files import atomic_write
 class Variable(NamedTuple):
     """A variable of a NetCDF file: real numbers or texts, with attributes by the CF conventions.
 
-    ``dimensions`` has a name for each axis of ``values``.
+    ``dimensions`` names each axis of ``values``.
     """
 
     dimensions: tuple[str, ...]
@@ -27,7 +27,7 @@ def write_netcdf(
 ) -> None:
     """Writes variables by name. A variable with the name of its only dimension is a coordinate.
 
-    Texts become characters with a dimension of their own, which xarray joins.
+    Texts are stored as characters along a further dimension; xarray joins them.
     """
     with atomic_write(file) as part, netcdf_file(part, "w", version=2) as content:
         _describe(content, {"Conventions": "CF-1.11", **attributes})

@@ -1,6 +1,6 @@
 """Text files of data sets: lines, tables of numbers, points and index files.
 
-Errors name file, line and content.
+Errors state file, line and content.
 """
 
 import codecs
@@ -33,7 +33,7 @@ NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)(e[+-]?\d+)?", re.ASCII | re.IGNOR
 
 
 def quote(value: object) -> str:
-    """A value as errors show it: printable and short."""
+    """A value for errors: printable and short."""
     # Few entries of a list are shown: aliases of YAML multiply.
     text = repr(value) if isinstance(value, str) else reprlib.repr(value)
     return text if len(text) <= 100 else f"{text[:100]} ..."
@@ -65,7 +65,7 @@ def find_file(file: str | Path, content: str, option: str = "the data's file") -
 
 
 def has_file(file: Path) -> bool:
-    """True if a folder has an optional file; a broken link counts, and reading it is an error."""
+    """True if a folder has an optional file; a broken link counts, and fails on reading."""
     return os.path.lexists(file)
 
 
@@ -76,9 +76,9 @@ def check_empty(folder: Path) -> None:
 
 
 def read_lines(file: Path, content: str) -> list[str]:
-    """Lines of a text file without the blank ones at its end; a ``ValueError`` for an empty file.
+    """Lines of a text file without blank lines at its end; a ``ValueError`` for an empty file.
 
-    The text is UTF-8, UTF-16 with a byte order mark, or else of western Windows, which has the
+    The encoding is UTF-8, UTF-16 with a byte order mark, or otherwise Windows-1252, which has the
     letters of Latin-1.
     """
     if not os.path.isfile(file):  # reading a pipe would block
@@ -100,7 +100,7 @@ def refuse(file: Path, wrong: Mapping[int, str], expected: str, unit: str = "lin
     """Raises a ``ValueError`` that names the first wrong line and counts the others.
 
     Args:
-        wrong: Contents of the wrong lines by number; empty without any.
+        wrong: Contents of the wrong lines by number; if empty, nothing is raised.
         unit: Word for a line, ``row`` in a data frame.
     """
     if not wrong:
@@ -112,7 +112,7 @@ def refuse(file: Path, wrong: Mapping[int, str], expected: str, unit: str = "lin
 
 
 def read_points(file: Path, names: Sequence[str], content: str) -> list[list[float]]:
-    """Coordinates [m], one point a line; the first line may hold the names of columns."""
+    """Coordinates [m], one point in each line; the first line may name the columns."""
     lines = read_lines(file, content)
     delimiter = find_delimiter(lines)
     header = [cell.lower() for cell in split_cells(lines[0], delimiter)]
@@ -167,9 +167,10 @@ def split_cells(line: str, delimiter: str = ",") -> list[str]:
 def split_rows(
     file: Path, lines: Sequence[str], names: Sequence[str], skip: int, delimiter: str
 ) -> dict[int, list[str]]:
-    """Cells of each line after the first ``skip``; a ``ValueError`` unless a line has one a name.
+    """Cells of each line after the first ``skip``, one for each of ``names``.
 
-    Where another character separates the cells, commas are decimal points.
+    Raises a ``ValueError`` for a line with another number of cells. Unless the delimiter is a
+    comma, commas are decimal points.
     """
     rows: dict[int, list[str]] = {}
     wrong: dict[int, str] = {}
@@ -183,7 +184,7 @@ def split_rows(
 
 
 def miscounted(line: str, cells: Sequence[str], count: int) -> str:
-    """The message's end for a line without ``count`` cells: their number, the line, the reason."""
+    """End of a message for a line without ``count`` cells: their number, the line, the reason."""
     others = [word for mark, word in SEPARATORS.items() if len(split_cells(line, mark)) == count]
     reason = f"; columns separated by {others[0]}?" if others else ""
     if len(cells) > count and all(re.fullmatch(r"[+-]?\d+", cell) for cell in cells):
@@ -198,7 +199,7 @@ def numbers_in(cell: str) -> list[float]:
 
 
 def described(cell: str) -> str:
-    """A cell that is not the expected number, quoted for errors, with the reason if it is plain."""
+    """A wrong cell in quotes for errors, with the reason if it is obvious."""
     if numbers_in(cell):
         return f"{quote(cell)}, several numbers,"
     if re.fullmatch(r"[+-]?\d+,\d+", cell):
@@ -219,11 +220,11 @@ class Table(NamedTuple):
 
     @property
     def heading(self) -> str:
-        """The place of the columns' names, for messages."""
+        """The location of the column names, for messages."""
         return f"{self.file}, line 1" if self.unit == "line" else str(self.file)
 
     def refuse(self, wrong: Mapping[int, str], expected: str) -> None:
-        """Raises a ``ValueError`` for wrong cells by the numbers of their rows, as ``refuse``."""
+        """Raises the ``ValueError`` of ``refuse`` for wrong cells by row number."""
         numbered = {self.first + row: cell for row, cell in wrong.items()}
         refuse(self.file, numbered, expected, self.unit)
 
@@ -232,7 +233,7 @@ class Table(NamedTuple):
         return f"{described(self.text(row, column))} in column {self.names[column]}"
 
     def column(self, name: str) -> int:
-        """The number of a column; a ``ValueError`` if there is none of that name."""
+        """The number of a column; a ``ValueError`` for an unknown name."""
         if name not in self.names:
             near = difflib.get_close_matches(name, self.names, n=1)
             hint = f" (did you mean {near[0]!r}?)" if near else ""
@@ -242,7 +243,7 @@ class Table(NamedTuple):
 
 
 def write_table(file: Path, rows: Iterable[Sequence]) -> None:
-    """Writes rows as a CSV table, the heading first; texts as ``inert`` gives them."""
+    """Writes rows as a CSV table, the heading first; texts after ``inert``."""
     with atomic_write(file) as part, part.open("w", encoding="utf-8", newline="") as opened:
         writer = csv.writer(opened, lineterminator="\n")
         for row in rows:
@@ -250,10 +251,10 @@ def write_table(file: Path, rows: Iterable[Sequence]) -> None:
 
 
 def inert(text: str) -> str:
-    """A text that no spreadsheet takes for a formula.
+    """A text that no spreadsheet reads as a formula.
 
-    A text that starts with =, +, -, @, a tab or a return gets an apostrophe in front, and so does
-    such a text behind apostrophes. Numbers stay as they are.
+    A text that starts with =, +, -, @, a tab or a return gets an apostrophe in front, even if it
+    already has some. Numbers are unchanged.
     """
     starts = text.lstrip("'").startswith(("=", "+", "-", "@", "\t", "\r"))
     return f"'{text}" if starts and text != "-inf" and math.isnan(to_number(text)) else text
@@ -295,10 +296,10 @@ def read_table(file: Path, content: str) -> Table:
 
 
 def to_level(cell: str, has_commas: bool = False) -> float:
-    """The number of a cell, NaN for an empty one, infinity for another text.
+    """The number in a cell, NaN for an empty cell, infinity for another text.
 
     Args:
-        has_commas: True if a comma is a decimal one.
+        has_commas: True if commas are decimal points.
     """
     text = re.sub(r"(?i)\s*dbm$", "", cell)
     value = to_number(text.replace(",", ".") if has_commas else text)
@@ -312,7 +313,8 @@ def to_numbers(
 ) -> list[list[float]]:
     """Cells of a table as numbers, NaN for other texts.
 
-    Raises a ``ValueError`` with the first cell for which ``holds`` is false in each wrong line.
+    Raises a ``ValueError`` with the first invalid cell of each wrong line; ``holds`` is true for a
+    valid number.
     """
     numbers: list[list[float]] = []
     wrong: dict[int, str] = {}
@@ -327,7 +329,7 @@ def to_numbers(
 
 
 def to_coordinates(file: Path, rows: Rows, names: Sequence[str]) -> list[list[float]]:
-    """Cells of a table as coordinates [m]; a ``ValueError`` where one is not finite, or too far."""
+    """Cells of a table as coordinates [m]; a ``ValueError`` for infinite or too large ones."""
     to_numbers(file, rows, names, math.isfinite, "a finite number")
     return to_numbers(file, rows, names, lambda value: abs(value) < FAR, WITHIN)
 
@@ -350,11 +352,11 @@ def to_index(text: str) -> int | None:
 def read_parts(
     root: Path, parse: Callable[[str], Hashable | None], expected: str
 ) -> tuple[list, list]:
-    """Distinct entries of ``train_index.txt`` and ``test_index.txt``, one a line.
+    """Distinct entries of ``train_index.txt`` and ``test_index.txt``, one in each line.
 
     Args:
-        parse: Turns a line into its entry; returns None for a line with a defect.
-        expected: What a line should hold, for errors.
+        parse: Function from a line to its entry; None for an invalid line.
+        expected: Expected content of a line, for errors.
     """
     places: dict[Hashable, str] = {}
     parts = []

@@ -1,6 +1,6 @@
-"""YAML files of data sets, with numbers as written.
+"""YAML files of data sets; numbers mean what people write.
 
-PyYAML reads 010 as 8, 1:30 as 90 and 1e-3 as a word.
+PyYAML would read 010 as 8, 1:30 as 90 and 1e-3 as a word.
 """
 
 import math
@@ -15,7 +15,7 @@ from gaigs.io.tables import quote, read_lines, to_number
 
 
 class TextLoader(yaml.SafeLoader):
-    """Loads scalars as text, and refuses unknown tags and repeated keys: PyYAML keeps the last."""
+    """Loads scalars as text, and rejects unknown tags and repeated keys (PyYAML keeps the last)."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict:
         """The mapping of a node."""
@@ -46,7 +46,7 @@ def read_mapping(file: Path, content: str) -> dict[str, object]:
 
 
 def to_vector(place: str, value: object, axes: str) -> list[float]:
-    """A list of one finite number for each axis; the ``ValueError`` of another value says where."""
+    """A list of one finite number for each axis; a ``ValueError`` names ``place``."""
     items = value if isinstance(value, list) else []
     octal = re.compile(r"[+-]?0[0-9]+")  # 010 is 8 in YAML 1.1 and 10 in YAML 1.2
     numbers = [
@@ -61,7 +61,7 @@ def to_vector(place: str, value: object, axes: str) -> list[float]:
 
 
 def to_position(place: str, value: object) -> list[float]:
-    """Coordinates x, y, z [m] within ``FAR``; the ``ValueError`` of another value says where."""
+    """Coordinates x, y, z [m] within ``FAR``; a ``ValueError`` names ``place``."""
     numbers = to_vector(place, value, "xyz")
     if max(map(abs, numbers)) >= FAR:
         raise ValueError(f"{place}: expected {WITHIN}, got {quote(value)}")

@@ -1,4 +1,4 @@
-"""Blends of two predictions, and the scores by which one is chosen."""
+"""Blends of two predictions, and scores to choose between them."""
 
 import math
 
@@ -13,7 +13,7 @@ from gaigs.data import Links
 def validation_scores(
     links: Links, values: Tensor, index: Int[Tensor, " k"] | None = None
 ) -> Float[Tensor, " k"]:
-    """The task's monitored score of predictions ``values``, turned so that higher is better.
+    """The task's monitored score of predictions ``values``, with its sign so that higher is better.
 
     The predictions are of the validation links, or of the links ``index``.
     """
@@ -26,8 +26,8 @@ def validation_scores(
 def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -> Tensor:
     """weight one + (1 - weight) other, as a new tensor.
 
-    Channels of unknown phase: ``one`` is first aligned to ``other``. A prediction whose weight is 0
-    is not read, since its NaN would spoil the sum, and may be None.
+    For channels of unknown phase ``one`` is first aligned to ``other``. A prediction with a weight
+    of 0 is not read and may be None, since its NaN would spoil the sum.
     """
     if weight in (0, 1):
         return (one if weight else other).clone()
@@ -37,9 +37,10 @@ def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -
 def is_surely_better(
     one: Float[Tensor, " k"], other: Float[Tensor, " k"], *, errors: float = 2.0
 ) -> bool:
-    """True if the mean of ``one`` is higher than that of ``other`` by ``errors`` standard errors.
+    """True if the mean of ``one`` is higher than the mean of ``other`` by ``errors`` standard
+    errors.
 
-    The error is the one of paired differences, link by link. False for fewer than two scores.
+    The standard error is of paired differences, link by link. False for fewer than two scores.
     """
     gain = one - other
     return len(gain) > 1 and bool(gain.mean() > errors * gain.std() / math.sqrt(len(gain)))

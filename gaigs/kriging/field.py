@@ -22,7 +22,7 @@ from gaigs.kriging.posterior import Posterior
 class Field(nn.Module):
     """The kriged residual at one receiver: places and weights of k known links.
 
-    Residuals are stored as scores of q principal components, since labels have many numbers.
+    Labels have many numbers, so residuals are stored as scores of q principal components.
     """
 
     places: Tensor  # places of the links (k, d) [m], see ``coordinates``
@@ -54,7 +54,7 @@ class Field(nn.Module):
     ) -> None:
         """Computes components and weights from residuals (k, *shape) at known places.
 
-        The components leave out at most ``share`` of the residuals' energy.
+        The components omit at most the fraction ``share`` of the residuals' energy.
         """
         residuals = residuals.reshape(len(residuals), -1)  # (k, m)
         components = principal_components(residuals, share)  # (q, m)
@@ -88,7 +88,7 @@ class Field(nn.Module):
         return self.size(process) * local_deviations(places, self.places, process)
 
     def size(self, process: Hyperparameters) -> Tensor:
-        """Most likely standard deviation of the process, a mean over a label's numbers."""
+        """Maximum-likelihood deviation of the process, a mean over a label's numbers."""
         if self.signal is None:
             # The mean of r' K^-1 r over numbers and links, with r the residuals of a number.
             covariances = covariance(self.places, process.length, process.nugget)
@@ -116,12 +116,12 @@ class Field(nn.Module):
 class FieldPosterior(Posterior):
     """Kriged residuals of labels of many numbers, a ``Field`` for each receiver.
 
-    Hyperparameters are the same for all receivers and numbers. The trend's weight is the candidate
-    with the largest likelihood. Residuals of channels are limited, see ``damping``.
+    All receivers and numbers share hyperparameters. The trend's weight is the candidate with the
+    largest likelihood. Residuals of channels are limited, see ``damping``.
 
-    Spectra have ``features``, the trend's spectra by ``coarse``: places correlate the less, the
-    more these differ, as where a shadow ends between them. Source: Wilson et al., Deep kernel
-    learning, 2016.
+    Spectra have ``features``, the trend's spectra on a coarse grid (``coarse``). The correlation of
+    places falls with the difference of features, as at the edge of a shadow. Source: Wilson et al.,
+    Deep kernel learning, 2016.
     """
 
     chooses_weight = True
@@ -254,23 +254,23 @@ class FieldPosterior(Posterior):
 
 
 def _like_loaded(buffer: Tensor, values: Tensor) -> Tensor:
-    """Values laid out like a loaded buffer: other types and strides round products differently."""
+    """Values with the memory layout of a loaded buffer: strides affect the rounding of products."""
     return buffer.new_empty(values.shape).copy_(values)
 
 
 def principal_components(
     residuals: Inexact[Tensor, "k m"], share: float = 2e-4, most: int = 512, exact: int = 512
 ) -> Inexact[Tensor, "q m"]:
-    """The fewest principal components that leave out at most a share of the residuals' energy.
+    """The smallest number of principal components that omit at most a fraction of the energy.
 
     Each is scaled to a largest magnitude of 1. Residuals of 0 have no components.
 
     Args:
         residuals: Residuals of links.
-        share: Largest share of the energy that the components leave out.
+        share: Largest fraction of the energy that the components omit.
         most: Largest number of components.
-        exact: Links or numbers of a label up to which components are exact; beyond it random
-            projections are faster.
+        exact: Number of links, or of numbers in a label, up to which components are exact; beyond
+            it random projections are faster.
     """
     if min(residuals.shape) <= exact:
         # By the smaller matrix of products: a decomposition of the residuals themselves takes ten

@@ -1,6 +1,4 @@
-"""Hyperparameters of a Gaussian process over links, fitted by maximum likelihood of held-out
-labels.
-"""
+"""Hyperparameters of a Gaussian process over links, by maximum likelihood of held-out labels."""
 
 import math
 from collections.abc import Callable
@@ -75,8 +73,8 @@ def damping(
     """Factors, at most 1, by which the residuals of k channels are multiplied before kriging.
 
     They limit the norm of a residual to ``most`` times the median norm of the known channels of its
-    receiver. Places within decimetres of a receiver pass the limit, and so do readings with a gross
-    error: a single one would spoil all predictions of the room.
+    receiver. Places within decimetres of a receiver exceed the limit, and so do gross errors. A
+    single one would spoil all predictions of the room.
     """
     sizes, levels = norms(residuals), norms(labels)
     factors = torch.ones_like(sizes)
@@ -103,22 +101,23 @@ def fit_hyperparameters(
     features: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
     length: float | None = None,
 ) -> tuple[Hyperparameters, float]:
-    """Hyperparameters with the largest likelihood, and their ``negative_log_likelihood`` summed
-    over receivers, -inf if all residuals are 0.
+    """Hyperparameters with the largest likelihood, and their ``negative_log_likelihood``.
+
+    The latter is summed over receivers, and is -inf if all residuals are 0.
 
     Args:
         scene: Receivers and task.
-        links: Known links of each receiver, and the split that says which links are held out.
+        links: Known links of each receiver, with the split that defines the held-out links.
         residuals: Function from indices of links to the residuals of their ``thin_labels``.
-        most: Held-out links of all receivers together; 300 take seconds at most.
-        nuggets: Bounds of the nugget. The lower keeps matrices regular in float64 if places are
+        most: Largest number of held-out links of all receivers together; 300 take a few seconds.
+        nuggets: Bounds of the nugget. The lower one keeps matrices regular in float64 if places are
             measured twice.
         edges: Longest correlation length [longest edges of the box of places]. Beyond it the kernel
-            is nearly linear within the box, so the length no longer shows.
+            is nearly linear within the box, and the length has no effect.
         features: Function from indices of links to their features, see ``coordinates``.
-        length: A known correlation length; the others then have the least squared error of the
-            held-out labels in place of the largest likelihood. A trend has seen the training links:
-            variances by their residuals mislead.
+        length: A known correlation length. The other hyperparameters then minimise the squared
+            error of the held-out labels instead of maximising the likelihood: a trend was trained
+            on the training links, so the variance of their residuals is misleading.
     """
     longest = (scene.upper - scene.lower).max().item()
     lengths = (scene.spacing, edges * longest) if length is None else (length, length)
@@ -187,7 +186,7 @@ def hold_out(
 
     Validation links are held out, and training links predict them. With fewer than ``FEWEST``
     validation links, training links are held out one by one, each with all links at its place. The
-    ``neighbours`` nearest links predict a held-out one; ``scale`` is that of ``coordinates`` [m].
+    ``neighbours`` nearest links predict a held-out one. ``scale`` is as for ``coordinates`` [m].
     None if all residuals are 0, or if no other place is known.
     """
     split, query = links.split, links.query
@@ -233,11 +232,11 @@ def negative_log_likelihood(
     *,
     by_errors: bool = False,
 ) -> Float[Tensor, ""]:
-    """-2 log p(held-out labels | labels around them) without constants, a mean over a label's
+    """-2 log p(held-out labels | labels around them) without constants, averaged over a label's
     numbers.
 
-    The signal's variance is the one with the largest likelihood at the receiver. With ``by_errors``
-    all held-out labels have one variance.
+    The signal's variance is the maximum-likelihood value at the receiver. With ``by_errors`` all
+    held-out labels have one variance.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """
@@ -268,7 +267,7 @@ def local_deviations(
 ) -> Float[Tensor, " b"]:
     """Standard deviations of noisy labels at ``asked`` places, over the signal's.
 
-    They are given the ``neighbours`` nearest of the known places; all are ``coordinates``.
+    They are conditional on the ``neighbours`` nearest known places. All places are ``coordinates``.
     """
     count = min(neighbours, len(known))
     variances = [asked.new_zeros(0)]

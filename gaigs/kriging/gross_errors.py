@@ -1,4 +1,4 @@
-"""Received levels with gross errors, which the levels around them contradict."""
+"""Received levels with gross errors, which contradict the levels around them."""
 
 import math
 from dataclasses import replace
@@ -13,15 +13,16 @@ from gaigs.kriging.links import coordinates, distances
 
 
 def without_gross_errors(links: Links, size: float = 6.0) -> Links:
-    """The links without known levels that have a gross error, since one of these moves a whole fit.
+    """The links without known levels that have a gross error, since one such error spoils a whole
+    fit.
 
-    Labels are one number each. Levels follow a law, a line over the logarithm of the distance to
-    their receiver, fitted with Cauchy's weights, which a few wrong levels do not move. A level is
-    left out if its error by the law exceeds ``size`` standard deviations and differs by as much
-    from the errors of the five nearest levels at its receiver. Errors that neighbours share, or
-    that more than one level in twenty has, are effects of the room and stay. The standard deviation
-    is 1.48 times the median error, of the receiver or of all receivers, whichever is larger, and at
-    least 1 dB. With fewer than 20 known links all stay.
+    Labels are scalars. Levels follow a law: a line over the logarithm of the distance to the
+    receiver, fitted with Cauchy's weights, so that a few wrong levels do not move it. A level is
+    removed if its error about the law exceeds ``size`` standard deviations, and also differs by
+    this much from the errors of the five nearest levels at its receiver. Errors that neighbours
+    share, or that more than one level in twenty has, are effects of the room and stay. The standard
+    deviation is 1.48 times the median error of the receiver or of all receivers, whichever is
+    larger, and at least 1 dB. With fewer than 20 known links all stay.
 
     Source: Maronna, Martin and Yohai, Robust Statistics, 2006, sections 4.4 and 5.2.
     """
@@ -58,10 +59,10 @@ def are_alone(
     threshold: Float[Tensor, ""],
     neighbours: int = 5,
 ) -> Bool[Tensor, " k"]:
-    """True for errors larger than ``threshold`` that differ by more than it from all errors nearby.
+    """True for errors above ``threshold`` that also differ by more than it from all errors nearby.
 
     Nearby are the nearest ``neighbours`` places. If more than one error in twenty would be True,
-    all are False: so many are an effect of the room.
+    all are False: such a number is an effect of the room.
     """
     is_alone = torch.zeros_like(errors, dtype=torch.bool)
     large = (errors.abs() > threshold).nonzero()[:, 0]
@@ -96,5 +97,5 @@ def errors_of_law(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> 
 
 
 def robust_deviation(errors: Float[Tensor, " k"]) -> Float[Tensor, ""]:
-    """Standard deviation of normal errors by their median magnitude; at least 1 [label's unit]."""
+    """Standard deviation of normal errors, from their median magnitude; at least 1."""
     return (1.4826 * errors.abs().median()).clamp_min(1.0)

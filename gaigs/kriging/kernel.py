@@ -1,6 +1,6 @@
 """Kernels of Gaussian processes, and kriging weights with their variance.
 
-Labels of many numbers and paths have ``kernel``, labels of one number ``matern``.
+Labels of many numbers and paths use ``kernel``, scalar labels ``matern``.
 """
 
 import math
@@ -16,7 +16,7 @@ from gaigs.kriging.links import distances
 
 @dataclass(frozen=True)
 class Process:
-    """The Gaussian process of one receiver's labels over places, and the readings that it knows."""
+    """The Gaussian process of one receiver's labels over places, and its known readings."""
 
     # Function of two sets of places (m, d) and (n, d) to the covariances of the process, in the
     # label's unit squared.
@@ -29,14 +29,14 @@ class Process:
     def whitened(
         self, asked: Float[Tensor, "g d"], rows: Int[Tensor, " j"] | slice = slice(None)
     ) -> tuple[Float[Tensor, "j g"], Float[Tensor, "j j"]]:
-        """Whitened covariances L^-1 C, and L. C is between readings and places, L L' among
-        readings.
+        """Whitened covariances L^-1 C, and L.
 
-        The known readings lower the variance at a place by the sum of squares of its column.
+        C are covariances of readings with places, L L' covariances among readings. The known
+        readings lower the variance at a place by the sum of squares of its column in L^-1 C.
 
         Args:
             asked: Places, ``coordinates`` of scale 1 [m].
-            rows: Known readings that count; by default all.
+            rows: Numbers of the known readings to use; by default all.
         """
         places = self.places[rows]
         between = self.covariances(places, places)
@@ -47,7 +47,7 @@ class Process:
 
 
 def resize(module: nn.Module, state: Mapping[str, Tensor], prefix: str, *names: str) -> None:
-    """Gives the buffers ``names`` the shapes that they have in a ``state`` about to be loaded."""
+    """Gives the buffers ``names`` the shapes in a ``state`` before it is loaded."""
     for name in names:
         if f"{prefix}{name}" in state:
             setattr(module, name, getattr(module, name).new_empty(state[f"{prefix}{name}"].shape))
@@ -61,7 +61,7 @@ SMOOTHNESSES = (0.5, 1.5)
 
 
 def matern(apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
-    """Matern correlation of places at some distances [m], of smoothness 1/2 or 3/2.
+    """Matern correlation of places at distances ``apart`` [m], of smoothness 1/2 or 3/2.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, equations 4.16
     and 4.17.
@@ -72,7 +72,7 @@ def matern(apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
 
 
 def matern_slope(correlation: Tensor, apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
-    """Derivative of ``matern``, whose value is ``correlation``, by the logarithm of the length."""
+    """Derivative of ``matern`` by the logarithm of the length; ``correlation`` is its value."""
     steps = apart * (math.sqrt(2 * smoothness) / length)  # s
     if smoothness == 0.5:  # d exp(-s) / d ln l = s exp(-s)
         return steps * correlation
@@ -83,12 +83,12 @@ def matern_slope(correlation: Tensor, apart: Tensor, length: Tensor, smoothness:
 def kernel(
     a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"], length: float | Tensor
 ) -> Float[Tensor, "*c m n"]:
-    """Covariances exp(-d / length) of places ``a`` and ``b`` [m] over the signal's variance."""
+    """Covariances exp(-d / length) of places ``a`` and ``b`` [m], over the signal's variance."""
     return (distances(a, b) / -length).exp_()
 
 
 def covariance(places: Float[Tensor, "k d"], length: float, nugget: float) -> Float[Tensor, "k k"]:
-    """Covariances of noisy labels over the signal's variance; options of ``kriging_weights``."""
+    """Covariances of noisy labels over the signal's variance; arguments of ``kriging_weights``."""
     covariances = kernel(places, places, length)
     covariances.diagonal().add_(nugget)
     return covariances
@@ -107,9 +107,9 @@ def kriging_weights(
     length: float | Tensor,
     nugget: float | Tensor,
 ) -> tuple[Float[Tensor, "b j"], Float[Tensor, " b"]]:
-    """Weights w of the known links around each asked link, and the variance of w'y as a prediction.
+    """Weights w of the known links around each asked link, and the variance of the prediction w'y.
 
-    The variance is over the signal's and includes the noise of the asked label.
+    The variance is relative to the signal's and includes the noise of the asked label.
 
     Args:
         asked, around: ``coordinates`` of the asked links, and of j known links around each [m].

@@ -1,4 +1,4 @@
-"""Densities of readings given those around them: normal, or with Student's t as noise."""
+"""Densities of readings given the readings around them: normal, or with Student's t noise."""
 
 import math
 from typing import NamedTuple
@@ -12,8 +12,10 @@ from gaigs.kriging.neighbours import Around
 
 
 class Choice(NamedTuple):
-    """Smoothness of the kernel, degrees of freedom of the noise (inf: normal), scale [m] or NaN;
-    True if length and noise differ from place to place.
+    """Kernel and noise of a process.
+
+    The fields are smoothness of the kernel, degrees of freedom of the noise (inf: normal), scale of
+    carriers [m] or NaN, and True if length and noise differ from place to place.
     """
 
     smoothness: float = 0.5
@@ -36,7 +38,8 @@ def covariances(
 ) -> Float[Tensor, "m i i"]:
     """Covariances of the process z at the readings around each place, and at the place itself.
 
-    ``hyperparameters`` are length, deviation of the signal and of the noise at each receiver.
+    ``hyperparameters`` are length, deviation of the signal and deviation of the noise, at each
+    receiver.
     """
     of_places = hyperparameters[around.receivers][..., None, None]  # (m, 3, 1, 1)
     length, signal, _ = of_places.unbind(1)
@@ -44,7 +47,7 @@ def covariances(
 
 
 def separations(around: Around, choice: Choice) -> Float[Tensor, "m i i"]:
-    """Distances in place and carrier, see ``coordinates``."""
+    """Distances in place and carrier, from ``coordinates``."""
     if around.bands is None:
         return around.apart
     return (around.apart.square() + choice.scale**2 * around.bands).sqrt()
@@ -53,12 +56,11 @@ def separations(around: Around, choice: Choice) -> Float[Tensor, "m i i"]:
 def conditional(
     between: Float[Tensor, "m i i"], values: Float[Tensor, "m j"], variances: Float[Tensor, "m j"]
 ) -> Conditional:
-    """Means and variances of z at places, from ``covariances``, the readings around, and the
-    variances of their noise.
+    """Means and variances of z at places, given the readings around and their noise variances.
 
-    The mean is w'y, and the variance k - 2 w'c + w'(C + N) w. Here y are the readings, N the
-    variances of their noise, and C, c and k the covariances among readings, with the place and at
-    the place. The weights w = (C + N)^-1 c minimise the variance.
+    ``between`` are ``covariances``. The mean is w'y, and the variance k - 2 w'c + w'(C + N) w. y
+    are the readings, N the variances of their noise, and C, c and k the covariances among readings,
+    with the place and at the place. The weights w = (C + N)^-1 c minimise the variance.
     """
     noisy = between[:, :-1, :-1] + torch.diag_embed(variances)
     towards = between[:, :-1, -1]  # c (m, j)
@@ -87,7 +89,8 @@ def slopes(
     dC e and the mean by -e' dC s, with ``errors`` e and ``solved`` s of ``solution``.
 
     Args:
-        around, hyperparameters, choice, between, variances: As for the functions above.
+        around, hyperparameters, choice, between, variances: As for ``covariances`` and
+            ``conditional``.
         solution: Result of ``conditional``.
         of_mean, of_variance: Derivatives of the cost by the means and variances of ``solution``.
     """
@@ -117,7 +120,7 @@ def expected_factors(
 ) -> Float[Tensor, "m j"]:
     """Expected variance of each reading's noise over ``noises``, by Student's t.
 
-    Only the readings around a place count: the held-out reading there must have no part in it.
+    Only the readings around a place are used; the held-out reading there must have no influence.
 
     Args:
         between: Covariances of z at the readings.
@@ -150,7 +153,7 @@ def log_density(
     """log p of errors, each the sum of a normal variable and of noise.
 
     The normal variable has the ``variances``. The noise has Student's t with ``degrees`` of freedom
-    and ``noises`` as squared scale; infinite ``degrees`` make it normal. Student's t is a mixture
+    and the squared scale ``noises``; infinite ``degrees`` make it normal. Student's t is a mixture
     of normal distributions, whose precision times ``noises`` is a gamma variable. The trapezoidal
     rule over its logarithm is exact to 1e-3 up to a hundred standard deviations.
     """

@@ -22,11 +22,11 @@ PART = 256
 def known_links(links: Links, any_receiver: bool = False) -> list[Int[Tensor, " k"]]:
     """Indices of the training and validation links, a tensor for each receiver.
 
-    With ``one_radio`` all links are in a single tensor.
+    With ``one_radio`` a single tensor has all links.
 
     Raises:
-        ValueError: A receiver has no links. With ``any_receiver``, for a model that needs none
-            there, this is allowed where the split holds out receivers.
+        ValueError: A receiver has no links. With ``any_receiver`` this is allowed if the split
+            holds out receivers, since the model needs no links there.
     """
     if links.one_radio:
         return [links.split.known]
@@ -45,7 +45,7 @@ def known_links(links: Links, any_receiver: bool = False) -> list[Int[Tensor, " 
 
 
 def check_known(links: Links) -> None:
-    """Raises the ``ValueError`` of ``known_links`` for all known and validation links."""
+    """Raises the ``ValueError`` of ``known_links`` for all known links and for validation links."""
     known_links(links, any_receiver=True)
     known_links(replace(links, split=links.split.validating()), any_receiver=True)
 
@@ -59,7 +59,7 @@ def limit_known(links: Links, most: int) -> Links:
 
 
 def folds_of(links: Links, index: Int[Tensor, " k"], count: int = 10) -> Int[Tensor, " k"]:
-    """Random fold, from 0, of some links; a group of the split, or a place, stays in one."""
+    """Random fold, from 0, of some links; a group of the split, or a place, is never divided."""
     groups = links.split.groups
     if groups is None:
         groups = place_numbers(links.query.transmitters[index])
@@ -71,13 +71,13 @@ def folds_of(links: Links, index: Int[Tensor, " k"], count: int = 10) -> Int[Ten
 
 
 def place_numbers(places: Float[Tensor, "k 3"]) -> Int[Tensor, " k"]:
-    """Number of each place, in the order of their coordinates; the same for the same place."""
+    """Number of each place, in the order of coordinates; equal places have equal numbers."""
     which = torch.zeros(len(places), dtype=torch.long)
     return Query(places, which).unique(with_receivers=False)[1]
 
 
 def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]:
-    """One random link of each place, receiver and carrier: repeated ones have alike errors."""
+    """One random link of each place, receiver and carrier: errors of repetitions are similar."""
     if not len(index):
         return index
     _, which = links.query[index].unique(with_receivers=True)
@@ -89,11 +89,12 @@ def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]
 def coordinates(
     scene: Scene, query: Query, scale: float | Tensor, features: Float[Tensor, "b c"] | None = None
 ) -> Float[Tensor, "b d"]:
-    """Points (float64) whose Euclidean distance is that of links: d² = |dx|² + (scale d ln f)².
+    """Points (float64) whose Euclidean distance d is the distance of links.
 
-    dx is the transmitters' step [m], f the carrier. With ``one_radio`` |dx|² counts both ends.
-    ``scale`` [m] has no effect unless the training links have several carriers, or links have
-    ``features``: then d² = |dx|² + (scale |d features|)².
+    d² = |dx|² + (scale d ln f)² for a difference dx of transmitters [m] and the carrier f. With
+    ``one_radio`` |dx|² includes both ends. ``scale`` [m] is used only if the training links have
+    several carriers, or if links have ``features``. With features d² = |dx|² + (scale |d
+    features|)².
     """
     positions = query.transmitters.double()
     if scene.one_radio:
@@ -113,30 +114,30 @@ def coarse(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b c"]:
 
 
 def scaled(places: Float[Tensor, "k d"], scale: float) -> Float[Tensor, "k d"]:
-    """The ``coordinates`` of a scale, from coordinates of scale 1."""
+    """``coordinates`` of a scale, from coordinates of scale 1."""
     ends = edges_of(places)
     return torch.cat((places[:, :ends], scale * places[:, ends:]), 1)
 
 
 def edges_of(places: Float[Tensor, "*k d"]) -> int:
-    """Number of ``coordinates`` that are edges in space: 3, or 6 where both ends move."""
+    """Number of ``coordinates`` that are spatial: 3, or 6 if both ends move."""
     return places.shape[-1] // 3 * 3
 
 
 def distances(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"]) -> Float[Tensor, "*c m n"]:
-    """Distances of all pairs [m], by differences: products would give equal places a distance."""
+    """Distances of all pairs [m], by differences: products would separate equal places."""
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 class Near(NamedTuple):
-    """The nearest known places of some asked ones, nearest first."""
+    """The known places nearest to some places, nearest first."""
 
     apart: Float[Tensor, "m j"]  # [m]
     rows: Int[Tensor, "m j"]  # of known places
 
 
 def nearest_places(asked: Float[Tensor, "m d"], known: Float[Tensor, "k d"], count: int) -> Near:
-    """The ``count`` nearest known places, fewer if there are not as many; by a tree."""
+    """The ``count`` nearest known places, or all if there are fewer; by a k-d tree."""
     count = min(count, len(known))
     # Splits in the middle of a box stay fast where a place is measured often.
     tree = cKDTree(known.double().cpu().numpy(), balanced_tree=False)
@@ -159,8 +160,8 @@ def reception_probability(
         asked: Places [m].
         known: Known places [m].
         receives: 1 where a receiver receives from a known place.
-        prior: Probability before any measurement; it counts as one more known place.
-        neighbours: Number of nearest known places whose share is taken.
+        prior: Probability without measurements; it counts as one more known place.
+        neighbours: Number of nearest known places to average.
     """
     count = min(neighbours, len(known))
     parts = []
@@ -171,11 +172,12 @@ def reception_probability(
 
 
 def scale_bounds(scene: Scene) -> tuple[float, float]:
-    """Least and largest ``scale`` [m] of ``coordinates`` that the training links can distinguish.
+    """Smallest and largest ``scale`` [m] of ``coordinates`` that the training links can
+    distinguish.
 
-    The scale turns the logarithm of the carrier into a distance. With the least scale the whole
-    band is as long as the spacing of the places. With the largest, neighbouring carriers are as far
-    apart as the longest edge of the transmitters' box.
+    The scale converts the logarithm of the carrier into a distance. With the smallest scale the
+    whole band equals the spacing of the places. With the largest, the distance of neighbouring
+    carriers equals the longest edge of the transmitters' box.
     """
     logarithms = scene.frequencies.double().log()
     edge = (scene.upper - scene.lower).max().item()
@@ -197,7 +199,7 @@ def at_directions(values: Tensor, batch: Batch, scene: Scene) -> Tensor:
 def nearest_angles(
     asked: Float[Tensor, " k"], known: Float[Tensor, " n"], period: float | None
 ) -> Int[Tensor, " k"]:
-    """Index of the known angle nearest to each asked one; angles and period in [rad]."""
+    """Index of the known angle nearest to each given one; angles and period in [rad]."""
     apart = asked.double().cpu()[:, None] - known.double().cpu()  # (k, n)
     if period is not None:
         apart = apart - period * (apart / period).round()

@@ -1,6 +1,4 @@
-"""Kriged strengths of propagation paths: complex Gaussian processes of the place, one for each
-path.
-"""
+"""Kriging of path strengths: a complex Gaussian process over places for each propagation path."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -28,7 +26,7 @@ class PathProcess(NamedTuple):
 
     @classmethod
     def usual(cls, spacing: float) -> "PathProcess":
-        """The usual process where neighbouring places are ``spacing`` apart [m].
+        """The default process if neighbouring places are ``spacing`` apart [m].
 
         A longer correlation length raises the mean score further, but may lower the median.
         """
@@ -41,13 +39,13 @@ class PathProcess(NamedTuple):
 
 @dataclass(frozen=True)
 class Equations:
-    """What k links say about the processes u of their n paths.
+    """Likelihood of the processes u of n paths, from k links.
 
-    The channel of a link is predicted as h + sum_i u_i m_i, with m_i the field by which path i
-    deviates for u_i = 1. With the residual r, and noise of ``nugget`` times p, the log likelihood
-    is -|r - sum_i u_i m_i|² / (nugget p), quadratic in u. The noise power p is the mean power of
-    the residual's numbers plus a ten-thousandth of the label's. So links with large residuals, as
-    in shadow, count less.
+    The channel of a link is predicted as h + sum_i u_i m_i, with m_i the prior standard deviation
+    of path i's field. With the residual r and noise of variance ``nugget`` p, the log likelihood is
+    -|r - sum_i u_i m_i|² / (nugget p), quadratic in u. The noise power p is the mean power of the
+    residual's numbers plus a ten-thousandth of the label's. Links with large residuals, as in
+    shadow, therefore have less weight.
     """
 
     places: Float[Tensor, "k 3"]  # [m]
@@ -63,14 +61,14 @@ class Equations:
         residuals: Complex[Tensor, "k e s"],
         least: float = 1e-4,
     ) -> "Equations":
-        """Equations of links, computed in parts: all fields together may take gigabytes.
+        """Equations of links, computed in parts, since all fields together may take gigabytes.
 
         Args:
             places: Places of the links [m].
             margins: Function from a slice of the links to their fields m_i.
             labels: Channels of the links.
             residuals: Labels minus predictions.
-            least: Share of the label's power that is added to the noise power p.
+            least: Fraction of the label's power that is added to the noise power p.
         """
         if not len(places):  # a receiver without links
             empty = torch.zeros(0, 0, 0, dtype=torch.complex128)
@@ -110,7 +108,7 @@ class PathField(nn.Module):
     def solve(self, equations: Equations, process: PathProcess, jitter: float = 1e-6) -> None:
         """Solves for the strengths of all paths at all known places, by conjugate gradients.
 
-        ``jitter`` is added to the diagonal of the kernel, since a place may be measured twice.
+        ``jitter`` is added to the diagonal of the kernel, since places may be measured twice.
         """
         identity = torch.eye(len(equations.places), dtype=torch.float64)
         between = kernel(equations.places, equations.places, process.length) + jitter * identity
@@ -144,7 +142,8 @@ class PathField(nn.Module):
     ) -> Float[Tensor, "b n"]:
         """Variances of each path's process at some places, as if the elements resolved all paths.
 
-        Only the ``most`` known links nearest to a place count, since these screen those behind.
+        Only the ``most`` known links nearest to a place are used, since they screen links behind
+        them.
         """
         apart = distances(places, self.places)
         near = apart.topk(min(most, len(self.places)), largest=False).indices  # (b, j)
@@ -170,12 +169,12 @@ class PathField(nn.Module):
 class PathPosterior(Posterior):
     """Kriged strengths of paths, a ``PathField`` for each receiver.
 
-    Phases of paths stay as geometry gives them. Hyperparameters follow from the places' spacing.
+    Phases of paths follow from geometry. Hyperparameters follow from the places' spacing.
 
     Args:
         scene: Receivers and task.
-        margins: Function from links to one receiver to the channels by which each of their paths
-            may deviate, one standard deviation each (b, n, e, s).
+        margins: Function from links to one receiver to the prior standard deviation of each path's
+            channel (b, n, e, s).
     """
 
     by_paths = True
@@ -195,7 +194,7 @@ class PathPosterior(Posterior):
         return PathProcess(*self.hyperparameters.tolist())
 
     def fit_process(self) -> None:
-        """Takes the process of the scene's spacing."""
+        """Sets the process for the scene's spacing."""
         process = PathProcess.usual(self.scene.spacing)
         self.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
 

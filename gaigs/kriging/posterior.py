@@ -1,4 +1,4 @@
-"""The contract of a posterior of residuals, which kriging uses."""
+"""The contract of a posterior of residuals, used by kriging."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -17,15 +17,15 @@ class Posterior(nn.Module):
     """Residuals of a trend as Gaussian processes over places, given known links.
 
     ``fit`` finds hyperparameters, ``solve`` takes known residuals, ``mean`` and ``deviations``
-    predict. The state dict has all that predictions need.
+    predict. The state dict has everything that predictions need.
 
     Attributes:
-        chooses_weight: True if validation links choose the weight of kriging, else 1.
+        chooses_weight: True if validation links choose the weight of kriging; otherwise it is 1.
         by_paths: True if strengths of paths are kriged, not labels.
-        start: Result of an earlier fit to nearly the same links, where the next starts; or None.
+        start: Result of an earlier fit to similar links, where the next fit starts; or None.
         seen: Known links that the fit has held out to choose hyperparameters; None: all.
         has_features: True if predictions need the trend's spectra at the asked links.
-        is_lazy: True if predictions are wanted at few places. With many known links only those near
+        is_lazy: True if only few places will be predicted. With many known links only those near
             these places are then solved for.
     """
 
@@ -41,7 +41,7 @@ class Posterior(nn.Module):
         return links
 
     def fit(self, links: Links, candidates: Mapping[float, Tensor]) -> float:
-        """Finds hyperparameters, and gives the trend weight.
+        """Finds hyperparameters, and returns the trend weight.
 
         Args:
             links: Links with a split.
@@ -51,12 +51,13 @@ class Posterior(nn.Module):
         raise NotImplementedError
 
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
-        """Takes the known links; ``residuals`` is a function from j rows to their (j, *shape)."""
+        """Takes the known links; ``residuals`` maps j rows to their residuals (j, *shape)."""
         raise NotImplementedError
 
     def start_from(self, other: Any) -> None:
-        """Starts the next fit where another posterior's ended, to save time; by default does
-        nothing.
+        """Starts the next fit at another posterior's hyperparameters, to save time.
+
+        By default nothing happens.
         """
 
     @abstractmethod
@@ -81,4 +82,4 @@ class Posterior(nn.Module):
         return None
 
     def take_hyperparameters(self, other: Any) -> None:
-        """Takes what ``deviations`` depend on from another posterior, by default nothing."""
+        """Copies the parameters of ``deviations`` from another posterior; by default nothing."""

@@ -1,4 +1,4 @@
-"""Hyperparameters of processes of one number, by the likelihood of held-out readings."""
+"""Hyperparameters of scalar processes, by the likelihood of held-out readings."""
 
 import math
 from dataclasses import dataclass
@@ -26,37 +26,37 @@ from gaigs.kriging.neighbours import HeldOutReadings
 
 @dataclass(frozen=True)
 class ScalarOptions:
-    """Options of a process of one number.
+    """Options of a process of scalar labels.
 
     Attributes:
-        neighbours: Readings around a held-out one while a process is fitted.
-        around: Nearest readings that enter a variance, if a receiver has more than ``many``; and
-            the noise of a reading with Student's t, if more than ``large`` are known. Farther
-            readings lower a deviation by a hundredth alone.
-        local: Nearest readings that enter the mean at a place while a process is not solved.
-        few: Known readings for each place asked at once. With more, an unsolved process answers by
-            ``local`` readings and stays unsolved; with fewer it is solved first.
-        large: Known readings above which a fold keeps the hyperparameters of all: ten times as many
-            as a fit holds out.
-        many: Largest number of a receiver's readings that all enter a variance. Of more the nearest
-            ``around`` do, which takes less time.
-        together: Most readings of a receiver in one covariance matrix; ``Tiles`` divide more.
-        scatter: Scatter between receivers of the logarithms of length, signal and noise, as the
-            prior has it.
-        degrees: Degrees of freedom of Student's t: of the scatter, and of the noise where it is not
+        neighbours: Readings around a held-out one during a fit.
+        around: Number of nearest readings for a variance, if a receiver has more than ``many``; and
+            for the noise of a reading with Student's t, if more than ``large`` are known. Farther
+            readings lower a deviation by only a hundredth.
+        local: Nearest readings for the mean at a place while a process is not solved.
+        few: Number of known readings for each predicted place above which an unsolved process
+            answers by ``local`` readings; otherwise it is solved first.
+        large: Number of known readings above which a fold keeps the hyperparameters of all
+            readings: ten times the number that a fit holds out.
+        many: Largest number of a receiver's readings that all enter a variance. With more, only the
+            nearest ``around`` enter, to save time.
+        together: Largest number of a receiver's readings in one covariance matrix; ``Tiles`` divide
+            more.
+        scatter: Prior scatter between receivers of the logarithms of length, signal and noise.
+        degrees: Degrees of freedom of Student's t, for this scatter and for noise that is not
             normal.
         rounds: Repetitions of expectation and maximisation for the variances of single readings.
-        iterations: Most iterations of a maximisation.
-        tolerance: Relative change of the negative log likelihood that ends a maximisation, far
-            below what distinguishes hyperparameters.
-        size: Places whose covariances are held in memory at a time.
-        edges: Longest correlation length, in longest edges of the box of places: beyond it the
-            kernel is a line in the box.
+        iterations: Largest number of iterations of a maximisation.
+        tolerance: Relative change of the negative log likelihood that ends a maximisation, much
+            smaller than differences between hyperparameters.
+        size: Number of places whose covariances are in memory at a time.
+        edges: Longest correlation length, in longest edges of the box of places. With longer ones
+            the kernel is linear in the box.
         widest: Largest deviation of the signal over the residuals' root mean square. Readings
-            millimetres apart show only the deviation's ratio to a power of the length. An unbounded
-            deviation would predict levels that no receiver reports.
+            millimetres apart determine only the ratio of the deviation to a power of the length,
+            and an unbounded deviation would predict impossible levels.
         largest: Largest deviation of the noise over the residuals' root mean square. Its inverse is
-            the least deviation of signal and noise. The noise keeps matrices regular where a place
+            the smallest deviation of signal and noise. The noise keeps matrices regular if a place
             is measured twice.
     """
 
@@ -79,7 +79,7 @@ class ScalarOptions:
 
 
 class ScalarFit(NamedTuple):
-    """Hyperparameters with the least cost.
+    """Hyperparameters with the lowest cost.
 
     Attributes:
         cost: Negative log likelihood of the held-out readings, with the prior.
@@ -95,16 +95,16 @@ class ScalarFit(NamedTuple):
 class HeldOutCost:
     """Negative log posterior of hyperparameters, given held-out readings.
 
-    A point in the space of the search is a row of numbers: the logarithms of length, signal and
-    noise, common to all receivers; that of the scale of carriers where there are several; and with
-    ``has_deviations`` each receiver's deviations from the first three, in units of their scatter.
+    A point of the search is a row of numbers: the common logarithms of length, signal and noise;
+    the logarithm of the scale of carriers if there are several; and with ``has_deviations`` each
+    receiver's deviations from the first three, in units of their scatter.
 
     Args:
         scene: Receivers and carriers.
         values: Known readings, residuals of a trend (k,).
-        held: Held-out readings, and those around them.
-        choice: Kernel and noise, which stay.
-        has_deviations: True if receivers have hyperparameters of their own.
+        held: Held-out readings, and readings around them.
+        choice: Kernel and noise, which are fixed.
+        has_deviations: True if each receiver has its own hyperparameters.
         prior: Logarithms about which the receivers' logarithms scatter; None: no prior.
         options: Options of the process.
     """
@@ -144,7 +144,7 @@ class HeldOutCost:
         return bounds
 
     def unpacked(self, point: Tensor) -> tuple[Float[Tensor, "r 3"], Choice]:
-        """Logarithms of each receiver's hyperparameters, and the choice, of a point."""
+        """Logarithms of each receiver's hyperparameters, and the choice, from a point."""
         logarithms = point[:3].expand(self.count, 3)
         if self.has_deviations:
             deviations = point[self.shared :].reshape(self.count, 3)
@@ -173,9 +173,9 @@ class HeldOutCost:
         return likelihood + prior.item(), gradient.numpy()
 
     def _likelihood(self, point: np.ndarray) -> tuple[float, Float[Tensor, "r 3"], float]:
-        """Negative log likelihood; its gradient by all logarithms, and by that of the scale.
+        """Negative log likelihood, its gradient by all logarithms, and its gradient by the scale.
 
-        The gradient of the matrices is written out: autograd takes several times as long.
+        The gradient of the matrices is written out; autograd would take several times as long.
         """
         logarithms, choice = self.unpacked(torch.from_numpy(point))
         receivers, hyperparameters = self.around.receivers, logarithms.exp()
@@ -197,7 +197,7 @@ class HeldOutCost:
         return total.item(), gradient, found[:, 3].sum().item()
 
     def start(self, logarithms: Float[Tensor, "r 3"] | None) -> np.ndarray:
-        """The point to start from: of earlier hyperparameters, or the best of a coarse grid."""
+        """The initial point: from earlier hyperparameters, or the best of a coarse grid."""
         if logarithms is not None:
             scale = np.log([self.choice.scale][: self.shared - 3])
             point = np.concatenate((logarithms.mean(0).numpy(), scale))
@@ -213,8 +213,9 @@ class HeldOutCost:
         return np.concatenate((point, np.zeros(len(self.bounds) - self.shared)))
 
     def expect(self, point: np.ndarray) -> None:
-        """Sets ``factors`` to the expected variances of single readings' noise, given a point. A
-        reading that disagrees with all around it then counts little.
+        """Sets ``factors`` to the expected variances of single readings' noise, given a point.
+
+        A reading that disagrees with all around it then has little weight.
         """
         logarithms, choice = self.unpacked(torch.from_numpy(point))
         between = covariances(self.around, logarithms.exp(), choice)[:, :-1, :-1]
@@ -230,9 +231,9 @@ class HeldOutCost:
 
 
 def maximise(cost: HeldOutCost, start: Float[Tensor, "r 3"] | None = None) -> ScalarFit:
-    """The hyperparameters with the least cost, from ``start`` or a coarse grid.
+    """The hyperparameters with the lowest cost, from ``start`` or a coarse grid.
 
-    Noise with Student's t takes a second maximisation, with expected variances of single readings.
+    Noise with Student's t needs a second maximisation, with expected variances of single readings.
     """
     if not cost.size:  # the trend explains all: any hyperparameters do
         return cost.fit_at(-math.inf, cost.bounds.mean(1))

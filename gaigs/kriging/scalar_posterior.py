@@ -1,4 +1,4 @@
-"""Kriged residuals of labels of one real number."""
+"""Kriged residuals of scalar labels."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -19,11 +19,11 @@ from gaigs.kriging.scalar import ScalarProcess
 
 
 class ScalarPosterior(Posterior):
-    """Kriged residuals of labels of one number, with a ``ScalarProcess``.
+    """Kriged residuals of scalar labels, with a ``ScalarProcess``.
 
-    The trend's weight is the mean of its candidates, each weighted by the likelihood of the
-    validation links. All readings of a place count as one. Without validation links all count
-    alike.
+    The trend's weight is the mean of its candidates, weighted by the likelihood of the validation
+    links. Without validation links candidates have equal weights. All readings of a place count as
+    one.
     """
 
     def __init__(self, scene: Scene):

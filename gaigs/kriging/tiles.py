@@ -13,7 +13,7 @@ from gaigs.kriging.links import nearest_places
 
 
 class Merged(NamedTuple):
-    """Readings of a receiver; several at one place and carrier may be merged into one."""
+    """Readings of a receiver; repeated readings at one place and carrier may be merged."""
 
     rows: Int[Tensor, " m"]  # of the first at each place
     values: Float[Tensor, " m"]  # means, weighted by 1 / variance
@@ -21,12 +21,12 @@ class Merged(NamedTuple):
 
 
 class Tiles(nn.Module):
-    """Groups of the readings of a receiver that has too many for one covariance matrix.
+    """Groups of the readings of a receiver with too many of them for one covariance matrix.
 
-    A tile is solved with ``size`` readings in this order: the ``core`` readings or fewer that
-    belong to the tile, the readings around each of these, which screen those behind, and the
-    readings nearest to the tile's centre. A place is predicted by the tile of the nearest reading.
-    A tile is solved when a place in it is first asked for.
+    A tile is solved with ``size`` readings, in this order: first its own readings, at most
+    ``core``; then neighbours of each of these, which screen readings farther away; then the
+    readings nearest to the tile's centre. A place is predicted by the tile of its nearest reading.
+    A tile is solved at the first prediction in it.
     """
 
     core = 64
@@ -61,7 +61,7 @@ class Tiles(nn.Module):
         return len(self.rows)
 
     def clear(self) -> None:
-        """Takes all tiles away."""
+        """Removes all tiles."""
         for name in self.stored[:-1]:
             setattr(self, name, getattr(self, name)[:0])
         self.rows = self.rows.new_zeros(0, self.size)
@@ -88,8 +88,9 @@ class Tiles(nn.Module):
     def numbers(
         self, asked: Float[Tensor, "b d"], places: Float[Tensor, "k d"], known: Bool[Tensor, " k"]
     ) -> Int[Tensor, " _"]:
-        """Tile of each asked place, by the nearest of ``places`` ``known`` to a receiver; empty if
-        the receiver has no tiles.
+        """Tile of each asked place, by its nearest reading; empty if the receiver has no tiles.
+
+        ``places`` are the places of all readings; ``known`` marks the readings of the receiver.
         """
         is_own = known[self.readings]
         rows, owners = self.readings[is_own], self.owners[is_own]
@@ -126,7 +127,7 @@ class Tiles(nn.Module):
         return means
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        if not len(state_dict.get(f"{prefix}rows", ())):  # also one of before
+        if not len(state_dict.get(f"{prefix}rows", ())):  # also in checkpoints without tiles
             state_dict.clear()
             for name in self.stored:
                 state_dict[f"{prefix}{name}"] = getattr(self, name)[:0]
@@ -138,7 +139,7 @@ class Tiles(nn.Module):
 def merged(
     places: Float[Tensor, "k d"], values: Float[Tensor, " k"], variances: Float[Tensor, " k"]
 ) -> Merged:
-    """Readings, one a place, from which the process follows as from all the given ones."""
+    """Readings merged to one for each place, with the same posterior of the process."""
     unique, numbers = places.unique(dim=0, return_inverse=True)
     rows = torch.arange(len(places), device=places.device)
     first = rows.new_full((len(unique),), len(rows)).scatter_reduce(0, numbers, rows, "amin")
@@ -148,7 +149,7 @@ def merged(
 
 
 def halves(places: Float[Tensor, "k d"], most: int) -> list[Int[Tensor, " _"]]:
-    """Rows of places in boxes of at most ``most``: a box is halved across its longest edge."""
+    """Rows of places in boxes of at most ``most``; boxes are halved across their longest edge."""
     parts = [torch.arange(len(places), device=places.device)]
     done = []
     while parts:

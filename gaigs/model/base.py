@@ -44,8 +44,8 @@ class Prediction(NamedTuple):
     """A model's answer to a batch.
 
     Attributes:
-        value: Predicted labels (b, *shape), shaped as the task's or the batch's directions.
-        penalties: Scalars added to the loss, by name; means over the batch's places.
+        value: Predicted labels (b, *shape); the pixels are the batch's directions.
+        penalties: Scalars by name that are added to the loss; means over the batch's places.
     """
 
     value: Tensor
@@ -53,10 +53,10 @@ class Prediction(NamedTuple):
 
 
 class Model(Movable):
-    """The contract of kind ``model``: ``forward`` takes a ``Batch`` and gives a ``Prediction``.
+    """The contract of kind ``model``: ``forward`` maps a ``Batch`` to a ``Prediction``.
 
-    The state dict has all that ``predict`` needs. A model with parameters is trained. One without
-    is a look-up: it learns in ``fit`` only, see ``LookUp``.
+    The state dict has everything that ``predict`` needs. A model with parameters is trained. A
+    model without parameters is a look-up, which learns only in ``fit``, see ``LookUp``.
 
     Args:
         scene: Receivers and task.
@@ -66,21 +66,20 @@ class Model(Movable):
         learning_rates: Default learning rate of each parameter group; ``training.learning_rates``
             overrides it.
         penalty_weights: Default weight of each penalty; ``training.penalties`` overrides it.
-        chunk: Largest number of pairs of a link and a direction evaluated at a time; None: whole
-            labels. Training sees as many as ``training.thinning`` leaves.
+        chunk: Largest number of (link, direction) pairs evaluated at a time, except in a training;
+            None: whole labels.
         revisions: Fractions of the training after which ``revise`` is called.
-        settles: True if no coming revision will lower errors suddenly. A training may then be
-            stopped once its errors, continued, would stay above those of a law of distance.
-        second_start: Options of a second training from another start; validation chooses. Empty
-            for one training.
+        settles: True if no later revision will lower errors suddenly. A training may then stop if
+            extrapolated errors stay above the errors of a law of distance.
+        second_start: Options of a second training from another start; the validation score chooses
+            between both. Empty for one training.
         predicts_untrained: True if predictions before the first step are scored, too.
         any_frequency, any_receiver: See ``Movable``.
-        configuration: Options that a registered model was made with; ``save`` stores them.
-        calibration: What intervals are made of; None if no validation links have measured the
-            model's errors.
+        configuration: Options of a registered model; ``save`` stores them.
+        calibration: Data of intervals; None if validation links have not measured the errors.
         known_places: Keys of the training and validation places, ``Query.place_keys``; None if
-            these are unknown.
-        links: Links that a look-up keeps.
+            unknown.
+        links: Known links of a look-up.
 
     Example:
         >>> class Nearest(gaigs.Model):
@@ -119,13 +118,13 @@ class Model(Movable):
 
     @property
     def device(self) -> torch.device:
-        """The device of the model's tensors; the CPU for a look-up without."""
+        """The device of the model's tensors; the CPU for a look-up without tensors."""
         tensors = itertools.chain(self.parameters(), self.buffers())
         return next((tensor.device for tensor in tensors), torch.device("cpu"))
 
     @property
     def is_trained(self) -> bool:
-        """True if a model has parameters to train, beside those that ``fit`` sets."""
+        """True if a model has parameters to train, not only parameters that ``fit`` sets."""
         return any(parameter.requires_grad for parameter in self.parameters())
 
     def fit(self, links: Links) -> None:
@@ -156,7 +155,7 @@ class Model(Movable):
         checkpoint.save(self, path)
 
     def calibrate(self, state: Mapping[str, Tensor] | None) -> None:
-        """Takes the state of a calibration from a checkpoint; None if it has none."""
+        """Sets the calibration from a checkpoint's state; None if it has none."""
         self.calibration = None if state is None else Calibration.from_state(state)
 
     @torch.no_grad()
@@ -192,44 +191,44 @@ class Model(Movable):
         frequencies: object = None,
         interval: float | None = None,
     ) -> Tensor | Estimate | dict:
-        """Values for transmitters at a point, a list or a grid of points, or for a query.
+        """Predicted labels for transmitters at a point, a list or a grid of points, or for a query.
 
         Args:
-            transmitters: Positions (..., 3), world frame [m], anything that becomes a float tensor;
-                or a whole query.
+            transmitters: Positions (..., 3), world frame [m], of any type that converts to a float
+                tensor; or a ``Query``.
             receiver: Name or index of one receiver, or one for each position; None: all receivers.
                 A model with ``any_receiver`` also takes a ``Receiver``, ``Pose`` or position [m]
                 without measurements, see ``at_receivers``.
             frequency: Carrier, one for all or one for each position, from 1e4 to 3e11 Hz; None: the
                 training links' only carrier.
             batch_size: Largest number of links computed at a time, but at least all links of one
-                position; None: as many as have 2^17 numbers together.
-            directions: Directions to predict; None: the label's own, if it has directions.
-            frequencies: Subcarriers of channels to predict (s,) [Hz], also ones that no label had;
-                None: the label's own. A model without ``any_frequency``, such as ``knn``, gives the
+                position. None: links with 2^17 numbers together.
+            directions: Directions to predict; None: the label's directions, if it has any.
+            frequencies: Subcarriers of channels to predict (s,) [Hz], possibly new ones; None: the
+                label's subcarriers. A model without ``any_frequency``, such as ``knn``, returns the
                 values of its nearest subcarriers.
             interval: Probability with which an interval holds the label, between 0 and 1, e.g. 0.9;
-                None: values alone.
+                None: no interval.
 
         Returns:
             Values (..., receivers, *shape): axes of the positions, receivers in the order of
-            ``model.scene.receivers``, and the task's shape. With ``receiver`` they are
-            (..., *shape), for a query (b, *shape). They are scaled as the training labels
-            (``model.scene.task.normalisation``), on the model's device. With an interval an
-            ``Estimate``: the value, its standard deviation, and the interval's ends. Where arrays
-            have different numbers of elements, channels of all receivers are a dictionary by name;
-            channels of a named receiver have the elements of its array.
+            ``model.scene.receivers``, and the task's shape. With ``receiver`` they are (...,
+            *shape), for a query (b, *shape). They are scaled like the training labels
+            (``model.scene.task.normalisation``), on the model's device. With an interval the result
+            is an ``Estimate``: the value, its standard deviation, and the interval's ends. If
+            arrays have different numbers of elements, channels of all receivers are a dictionary by
+            name. Channels of a named receiver have the elements of its array.
 
         Warns:
             ExtrapolationWarning: A position is outside the training transmitters' box by more than
-                the diagonal of transmitters and receivers together; or a frequency is outside the
-                training links' band; or subcarriers are farther from the labels' band than it is
-                wide; or the values belong to other subcarriers. A query gives no warning.
+                the diagonal of the box of transmitters and receivers; a frequency is outside the
+                training links' band; subcarriers are farther from the labels' band than its width;
+                or the values are of other subcarriers. A query gives no warning.
 
         Raises:
-            ValueError: The batch size is less than 1, or a position, receiver, frequency or
-                direction is impossible; or the labels have no subcarriers; or the model had too few
-                validation links for the interval.
+            ValueError: The batch size is less than 1; a position, receiver, frequency or direction
+                is impossible; the labels have no subcarriers; or the model had too few validation
+                links for the interval.
 
         Example:
             >>> model = gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0))
@@ -266,8 +265,9 @@ class Model(Movable):
         return request.estimates(fields, scene)
 
     def to_xarray(self, transmitters: object, interval: float | None = None, **named: Any) -> Any:
-        """``predict`` with arguments by name as an ``xarray.Dataset``, without an interval of
-        ``value`` alone; a dictionary by receiver where numbers of elements differ.
+        """``predict`` as an ``xarray.Dataset``, with arguments by name.
+
+        If numbers of elements differ, the result is a dictionary by receiver.
         """
         model, receiver = self._located(named.pop("receiver", None), transmitters)
         options = (named.get(name) for name in ("frequency", "directions", "frequencies"))
@@ -283,10 +283,10 @@ class Model(Movable):
         directions: Directions | None = None,
         frequencies: object = None,
     ) -> Iterator[Any]:
-        """The values of ``predict`` for a list of positions, each batch computed when asked for.
+        """The values of ``predict`` for a list of positions, each batch computed on request.
 
         A batch is (b, receivers, *shape), with a receiver (b, *shape). Arguments, warnings and
-        errors are those of ``predict``, and come at once. The positions of a grid are in the order
+        errors are as for ``predict``, and are checked at once. Positions of a grid are in the order
         of ``reshape(-1, 3)``; the last batch may be smaller.
         """
         model, receiver = self._located(receiver, transmitters)
@@ -299,7 +299,7 @@ class Model(Movable):
         )
 
     def _located(self, receiver: object, transmitters: object) -> tuple[Any, object]:
-        """This model and the argument of ``predict``; for a new receiver a copy there, and 0."""
+        """This model and its ``receiver``; for a new receiver a copy of the model there, and 0."""
         new = as_new_receiver(receiver, self.scene, transmitters)
         if new is None:
             return self, receiver
@@ -316,7 +316,7 @@ class Model(Movable):
         directions: Directions | None,
         frequencies: object,
     ) -> Request:
-        """The checked arguments of ``predict``, whose warnings name the line that called it."""
+        """The checked arguments of ``predict``; warnings point to the caller's line."""
         subcarriers = as_known_subcarriers(frequencies, self.scene, self.any_frequency)
         request = Request.of(self.scene, transmitters, receiver, frequency, directions, subcarriers)
         for message in request.warnings:
@@ -333,7 +333,7 @@ class Model(Movable):
     def _estimates(
         self, request: Request, batch_size: int | None, interval: float
     ) -> Iterator[Estimate]:
-        """Estimates of the links at the wanted subcarriers, a batch at a time."""
+        """Estimates of the links at the requested subcarriers, a batch at a time."""
         columns = request.subcarriers.columns
 
         def chosen(part: Tensor | None) -> Tensor | None:
@@ -363,7 +363,7 @@ class Model(Movable):
     @usual_modes()
     @torch.no_grad()
     def _answer(self, batch: Batch) -> Tensor:
-        """Values of a batch in evaluation mode; the mode stays as it was."""
+        """Values of a batch in evaluation mode; the mode is restored."""
         training = self.training
         self.eval()
         try:
@@ -373,7 +373,7 @@ class Model(Movable):
 
     @usual_modes()
     def _estimate(self, batch: Batch, interval: float) -> Estimate:
-        """Values of a batch with their intervals, by the calibration."""
+        """Values of a batch with their intervals, from the calibration."""
         value = self._answer(batch)
         assert self.calibration is not None
         query = self.scene.by_radio(batch.query)
@@ -381,10 +381,10 @@ class Model(Movable):
 
     @torch.no_grad()
     def spread(self, batch: Batch, value: Tensor) -> Tensor:
-        """Standard deviations (b,) or (b, *shape) of the labels, which a calibration scales.
+        """Standard deviations (b,) or (b, *shape) of the labels, before a calibration scales them.
 
-        They are ``deviations``, or ``usual_deviations`` where the model knows none. They are NaN at
-        elements that a receiver's array lacks and outside its band, where there is no error.
+        They are ``deviations`` or, if these are None, ``usual_deviations``. They are NaN at missing
+        elements of an array and outside a receiver's band, where there is no error.
         """
         deviations = self.deviations(batch)
         if deviations is None:
@@ -402,16 +402,17 @@ class Model(Movable):
     # --- what a run asks a model for, beside values ---
 
     def facts(self) -> dict[str, Any]:
-        """Entries of ``metrics.json`` beside the model's sizes; plain values by name."""
+        """Entries of ``metrics.json`` besides the model's sizes; plain values by name."""
         return {}
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
-        """The rendering alone of a batch, to be timed; None for a model that renders nothing."""
+        """A function that only renders a batch, for timing; None for a model without rendering."""
         return None
 
     def learnt_room(self, links: Links | None = None) -> Any:
-        """The learnt room for figures, a ``gaigs.planes.learnt_room.LearntRoom``. Without links
-        only the state tells where planes end. None for a model that learns no room.
+        """The learnt room, a ``gaigs.planes.learnt_room.LearntRoom``; None if no room is learnt.
+
+        Paths of the ``links`` outline planes; without links, paths from places over the scene.
         """
         return None
 
@@ -427,7 +428,7 @@ class Model(Movable):
     ) -> str:
         """Changes the model between two training steps, such as by a search.
 
-        Parameters keep their shapes, and the state dict has every decision.
+        Parameters keep their shapes, and the state dict records every decision.
 
         Args:
             number: Index into ``revisions``.
@@ -443,30 +444,31 @@ class Model(Movable):
     # --- what a model knows of its errors ---
 
     def deviations(self, batch: Batch) -> Tensor | None:
-        """Standard deviations (b, *shape) of the labels up to a common factor, or root mean squares
-        (b,) of these over a label's numbers. None if unknown.
+        """Standard deviations (b, *shape) of the labels up to a common factor; None if unknown.
+
+        They may also be (b,), root mean squares over the numbers of a label.
         """
         return None
 
     def process_at(self, receiver: int) -> Process | None:
-        """The Gaussian process of a receiver's labels, which plans surveys; None without one."""
+        """The Gaussian process of a receiver's labels, for surveys; None without one."""
         return None
 
     @property
     def has_margins(self) -> bool:
-        """True if a model of channels knows its paths, so that ``margins`` is defined."""
+        """True if ``margins`` is defined: a model of channels with known paths."""
         return False
 
     def margins(self, query: Query) -> Complex[Tensor, "b n e s"]:
-        """Channel by which each of n paths may deviate, one standard deviation, for kriging."""
+        """Prior standard deviation of the channel of each of n paths, for kriging."""
         raise ValueError("the model has no paths of channels; ask has_margins first")
 
     def refit(self, links: Links) -> None:
-        """Fits again to mostly the same links; may keep choices of the earlier fit, to be fast."""
+        """Fits again to similar links; to save time, choices of the earlier fit may stay."""
         self.fit(links)
 
     def take_hyperparameters(self, other: "Model") -> None:
-        """Copies what ``deviations`` depend on from a model of this kind; by default nothing."""
+        """Copies the parameters of ``deviations`` from a similar model; by default nothing."""
 
     @property
     def fold_count(self) -> int:
@@ -474,12 +476,11 @@ class Model(Movable):
         return 1 if self.is_trained else LOOK_UP_FOLDS
 
     def unseen(self, links: Links) -> Iterator[Unseen]:
-        """Yields models like this one, each with links that it has not seen.
+        """Yields models like this one, each with links outside its training.
 
-        A look-up is fitted anew without each fold of the known links; estimated places of receivers
-        are estimated anew, too. A trained model comes with the validation links, which have chosen
-        its step of the training. Repeated readings count once. Folds end with the time limit of a
-        run.
+        A look-up is fitted again without each fold of the known links, and so are estimated places
+        of receivers. A trained model comes with the validation links, although these have chosen
+        its training step. Repeated readings count once. Folds end with the time limit of a run.
         """
         if not self.is_trained:
             for fold in held_out_folds(links):
@@ -491,7 +492,7 @@ class Model(Movable):
     def refitted(self, links: Links) -> "Model":
         """A copy that ``refit`` fits to links."""
         scene = replace(self.scene, receivers=links.receivers)  # whose places may be estimated
-        # Known links are large, and stay as they are.
+        # Known links are large and unchanged, so they are not copied.
         memo: dict[int, Any] = {id(self.links): self.links, id(self.scene): scene}
         memo[id(self.calibration)] = self.calibration
         copied = copy.deepcopy(self, memo)

@@ -1,4 +1,4 @@
-"""Means of several models: of seeds, which show how certain they are, and of different models."""
+"""Means of several models: of seeds, whose scatter shows the uncertainty, or of any models."""
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -25,14 +25,14 @@ class Ensemble(Wrapper):
 
     Args:
         members: Trained and fitted models, or their configurations if a state is to be loaded.
-        weights: Shares of different models, which sum to 1; None: equal ones of trained models that
-            differ by their seed alone.
+        weights: Weights of different models, with sum 1; None: equal weights of trained models that
+            differ only in their seed.
 
     Attributes:
         typical: Mean square difference of the members, over all links.
 
     Raises:
-        ValueError: The weights are no shares of the members.
+        ValueError: The weights do not match the members, or their sum is not 1.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=50)
@@ -72,7 +72,7 @@ class Ensemble(Wrapper):
 
     @property
     def underlying(self) -> Model:
-        """The first trained member, whose room and Gaussians stand for all."""
+        """The first trained member; figures show its room and Gaussians."""
         return next((member for member in self._members if member.is_trained), self._members[0])
 
     @property
@@ -80,14 +80,14 @@ class Ensemble(Wrapper):
         return [*self.members]  # type: ignore[list-item]
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
-        """Renders by all members that do, one after the other."""
+        """Renders with all members that can, one after the other."""
         asked = (member.rendering(batch) for member in self._members)
         parts = [part for part in asked if part is not None]
         return (lambda: [part() for part in parts]) if parts else None
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Takes the mean square difference of the members at training links."""
+        """Computes the mean square difference of the members at training links."""
         index = evenly(links.split.train, 256)
         parts = [self._squares(links.batch(part).to(self.device)) for part in index.split(32)]
         self.typical = torch.cat(parts).mean()
@@ -97,10 +97,12 @@ class Ensemble(Wrapper):
         return Prediction(torch.tensordot(values.new_tensor(self.weights), values, 1), {})
 
     def deviations(self, batch: Batch) -> Tensor | None:
-        """Deviations of labels: the members' root mean square difference over a label's numbers.
+        """Deviations of labels: the root mean square difference of the members over a label's
+        numbers.
 
         Few members may agree by chance, so the ``typical`` mean square counts as four more members.
-        A blend of different models has the weighted root mean square of its members' deviations.
+        A blend of different models returns the weighted root mean square of its members'
+        deviations.
         """
         if not self.is_blend:
             count = len(self._members) - 1
@@ -135,7 +137,7 @@ class Ensemble(Wrapper):
         return moved
 
     def unseen(self, links: Links) -> Iterator[Unseen]:
-        """Models like this one with links that no member has seen.
+        """Models like this one with links that no member was trained on.
 
         If a member is trained, these are validation links, and look-ups are fitted without them.
         """
@@ -177,7 +179,7 @@ class Ensemble(Wrapper):
         return self._each(batch.to(self.device))[..., None].flatten(2).var(0).mean(1)
 
     def _each(self, batch: Batch) -> Tensor:
-        """Values of all members (members, b, *shape); look-ups answer on the processor."""
+        """Values of all members (members, b, *shape); look-ups run on the CPU."""
         device = batch.query.transmitters.device
         values = [member(batch.to(member.device)).value.to(device) for member in self._members]
         return torch.stack(values)

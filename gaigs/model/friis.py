@@ -1,4 +1,4 @@
-"""Free space: the direct wave alone."""
+"""Free space: only the direct wave."""
 
 import torch
 from jaxtyping import Complex, Float
@@ -16,15 +16,17 @@ from gaigs.registry import register
 
 @register("model", "friis")
 class Friis(Model):
-    """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element, one complex g a receiver.
+    """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element, with a gain g a receiver.
 
-    a is the elements' pattern towards the transmitter. The gain g, ``fit_gain`` of the known links,
-    contains transmit power, cables and the clock's phase; it is NaN before ``fit``. The sign of the
-    phase is estimated from the known links, as both time conventions are in use. With fewer than
-    ``TELLING`` links a receiver it is -1. If enough links show no sign, gains are 0.
+    a is the elements' pattern towards the transmitter. The complex gain g, ``fit_gain`` of the
+    known links, contains transmit power, cables and the clock's phase; it is NaN before ``fit``.
+    The sign of the phase is estimated from the known links, since both time conventions are in use.
+    With fewer than ``TELLING`` links a receiver the sign is -1. If enough links support neither
+    sign, gains are 0.
 
     Raises:
-        ValueError: The labels are not channels, or their number of elements is not the array's.
+        ValueError: The labels are not channels, or their number of elements differs from the
+            array's.
 
     Source: Friis, A note on a simple transmission formula, 1946.
     """
@@ -69,7 +71,7 @@ class Friis(Model):
         return Prediction(gains[:, None, None] * waves, {})
 
     def _waves(self, query: Query) -> Complex[Tensor, "b e s"]:
-        """The direct wave behind each element's front end, with a gain of 1."""
+        """The direct wave after each element's front end, with a gain of 1."""
         waves = direct_waves(self.scene, query, self.frequencies, int(self.sign))
         waves = direct_gains(self.scene, query)[:, None, None] * waves
         return self.scene.received(query, waves)

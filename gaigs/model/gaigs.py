@@ -1,4 +1,4 @@
-"""The splatting pipeline: GAI-GS, its ablations and its neighbours, from registered parts."""
+"""The splatting pipeline: GAI-GS, its ablations and variants, from registered parts."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -28,7 +28,7 @@ from gaigs.splatting.rasterizer import Rasterizer
 
 
 class Excited(NamedTuple):
-    """The Gaussians as a transmitter at each of some places excites them."""
+    """The Gaussians for a transmitter at each of some places."""
 
     placed: Placed  # Gaussians before the deformation
     residuals: Residuals  # changes by the deformation
@@ -45,25 +45,25 @@ class Strengths(NamedTuple):
 
 @register("model", "gaigs")
 class GaussianSplatting(Model):
-    """The paper's pipeline of splatting, of exchangeable parts.
+    """The paper's splatting pipeline with exchangeable parts.
 
-    A placement gives Gaussians for each query. A tokenizer and a deformation change these. A
-    projection and a rasterizer draw them as a map over directions, and the pooling turns the map
-    into the label. If the pooling takes paths, there are no splats and no map.
+    A placement provides Gaussians for each query. A tokenizer and a deformation modify them. A
+    projection and a rasterizer draw them as a map over directions, and the pooling converts the map
+    into the label. A pooling of paths needs no splats and no map.
 
     Args:
         scene: Receivers and task.
         placement, tokenizer, deformation, projection, rasterizer, pooling: Registered components:
             each the name, the configuration (a mapping with ``name`` and options), or the object
-            itself. Pooling None is the label's own. Projection and rasterizer are None if the
-            pooling takes paths.
-        gaussians: Options of ``gaigs.splatting.gaussians.Gaussians`` [m]; None if the placement
-            alone brings Gaussians.
-        trend: Model to whose value the pooled map is added, given like a component; None: 0.
+            itself. Pooling None is the default of the label. Projection and rasterizer are None for
+            a pooling of paths.
+        gaussians: Options of ``gaigs.splatting.gaussians.Gaussians`` [m]; None if all Gaussians
+            come from the placement.
+        trend: Model whose prediction is added to the pooled map, given like a component; None: 0.
 
     Raises:
-        ValueError: The pooling does not give the task's labels; the projection does not see all of
-            the map; parts do not go together; the trend needs its data or a training of its own.
+        ValueError: The pooling does not return the task's labels; the projection does not cover the
+            map; parts do not match; the trend needs its data or a training.
 
     Source: GAI-GS, section "Framework"; the trend is ours (docs/methods.md).
 
@@ -126,7 +126,7 @@ class GaussianSplatting(Model):
         self.deformation = registry("deformation").build(deformation, **context)
 
     def _built_trend(self, trend: str | Mapping | Model) -> Model:
-        """The trend, which must have no parameters and keep no links; adds the buffer ``level``."""
+        """The trend, without parameters and stored links; adds the buffer ``level``."""
         built = build_trend(trend, self.scene)
         keeps_links = isinstance(built, LookUp) or not built.state_dict()
         if keeps_links or [*built.parameters()]:
@@ -137,7 +137,7 @@ class GaussianSplatting(Model):
         return built
 
     def _check_paths(self, projection: object, rasterizer: object) -> None:
-        """Raises a ``ValueError`` unless parts suit a pooling of paths."""
+        """Raises a ``ValueError`` unless parts match a pooling of paths."""
         if projection is not None or rasterizer is not None:
             raise ValueError(
                 f"pooling {name_of(self.pooling)!r} takes paths, and no map is projected or "
@@ -182,7 +182,7 @@ class GaussianSplatting(Model):
         return grid
 
     def _check_placement(self) -> None:
-        """Raises a ``ValueError`` unless the placement makes a model of this name."""
+        """Raises a ``ValueError`` unless the placement may be used by a model of this name."""
         name = name_of(self.placement)
         if self.placement.model not in (None, self.name):
             raise ValueError(
@@ -195,9 +195,10 @@ class GaussianSplatting(Model):
             )
 
     def _built_gaussians(self, options: Mapping | None, zone: Any) -> Gaussians | None:
-        """Free Gaussians, brought by no placement, at elevations in ``zone`` [rad]; or None.
+        """Free Gaussians, independent of the placement, at elevations in ``zone`` [rad]; or None.
 
-        Beside Gaussians of a placement their signal must not depend on the direction (degree 0).
+        Together with Gaussians of a placement their signal must not depend on the direction (degree
+        0).
         """
         name = name_of(self.placement)
         if options is None:
@@ -230,7 +231,7 @@ class GaussianSplatting(Model):
 
     @staticmethod
     def own_pooling(scene: Scene) -> str:
-        """The pooling that suits the scene's labels."""
+        """The default pooling for the scene's labels."""
         if scene.task.directions is not None:
             return "spectrum"
         return "element_sum" if scene.task.dtype.is_complex else "softmax_attention"
@@ -278,7 +279,7 @@ class GaussianSplatting(Model):
         return self.respond(self.excite(places), which, batch)
 
     def respond(self, excited: Excited, which: Int[Tensor, " b"], batch: Batch) -> Prediction:
-        """Values of a batch, whose rows have the excited Gaussians of places ``which``."""
+        """Values of a batch; ``which`` is the row of ``excited`` for each link."""
         query = batch.query
         links, values = [], []
         together = self.takes_paths and self.pooling.is_same_for_all
@@ -321,7 +322,7 @@ class GaussianSplatting(Model):
         return knows_all and (self.trend is None or self.trend.any_receiver)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """A group for each parameter of the Gaussians, the placement's, and all networks."""
+        """A group for each parameter of the Gaussians, the placement's groups, and all networks."""
         groups = {}
         if self.gaussians is not None:
             groups = {name: [parameter] for name, parameter in self.gaussians.named_parameters()}
@@ -340,7 +341,7 @@ class GaussianSplatting(Model):
         return {} if self.rasterizer is None else {"rasterizer": self.rasterizer.used}
 
     def rendering(self, batch: Batch) -> Callable[[], object]:
-        """The rasterizer alone, or the sum over paths, for links to the first link's receiver."""
+        """The rasterizer, or the sum over paths, for links to the first link's receiver."""
         receiver = int(batch.query.receivers[0])
         query = batch.query[(batch.query.receivers == receiver).nonzero()[:, 0]]
         with torch.no_grad():
@@ -357,7 +358,7 @@ class GaussianSplatting(Model):
             self.gaussians.save_ply(folder / "gaussians.ply")
 
     def excite(self, query: Query) -> Excited:
-        """The Gaussians as each row of a query excites them."""
+        """The Gaussians for the transmitter in each row of a query."""
         placed = self.placement(self.gaussians, query)
         if placed.opacities is None:
             free = self.gaussians
@@ -424,14 +425,14 @@ class GaussianSplatting(Model):
     ) -> list[tuple]:
         """Arguments of each call of the rasterizer, for links to one receiver.
 
-        One call draws all links if the Gaussians stand still, else one link.
+        If the Gaussians do not move between links, one call draws all links; otherwise one link.
         """
         placed, axes = excited.placed, excited.semi_axes
         if self.pooling.grid is not None or directions is None:
             directions = self.pooling.grid or self.scene.task.directions
         plane = self.projection.plane(directions.to(placed.means.device).to(placed.means.dtype))
         means = placed.means
-        if not len(means):  # no query: Gaussians that follow it may stand anywhere
+        if not len(means):  # no query: Gaussians that depend on it may be anywhere
             axes = means.new_ones(1, means.shape[1], 3, 3)
             means = means.new_zeros(1, means.shape[1], 3)
         pose = self.scene.receivers[receiver].pose
@@ -444,7 +445,7 @@ class GaussianSplatting(Model):
         return calls
 
     def _strengths(self, excited: Excited, which: Int[Tensor, " b"]) -> Strengths:
-        """Strengths of the Gaussians for each row ``which`` of the places."""
+        """Strengths of the Gaussians for each row ``which`` of ``excited``."""
         placed, residuals = excited.placed, excited.residuals
         signal, opacities = placed.signal, placed.opacities
         if signal.ndim == 4:  # another for each query
@@ -466,7 +467,7 @@ class GaussianSplatting(Model):
         return Strengths(signal.expand(count, -1, -1), opacities.expand(count, -1), attenuations)
 
     def _check_gives(self, received: Tensor | ReceivedPaths) -> None:
-        """Raises a ``ValueError`` unless the pooling gives labels of the task's shape."""
+        """Raises a ``ValueError`` unless the pooling returns labels of the task's shape."""
         any_carrier = torch.tensor([1e9])
         query = Query(torch.zeros(1, 3), torch.zeros(1, dtype=torch.long), any_carrier)
         shape, task = tuple(self.pooling(received, query).shape[1:]), self.scene.task
@@ -480,7 +481,7 @@ class GaussianSplatting(Model):
 def _towards(
     bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]
 ) -> Float[Tensor, "*b n c 1"]:
-    """Signal of Gaussians towards transmitters, over the value of the constant harmonic.
+    """Signal of Gaussians towards transmitters, relative to the constant harmonic.
 
     ``offsets`` lead from the Gaussians to the transmitters [m].
     """

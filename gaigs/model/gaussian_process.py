@@ -31,7 +31,7 @@ from gaigs.registry import name_of, register
 
 
 class Solved(NamedTuple):
-    """What predictions of one receiver are made from; both are None in local kriging."""
+    """Stored solution of one receiver; both fields are None in local kriging."""
 
     solution: Tensor | None  # residuals over the covariances of their links (k, m)
     factor: Tensor | None  # Cholesky factor of the covariances (k, k)
@@ -39,28 +39,28 @@ class Solved(NamedTuple):
 
 @register("model", "gaussian_process")
 class GaussianProcess(LookUp):
-    """label = trend + z + noise, z a process over places with the kernel exp(-d / l), Matern-1/2.
+    """label = trend + z + noise, with a process z over places with the kernel exp(-d / l),
+    Matern-1/2.
 
-    d is the distance of transmitters. With several carriers it is the distance in place and
-    frequency, d² = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are
-    processes of their own with one kernel.
+    d is the distance of transmitters. With several carriers it combines distance and frequency, d²
+    = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are separate processes
+    with one kernel.
 
-    Length l [m], nugget (variance of the noise over the signal's) and s [m] maximise the
-    likelihood of the validation links given the training links around them, see
-    ``gaigs.kriging.fit``. All receivers share the three. The signal's variance is each receiver's
-    most likely one.
+    Length l [m], nugget (variance of the noise over the signal's) and s [m] maximise the likelihood
+    of the validation links given the training links around them, see ``gaigs.kriging.fit``. All
+    receivers share the three. The signal's variance is each receiver's maximum-likelihood value.
 
-    Labels of one real number have ``gaigs.kriging.scalar.ScalarProcess`` instead: folds of the
-    known links choose kernel, noise and trend by the likelihood, and each receiver has
-    hyperparameters of its own. Many readings are solved in parts, see ``gaigs.kriging.tiles``.
+    Scalar labels use ``gaigs.kriging.scalar.ScalarProcess`` instead: folds of the known links
+    choose kernel, noise and trend by the likelihood, and each receiver has its own hyperparameters.
+    Many readings are solved in parts, see ``gaigs.kriging.tiles``.
 
     For other labels, a receiver with more than ``LIMIT`` known links is predicted from the 300
-    nearest to each query (local kriging): with this kernel near links screen those behind them.
+    nearest to each query (local kriging): with this kernel near links screen links behind them.
     Residuals of channels are limited, see ``gaigs.kriging.fit.damping``.
 
     Args:
         trend: Configuration of the model whose residuals the process describes. None: ``friis`` for
-            channels, else each receiver's mean label; for labels of one real number this or
+            channels, each receiver's mean for spectra; for scalar labels the better one of mean and
             ``shaped_path_loss``.
 
     Raises:
@@ -114,11 +114,10 @@ class GaussianProcess(LookUp):
         report_terms(self.trend)
 
     def refit(self, links: Links) -> None:
-        """Fits to some of the known links with the choices of ``fit``.
+        """Fits to some of the known links, with kernel, noise and trend from ``fit``.
 
-        For labels of many numbers all hyperparameters stay. For labels of one number the kernel,
-        the noise and the chosen trend stay. Length and deviations are then fitted anew, unless more
-        than ``ScalarOptions.large`` links are known.
+        Labels of many numbers also keep all hyperparameters. For scalar labels lengths and
+        deviations are fitted again, unless more than ``ScalarOptions.large`` links are known.
         """
         self._fit(links, chooses=False)
 
@@ -144,7 +143,7 @@ class GaussianProcess(LookUp):
 
     @torch.no_grad()
     def _solve_known(self, chooses: bool) -> None:
-        """Solves for predictions from the known links, receiver by receiver.
+        """Prepares predictions from the known links, receiver by receiver.
 
         With ``chooses`` the hyperparameters are fitted first.
         """
@@ -175,7 +174,7 @@ class GaussianProcess(LookUp):
             self.signals.append(white.abs().square().mean().sqrt().item())
 
     def _fit_scalar(self, process: ScalarProcess, links: Links, chooses: bool) -> None:
-        """Fits the process of labels of one number; with ``chooses`` its kernel and trend too."""
+        """Fits the process of scalar labels; with ``chooses`` also its kernel and trend."""
         index = torch.cat(known_links(links, any_receiver=True))
         query = links.query[index]
         known = coordinates(self.scene, query, 1.0), self.scene.radio_of(query.receivers)
@@ -208,7 +207,7 @@ class GaussianProcess(LookUp):
         return self.trend.any_frequency
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
-        """The trend alone: residuals at other frequencies do not correlate with the known ones."""
+        """Only the trend: residuals at other frequencies do not correlate with known ones."""
         return self.trend.at_frequencies(frequencies)
 
     @property
@@ -218,10 +217,10 @@ class GaussianProcess(LookUp):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """The last of the trends alone; for received levels this is a law of distance.
+        """The last of the trends, without a process; for received levels this is a law of distance.
 
-        Residuals at one receiver do not correlate with those at others. The process stays where the
-        receivers are places of one radio.
+        Residuals at one receiver do not correlate with residuals at others. The process stays if
+        the receivers are places of one radio.
         """
         if self.scene.one_radio or not self.any_receiver:
             moved = super().at_receivers(receivers)  # raises without ``any_receiver``
@@ -234,7 +233,7 @@ class GaussianProcess(LookUp):
     def facts(self) -> dict[str, object]:
         """``length_m``, ``nugget`` and, with several carriers, ``frequency_scale_m``.
 
-        For labels of one number the facts of ``ScalarProcess`` and the trend.
+        For scalar labels the facts of ``ScalarProcess`` and the trend.
         """
         if self.scalar is not None:
             return {**self.scalar.facts(), "trend": name_of(self.trend)} | self.trend.facts()
@@ -302,7 +301,7 @@ class GaussianProcess(LookUp):
         return Solved(torch.cholesky_solve(residuals.to(wide), factor.to(wide)), None)
 
     def _residuals(self, index: Int[Tensor, " k"]) -> Iterator[Tensor]:
-        """Yields labels, aligned to their trend, less this trend, for ``PART`` links at a time.
+        """Yields labels minus their trend, after alignment to it, for ``PART`` links at a time.
 
         Channels are damped by ``factors``.
         """
@@ -316,8 +315,8 @@ class GaussianProcess(LookUp):
     def _kriged(self, query: Query, receiver: int) -> Tensor:
         """Residuals (b, *shape) that the process predicts for links to one receiver.
 
-        They are k K^-1 r, with the kernel k, and covariances K and residuals r of the known links.
-        K^-1 r is stored unless it has more numbers than K.
+        The result is k K^-1 r, with the kernel k, and covariances K and residuals r of the known
+        links. K^-1 r is cached unless it has more numbers than K.
         """
         index = self.known[receiver]
         task = self.scene.task

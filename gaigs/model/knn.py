@@ -41,17 +41,17 @@ class HeldOutLinks(NamedTuple):
 class KNearestNeighbours(LookUp):
     """The mean of the k known labels nearest to the transmitter, weighted by 1 / distance^power.
 
-    Links as near as the k-th count too, so that the order of links does not matter. Channels of
-    unknown phase are aligned to the nearest. The look-up keeps all links, one byte a pixel for
-    images.
+    Links at the distance of the k-th count too, so the order of links has no effect. Channels of
+    unknown phase are aligned to the nearest one. The look-up stores all links, with one byte a
+    pixel for images.
 
-    Where the training links have several carriers, distances are in place and frequency, d² =
-    |dx|² + (s d ln f)². ``fit`` chooses the scale s [m] that predicts known links from those at
-    other places with the least squared error.
+    If the training links have several carriers, distances combine place and frequency, d² = |dx|² +
+    (s d ln f)². ``fit`` chooses the scale s [m] that predicts known links from links at other
+    places with the least squared error.
 
     Args:
         k: Number of neighbours; with fewer known links, all of them. None: 3; for noisy labels the
-            one of ``COUNTS`` that predicts known links best from those of other folds, see
+            number in ``COUNTS`` with the best cross-validation, see
             ``gaigs.kriging.links.folds_of``.
         power: Exponent of the distance; 0 weights all neighbours equally. None: 2, or 1 for noisy
             labels.
@@ -59,9 +59,9 @@ class KNearestNeighbours(LookUp):
     Attributes:
         chosen: Number of neighbours in use.
         scale: s [m]; NaN with one carrier.
-        home: Scene of the known links; ``scene`` differs in a copy at other receivers.
+        home: Scene of the known links; ``scene`` differs in a copy for other receivers.
 
-    Source: reference look-up of the data sets' own README; Shepard, 1968.
+    Source: look-up in the README of the NeRF² data sets; Shepard, 1968.
     """
 
     learnt = "chosen", "scale"
@@ -86,7 +86,7 @@ class KNearestNeighbours(LookUp):
         return self.scene.one_radio
 
     def fit(self, links: Links) -> None:
-        """Keeps the links; chooses the scale of frequencies, and the number of neighbours."""
+        """Stores the links; chooses the scale of frequencies, and the number of neighbours."""
         self.links, self.known = links, known_links(links)
         self.scale = math.nan
         self.chosen = self.k or 3
@@ -130,7 +130,7 @@ class KNearestNeighbours(LookUp):
     def _distances(
         self, query: Query, index: Int[Tensor, " k"], scale: float
     ) -> Float[Tensor, "b k"]:
-        """Distances from the places of links to those of known links [m]."""
+        """Distances from the places of links to the places of known links [m]."""
         asked = coordinates(self.scene, query, scale)
         known = coordinates(self.home, self.links.query[index], scale)
         return distances(asked, known)
@@ -138,11 +138,11 @@ class KNearestNeighbours(LookUp):
     def _levels(
         self, query: Query, index: Int[Tensor, " k"], count: int, size: int = 2**20
     ) -> Float[Tensor, " b"]:
-        """Predictions of labels of one number, for a receiver with known links ``index``.
+        """Predictions of scalar labels, for a receiver with known links ``index``.
 
-        The ``count`` nearest known links are searched. Where the last of these is as near as the
-        last neighbour in use, more may be as near, so four times as many are searched, with at most
-        ``size`` distances in memory.
+        The ``count`` nearest known links are searched. If the last of them is at the distance of
+        the last neighbour in use, further links may be at this distance. Then four times as many
+        are searched, with at most ``size`` distances in memory.
         """
         asked = coordinates(self.scene, query, self.scale)
         known = coordinates(self.home, self.links.query[index], self.scale)
@@ -158,7 +158,7 @@ class KNearestNeighbours(LookUp):
     def _weights(self, apart: Float[Tensor, "b j"]) -> Float[Tensor, "b j"]:
         """Weights of known links by their distances, with a sum of 1.
 
-        They are 0 beyond the last neighbour, and at an infinite distance.
+        Weights are 0 beyond the last neighbour, and at an infinite distance.
         """
         farthest = apart.topk(min(self.chosen, apart.shape[1]), largest=False).values[:, -1:]
         near = (apart <= farthest) & apart.isfinite()
@@ -168,12 +168,12 @@ class KNearestNeighbours(LookUp):
         return weights / weights.sum(1, keepdim=True)
 
     def _mean(self, near: Near, index: Int[Tensor, " k"]) -> Float[Tensor, " b"]:
-        """Weighted means of the labels of the nearest known links, for labels of one number."""
+        """Weighted means of the labels of the nearest known links, for scalar labels."""
         labels = self.links.labels[index]
         return (self._weights(near.apart).to(labels) * labels[near.rows]).sum(1)
 
     def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, " k"]) -> Tensor:
-        """Weighted means of the labels of known links, by their distances, for other labels."""
+        """Weighted means of the labels of known links by their distances, for other labels."""
         weights = self._weights(apart)
         used = weights.any(0)
         labels, align = self.links.labels[index[used]], self.scene.task.align
@@ -187,8 +187,8 @@ class KNearestNeighbours(LookUp):
     def _held_out(self, folds: Sequence[Int[Tensor, " _"]] | None = None) -> Iterator[HeldOutLinks]:
         """Holds out at most about 256 known links of all receivers together, in groups of 32.
 
-        All known links at the place of a held-out link are held out, too. With ``folds``, the fold
-        of each known link of each receiver, the whole fold of a held-out link is held out.
+        All known links at the place of a held-out link are held out, too. ``folds`` holds the fold
+        of each known link of each receiver; with it the whole fold of a held-out link is held out.
         """
         for receiver, index in enumerate(self.known):
             for rows in evenly(torch.arange(len(index)), max(1, 256 // len(self.known))).split(32):

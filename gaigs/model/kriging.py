@@ -35,32 +35,33 @@ log = logging.getLogger(__name__)
 class Kriging(Wrapper):
     """weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend.
 
-    The trend is a trained model. The fallback is a simple model, fitted at once. z is the mean of a
-    Gaussian process over places, as in ``gaigs.model.gaussian_process``, and 0 far from all known
-    links. With a trend weight of 0 and a weight of 1 this is ``gaussian_process`` with the
-    fallback as its trend; only hyperparameters of labels of one real number differ.
+    The trend is a trained model. The fallback is a simple model, fitted by this class. z is the
+    mean of a Gaussian process over places, as in ``gaigs.model.gaussian_process``, and 0 far from
+    all known links. With a trend weight of 0 and a weight of 1 the model equals
+    ``gaussian_process`` with the fallback as its trend, except for the hyperparameters of scalar
+    labels.
 
     Trend weight, length and nugget maximise the likelihood of the validation links given the
-    training links around them. The weight is the one with which the validation links, predicted
-    from the training links, score best: the likelihood alone would trust kriging too far where
+    training links around them. The weight gives the validation links their best score when they are
+    predicted from the training links. The likelihood alone would give kriging too much weight if
     cubes of space are held out.
 
-    z comes from one of three posteriors. ``ScalarPosterior`` is for labels of one real number, with
-    hyperparameters of each receiver. ``FieldPosterior`` is for other labels. ``PathPosterior`` is
-    for a trend with ``margins``, fields by which paths may deviate: strengths of paths are kriged.
-    The first and the last have a weight of 1, or 0. Where validation links are surely better by
-    kriged labels than by paths, as at places closer than half a wavelength, labels are kriged.
+    z comes from one of three posteriors. ``ScalarPosterior`` is for scalar labels, with
+    hyperparameters for each receiver. ``FieldPosterior`` is for other labels. ``PathPosterior``
+    kriges the strengths of paths, for a trend with ``margins``, the deviations of its paths. The
+    first and the last have a weight of 1 or 0. Labels are kriged instead of paths if this clearly
+    improves the validation score, as at places closer than half a wavelength.
 
-    A run makes this model by ``kriging=true``. A checkpoint holds the residuals as a few principal
-    components. If a receiver has more than ``LIMIT`` known links, an even part of them is used;
-    labels of one number use all.
+    A run makes this model with ``kriging=true``. A checkpoint stores the residuals as a few
+    principal components. If a receiver has more than ``LIMIT`` known links, an evenly spread part
+    of them is used; scalar labels use all.
 
     Args:
         trend: The trained model, or its configuration if a state is to be loaded.
         fallback: Configuration of the fallback; None: ``mean``.
 
     Raises:
-        ValueError: The trend has no training, or the fallback is trained or needs its data.
+        ValueError: The trend is not a trained model, or the fallback is trained or needs its data.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7
     and 5.4.2.
@@ -132,17 +133,17 @@ class Kriging(Wrapper):
     ) -> "Kriging":
         """Fits this model, and returns its validation model.
 
-        The validation model has the same hyperparameters and weights, and knows the training links
-        alone.
+        The validation model has the same hyperparameters and weights, but knows only the training
+        links.
 
         Args:
             links: Links with a split.
-            is_final: False if only the validation model is wanted: this model keeps no residuals,
-                and nothing is logged.
-            by_paths: True if strengths of paths are kriged, False if labels are. None: the
-                validation links choose, if there are ``FEWEST`` or more; else paths.
-            most: Largest number of known links of a receiver; None: ``LIMIT``, or all for labels of
-                one number.
+            is_final: False if only the validation model is needed: this model then stores no
+                residuals, and nothing is logged.
+            by_paths: True to krige strengths of paths, False to krige labels. None: the validation
+                links choose, if there are at least ``FEWEST``; otherwise paths.
+            most: Largest number of known links of a receiver; None: ``LIMIT``, or all for scalar
+                labels.
         """
         links = self.posterior.cleaned(links)
         count = len(links.split.known)
@@ -162,10 +163,10 @@ class Kriging(Wrapper):
         return krige(links, values, is_final)
 
     def law_scores(self, links: Links, held: Int[Tensor, " h"]) -> Float[Tensor, " h"]:
-        """Scores of validation links by the law that may take the trend's place, which is kept."""
+        """Scores of validation links by the law that may replace the trend; the law is stored."""
         train, task = links.split.train, self.scene.task
         if self.laws is None or not torch.equal(self.laws[1], train):
-            # Levels know their place by more than the distance to a receiver.
+            # For levels the law has more terms than the distance to a receiver.
             options = task.trends[-1] if task.is_scalar else self.fallback_options
             self.laws = registry("model").build(options, scene=self.scene), train
             self.laws[0].fit(replace(links, split=links.split.validating()))
@@ -174,7 +175,7 @@ class Kriging(Wrapper):
     def _krige_better(
         self, links: Links, values: Tensor, is_final: bool, is_few: bool
     ) -> "Kriging":
-        """``krige`` by paths, or by labels where enough validation links surely prefer these."""
+        """``krige`` by paths, or by labels if these clearly improve enough validation links."""
         if is_few:
             return self._krige_paths(links, values, is_final)
         of_labels = self._krige_labels(links, values, False)
@@ -195,10 +196,10 @@ class Kriging(Wrapper):
         return self._krige_labels(links, values, is_final)
 
     def _krige_labels(self, links: Links, values: Tensor | None, is_final: bool) -> "Kriging":
-        """``krige`` of labels, where the trend may lose its weight to a law of distance.
+        """``krige`` of labels, where a law of distance may replace the trend.
 
-        ``values`` are the trend's predictions of the known links, validation links last. They are
-        None for labels of one number, and computed if the trend may have weight.
+        ``values`` are the trend's predictions of the known links, validation links last. None for
+        scalar labels; they are then computed if the trend may have weight.
         """
         self._make_posterior(False)
         split, is_scalar = links.split, self.scene.task.is_scalar
@@ -248,10 +249,10 @@ class Kriging(Wrapper):
     def _validation_model(
         self, links: Links, values: Tensor, weights: Sequence[float]
     ) -> "Kriging":
-        """Fits trend weight and hyperparameters; returns a model of the training links alone."""
+        """Fits trend weight and hyperparameters; returns a model of only the training links."""
         split = links.split
         candidates = weighed_residuals(links, self.fallback, values, weights)
-        # A trend that may have no weight tells no places apart either.
+        # A trend without weight gives no features either.
         features = self._features(values) if any(weights) else ()
         self.trend_weight.fill_(self.posterior.fit(links, candidates, *features))
         training = replace(links, split=split.validating())
@@ -277,7 +278,7 @@ class Kriging(Wrapper):
         return model
 
     def _copy_choices(self, other: "Kriging") -> None:
-        """Takes weights, hyperparameters and the law of another model."""
+        """Copies weights, hyperparameters and the law of another model."""
         for mine, own in zip(
             self.buffers(recurse=False), other.buffers(recurse=False), strict=True
         ):
@@ -305,14 +306,14 @@ class Kriging(Wrapper):
         self.posterior.to(self.weight.device)
 
     def _features(self, spectra: Tensor) -> tuple[Tensor, ...]:
-        """``coarse`` spectra of a trend without paths, which stays at its receivers; or nothing."""
+        """``coarse`` spectra of a trend without paths at its own receivers; otherwise None."""
         scene = self.scene
         if scene.task.directions is None or scene.has_band or scene.one_radio:
             return ()
         return () if self.trend.has_margins else (coarse(spectra),)
 
     def _features_at(self, batch: Batch, trend: Tensor | None) -> tuple[Tensor, ...]:
-        """``_features`` of a batch, whose trend may be known in its directions."""
+        """``_features`` of a batch; ``trend`` may have predictions in the batch's directions."""
         if not self.posterior.has_features:
             return ()
         directions = self.scene.task.directions
@@ -323,16 +324,17 @@ class Kriging(Wrapper):
     def _krige_paths(self, links: Links, values: Tensor, is_final: bool) -> "Kriging":
         """``krige`` by paths of the trend.
 
-        The weight of kriging is 1 if it raises the mean score of the validation links by more than
-        1.5 standard errors, and these are ``FEWEST`` or more; else 0.
+        The weight of kriging is 1 if it raises the mean score of at least ``FEWEST`` validation
+        links by more than 1.5 standard errors, otherwise 0.
 
         Args:
             links: Links with a split.
             values: The trend's predictions of the known links, training links first.
-            is_final: True if this model, too, is to predict; it then knows the validation links.
+            is_final: True if this model is also used for predictions; it then knows the validation
+                links.
 
         Returns:
-            A model that knows the training links alone.
+            A model that knows only the training links.
         """
         self._make_posterior(True)
         split = links.split
@@ -373,10 +375,9 @@ class Kriging(Wrapper):
         return self.posterior.process_at(receiver)
 
     def deviations(self, batch: Batch) -> Tensor:
-        """Standard deviations of the labels; of spectra means over their pixels.
+        """Standard deviations of the labels; for spectra means over their pixels.
 
-        Processes of kriged paths have no noise, and treat paths as if the elements resolved them
-        all.
+        Processes of kriged paths have no noise, and assume that the elements resolve all paths.
         """
         return self.posterior.deviations(batch, *self._features_at(batch, None))
 
@@ -406,7 +407,7 @@ class Kriging(Wrapper):
         return self._alone.any_frequency
 
     def at_frequencies(self, frequencies: Float[Tensor, " s"]) -> Model:
-        """``_alone`` at other frequencies, at which residuals do not correlate."""
+        """``_alone`` at other frequencies, where residuals do not correlate."""
         return self._alone.at_frequencies(frequencies)
 
     @property
@@ -416,10 +417,10 @@ class Kriging(Wrapper):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """Trend and fallback at other receivers, by ``new_weight``.
+        """Trend and fallback at other receivers, weighted by ``new_weight``.
 
-        Nothing is kriged there, as no residuals are known. Where receivers are places of one radio,
-        labels are kriged over these places, too: then the whole model moves with its process.
+        Nothing is kriged there, since no residuals are known. If receivers are places of one radio,
+        labels are kriged over these places, too, and the process stays.
         """
         if self.scene.one_radio and not self.posterior.by_paths:
             return super().at_receivers(receivers)
@@ -434,10 +435,10 @@ class Kriging(Wrapper):
     def unseen(self, links: Links, enough: int = 1000, most: int = 4000) -> Iterator[Unseen]:
         """Yields models that krige the training links, with validation links that they do not know.
 
-        Each of two models comes with one half of the validation links; the other half has chosen
-        its weights and hyperparameters. Links of a single group, which cannot be halved, do both.
-        If ``enough`` validation links have chosen nothing (``chosen_by``), this model itself comes
-        with these. For labels of one number ``most`` links suffice for quantiles.
+        There are two models, each for one half of the validation links. The other half has chosen
+        its weights and hyperparameters. Links of a single group cannot be halved and do both. If at
+        least ``enough`` validation links had no part in any choice (``chosen_by``), this model
+        itself comes with these links. ``most`` scalar labels suffice for quantiles.
         """
         if not len(links.split.validation):
             return
@@ -454,7 +455,7 @@ class Kriging(Wrapper):
             kriged.posterior.start_from(self.posterior)
             kriged.laws = self.laws
             if links.task.is_scalar and len(chooses) >= 300:
-                # A half of so many would choose the same weight as all of them.
+                # Half of so many links would choose the same weight as all of them.
                 kriged.weights = (self.trend_weight.item(),)
             half = replace(links, split=links.split.choosing(chooses))
             kriged = kriged.krige(half, is_final=False, by_paths=self.posterior.by_paths)
@@ -487,7 +488,7 @@ class Kriging(Wrapper):
 
     @property
     def has_room(self) -> bool:  # type: ignore[override]
-        """True if predictions have a part of the trend."""
+        """True if the trend contributes to predictions."""
         return bool(self.trend_weight > 0 or self.weight < 1 or self.posterior.has_features)
 
     def facts(self) -> dict[str, Any]:

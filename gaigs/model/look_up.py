@@ -1,4 +1,4 @@
-"""Base of models that keep the links that they know."""
+"""Base of models that store their known links."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,12 +14,12 @@ from gaigs.registry import name_of
 
 
 class LookUp(Model):
-    """Base of a model whose state are its known links and the attributes named in ``learnt``.
+    """Base of models whose state is their known links and the attributes named in ``learnt``.
 
-    It stays on the CPU.
+    Such a model stays on the CPU.
 
     Attributes:
-        links: Links, or a batch of the known ones; None before the fit.
+        links: Links, or a batch of the known links; None before the fit.
         known: Numbers of each receiver's known links.
         learnt: Names of attributes with plain values that ``fit`` sets.
     """
@@ -47,7 +47,7 @@ class LookUp(Model):
         return {"query": vars(self.links.query[index]), "labels": labels, **learnt}
 
     def set_extra_state(self, state: dict) -> None:
-        """Takes the state of a fitted look-up."""
+        """Sets the state of a fitted look-up."""
         labels = [part / 255 if part.dtype == torch.uint8 else part for part in state["labels"]]
         self.links = Batch(Query(**state["query"]), None, torch.cat(labels))
         radios = self.scene.radio_of(self.links.query.receivers)

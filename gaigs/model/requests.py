@@ -1,4 +1,4 @@
-"""Arguments of ``Model.predict``: checked, with the axes of the answer and the warnings."""
+"""Arguments of ``Model.predict``: checks, axes of the result, and warnings."""
 
 import copy
 import math
@@ -27,7 +27,7 @@ from gaigs.core.task import Axis
 
 
 class Subcarriers(NamedTuple):
-    """Subcarriers that a prediction is asked at."""
+    """Requested subcarriers of a prediction."""
 
     # Frequencies [Hz] that the model computes in place of the labels' own; None: the labels' own.
     exchanged: Float[Tensor, " s"] | None = None
@@ -37,7 +37,7 @@ class Subcarriers(NamedTuple):
 
 
 class Request(NamedTuple):
-    """Links to predict, and how their values are arranged."""
+    """Links to predict, and the arrangement of their values."""
 
     query: Query  # links, the receivers of a position one after the other
     axes: tuple[int, ...]  # axes of the links in the answer, see ``Query.from_positions``
@@ -72,7 +72,7 @@ class Request(NamedTuple):
         return cls(query, axes, receiver, each, directions, subcarriers, warnings)
 
     def asked(self, scene: Scene, name: str | None = None) -> Asked:
-        """Names and coordinates of the answer's axes, or of its part at receiver ``name``."""
+        """Names and coordinates of the result's axes, or of its part at receiver ``name``."""
         task = self._task(scene)
         known = [receiver.name for receiver in scene.receivers]
         receiver = self.receiver if name is None else name
@@ -97,7 +97,7 @@ class Request(NamedTuple):
         return Asked(positions, names, has_axis, axes, task.quantity, task.unit)
 
     def _task(self, scene: Scene) -> Any:
-        """The task at the subcarriers that are asked for."""
+        """The task at the requested subcarriers."""
         task = scene.task
         if self.subcarriers.exchanged is not None:
             return task.at_frequencies(self.subcarriers.exchanged)
@@ -106,7 +106,7 @@ class Request(NamedTuple):
         return task
 
     def estimates(self, fields: Sequence, scene: Scene) -> Any:
-        """The ``Estimate`` of its fields, or a dictionary if these are dictionaries by receiver."""
+        """The ``Estimate`` of its fields, or a dictionary if they are dictionaries by receiver."""
         if not isinstance(fields[0], dict):
             return Estimate(*fields).about(self.asked(scene))
         estimates = {}
@@ -116,7 +116,7 @@ class Request(NamedTuple):
         return estimates
 
     def to_xarray(self, answer: Any, scene: Scene) -> Any:
-        """An answer as a data set, or a dictionary of data sets by receiver."""
+        """A result as a data set, or a dictionary of data sets by receiver."""
 
         def labelled(part: Any, name: str | None = None) -> Any:
             if not isinstance(part, Estimate):
@@ -128,11 +128,11 @@ class Request(NamedTuple):
         return {name: labelled(part, name) for name, part in answer.items()}
 
     def arranged(self, values: Tensor, scene: Scene, axes: tuple[int, ...] | None = None) -> Any:
-        """Reshapes values of links (b, ...) to the axes of the answer, or to other ones.
+        """Reshapes values of links (b, ...) to the axes of the result, or to other axes.
 
-        Channels come padded to the largest array and to all subcarriers. Where receivers differ in
-        these, the padding is cut: a request for all receivers then gives a dictionary of tensors by
-        name, a request for one receiver its tensor.
+        Channels are padded to the largest array and to all subcarriers. If receivers differ in
+        these, the padding is removed. A request for all receivers then returns a dictionary of
+        tensors by name, a request for one receiver its tensor.
         """
         axes = self.axes if axes is None else axes
         receivers = scene.receivers
@@ -156,11 +156,11 @@ class Request(NamedTuple):
 
 
 def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver | None:
-    """The new receiver that an argument of ``Model.predict`` gives; None for names and indices.
+    """The new receiver in an argument of ``Model.predict``; None for names and indices.
 
-    The argument may be a ``Receiver``, a pose, or a position [m]. A pose or position gets the array
-    of the scene's receivers; for a position that array must need no orientation. Three whole
-    numbers beside three transmitters are indices of receivers.
+    The argument may be a ``Receiver``, a ``Pose``, or a position [m]. A pose or position gets the
+    array of the scene's receivers. A position requires an array without orientation. With three
+    transmitters, three whole numbers are indices of receivers.
     """
     if isinstance(receiver, Receiver) or receiver is None:
         return receiver
@@ -199,7 +199,7 @@ def is_same(one: Receiver, other: Receiver) -> bool:
 
 
 def _kind_of(values: Any) -> tuple[str, tuple[int, ...]]:
-    """numpy's kind of dtype, and the shape, of numbers; kind ``O`` for anything else."""
+    """Numpy's kind of dtype, and the shape, of numbers; kind ``O`` for anything else."""
     try:
         array = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
     except ValueError:  # ragged lists
@@ -219,9 +219,9 @@ def lacks_numbers(scene: Scene) -> bool:
 
 
 def as_known_subcarriers(frequencies: object, scene: Scene, any_frequency: bool) -> Subcarriers:
-    """The wanted subcarriers, checked, with a warning if they are far from the labels' own.
+    """The requested subcarriers, checked, with a warning if they are far from the labels' band.
 
-    Without ``any_frequency`` the model gives the labels' nearest ones.
+    Without ``any_frequency`` the model returns the nearest subcarriers of the labels.
     """
     if frequencies is None:
         return Subcarriers()
@@ -257,9 +257,9 @@ def check_interval(
     frequencies: object,
     any_frequency: bool,
 ) -> None:
-    """Raises the ``ValueError`` of ``Model.predict`` for an interval that it cannot give.
+    """Raises the ``ValueError`` of ``Model.predict`` for an impossible interval.
 
-    ``calibrations`` are the trained model's and its copy's at the receiver that is asked for.
+    ``calibrations`` are of the trained model and of its copy at the requested receiver.
     """
     if not 0 < interval < 1:
         raise ValueError(
@@ -285,7 +285,7 @@ def check_interval(
 
 
 def usual_batch_size(shape: tuple[int, ...], numbers: int = 2**17, most: int = 1024) -> int:
-    """Number of links whose labels have so many numbers together; from 16 to ``most``."""
+    """Number of links whose labels have ``numbers`` values together; from 16 to ``most``."""
     return min(most, max(16, numbers // math.prod(shape)))
 
 

@@ -42,7 +42,7 @@ class ShapedPathLoss(PathLoss):
         return Prediction(super().forward(batch).value + terms, {})
 
     def facts(self) -> dict[str, object]:
-        """``terms``, and ``break_m`` where there are break points."""
+        """``terms``, and ``break_m`` if there are break points."""
         return {**self.terms.facts()}
 
     def _load_from_state_dict(self, state_dict, prefix, *args):

@@ -1,4 +1,4 @@
-"""Log-distance path loss and what buildings on a map take from it."""
+"""Log-distance path loss, and the loss by buildings on a map."""
 
 import logging
 import math
@@ -26,22 +26,23 @@ log = logging.getLogger(__name__)
 
 @register("model", "site")
 class Site(Model):
-    """``path_loss`` of each receiver, less a common loss by buildings; NaN before ``fit``.
+    """``path_loss`` of each receiver, minus a common loss by buildings; NaN before ``fit``.
 
     Loss = c1 [a roof is above the direct path] + c2 10 log10(1 + length inside / 1 m) + c3 (walls
     crossed) + c4 (knife-edge loss over the roofs). The coefficients are fitted by least squares
     together with the level and exponent of each receiver, see ``shared_coefficients``. ``fit``
-    reads the file, and a checkpoint keeps the roofs on a grid of 1 m, or coarser for a large site.
+    reads the file. A checkpoint stores the roofs on a grid of 1 m, or coarser for a large site.
 
     Args:
-        buildings: GeoJSON file, see ``gaigs.data.geojson.read_buildings``: longitude and latitude,
-            or easting and northing, if the data have a place on the map; else metres of the data.
-        height: Height of buildings without one [m]; None: each must have its own.
+        buildings: GeoJSON file, see ``gaigs.data.geojson.read_buildings``. Coordinates are
+            longitude and latitude, or easting and northing, if the data have a frame; otherwise
+            metres of the data.
+        height: Height of buildings without this property [m]; None: each must have it.
 
     Raises:
         FileNotFoundError: ``fit`` finds no such file.
         ValueError: A label is more than one real number. In ``fit``: the file has a defect, or no
-            building near the links.
+            building is near the links.
 
     Source: ITU-R P.526-15, sections 4.1 and 4.5.1; Lawson and Hanson, Solving Least Squares
     Problems, 1974, chapter 23.
@@ -91,7 +92,7 @@ class Site(Model):
         return Prediction(self.law(batch).value - loss, {})
 
     def _features(self, query: Query) -> Float[Tensor, "b 4"]:
-        """The four factors of c1 to c4 for each link; NaN before ``fit``."""
+        """The features of c1 to c4 in the loss of each link; NaN before ``fit``."""
         x, y, cell = self.grid.tolist()
         if not cell:  # before the fit
             return query.transmitters.new_full((len(query), 4), torch.nan)
@@ -105,7 +106,7 @@ class Site(Model):
         return features
 
     def _read_roofs(self) -> Roofs:
-        """The roofs as far from the links as predictions go without a warning."""
+        """Roofs in the area where predictions give no warning of extrapolation."""
         buildings = read_buildings(self.buildings, self.scene.frame, self.height)
         corners = np.concatenate([rings[0] for rings, _ in buildings])
         lower, upper = (corner[:2].double().numpy() for corner in self.scene.box)
@@ -127,12 +128,12 @@ def shared_coefficients(
 ) -> Float[Tensor, " f"]:
     """Non-negative coefficients c of features x in y = level + exponent log10(d) + c . x.
 
-    Level and exponent differ from receiver to receiver, c is shared. A ridge draws each coefficient
-    towards 0, like one more link. A feature that level and exponent explain has the coefficient 0.
+    Each receiver has its own level and exponent; c is shared. A ridge shrinks each coefficient,
+    with the weight of one more link. If level and exponent explain a feature, its coefficient is 0.
 
     Args:
-        columns: Level y of each link [dBm], then its features x. A loss has a negative sign, since
-            c is not negative.
+        columns: Level y of each link [dBm], then its features x. Losses are negative features,
+            since c is not negative.
         lengths: Distances d [m].
         receivers: Number of each link's receiver.
 

@@ -23,18 +23,18 @@ from gaigs.registry import register, suggest
 class SklearnRegressor(LookUp):
     """A regressor of scikit-learn for each receiver, on x, y and z of the transmitter [m].
 
-    With several carriers there is a fourth input, the logarithm of the carrier from the middle of
-    the band. Labels of several numbers take a regressor with several outputs. Checkpoints hold the
-    links and the estimator's options: loading fits again, with ``random_state`` 0 where none is
-    given. Regressors whose ``predict`` has ``return_std`` give the deviations of intervals.
+    With several carriers a fourth input is the logarithm of the carrier relative to the middle of
+    the band. Labels of several numbers need a regressor with several outputs. Checkpoints store the
+    links and the estimator's options. Loading fits again, by default with ``random_state`` 0. If
+    ``predict`` of the regressor has ``return_std``, this gives the deviations of intervals.
 
     Args:
         estimator: Name of a class, such as ``sklearn.ensemble.RandomForestRegressor``; or a mapping
-            of ``_target_``, the name, and its options, which may hold further estimators.
+            of ``_target_``, the name, and options, which may contain estimators.
 
     Raises:
         ImportError: scikit-learn is not installed.
-        ValueError: The estimator is no regressor of scikit-learn, or an option is unknown.
+        ValueError: The estimator is not a regressor of scikit-learn, or an option is unknown.
 
     Source: Pedregosa et al., Scikit-learn: Machine Learning in Python, JMLR 12, 2011.
     """
@@ -64,7 +64,7 @@ class SklearnRegressor(LookUp):
         self._fit()
 
     def fit(self, links: Links) -> None:
-        """Keeps the links, and fits the regressor of each receiver to its known ones."""
+        """Stores the links, and fits the regressor of each receiver to its known links."""
         self.links, self.known = links, known_links(links)
         self._fit()
 
@@ -125,11 +125,11 @@ class SklearnRegressor(LookUp):
 def build_estimator(given: Any) -> Any:
     """Builds estimators from names and mappings, also within lists and options.
 
-    Other values are returned as they are.
+    Other values are unchanged.
 
     Raises:
         ImportError: scikit-learn is not installed.
-        ValueError: A name is none of scikit-learn, or an option is unknown.
+        ValueError: A name is not in scikit-learn, or an option is unknown.
     """
     if isinstance(given, list | tuple):
         return [build_estimator(entry) for entry in given]
@@ -147,7 +147,7 @@ def build_estimator(given: Any) -> Any:
 
 
 def find_class(target: str) -> type:
-    """A class of scikit-learn. Others are refused: a stranger's checkpoint may name them."""
+    """A class of scikit-learn; no others, since a checkpoint of a stranger may name them."""
     try:
         from sklearn.base import BaseEstimator
         from sklearn.gaussian_process.kernels import Kernel

@@ -1,4 +1,4 @@
-"""Models that are made of other models."""
+"""Models made of other models."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -14,16 +14,16 @@ from gaigs.splatting.gaussians import Gaussians
 
 
 class Wrapper(Model):
-    """Base of a model around an ``underlying`` one, whose room, Gaussians and files it shows."""
+    """Base of a model around an ``underlying`` one; it shows the latter's room and files."""
 
     @property
     @abstractmethod
     def underlying(self) -> Model:
-        """The model within, such as the trend of kriging."""
+        """The wrapped model, such as the trend of kriging."""
 
     @property
     def has_room(self) -> bool:
-        """False if predictions have no part of the underlying model: its room is not shown."""
+        """False if the underlying model has no part in predictions; its room is not shown."""
         return True
 
     @property
@@ -45,7 +45,7 @@ class Wrapper(Model):
 
 
 def build_trend(trend: str | Mapping | Model, scene: Scene) -> Model:
-    """The model that is a trend; errors name the option ``model.trend``."""
+    """Builds the model of a trend; errors name the option ``model.trend``."""
     try:
         return registry("model").build(trend, scene=scene)
     except ValueError as error:

@@ -20,9 +20,9 @@ log = logging.getLogger(__name__)
 class AxisPlanes(PlaneSearch[SlabRoom]):
     """Search for planes along the axes of a room, near its known planes.
 
-    Normals are those of the room's axes, and only offsets are searched. With so few candidates,
-    fainter planes stand out from noise, and walls behind the array from the direct path. Walls are
-    added before other planes. After each addition all planes move a little.
+    Only offsets along the room's axes are searched. With so few candidates, faint planes exceed the
+    noise, and walls behind the array differ from the direct path. Walls are added before other
+    planes. After each addition all planes are adjusted slightly.
     """
 
     score: ChannelScore
@@ -32,7 +32,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         self.data = data
 
     def find_upright(self, room: SlabRoom) -> SlabRoom:
-        """A room of the single upright plane that explains most; empty if there is none.
+        """A room of the single vertical plane that explains most; empty if there is none.
 
         The plane is along the axes of ``room``.
         """
@@ -51,10 +51,10 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
     def grow_along(
         self, room: SlabRoom, most: int, others: Float[Tensor, "v 4"] | None = None
     ) -> SlabRoom:
-        """The room with further planes, ``most`` in all.
+        """The room with further planes, ``most`` in total.
 
-        Added first are walls along the room's axes, then planes along these axes amid the places,
-        then planes of ``others``.
+        Walls along the room's axes are added first, then planes along these axes between the
+        places, then planes of ``others``.
         """
         count = len(room.planes)
 
@@ -83,11 +83,11 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
     def propose_along(
         self, room: SlabRoom, normals: Float[Tensor, "k 3"], least: float
     ) -> tuple[list[Float[Tensor, "4"]], list[Float[Tensor, "4"]]]:
-        """Planes with these normals that explain more than a share ``least`` of the residual.
+        """Planes with these normals that explain more than the fraction ``least`` of the residual.
 
         Returns:
-            At most four walls, which have all places on one side, and at most four planes amid the
-            places, each list best first. In one list those amid the places would displace walls.
+            At most four walls, which have all places on one side, and at most four planes between
+            the places, each list best first. In a single list the latter would displace walls.
         """
         walls: list[Candidate] = []
         amid: list[Candidate] = []
@@ -114,9 +114,9 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         return self.score.polish(best[0], steps=12, rate=5e-4, only=number) if best else room
 
     def settle(self, room: SlabRoom, polishes: bool = False) -> SlabRoom:
-        """The room with each plane moved once more, as the others are known now.
+        """The room with each plane moved again, given the present positions of all others.
 
-        ``polishes`` adds a descent to each move.
+        ``polishes`` adds a gradient descent to each move.
         """
         move = self.score.move_and_polish if polishes else self.score.move
         room = self.sweep(room, range(len(room.planes)), move=move)
@@ -138,8 +138,8 @@ def _strongest(candidates: list[Candidate], least: float) -> list[Float[Tensor, 
 def room_axes(planes: Float[Tensor, "w 4"]) -> Float[Tensor, "k 3"]:
     """Normals along which a room may have further planes.
 
-    They are the normals of the planes, the vertical, the horizontal parts of steep planes' normals,
-    and the horizontal normals at right angles to these parts.
+    These are the normals of the planes, the vertical, the horizontal parts of steep planes'
+    normals, and the horizontal normals perpendicular to these parts.
     """
     normals = planes[:, :3]
     up = planes.new_tensor([0.0, 0.0, 1.0])
@@ -150,14 +150,14 @@ def room_axes(planes: Float[Tensor, "w 4"]) -> Float[Tensor, "k 3"]:
 
 
 def is_square(planes: Float[Tensor, "w 4"]) -> bool:
-    """True if planes are level or upright, and parallel or at right angles, to a degree or so."""
+    """True if planes are horizontal or vertical, parallel or perpendicular, to about a degree."""
     normals = torch.cat((planes[:, :3], planes.new_tensor([[0.0, 0.0, 1.0]])))
     cosines = (normals @ normals.mT).abs()
     return bool(((cosines < 0.02) | (cosines > 0.9998)).all())
 
 
 def find_maxima(ratings: Float[Tensor, " k"], width: int) -> list[int]:
-    """Indices of at most two maxima over 0, each the largest of ``width`` neighbours."""
+    """Indices of at most two maxima above 0, each the largest of ``width`` neighbours."""
     is_peak = functional.max_pool1d(ratings[None], width, 1, width // 2)[0] == ratings
     at = (ratings * is_peak).topk(2).indices
     return at[ratings[at] * is_peak[at] > 0].tolist()

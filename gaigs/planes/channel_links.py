@@ -74,14 +74,14 @@ class SlabRoom(NamedTuple):
     slabs: Float[Tensor, "w 3"]
 
     def with_plane(self, plane: Float[Tensor, "4"], material: Float[Tensor, "3"]) -> "SlabRoom":
-        """The room with a plane behind the others."""
+        """The room with one more plane, the last."""
         planes = torch.cat((self.planes, plane[None]))
         return SlabRoom(planes, torch.cat((self.slabs, material[None])))
 
     def replace_plane(
         self, number: int, plane: Float[Tensor, "4"], material: Float[Tensor, "3"]
     ) -> "SlabRoom":
-        """The room with another plane at a number."""
+        """The room with another plane as plane ``number``."""
         room = SlabRoom(self.planes.clone(), self.slabs.clone())
         room.planes[number] = plane
         room.slabs[number] = material
@@ -89,7 +89,7 @@ class SlabRoom(NamedTuple):
 
 
 def half_spaces(planes: Float[Tensor, "w 4"]) -> SlabRoom:
-    """A room whose planes are faces of half-spaces: thick slabs, the second of ``SLABS``."""
+    """A room with planes as faces of half-spaces: thick slabs, the second of ``SLABS``."""
     return SlabRoom(planes, SLABS[1].repeat(len(planes), 1))
 
 
@@ -101,7 +101,7 @@ class SlabMaterials(NamedTuple):
 
 
 def materials_of(slabs: Float[Tensor, "*w 3"]) -> SlabMaterials:
-    """Permittivities and thicknesses of slabs, which are given as in ``SLABS``."""
+    """Permittivities and thicknesses of slabs, in the form of ``SLABS``."""
     real, imaginary, thicknesses = slabs.exp().unbind(-1)
     return SlabMaterials(torch.complex(1 + real, -imaginary), thicknesses)
 
@@ -120,10 +120,10 @@ class ReceiverChannels:
     def of(
         cls, links: Links, number: int, sign: int, elements: int = 16, subcarriers: int = 32
     ) -> "ReceiverChannels":
-        """Channels of receiver ``number`` that carry power, with phases as of exp(-j 2 pi f t).
+        """Channels of receiver ``number`` with nonzero power, with phases as of exp(-j 2 pi f t).
 
         Args:
-            links: Their training links count.
+            links: Links, of which the training links are used.
             number: Number of the receiver.
             sign: Sign of the labels' phases.
             elements, subcarriers: Largest numbers, evenly spread over the array and the band.
@@ -167,7 +167,7 @@ class ReceiverChannels:
         )
 
     def single(self) -> "ReceiverChannels":
-        """The same channels in single precision, for descents."""
+        """The same channels in single precision, for gradient descent."""
         parts = {
             name: part.float()
             for name, part in vars(self).items()
@@ -191,7 +191,7 @@ class ReceiverChannels:
 
     @property
     def few_subcarriers(self) -> slice:
-        """Every fifth subcarrier, or more of them if a channel would keep fewer than 64 numbers."""
+        """Every fifth subcarrier, or more to keep at least 64 numbers in a channel."""
         return slice(None, None, min(5, max(1, self.flat.shape[1] // 64)))
 
     def images(
@@ -217,8 +217,8 @@ class ReceiverChannels:
     ) -> Complex[Tensor, "b n k"]:
         """Waves of all paths after their reflections; 0 for a path that does not meet its planes.
 
-        Reflection coefficients are those at the frequencies ``at`` [Hz], by default each
-        subcarrier's. A single one saves work with half-spaces, which reflect alike at all
+        Reflection coefficients are computed at the frequencies ``at`` [Hz], by default at each
+        subcarrier. A single frequency saves time for half-spaces, whose reflection is equal at all
         frequencies.
         """
         at = self.frequencies if at is None else at
@@ -257,11 +257,11 @@ class ChannelData:
     """All training channels of a search, in the frame of the room.
 
     Args:
-        links: Their training links count; of the task ``csi``.
+        links: Links of task ``csi``, of which the training links are used.
         sign: Sign of the channels' phases.
-        has_common_phase: True if all channels have one phase in common.
-        order: Largest number of reflections of a path; more than 2 count as 2, as longer paths
-            hardly locate a plane.
+        has_common_phase: True if all channels share one unknown phase.
+        order: Largest number of reflections of a path. More than 2 count as 2: longer paths hardly
+            locate a plane.
         options: Options of the search.
     """
 
@@ -298,7 +298,7 @@ class ChannelData:
     def draw(
         self, count: int, subcarriers: int | None = None, fewest: int = 4
     ) -> list[ReceiverChannels]:
-        """All receivers with about ``count`` random places together, ``fewest`` or more each."""
+        """All receivers with about ``count`` random places in total, at least ``fewest`` each."""
         each = max(fewest, count // len(self.receivers))
         parts = []
         for receiver in self.receivers:
@@ -329,9 +329,7 @@ class ChannelData:
     def fit_free(
         self, receiver: ReceiverChannels, planes: Float[Tensor, "w 4"], ridge: float | None = None
     ) -> FreeFit:
-        """Complex strengths of all paths at planes, fitted at each place; see
-        ``strengths.fit_free``.
-        """
+        """Complex strengths of all paths at planes, by ``strengths.fit_free`` at each place."""
         waves = receiver.waves(receiver.images(planes, self.sequences(planes)))
         return fit_free(waves, receiver.flat, self.options.ridge if ridge is None else ridge)
 
@@ -340,7 +338,7 @@ class ChannelData:
     ) -> list[Complex[Tensor, " c"]]:
         """Phase of the direct paths to each receiver, as numbers of magnitude 1.
 
-        There is one for all places (1,) if channels share a phase, else one for each place (b,).
+        Channels that share a phase have one for all places (1,), others one for each place (b,).
         """
         phases = []
         for receiver in receivers:

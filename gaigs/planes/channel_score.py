@@ -1,4 +1,4 @@
-"""The score of planes by channels: real strengths of slabs, and neighbours that predict a place."""
+"""The score of planes by channels: real strengths of slabs, predicted from neighbouring places."""
 
 import math
 from functools import cached_property
@@ -16,7 +16,7 @@ from gaigs.planes.strengths import align_phases, log_share, real_residual, real_
 
 
 class NeighbourLinks(NamedTuple):
-    """Channels of one receiver, and the nearest places to those that are predicted."""
+    """Channels of one receiver, and the places nearest to predicted ones."""
 
     receiver: ReceiverChannels  # channels of targets and neighbours
     targets: Int[Tensor, " t"]  # rows of the predicted places
@@ -27,16 +27,16 @@ class NeighbourLinks(NamedTuple):
 
 
 class ChannelScore(Score[SlabRoom]):
-    """Planes by the phases of reflections at slabs, with real strengths that are not negative.
+    """Planes by the phases of reflections at slabs, with real, non-negative strengths.
 
-    A true plane's strengths vary little from place to place, so channels are predicted with the
-    strengths of the nearest places. The error of a room is the mean log of the share of power that
-    the prediction leaves, plus a price for each plane. A false plane that explains one place by
-    chance fails at the next.
+    The strengths of a true plane vary little from place to place, so channels are predicted with
+    the strengths of the nearest places. The error of a room is the mean log of the unexplained
+    fraction of power, plus a price for each plane. A false plane that explains one place by chance
+    fails at the next.
 
     Args:
         data: Training channels.
-        has_free_strengths: True if channels have numbers enough for complex strengths in ratings.
+        has_free_strengths: True if channels have enough numbers for complex strengths in ratings.
 
     Source: Stone, Cross-validatory choice and assessment of statistical predictions, 1974.
     """
@@ -62,7 +62,7 @@ class ChannelScore(Score[SlabRoom]):
         room: SlabRoom,
         sequences: Int[Tensor, "n order"],
     ) -> Float[Tensor, " t"]:
-        """Log of the share of each predicted place's power that neighbours do not explain."""
+        """Log of the fraction of each predicted place's power that neighbours do not explain."""
         receiver = links.receiver.at(slice(None), links.receiver.few_subcarriers).single()
         channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
         power = receiver.flat.abs().square().sum(1)[:, None, None]
@@ -117,7 +117,7 @@ class ChannelScore(Score[SlabRoom]):
         return self._best_moves(room, number)[0]
 
     def move_and_polish(self, room: SlabRoom, number: int) -> SlabRoom:
-        """The best of the three best moves of a plane, and of a descent from each.
+        """The best result of the three best moves of a plane, each also after a gradient descent.
 
         The descent also fits the slab, since a wrong slab may hide the best offset.
         """
@@ -153,10 +153,10 @@ class ChannelScore(Score[SlabRoom]):
     def measure(
         self, sample: ChannelSample, room: SlabRoom, resolved: Bool[Tensor, " w"] | bool = True
     ) -> Float[Tensor, ""]:
-        """Mean log of the share of power that real strengths do not explain.
+        """Mean log of the fraction of power that real strengths do not explain.
 
         A plane is ``resolved`` once its offset is known to a fraction of the wavelength. Paths at
-        other planes have complex strengths, since their phases say nothing yet.
+        other planes have complex strengths, since their phases are still meaningless.
         """
         shares = []
         residuals = self.residuals(sample, room, resolved)
@@ -187,9 +187,9 @@ class ChannelScore(Score[SlabRoom]):
         return residuals
 
     def polish(self, room: SlabRoom, steps: int, rate: float, only: int | None = None) -> SlabRoom:
-        """The room after a descent on ``measure`` with all planes, or with plane ``only``.
+        """The room after gradient descent on ``measure`` with all planes, or with plane ``only``.
 
-        ``steps`` and ``rate`` [m] as in ``search.descend``.
+        ``steps`` and ``rate`` [m] are as for ``search.descend``.
         """
         moves = torch.ones(len(room.planes), dtype=torch.bool)
         if only is not None:
@@ -226,12 +226,12 @@ class ChannelScore(Score[SlabRoom]):
         return GridRatings(ratings, lambda planes: self.added_shares(room, planes))
 
     def added_shares(self, room: SlabRoom, planes: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
-        """Mean share, 0 to 1, of the residual's power that an image in each plane explains.
+        """Mean fraction, 0 to 1, of the residual's power that an image in each plane explains.
 
-        The residual is what known paths leave. Only the part of the image's wave that known paths
-        do not explain counts, in numerator and denominator: the image in a wall behind the array
-        resembles the direct path and would be underrated. The share is 0 for a plane between
-        transmitter and receiver.
+        The residual is the part of a channel that known paths do not explain. The known paths are
+        also removed from the image's wave, in numerator and denominator. Otherwise the image in a
+        wall behind the array, which resembles the direct path, would be underrated. The fraction is
+        0 for a plane between transmitter and receiver.
         """
         total = planes.new_zeros(len(planes))
         count = 0
@@ -256,7 +256,7 @@ class ChannelScore(Score[SlabRoom]):
     def _fitted_part(self, values: Tensor) -> Tensor:
         """Strengths or Gram matrices; only their real part unless strengths are free.
 
-        Free strengths would explain channels of few numbers by any plane.
+        With free strengths any plane would explain channels of few numbers.
         """
         return values if self.has_free_strengths else values.real.to(values)
 
@@ -273,8 +273,8 @@ class ChannelScore(Score[SlabRoom]):
         Args:
             receiver: Places and elements.
             known: Waves of the known paths.
-            inverse: Pseudo-inverse of ``known``: its product with a wave gives the strengths of
-                known waves that explain it best.
+            inverse: Pseudo-inverse of ``known``: its product with a wave is the least-squares
+                strengths of the known waves.
             residual: Residual of the known paths.
             planes: Candidates.
         """

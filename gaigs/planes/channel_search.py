@@ -26,24 +26,24 @@ log = logging.getLogger(__name__)
 class ChannelSearch:
     """Planes whose images explain the training channels.
 
-    1. ``FreeScore`` finds planes one after the other, without a guess of the room.
-    2. Phases are used: a periodogram over offset and two tilts proposes planes and slabs whose
-       reflections have like phases at all places. The residual decides between these; delays enter
-       into it, so planes half a wavelength apart differ.
-    3. Planes with which neighbouring places do not predict each other better are dropped
-       (``ChannelScore``), and the search is repeated for what these explained.
-    4. Where planes are tilted, or walls known, a second room along the axes is searched. For
-       channels of few numbers ``CommonGains`` finds its planes.
-    5. The room grows along its axes (``AxisPlanes``), which shows planes that hide behind the
-       direct path.
+    1. ``FreeScore`` finds planes one after the other, without an initial room.
+    2. A periodogram over offset and two tilts proposes planes and slabs whose reflections have
+       equal phases at all places. The residual, which includes delays, decides between them, so
+       planes half a wavelength apart differ.
+    3. Planes that do not improve the prediction between neighbouring places are dropped
+       (``ChannelScore``). The search is repeated for the power that they explained.
+    4. If planes are tilted, or walls known, a second room along the axes is searched. For channels
+       of few numbers ``CommonGains`` finds its planes.
+    5. ``AxisPlanes`` adds planes along the room's axes, such as planes hidden behind the direct
+       path.
 
     Args:
-        links: Their training links count; of the task ``csi``.
+        links: Links of task ``csi``, of which the training links are used.
         sign: Sign of the channels' phases.
-        has_common_phase: True if channels have a phase in common.
+        has_common_phase: True if all channels share one unknown phase.
         order: Largest number of reflections of a path.
         most: Largest number of planes.
-        start: Planes known before (w, 4).
+        start: Initial planes (w, 4).
         options: Options of the search.
 
     Source: ours.
@@ -72,7 +72,7 @@ class ChannelSearch:
 
     @torch.no_grad()
     def run(self) -> SlabRoom:
-        """Planes in the world's frame, the start's first, and their slabs as in ``SLABS``."""
+        """Planes in the world frame, initial ones first, and their slabs as in ``SLABS``."""
         room = self.find_room()
         return SlabRoom(self.frame.to_world(room.planes), room.slabs)
 
@@ -108,10 +108,10 @@ class ChannelSearch:
         return self.prune(self.along_axes.grow_along(best, self.most))
 
     def search_anew(self, room: SlabRoom) -> SlabRoom:
-        """The best of a room, from which pruning has dropped planes, and of two variants.
+        """The best of three rooms: a room after pruning, and two variants.
 
-        The first variant has further planes for what the dropped ones explained. The second is the
-        better room so far, resolved again, because false planes had moved the others.
+        The first variant has further planes for the power that the dropped ones explained. The
+        second is the better room so far, resolved again, since false planes had moved the others.
         """
         planes = self.find_free(self.free.descend(room.planes, steps=100, rate=1e-2))
         again = self.prune(self.resolve(self.free.descend(planes, steps=300, rate=5e-3)))
@@ -119,15 +119,15 @@ class ChannelSearch:
         return min(room, self.resolve(room.planes), key=self.score.error)
 
     def prune(self, room: SlabRoom) -> SlabRoom:
-        """The room without the planes whose absence lowers the error; known planes stay."""
+        """The room without planes whose removal lowers the error; known planes stay."""
         return self.along_axes.prune(room, len(self.start))
 
     def find_axis_walls(self) -> SlabRoom:
-        """Walls along the axes of coordinates, by gains in common."""
+        """Walls along the coordinate axes, by ``CommonGains``."""
         return CommonGains(self.data, self.start, self.most).find_axis_walls()
 
     def find_free(self, known: Float[Tensor, "v 4"]) -> Float[Tensor, "w 4"]:
-        """Known planes and those that ``FreeScore`` adds, all refined after each addition."""
+        """Known planes and further ones by ``FreeScore``, all refined after each addition."""
         normals = torch.cat((fibonacci_lattice(400, 0.0, math.pi / 2), torch.eye(3)))
         grid = self.frame.grid(normals.to(self.frame.points), 80, self.data.options.margin)
         search = PlaneSearch(self.frame, self.free)
@@ -148,17 +148,16 @@ class ChannelSearch:
             return min([*search.list_extensions(others, grid), last], key=self.free.error)
 
         room = search.grow(self.free.evaluate(known), self.most, extend)
-        # Each new plane is searched once more, as the others are known now. It becomes the last, so
-        # the next one always stands first, behind the known planes.
+        # Each new plane is searched again, given all others. It becomes the last plane, so the next
+        # plane to search is always the first one after the known planes.
         turns = [len(known)] * (len(room.planes) - len(known))
         return search.sweep(room, turns, "search of planes", replace).planes
 
     def resolve(self, planes: Float[Tensor, "w 4"]) -> SlabRoom:
-        """The room with each plane's offset known to a fraction of the wavelength, and its best
-        slab.
+        """The room with each plane's offset to a fraction of the wavelength, and its best slab.
 
-        Planes are moved one after the other, in three rounds. A plane that has not been moved yet
-        keeps complex strengths, see ``ChannelScore.measure``.
+        Planes are moved one after the other, in three rounds. Until its first move a plane has
+        complex strengths, see ``ChannelScore.measure``.
         """
         room = half_spaces(planes)
         resolved = torch.zeros(len(planes), dtype=torch.bool)
@@ -199,10 +198,10 @@ class ChannelSearch:
     def square_variants(
         self, planes: Float[Tensor, "w 4"], number: int
     ) -> list[Float[Tensor, "w 4"]]:
-        """Copies of the planes in which plane ``number`` is parallel or square to others.
+        """Copies of the planes in which plane ``number`` is parallel or perpendicular to others.
 
-        Each of its normals gives two copies, at the best two offsets nearby: a tilted plane may
-        stand for two parallel ones.
+        Each possible normal gives two copies, at the best two offsets nearby: a tilted plane may be
+        a fit to two parallel ones.
         """
         is_other = torch.arange(len(planes)) != number
         axes = _square_axes(planes, number, is_other)
@@ -228,7 +227,7 @@ class ChannelSearch:
 def _square_axes(
     planes: Float[Tensor, "w 4"], number: int, is_other: Bool[Tensor, " w"]
 ) -> list[Float[Tensor, "3"]]:
-    """At most three normals (3,) near plane ``number``'s, parallel or square to other planes."""
+    """At most three normals near plane ``number``'s, parallel or perpendicular to other planes."""
     normals = planes[is_other, :3]
     pairs = torch.combinations(torch.arange(len(normals)))
     crossed = torch.linalg.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])

@@ -1,4 +1,4 @@
-"""Walls along the axes of coordinates, by paths with one gain for all places."""
+"""Walls along the coordinate axes, by paths with one gain for all places."""
 
 from typing import NamedTuple
 
@@ -12,25 +12,25 @@ from gaigs.splatting.placement.mirrored.reflections import all_sequences
 
 
 class CommonFit(NamedTuple):
-    """Mean share of power that common gains leave, and the residuals of each receiver."""
+    """Mean fraction of power that common gains do not explain, and residuals of each receiver."""
 
     share: float
     residuals: list[Complex[Tensor, "b k"]]
 
 
 class BestOffset(NamedTuple):
-    """A plane at its best offset, and the share of power that its image explains there."""
+    """A plane at its best offset, and the fraction of power that its image explains there."""
 
     share: float
     plane: Float[Tensor, "4"]
 
 
 class CommonGains:
-    """Planes square to the axes of coordinates, found one after the other: a matching pursuit.
+    """Planes perpendicular to the coordinate axes, found one after the other by matching pursuit.
 
-    Each image has one real gain that all places share, as by a half-space. A strength of its own at
-    each place would explain channels of few numbers by any plane. A common gain explains hardly
-    anything by chance, and shows offsets to millimetres.
+    Each image has one real gain, common to all places, as for a half-space. With a separate
+    strength at each place any plane would explain channels of few numbers. A common gain explains
+    hardly anything by chance, and determines offsets to millimetres.
 
     Args:
         data: Training channels.
@@ -46,10 +46,10 @@ class CommonGains:
         self.most = most
 
     def find_axis_walls(self) -> SlabRoom:
-        """Half-spaces of the known walls and of further planes square to the axes.
+        """Half-spaces of the known walls and of further planes perpendicular to the axes.
 
-        Known walls move along their normals where that explains more than by chance. The result is
-        empty for a room of so many wavelengths that ``most_waves`` allows fewer than 50 places.
+        Known walls move along their normals if this explains more than chance does. The result is
+        empty for a room so large in wavelengths that ``most_waves`` allows fewer than 50 places.
         """
         options = self.data.options
         frame = self.data.frame
@@ -98,8 +98,7 @@ class CommonGains:
     ) -> Float[Tensor, "w 4"]:
         """Known walls moved to where phases agree, by at most ``drawing_error``.
 
-        In each round the wall that explains most is placed, beside which the others are then
-        fitted.
+        Each round fixes the wall that explains most. The others are then fitted together with it.
         """
         planes = self.start.clone()
         waiting = list(range(len(self.start)))
@@ -121,9 +120,9 @@ class CommonGains:
         lines: Float[Tensor, "c 4"],
         by_chance: float,
     ) -> Float[Tensor, "v 4"]:
-        """The planes, and further ones chosen from ``lines`` while one explains more than chance.
+        """The planes, and further ones from ``lines`` while one explains more than chance does.
 
-        Each choice is the plane that explains most of the residual (a matching pursuit).
+        Each choice is the plane that explains most of the residual (matching pursuit).
         """
         while len(planes) < self.most:
             known = self.fit(receivers, half_spaces(planes))
@@ -138,11 +137,11 @@ class CommonGains:
     def choose_lobes(
         self, receivers: list[ReceiverChannels], planes: Float[Tensor, "w 4"], by_chance: float
     ) -> Float[Tensor, "w 4"]:
-        """The planes, each moved to the offset of the smallest residual of paths of all orders.
+        """The planes, each moved to the offset with the smallest residual of paths of all orders.
 
-        The fit over an offset has a maximum (a lobe) every half wavelength: a reflected path then
-        changes by a whole wavelength, and phases agree again. Known walls move at most
-        ``drawing_error`` in all, and only if that lowers the residual by more than chance.
+        The fit over an offset has a maximum (a lobe) every half wavelength, where a reflected path
+        is longer by a whole wavelength. Known walls move at most ``drawing_error``, and only if
+        that lowers the residual by more than chance does.
         """
         options = self.data.options
         order = self.data.order
@@ -176,9 +175,10 @@ class CommonGains:
 
         Args:
             receivers: Channels.
-            others: Planes whose images the fit has already.
+            others: Planes whose images are already in the fit.
             plane: The plane, at its present offset.
-            bonus: Advantage given to the present offset [share of the power that the others leave].
+            bonus: Advantage of the present offset [fraction of the power unexplained by the
+                others].
         """
         known = self.fit(receivers, half_spaces(others))
         error = self.data.options.drawing_error
@@ -191,9 +191,9 @@ class CommonGains:
         return BestOffset(shares.max().item(), line[shares.argmax()])
 
     def fit(self, receivers: list[ReceiverChannels], room: SlabRoom, order: int = 1) -> CommonFit:
-        """Least squares of one real gain for each path, not negative and common to all places.
+        """Least squares of one real gain for each path, non-negative and common to all places.
 
-        Places count alike: the squares of each are divided by the place's power.
+        All places have equal weight: the squares of each are divided by the place's power.
         """
         sequences = all_sequences(len(room.planes), order)
         waves = []
@@ -231,7 +231,7 @@ class CommonGains:
         residuals: list[Complex[Tensor, "b k"]],
         line: Float[Tensor, "c 4"],
     ) -> Float[Tensor, " c"]:
-        """Share of power that the image in each plane of ``line`` explains by a common gain."""
+        """Fraction of power that the image in each plane of ``line`` explains by a common gain."""
         total, size = line.new_zeros(2, len(line))
         for receiver, residual in zip(receivers, residuals, strict=True):
             single = receiver.single()

@@ -1,4 +1,4 @@
-"""Rooms that explain fields of few numbers a place: planes whose gains all places share."""
+"""Rooms that explain channels of few numbers: planes with gains common to all places."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -16,9 +16,9 @@ from gaigs.splatting.placement.mirrored.reflections import all_sequences
 class FieldRoom(NamedTuple):
     """Planes in the frame, their slabs as in ``SLABS``, and gains that multiply the reflections.
 
-    A path's strength is the product of its planes' gains and the receiver's gain, so a few numbers
-    explain many paths. All bands have the same planes, but each band has other gains. These stay 0
-    where a band does not use the plane.
+    The strength of a path is the product of its planes' gains and the receiver's gain, so a few
+    numbers explain many paths. All bands share the planes, but each band has its own gains. A gain
+    is 0 if the band does not use the plane.
     """
 
     planes: Float[Tensor, "w 4"]
@@ -30,7 +30,7 @@ class FieldRoom(NamedTuple):
     def with_plane(
         self, plane: Float[Tensor, "4"], slab: Float[Tensor, "3"], uses: Bool[Tensor, " bands"]
     ) -> "FieldRoom":
-        """The room with a plane behind the others, as yet without a gain."""
+        """The room with one more plane, the last, with a gain of 0."""
         return FieldRoom(
             torch.cat((self.planes, plane[None])),
             torch.cat((self.slabs, slab[None])),
@@ -56,17 +56,17 @@ Operator = Callable[[Tensor], Tensor]
 
 
 class Kriged(NamedTuple):
-    """Linear operators on residuals, by kriging of each path's field from the places nearby."""
+    """Linear operators on residuals, by kriging each path's field from nearby places."""
 
     whiten: Operator  # decorrelates residuals: by the inverse Cholesky factor
     unseen: Operator  # errors of each place as the other places of its block predict it
 
 
 class Variation(NamedTuple):
-    """How strengths of paths vary over places: a Gaussian process for each path.
+    """Variation of path strengths over places: a Gaussian process for each path.
 
     Attributes:
-        share: Standard deviation of a path's field over its mean.
+        share: Standard deviation of a path's field, as a fraction of its mean.
         length: Distance at which the kernel falls to 1 / e [m].
         noise: Standard deviation of uncorrelated errors over the mean field.
     """
@@ -111,9 +111,9 @@ class PlaceBlock(NamedTuple):
     """Channel values of neighbouring places at one receiver, whose residuals are correlated.
 
     Attributes:
-        rows: Rows of the values, a place after the other.
-        gaps: Distances of the values' places [m].
-        each: Number of values of a place.
+        rows: Rows of the values, one place after the other.
+        gaps: Distances between the places of the values [m].
+        each: Number of values at a place.
         band: Number of the receiver's band.
     """
 
@@ -126,22 +126,22 @@ class PlaceBlock(NamedTuple):
 class FieldFit:
     """Least squares of fields by the images in a room's planes, over all places at once.
 
-    Every number is multiplied by the link's distance, else near places would dominate.
+    Every number is multiplied by the link's distance; otherwise near places would dominate.
 
     Args:
-        data: Training channels with a phase in common.
-        floor: Share of the mean power below which an error hardly counts; the default is -20 dB.
-        damping: Share of the mean squared derivative added in each step of Gauss and Newton.
-        largest: About the number of channel values of a ``PlaceBlock``; a larger one costs time.
+        data: Training channels with a common phase.
+        floor: Fraction of the mean power below which an error hardly counts; the default is -20 dB.
+        damping: Fraction of the mean squared derivative added in each Gauss-Newton step.
+        largest: Approximate number of channel values in a ``PlaceBlock``; larger blocks cost time.
 
     Attributes:
         values: Channel values of all receivers (m,), scaled to a mean power of 1 at each.
         scale: Factor from channel values to ``values`` (m,).
         owner: Number of each value's receiver (m,).
-        bands: Different wavelengths [m].
+        bands: Distinct wavelengths [m].
         band_numbers: Number of each receiver's band.
         band: Number of each value's band (m,).
-        variations: How strengths of paths vary over places in each band.
+        variations: Variation of path strengths over places, in each band.
         blocks: Neighbouring places that are kriged together.
     """
 
@@ -174,7 +174,7 @@ class FieldFit:
     def _divide(self, largest: int) -> Iterator[PlaceBlock]:
         """Splits ``values`` into blocks of neighbouring places, with about ``largest`` values each.
 
-        Kriging solves a linear system for each block in place of one for all places.
+        Kriging solves one linear system for each block instead of one for all places.
         """
         # ``values`` has the receivers one after the other, each with b places of k values.
         first = 0
@@ -207,7 +207,7 @@ class FieldFit:
         return self.fit_gains(FieldRoom(planes.double(), slabs, gains, receivers, uses), 12)
 
     def waves(self, planes: Float[Tensor, "w 4"], room: FieldRoom) -> Complex[Tensor, "m n"]:
-        """Waves of all paths after reflection by the room's slabs, scaled as ``values``."""
+        """Waves of all paths after reflection by the room's slabs, scaled like ``values``."""
         sequences = all_sequences(len(planes), self.order)
         slabs = SlabRoom(planes, room.slabs)
         parts = []
@@ -225,11 +225,11 @@ class FieldFit:
     ) -> FieldRoom:
         """The room with gains that minimise the mean log error, by damped Gauss-Newton steps.
 
-        Weights turn least squares into the mean logarithm (iteratively reweighted least squares).
+        Weights convert least squares to the mean logarithm (iteratively reweighted least squares).
 
         Args:
-            room: Planes, and gains at the start.
-            steps: Number of steps. One that raises the error is undone, and damping then grows.
+            room: Planes, and initial gains.
+            steps: Number of steps. A step that raises the error is undone, and damping then grows.
             waves: The room's ``waves`` if they are known.
             kriged: The room's ``krige`` if it is known.
         """
@@ -260,8 +260,8 @@ class FieldFit:
     ) -> FieldRoom:
         """The room after one damped step of all gains (Levenberg and Marquardt)."""
         sequences = all_sequences(len(room.planes), self.order)
-        # Derivatives of the predicted values: by a receiver's gain they are the values at a gain of
-        # 1, by a plane's gain those of the paths at this plane.
+        # Derivatives of the predicted values by a receiver's gain are the values at a gain of 1.
+        # Derivatives by a plane's gain are the values of the paths at this plane.
         by_receiver = torch.zeros_like(self.values)  # (m,)
         by_plane = waves.new_zeros(len(waves), *room.gains.shape)  # (m, bands, w)
         for number, gains in enumerate(room.gains):
@@ -301,10 +301,10 @@ class FieldFit:
 
     @torch.no_grad()
     def krige(self, room: FieldRoom, waves: Complex[Tensor, "m n"]) -> Kriged:
-        """Operators that whiten the residuals of a room, and that predict each place from others.
+        """Operators that whiten the residuals of a room, and predict each place from others.
 
-        The covariance of two channel values is the product of their paths' fields, summed over
-        paths, times the kernel of their places; on the diagonal noise is added.
+        The covariance of two channel values is the sum over paths of the product of their fields,
+        times the kernel of their places. Noise is added on the diagonal.
 
         Source: Dubrule, Cross validation of kriging in a unique neighborhood, 1983.
         """
@@ -339,12 +339,12 @@ class FieldFit:
         return applied
 
     def unseen(self, room: FieldRoom) -> Complex[Tensor, " m"]:
-        """Scaled errors at each place, which the other places of the block predict."""
+        """Scaled errors at each place when predicted from the other places of the block."""
         waves = self.waves(room.planes, room)
         return self.krige(room, waves).unseen(self.residual(room, waves))
 
     def choose_variation(self, room: FieldRoom) -> None:
-        """Sets ``variations``: for each band the one by which places best predict each other."""
+        """Sets ``variations``: for each band the one with the best prediction between places."""
         waves = self.waves(room.planes, room)
         rest = self.residual(room, waves)
         errors = []
@@ -362,7 +362,7 @@ class FieldFit:
 
 
 def group_places(places: Float[Tensor, "b 3"], count: int) -> Int[Tensor, " b"]:
-    """Group of each place, of ``count`` groups of neighbours, a power of two.
+    """Group of each place, in ``count`` groups of neighbours, a power of two.
 
     Groups are halved at the median of their longest axis until there are ``count``.
     """

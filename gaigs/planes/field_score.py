@@ -1,4 +1,4 @@
-"""The score of planes by fields of few numbers a place: coherent over places."""
+"""The score of planes by channels of few numbers: coherent over places."""
 
 import itertools
 import math
@@ -20,21 +20,20 @@ from gaigs.splatting.placement.mirrored.reflections import reflect
 class FieldScore(Score[FieldRoom]):
     """Planes by the power that an image explains with one gain for all places.
 
-    One number at each place is explained by any plane if each place has a gain of its own, but not
-    if all places share the gain. A few hundred places are then one large array, over which the
-    phases of a wrong plane do not fit. Receivers and groups of places, whose relative phases are
-    unknown, are summed as powers.
+    With a separate gain at each place, any plane would explain one number a place. A common gain
+    makes a few hundred places one large array, over which the phases of a wrong plane do not fit.
+    Powers are summed over receivers and groups of places, whose relative phases are unknown.
 
     Args:
-        data: Training channels with a phase in common.
-        price: Least fall by a true plane of the sum of log squared errors over all channel values.
-            The best of n false planes reaches about log n.
-        chunk: Waves that are computed at a time.
-        upright: Cosine of the largest tilt, 3.6 degrees, from which a plane is tried upright or
+        data: Training channels with a common phase.
+        price: Smallest fall of the sum of log squared errors over all channel values by a true
+            plane. The best of n false planes reaches about log n.
+        chunk: Number of waves computed at a time.
+        upright: Cosine of the largest tilt, 3.6 degrees, at which a plane is also tried vertical or
             along an axis.
 
     Attributes:
-        groups: Number of groups of places in ratings of a grid.
+        groups: Number of groups of places in the ratings of a grid.
         rated: True for bands whose links rate planes.
 
     Source: Mallat and Zhang, Matching pursuits with time-frequency dictionaries, 1993.
@@ -54,7 +53,7 @@ class FieldScore(Score[FieldRoom]):
         self.chunk = chunk
         self.groups = 1
         self.rated = torch.ones(len(self.fit.bands), dtype=torch.bool)
-        # Metal, which reflects alike at all angles.
+        # Metal, whose reflection is equal at all angles.
         self.mirror = torch.tensor([0.0, math.log(1e6), 0.0], dtype=torch.float64)
 
     def error(self, room: FieldRoom) -> float:
@@ -64,9 +63,11 @@ class FieldScore(Score[FieldRoom]):
     # --- ratings ---
 
     def rate(self, room: FieldRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
-        """Ratings of planes by the ``rated`` bands; noise gives 1 for each receiver and group.
+        """Ratings of planes by the ``rated`` bands. Noise has an expected rating of 1 for each
+        receiver and group.
 
-        The grid is rated with places in ``groups``, single planes with all places together.
+        Ratings of the grid treat groups of places as incoherent. The returned function rates single
+        planes by all places coherently.
         """
         ratings = self._explain(room, grid.flatten(0, 1), self.groups)
         return GridRatings(
@@ -118,9 +119,9 @@ class FieldScore(Score[FieldRoom]):
     def _waves(
         receiver: ReceiverChannels, planes: Float[Tensor, "c 4"]
     ) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
-        """Yields the images' waves (c, b) for each number of a channel.
+        """Yields the images' waves for each element and subcarrier.
 
-        They are real parts, negative imaginary parts and amplitudes.
+        A wave is three tensors (c, b): real part, negative imaginary part and amplitude.
         """
         normals, offsets = planes[:, :3], planes[:, 3:]
         places = receiver.places.float()
@@ -159,8 +160,8 @@ class FieldScore(Score[FieldRoom]):
     def _readings(self, room: FieldRoom, plane: Float[Tensor, "4"]) -> list[Float[Tensor, "4"]]:
         """A found plane, and the planes that would give its image together with a known plane.
 
-        With a single receiver position, an image of second order looks like the image in one
-        further plane. So the true plane may be one that reflects before or after a known plane.
+        With a single receiver position, an image of second order resembles the image in one further
+        plane. The true plane may therefore be one that reflects before or after a known plane.
         """
         readings = [plane]
         position = self.data.receivers[0].position
@@ -180,9 +181,9 @@ class FieldScore(Score[FieldRoom]):
         return self.descend(room, 40)
 
     def square(self, room: FieldRoom) -> FieldRoom:
-        """The room with planes upright and along axes, if tilts explain no more than noise does.
+        """The room with planes vertical and along axes, if tilts explain no more than noise does.
 
-        By chance each fitted number may lower the sum of log errors over n values by log(n) / 2.
+        Each fitted number may lower the sum of log errors over n values by log(n) / 2 by chance.
 
         Source: Schwarz, Estimating the dimension of a model, 1978.
         """
@@ -203,9 +204,9 @@ class FieldScore(Score[FieldRoom]):
         return trial if self.error(trial) < self.error(room) + chance else room
 
     def descend(self, room: FieldRoom, steps: int, turns: float = 0.4) -> FieldRoom:
-        """The room after a descent of the planes; gains are fitted anew in each step.
+        """The room after gradient descent of the planes; gains are fitted again in each step.
 
-        ``steps`` and ``turns`` are as in ``search.descend``.
+        ``steps`` and ``turns`` are as for ``search.descend``.
 
         Source: Golub and Pereyra, 1973.
         """
@@ -230,6 +231,6 @@ class FieldScore(Score[FieldRoom]):
 
 
 def bisect(one: Float[Tensor, "3"], other: Float[Tensor, "3"]) -> Float[Tensor, "4"]:
-    """The plane that mirrors two points to each other; NaN for equal ones."""
+    """The plane of symmetry of two points; NaN for equal points."""
     normal = (other - one) / (other - one).norm()
     return torch.cat((normal, (normal @ (one + other) / 2)[None]))

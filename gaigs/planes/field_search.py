@@ -1,4 +1,4 @@
-"""Search for planes in fields of few numbers a place."""
+"""Search for planes in channels of few numbers at each place."""
 
 import logging
 import math
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class PlaneGrid(NamedTuple):
-    """Planes that are rated with places in groups."""
+    """Candidate planes for a rating by groups of places."""
 
     title: str  # for the log
     normals: Float[Tensor, "n 3"]  # their normals
@@ -39,23 +39,23 @@ class PlaneGrid(NamedTuple):
 
 
 class FieldSearch:
-    """Planes whose images explain fields of few numbers a place, with phases that all places share.
+    """Planes whose images explain channels of few numbers, with one unknown phase for all places.
 
-    Planes along the axes of the room come first, then upright ones, then tilted ones, since the
-    more planes are tried, the more one of them explains by chance. Where a grid of planes is too
-    large for all places at once, a coarser one is rated by groups of neighbouring places, whose
-    relative phases do not count. Planes about its maxima are then rated by all places.
+    Planes along the axes of the room are searched first, then vertical ones, then tilted ones: more
+    candidates explain more by chance. If a grid of planes is too large for all places at once, a
+    coarser grid is rated by groups of neighbouring places, without the phases between groups.
+    Planes around its maxima are then rated by all places.
 
     Args:
-        links: Their training links count; of the task ``csi``, with a known phase.
+        links: Links of task ``csi`` with a known phase, of which the training links are used.
         sign: Sign of the channels' phases.
         order: Largest number of reflections of a path.
         most: Largest number of planes.
-        start: Planes known before (w, 4).
+        start: Initial planes (w, 4).
         options: Options of the search.
-        smallest: Fewest places of a group.
-        fewest: Fewest channel values for a search, ten for each plane of a box. With 22 values a
-            false plane explained more than its price.
+        smallest: Smallest number of places in a group.
+        fewest: Smallest number of channel values for a search, ten for each plane of a box. With 22
+            values a false plane explained more than its price.
 
     Source: ours.
     """
@@ -81,7 +81,7 @@ class FieldSearch:
 
     @torch.no_grad()
     def run(self) -> FieldRoom:
-        """The room in the frame, the start's planes first."""
+        """The room in the frame, initial planes first."""
         fit = self.score.fit
         room = fit.start(self.start)
         fit.choose_variation(room)
@@ -105,9 +105,9 @@ class FieldSearch:
         return self.score.square(room)
 
     def _extend(self, room: FieldRoom, grids: list[PlaneGrid]) -> FieldRoom | None:
-        """The room with one more plane, from the first grid that has one which lowers the error.
+        """The room with one more plane; None if no plane lowers the error.
 
-        None if no grid has any.
+        Grids are tried in order, up to the first with such a plane.
         """
         score = self.score
         for grid in [self._make_axes(room), *grids]:
@@ -136,8 +136,8 @@ class FieldSearch:
     def _rated(self) -> list[Bool[Tensor, " bands"]]:
         """Masks of the bands that rate planes: all bands, and each alone if there are several.
 
-        Shadows and wavelengths differ between bands, so a plane that one band shows may be lost in
-        the noise of the others.
+        Shadows and wavelengths differ between bands, so the noise of other bands may hide a plane
+        that one band shows.
         """
         alone = torch.eye(len(self.score.fit.bands), dtype=torch.bool)
         together = torch.ones_like(alone[:1])
@@ -146,14 +146,14 @@ class FieldSearch:
     # --- grids ---
 
     def _make_axes(self, room: FieldRoom) -> PlaneGrid:
-        """Planes along three sets of axes: the room's planes', the places' and the coordinates'."""
+        """Planes along three sets of axes: of the room's planes, the places and the coordinates."""
         turn = upright_turn(self.frame.points).to(self.frame.points)
         axes = torch.cat((room_axes(room.planes), torch.eye(3).to(turn), turn.mT))
         normals = torch.stack(distinct(axes, 2e-4))
         return self._make_grid("along the axes", 1, lambda turn: normals)
 
     def _make_upright(self) -> PlaneGrid | None:
-        """Upright planes with evenly spaced normals."""
+        """Vertical planes with evenly spaced normals."""
 
         def make(turn: float) -> Float[Tensor, "n 3"]:
             angles = torch.arange(0, math.pi, turn)
@@ -193,7 +193,7 @@ class FieldSearch:
     def _make_grid(
         self, title: str, groups: int, make: Callable[[float], Float[Tensor, "n 3"]]
     ) -> PlaneGrid:
-        """A grid so fine that phases of a group of places differ by less than half a turn."""
+        """A grid fine enough that phases of a group of places differ by less than half a turn."""
         part = groups ** (-1 / 3)  # of the diagonal
         turn = self.data.wavelength / (part * self.frame.diagonal)
         shift = self.data.wavelength / (8 * part)

@@ -12,16 +12,16 @@ from gaigs.splatting.placement.mirrored.reflections import reflection_points, se
 class RoomFrame:
     """Transmitters and receivers about the middle of their box.
 
-    Near the origin single precision suffices, and a plane that turns moves little. A plane is a row
+    Near the origin single precision suffices, and a rotated plane moves little. A plane is a row
     (unit normal, offset along it [m]).
 
     Args:
-        points: Transmitters and receivers in the world's frame (n, 3) [m].
+        points: Transmitters and receivers in the world frame (n, 3) [m].
 
     Attributes:
-        middle: Origin of the frame in the world's (3,) [m].
+        middle: Origin of the frame in the world frame (3,) [m].
         points: Transmitters and receivers in the frame (n, 3) [m].
-        diagonal: Diagonal of their box [m].
+        diagonal: Diagonal of the box of all points [m].
     """
 
     def __init__(self, points: Float[Tensor, "n 3"]):
@@ -33,19 +33,19 @@ class RoomFrame:
 
     @cached_property
     def generator(self) -> torch.Generator:
-        """Random numbers of the search; the training's give the seed when they are first used."""
+        """Random numbers of the search, seeded at the first use from the training's generator."""
         return torch.Generator().manual_seed(int(torch.randint(2**31, ())))
 
     def from_world(self, planes: Float[Tensor, "*w 4"]) -> Float[Tensor, "*w 4"]:
-        """Planes of the world in the frame, float64."""
+        """Planes of the world frame in this frame, float64."""
         return seen_from(planes.double(), self.middle)
 
     def to_world(self, planes: Float[Tensor, "*w 4"]) -> Float[Tensor, "*w 4"]:
-        """Planes of the frame in the world's."""
+        """Planes of this frame in the world frame."""
         return seen_from(planes, -self.middle)
 
     def describe(self, plane: Float[Tensor, "4"]) -> str:
-        """A plane in the world's frame, for the log."""
+        """A plane in the world frame, as text for the log."""
         *normal, offset = self.to_world(plane).tolist()
         return "plane ({:.2f}, {:.2f}, {:.2f}) at {:.2f} m".format(*normal, offset)
 
@@ -74,7 +74,7 @@ class RoomFrame:
 def mean_bounces(receivers: list, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "w 3"]:
     """Mean of the points at which each plane reflects from places to receivers [m].
 
-    A plane that turns about this point changes the lengths of paths least. ``receivers`` are
+    A rotation of the plane about this point changes path lengths least. ``receivers`` are
     ``ReceiverChannels`` or ``ReceiverLags``.
     """
     points = []

@@ -14,7 +14,7 @@ from gaigs.planes.strengths import fit_free, log_share
 
 
 class FreeRoom(NamedTuple):
-    """Planes, and how far their paths explain channels, with free strengths at each place."""
+    """Planes, and the fit of channels by their paths, with free strengths at each place."""
 
     planes: Float[Tensor, "w 4"]  # planes in the frame
     error: float  # mean over links of the log of the share of power that remains
@@ -24,14 +24,14 @@ class FreeRoom(NamedTuple):
 class FreeScore(Score[FreeRoom]):
     """Planes by the power of their images, with a free complex strength of each path and place.
 
-    Neither phases nor blockage are assumed. A candidate's rating is the share of the channels'
-    power that its image explains in the residual, a mean over places and receivers: a Hough
-    transform over normals and offsets. Planes are refined by variable projection: strengths are
-    solved for at each step.
+    Neither phases nor blockage are assumed. The rating of a candidate is the fraction of the
+    channels' power that its image explains in the residual, a mean over places and receivers: a
+    Hough transform over normals and offsets. Planes are refined by variable projection: each step
+    solves for the strengths.
 
     Attributes:
         links: At most 200 random training links, for errors and ratings.
-        numbers: Independent values of a channel that band and array resolve.
+        numbers: Number of independent values in a channel that band and array resolve.
 
     Source: Golub and Pereyra, The differentiation of pseudo-inverses and nonlinear least squares
     problems whose variables separate, 1973.
@@ -78,8 +78,8 @@ class FreeScore(Score[FreeRoom]):
     def add(self, room: FreeRoom, candidate: Candidate) -> FreeRoom | None:
         """The room with the candidate; None if it explains too little.
 
-        A plane that explains ``certain_share`` is taken. A plane that explains ``faint_share``, and
-        more than chance does, is taken if the error falls by ``certain_fall``.
+        A plane that explains ``certain_share`` is added. A plane that explains ``faint_share``, and
+        more than chance does, is added if the error falls by ``certain_fall``.
         """
         options = self.data.options
         # The room leaves a share exp(error) of the power. If that is noise, one wave explains
@@ -105,7 +105,7 @@ class FreeScore(Score[FreeRoom]):
     def descend(
         self, planes: Float[Tensor, "w 4"], steps: int, rate: float
     ) -> Float[Tensor, "w 4"]:
-        """Planes after a descent at random links; ``steps``, ``rate``: as in ``search.descend``."""
+        """Planes after gradient descent at random links; arguments as for ``search.descend``."""
         sequences = self.data.sequences(planes)
 
         def loss(planes: Float[Tensor, "w 4"]) -> Float[Tensor, ""]:
@@ -125,8 +125,8 @@ class FreeScore(Score[FreeRoom]):
     ) -> Float[Tensor, "b e t 2"]:
         """Delay profiles of a residual at each of e elements, at t delays, over the channel's norm.
 
-        A candidate plane is then rated by one look-up for each element, not by a sum over
-        subcarriers. Delays are relative to the mean carrier; the last dimension is real and
+        Rating a candidate plane then takes one look-up for each element, not a sum over
+        subcarriers. Delays are relative to the mean carrier. The last dimension is real and
         imaginary part.
         """
         residual = residual / (
@@ -189,7 +189,7 @@ class _ProfileTable:
     def image_powers(
         self, normal: Float[Tensor, "3"], heights: Float[Tensor, "b k"]
     ) -> Float[Tensor, "b k"]:
-        """Power of profiles, summed over elements in phase with an image's wave, at b places.
+        """Power of profiles after a sum over elements in phase with an image's wave, at b places.
 
         The k planes share ``normal``. ``heights`` are the places' signed distances from them [m].
         """

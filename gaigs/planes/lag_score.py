@@ -39,7 +39,7 @@ class LagOptions:
 
 
 class LagRoom(NamedTuple):
-    """Planes of the room, and which paths are open, that is not blocked, at each link."""
+    """Planes of the room, and the paths that are open (not blocked) at each link."""
 
     planes: Float[Tensor, "w 4"]  # normals and offsets [m]
     # True where paths are open at a link: column 0 the direct path, then all paths at each plane
@@ -84,12 +84,12 @@ class LinkPaths:
         return other
 
     def split(self, passing: Tensor) -> list[tuple[ReceiverLags, Tensor]]:
-        """Pairs of each receiver and its links' rows of ``passing`` (b, v)."""
+        """Pairs of each receiver and the rows of ``passing`` (b, v) of its links."""
         parts = passing.split([len(receiver.places) for receiver in self.receivers])
         return list(zip(self.receivers, parts, strict=True))
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
-        """Sequences of planes; of several reflections only those whose power is not faint."""
+        """Sequences of planes; several reflections only if their power is not faint."""
         sequences = all_sequences(len(planes), self.order)
         powers = self.powers(planes, sequences)
         is_short = (sequences >= 0).sum(1) <= 1
@@ -116,8 +116,8 @@ class LagScore(Score[LagRoom]):
 
     Covariances of the array's elements follow from a spectrum (``Beamformer.lags``), so predicted
     covariances are compared with measured spectra. At each link the paths at a plane may be
-    blocked, for a price. A plane is moved to a maximum of ``PlanePeriodogram``; the error decides
-    between the maxima. Further planes are rated by their power alone, without phases.
+    blocked, at a price. A plane moves to a maximum of ``PlanePeriodogram``; the error decides
+    between the maxima. Further planes are rated only by their power, without phases.
 
     Source: ours; Van Trees, Optimum Array Processing, 2002, section 2.4, for the covariances.
     """
@@ -136,9 +136,10 @@ class LagScore(Score[LagRoom]):
         sequences: Int[Tensor, "n order"] | None = None,
         every: int = 1,
     ) -> Float[Tensor, " c"]:
-        """Log of the share of each spectrum that paths do not explain, at one link of ``every``.
+        """Log of the fraction of each spectrum that paths do not explain, at every ``every``-th
+        link.
 
-        Logarithms keep single links from dominating a mean. ``open_`` is as in ``LagRoom``.
+        Logarithms limit the weight of single links in a mean. ``open_`` is as in ``LagRoom``.
         """
         sequences = self.paths.sequences(planes) if sequences is None else sequences
         logs = []
@@ -151,9 +152,10 @@ class LagScore(Score[LagRoom]):
     # --- moves ---
 
     def move(self, room: LagRoom, number: int) -> LagRoom:
-        """The room with plane ``number`` moved to the peak of its periodogram with the least error.
+        """The room with plane ``number`` moved to the peak of its periodogram with the lowest
+        error.
 
-        The normals of ``square_normals`` are tried. The plane stays if no peak is surely better.
+        The normals of ``square_normals`` are tried. The plane stays if no peak is clearly better.
         Its paths are open at links whose error they lower.
         """
         # The wave that the other planes' paths lack, and the errors without this plane.
@@ -187,7 +189,7 @@ class LagScore(Score[LagRoom]):
         open_: Bool[Tensor, "b v"],
         sequences: Int[Tensor, "n order"],
     ) -> list[FurtherWave]:
-        """For each receiver, the wave that the paths at planes lack to explain the spectra."""
+        """For each receiver, the wave that the known paths lack to explain the spectra."""
         waves = []
         for receiver, passing in self.paths.split(open_):
             paths = receiver.paths(planes, sequences, passing)
@@ -195,11 +197,12 @@ class LagScore(Score[LagRoom]):
         return waves
 
     def refine(self, room: LagRoom) -> LagRoom:
-        """The room after a descent with all planes.
+        """The room after gradient descent with all planes.
 
         First the direct path is blocked at links whose error it raises by more than
-        ``LagOptions.blocked``. Then all planes descend. The moved planes are kept only if the mean
-        error falls by more than ``LagOptions.certain`` standard errors. ``errors`` are not renewed.
+        ``LagOptions.blocked``. Then all planes descend. The moved planes are accepted only if the
+        mean error falls by more than ``LagOptions.certain`` standard errors. ``errors`` are not
+        updated.
         """
         with_direct = self.errors(room.planes, room.opened(0, True))
         without = self.errors(room.planes, room.opened(0, False))
@@ -245,7 +248,8 @@ class LagScore(Score[LagRoom]):
     def _rate_powers(
         self, maps: list[Float[Tensor, "b 1 k k"]], planes: Float[Tensor, "c 4"]
     ) -> Float[Tensor, " c"]:
-        """Fall of the errors by the power of a reflection at each plane, over that power's norm.
+        """Fall of the errors by the power of a reflection at each plane, over the norm of this
+        power.
 
         ``maps`` have each link's fall by a wave from each direction, on a grid of k x k sines.
         """

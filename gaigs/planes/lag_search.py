@@ -42,13 +42,13 @@ def frame_of(links: Links) -> RoomFrame:
 def group_links(
     links: Links, frequencies: Float[Tensor, " n"], frame: RoomFrame, most: int, pairs: int
 ) -> list[LinkGroup]:
-    """Training links in groups by receiver and carrier, both evenly thinned.
+    """Training links in groups by receiver and carrier. Groups and their links are evenly thinned.
 
     Args:
-        links: Their training links count.
+        links: Links, of which the training links are used.
         frequencies: Carrier of each link [Hz].
         frame: Frame of the poses.
-        most: About the number of links in all; each group has 20, or as many as there are.
+        most: Approximate number of links in total; each group has at least 20, or all of its links.
         pairs: Largest number of groups.
     """
     train = links.split.train
@@ -70,17 +70,17 @@ class LagSearch:
     """Planes whose reflections explain spectra, see ``LagScore``.
 
     Args:
-        links: Their training links count; of the task ``spectrum``.
+        links: Links of task ``spectrum``, of which the training links are used.
         frequencies: Carrier of each link [Hz].
-        lags_of: Function from labels and their query to two things: the covariances of each label
-            at the array's lags, up to a factor, and the share of each label that these do not
+        lags_of: Function from labels and their query to the covariances of each label at the
+            array's lags, up to a factor, and to the fraction of each label that these do not
             explain.
         order: Largest number of reflections of a path; more than 2 count as 2.
         most: As for ``group_links``.
         options: Options of the search.
 
     Attributes:
-        doubts: Sentences for the log, on signs that the data's geometry is wrong.
+        doubts: Sentences for the log, on signs of wrong geometry in the data.
         paths: Paths at the receivers whose spectra their arrays explain.
 
     Source: ours.
@@ -129,7 +129,7 @@ class LagSearch:
         self.use(receivers, order)
 
     def use(self, receivers: list[ReceiverLags], order: int) -> None:
-        """Replaces the receivers whose links are searched."""
+        """Replaces the receivers of the search."""
         self.paths = LinkPaths(self.frame, receivers, self.wavelength, order, self.options.faint)
         self.score = LagScore(self.paths, self.options)
         self.search = PlaneSearch(self.frame, self.score)
@@ -147,12 +147,12 @@ class LagSearch:
     def run(
         self, planes: Float[Tensor, "w 4"], bandwidth: float | None, most: int
     ) -> Float[Tensor, "v 4"]:
-        """Planes in the world's frame: the given ones, moved, and then further ones.
+        """Planes in the world frame: the given ones, moved, and then further ones.
 
         A plane moves twice, each time by up to 8 % of the diagonal and 18 degrees.
 
         Args:
-            planes: Planes at the start, in the world's frame.
+            planes: Initial planes, in the world frame.
             bandwidth: Band over which powers are averaged [Hz]. None: see ``_choose_bandwidth``.
             most: Largest number of planes.
         """
@@ -168,9 +168,9 @@ class LagSearch:
     def _choose_bandwidth(self, start: LagRoom, choices: list[float]) -> LagRoom:
         """Sets the best of some bandwidths, and returns the start with all planes moved.
 
-        The best is the one with which moving the strongest plane leaves the smallest error. The
-        best and the first choice, nearly a single carrier, are compared once more with all planes
-        moved: while other planes are in the wrong places, one hardly interferes.
+        The best bandwidth gives the smallest error after a move of the strongest plane. It is then
+        compared with the first choice, nearly a single carrier, after moves of all planes: while
+        other planes are wrong, a single plane hardly interferes.
         """
         best = choices[0]
         if len(choices) > 1:
@@ -188,7 +188,7 @@ class LagSearch:
         return rooms[self.paths.bandwidth]
 
     def move_around(self, room: LagRoom) -> LagRoom:
-        """Each plane moved, the strongest first; then all together."""
+        """Each plane moved, the strongest first; then all planes together."""
         numbers = self.paths.sort_by_strength(room.planes)
         room = self.search.sweep(room, numbers, "search of planes")
         return self.score.refine(room)
@@ -201,7 +201,7 @@ class LagSearch:
 
 
 def list_bandwidths(known: float | None, frame: RoomFrame, options: LagOptions) -> list[float]:
-    """The known bandwidth, or those to try [Hz]."""
+    """The known bandwidth, or bandwidths to try [Hz]."""
     if known is not None:
         return [known]
     return [rooms * speed_of_light / frame.diagonal for rooms in options.bands]

@@ -1,4 +1,4 @@
-"""Covariances of an array's elements at the training links of a receiver, and paths in them."""
+"""Covariances of an array's elements at the training links of a receiver, and their paths."""
 
 import itertools
 import math
@@ -28,7 +28,7 @@ def reflection(
 
 
 class ArrayPaths(NamedTuple):
-    """Paths as an array receives them."""
+    """Paths as received by an array."""
 
     fields: Complex[Tensor, "b n"]  # fields at the middle of the array
     steering: Complex[Tensor, "b n e"]  # phase factors at the elements
@@ -36,7 +36,7 @@ class ArrayPaths(NamedTuple):
 
 
 class FurtherWave(NamedTuple):
-    """How a further path would lower the error of the known paths' covariances.
+    """Fall of the error of the known paths' covariances by a further path.
 
     A weak further path with the wave w at the elements lowers the error by 2 Re sum(w* weights),
     summed over known paths and elements.
@@ -73,7 +73,7 @@ class ReceiverLags:
     )
 
     def at(self, index: object) -> "ReceiverLags":
-        """The covariances of the links that an index, mask or slice chooses."""
+        """The covariances of some links, by an index, mask or slice."""
         return replace(self, places=self.places[index], lags=self.lags[index])
 
     @property
@@ -115,7 +115,7 @@ class ReceiverLags:
     def shape_of(self, lags: Complex[Tensor, "b l"]) -> Float[Tensor, "b k"]:
         """Amplitudes of spectra in ``directions``, with a mean of 0 and a norm of 1.
 
-        Labels are known up to a factor and an offset, which this removes.
+        This removes the unknown factor and offset of labels.
         """
         later = lags[:, lags.shape[1] // 2 :]  # the others are their conjugates
         later = later / later[:, :1].real.clamp_min(1e-12)
@@ -125,7 +125,7 @@ class ReceiverLags:
         return amplitudes / amplitudes.norm(dim=1, keepdim=True).clamp_min(1e-6)
 
     def errors(self, lags: Complex[Tensor, "b l"]) -> Float[Tensor, " b"]:
-        """Log of the share of each spectrum's variance that a model's lags do not explain."""
+        """Log of the fraction of each spectrum's variance that a model's lags do not explain."""
         floor = 0.01  # share below which an error hardly counts
         alike = (self.shape_of(lags) * self.shapes).sum(1).clamp_min(0)
         return (1 - alike.square() + floor).log()
@@ -167,8 +167,8 @@ class ReceiverLags:
     ) -> ArrayPaths:
         """All paths at planes.
 
-        ``passing`` (b, w + 1) has the share of the field that obstacles let through, of the direct
-        path first, then of the paths at each plane. Booleans stand for all and nothing. None: all.
+        ``passing`` (b, w + 1) is the fraction of the field that obstacles transmit: of the direct
+        path, then of the paths at each plane. Booleans mean 1 and 0. None: all 1.
         """
         normals, offsets = planes[:, :3], planes[:, 3]
         points = images(self.places, sequences, normals, offsets)
@@ -189,10 +189,10 @@ class ReceiverLags:
         return ArrayPaths(fields, self.steer(directions), lengths)
 
     def covariances(self, paths: ArrayPaths, bandwidth: float) -> Complex[Tensor, "b l"]:
-        """Lags of interfering paths, as of ``LagPooling``; powers are averaged over a band [Hz]."""
+        """Lags of interfering paths, as in ``LagPooling``; powers are averaged over a band [Hz]."""
         fields, steering, lengths = paths
         if bandwidth:
-            # Over a band two paths stay alike by sinc(B (L - L') / c).
+            # Over a band the correlation of two paths is sinc(B (L - L') / c).
             gaps = lengths[:, :, None] - lengths[:, None]  # (b, n, n)
             likeness = sinc(bandwidth / speed_of_light * gaps)
             together = fields[:, :, None] * fields[:, None].conj() * likeness
@@ -224,7 +224,7 @@ class ReceiverLags:
         return SingleReflections(directions, lengths, gains, cosines)
 
     def describe_doubts(self, name: str) -> list[str]:
-        """A sentence for the log if spectra show the direct path elsewhere than geometry does."""
+        """A sentence for the log if spectra contradict the geometry of the direct path."""
         _, pairs, _ = self.array.lags
         matrices = self.lags[:, pairs].view(-1, len(self.array), len(self.array))
         directions, _ = self.look_at(self.places)

@@ -59,23 +59,23 @@ class Matter(NamedTuple):
 
 
 class LearntRoom(NamedTuple):
-    """The parts of a learnt room that figures show."""
+    """The parts of a learnt room in figures."""
 
     planes: list[LearntPlane]  # strongest first
     matter: Matter | None  # None without obstacles
     paths: list[LearntPath]  # a transmitter's strongest paths
 
     def plot(self, ax: Any = None, **options: Any) -> Any:
-        """Draws it as ``gaigs.plot`` does, which lists the options."""
+        """Draws the room by ``gaigs.plot``, which lists the options."""
         return plot(self, ax, **options)
 
 
 @torch.no_grad()
 def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
-    """The learnt room as paths of links show it.
+    """The learnt room, from paths of links.
 
-    Paths of some training links outline the planes; without links paths of ``spread_links`` do. The
-    paths that are drawn lead from the first test transmitter; without links none are.
+    Paths of some training links outline the planes; without links, paths of ``spread_links`` do.
+    The drawn paths are of the first test transmitter; without links there are none.
     """
     if links is None:
         query = spread_links(placement.scene)
@@ -124,7 +124,8 @@ def tabulate_planes(placement: Mirrored, ends: Float[ndarray, "k 3"]) -> PlaneTa
 def other_offset(scene: Scene, planes: PlaneTable, number: int) -> float | None:
     """The second offset [m] at which a plane would give all paths the same lengths.
 
-    It exists for a plane square to an axis that places do not span, see ``FlatAxis``; else None.
+    It exists for a plane across an axis of ``FlatAxis``, along which places do not vary; otherwise
+    None.
     """
     normal = planes.normals[number]
     for flat in scene.flat_axes:
@@ -144,10 +145,10 @@ class HalfSpace(NamedTuple):
 def outline_planes(placement: Mirrored, traced: TracedPaths) -> list[LearntPlane]:
     """The planes as convex polygons, strongest first.
 
-    A wall has all transmitters and receivers on one side. It reaches to the other walls, to the
+    A wall has all transmitters and receivers on one side. It extends to the other walls, to the
     edge of its reflecting area, or to the box around the paths' ends, whichever is nearest. Any
-    other plane, such as furniture, is the rectangle around its bounces, cut by walls and box.
-    Planes without paths, or outside the box, are left out.
+    other plane, such as furniture, is the rectangle around its reflection points, cut by walls and
+    box. Planes without paths, or outside the box, are omitted.
     """
     table = tabulate_planes(placement, traced.ends)
     plane_shares = traced.plane_shares
@@ -197,7 +198,7 @@ def outline_planes(placement: Mirrored, traced: TracedPaths) -> list[LearntPlane
 def _furniture_corners(
     table: PlaneTable, number: int, traced: TracedPaths, tolerance: np.floating
 ) -> Float[ndarray, "4 3"]:
-    """The rectangle around a plane's bounces, without those of paths below 1 % of the strongest."""
+    """The rectangle around a plane's reflection points; paths below 1 % do not count."""
     shares = traced.shares
     link, path, step = np.nonzero((traced.sequences == number) & (shares > 0)[..., None])
     share = shares[link, path]
@@ -209,7 +210,7 @@ def _furniture_corners(
 
 
 def _basis(normal: Float[ndarray, "3"]) -> Float[ndarray, "3 2"]:
-    """Two unit vectors of a plane, right-handed with its normal; the first is level."""
+    """Two unit vectors of a plane, right-handed with its normal; the first is horizontal."""
     level = np.cross((0.0, 0.0, 1.0), normal)
     length = np.linalg.norm(level)
     level = level / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
@@ -222,7 +223,7 @@ def _rectangle(
     low: Float[ndarray, "2"],
     high: Float[ndarray, "2"],
 ) -> Float[ndarray, "4 3"]:
-    """Corners of a rectangle on a plane, counterclockwise as seen from the normal's end.
+    """Corners of a rectangle on a plane, counterclockwise when seen against the normal.
 
     ``low`` and ``high`` are bounds from ``middle`` along ``_basis`` [m].
     """

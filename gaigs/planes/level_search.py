@@ -49,14 +49,14 @@ class ReceiverLevels(ReceiverLags):
         return 10 * self.lags[:, 0].real.log10()
 
     def errors(self, lags: Complex[Tensor, "b 1"]) -> Float[Tensor, " b"]:
-        """Log of 1 + the squared error of each level; the receiver's gain drops out."""
+        """Log of 1 + the squared error of each level, independent of the receiver's gain."""
         scale = 3.0  # [dB]; larger errors hardly count
         errors = 10 * lags[:, 0].real.clamp_min(1e-12).log10() - self.levels
         return ((errors - errors.detach().median()) / scale).square().log1p()
 
 
 class LevelRoom(NamedTuple):
-    """Planes of the room, and what a model that adds powers knows about their paths."""
+    """Planes of the room, and facts on their paths from a model that adds powers."""
 
     planes: Float[Tensor, "w 4"]  # normals and offsets [m]
     located: Bool[Tensor, " w"]  # True for planes whose paths interfere
@@ -69,10 +69,10 @@ class LevelRoom(NamedTuple):
 
 
 class LevelScore(Score[LevelRoom]):
-    """Planes by received levels. Only paths at located planes interfere, others add as powers.
+    """Planes by received levels. Paths at located planes interfere; powers of other paths add.
 
-    A plane is located once its phases are known: a wrong phase would be worse than none. The error
-    is the negative gain of the plane located last.
+    A plane is located once its phases are known, since a wrong phase is worse than no phase. The
+    error is the negative gain of the plane located last.
     """
 
     def __init__(self, paths: LinkPaths, options: LevelOptions):
@@ -85,7 +85,7 @@ class LevelScore(Score[LevelRoom]):
     def move(self, room: LevelRoom, number: int) -> LevelRoom:
         """The room with a plane moved to where its phases lower the errors most clearly.
 
-        ``gain`` of the result is 0 if no place of the plane lowers the errors.
+        ``gain`` of the result is 0 if no position of the plane lowers the errors.
         """
         sequences = self.paths.sequences(room.planes)
         phased = is_phased(sequences, room.located)  # (n,)
@@ -112,7 +112,7 @@ class LevelScore(Score[LevelRoom]):
     def _find_peaks(
         self, planes: Float[Tensor, "w 4"], waves: list[FurtherWave], number: int
     ) -> list[TilePeak]:
-        """Maxima of the periodograms about normals near a plane's, highest first."""
+        """Maxima of the periodograms for normals near a plane's normal, highest first."""
         peaks = []
         for normal in square_normals(planes[:, :3], number):
             peaks += self.paths.periodogram.find_peaks(
@@ -138,7 +138,7 @@ class LevelScore(Score[LevelRoom]):
         return mean.item() / max(deviation.item(), 1e-12) * math.sqrt(len(room.passing))
 
     def add_powers(self, paths: ArrayPaths, phased: Bool[Tensor, " n"]) -> Complex[Tensor, "b 1"]:
-        """Powers of paths: ``phased`` paths interfere, the others add as powers."""
+        """Powers of paths: ``phased`` paths interfere, powers of the others add."""
         waves = paths.fields[:, phased]
         lengths = paths.lengths[:, phased]
         gaps = lengths[:, :, None] - lengths[:, None]  # (b, n, n)
@@ -150,7 +150,7 @@ class LevelScore(Score[LevelRoom]):
     def measure_chance(self, room: LevelRoom, numbers: list[int], enough: float) -> float:
         """Largest gain of planes ``numbers`` by chance, measured with errors shuffled among links.
 
-        The first gain above ``enough`` ends the trials. The result is infinite if the time is up.
+        Trials end at the first gain above ``enough``. The result is infinite if the time is up.
         """
         sequences = self.paths.sequences(room.planes)
         phased = is_phased(sequences, room.located)
@@ -177,17 +177,19 @@ class LevelScore(Score[LevelRoom]):
 class LevelSearch:
     """Planes whose reflections interfere in received levels.
 
-    A level is one number, so phases say nothing before a model knows from powers what obstacles let
-    through. Then planes are located one after the other, the clearest first (``LevelScore``).
+    A level is one number, so its phases are useful only after a model has learnt the losses by
+    obstacles from powers. Then planes are located one after the other, the clearest first
+    (``LevelScore``).
 
     Args:
-        links: Their training links count; of the task ``rssi``. Readings at one place count as one.
+        links: Links of task ``rssi``, of which the training links are used. Readings at one place
+            count as one.
         frequencies: Carrier of each link [Hz].
-        trend: Levels on which the paths' powers stand [dB].
-        planes: Normals and offsets at the start (w, 4) [m]. Each is searched near its start.
+        trend: Levels to which the paths' powers are relative [dB].
+        planes: Initial normals and offsets (w, 4) [m]. Each plane is searched near its start.
         numbers: Numbers of the planes in the placement.
         order: Largest number of reflections of a path; more than 2 count as 2.
-        most: Links that count, of all receivers together.
+        most: Largest number of links, of all receivers together.
         options: Options of the search.
 
     Source: ours.
@@ -238,7 +240,7 @@ class LevelSearch:
 
     @torch.no_grad()
     def locate(self, placement: Mirrored) -> list[int]:
-        """Moves the placement's planes to clear maxima, one by one, and lets paths interfere.
+        """Moves the placement's planes to clear maxima, one by one, and lets their paths interfere.
 
         Returns:
             Numbers of these planes in the placement.
@@ -276,9 +278,10 @@ class LevelSearch:
     def locate_one(
         self, room: LevelRoom, numbers: list[int], bandwidths: list[float]
     ) -> LevelRoom | None:
-        """The room with one of planes ``numbers`` moved, the clearest; None if the time is up.
+        """The room with the clearest of planes ``numbers`` moved; None if the time is up.
 
-        Each plane is tried with each of ``bandwidths`` [Hz]. The best one stays set in ``paths``.
+        Each plane is tried with each of ``bandwidths`` [Hz]. The best bandwidth stays set in
+        ``paths``.
         """
         trials = []
         pairs = [*itertools.product(bandwidths, numbers)]
@@ -292,17 +295,17 @@ class LevelSearch:
         return best
 
     def room_of(self, placement: Mirrored) -> LevelRoom:
-        """The room of a placement: located planes where they are, the others at their start."""
+        """The room of a placement: located planes at their place, others at their start."""
         located = placement.located[self.numbers].cpu()
         placed = self.frame.from_world(placement.planes[self.numbers].cpu()).float()
         planes = torch.where(located[:, None], placed, self.start)
         return LevelRoom(planes, located, self.passing(placement, planes))
 
     def passing(self, placement: Mirrored, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b v"]:
-        """Shares of fields that a model's obstacles let through, see ``LevelRoom.passing``.
+        """Fractions of fields that a model's obstacles transmit, see ``LevelRoom.passing``.
 
-        They are the model's fields over the fields by reflection alone. They are limited to 1,
-        since near Brewster's angle planes reflect next to nothing and the quotient has no meaning.
+        They are the model's fields over the fields without obstacles, at most 1. Near Brewster's
+        angle planes reflect almost nothing, and the quotient is meaningless.
         """
         columns = [0, *(number + 1 for number in self.numbers)]
         parts = []

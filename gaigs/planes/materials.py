@@ -1,4 +1,4 @@
-"""Materials of ITU-R P.2040 that reflect as learnt planes do."""
+"""Materials of ITU-R P.2040 whose reflections match learnt planes."""
 
 import math
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class Material(NamedTuple):
 
 
 class SlabOption(NamedTuple):
-    """A material that is compared, with a thickness for each plane."""
+    """A candidate material, with a thickness for each plane."""
 
     name: str
     permittivity: complex  # relative
@@ -34,11 +34,11 @@ class SlabOption(NamedTuple):
 def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, Material]:
     """Material and thickness of each plane that a query's paths meet, at a carrier [Hz].
 
-    The material is the one whose reflections have the least squared difference from the learnt ones
-    at the bounces of these paths, weighted by the paths' powers. A learnt reflection includes the
-    plane's gain, and a share of the path's gain over the direct path's, the same at each bounce. If
-    phases of paths are learnt, only magnitudes are compared. The thickness is the learnt one or, if
-    a half-space fits better, 1 m.
+    The material's reflections have the smallest squared difference from the learnt ones, at the
+    reflection points of these paths, weighted by the paths' powers. A learnt reflection includes
+    the plane's gain. It also includes a part of the path's gain over the direct path's, equal at
+    each reflection. If phases of paths are learnt, only magnitudes are compared. The thickness is
+    the learnt one, or 1 m if a half-space fits better.
 
     Source: ITU-R P.2040-3, table 3; outside 1 to 40 GHz its formulas are extrapolated.
     """

@@ -1,7 +1,7 @@
 """Surfaces of learnt obstacles, for ray tracers and 3-D programs.
 
-A sheet is a thin absorbing surface around matter, through points of equal density. Sheets stand for
-learnt obstacles in programs that know only surfaces.
+A sheet is a thin absorbing surface around matter, through points of equal density. Sheets replace
+learnt obstacles in programs that only know surfaces.
 """
 
 import itertools
@@ -26,7 +26,7 @@ from gaigs.splatting.placement.mirrored.paths import Mirrored
 
 @dataclass(frozen=True)
 class SurfaceOptions:
-    """Options of the fit of sheets, thin absorbing surfaces that stand for obstacles."""
+    """Options of the fit of sheets, thin absorbing surfaces that replace obstacles."""
 
     # Number of densities with sheets: more are more exact, but a ray tracer counts each crossing as
     # an interaction.
@@ -43,9 +43,9 @@ class SurfaceOptions:
 
 
 class Sheet(NamedTuple):
-    """A closed surface of even density of matter, as a thin material that absorbs.
+    """A closed surface of equal density of matter, as a thin absorbing material.
 
-    The sheet is far thinner than the wavelength. ``conductance`` is relative to the admittance of
+    The sheet is much thinner than the wavelength. ``conductance`` is relative to the admittance of
     free space. With c the cosine of the angle of incidence, the field falls to 1 / (1 + conductance
     / (2 c)) for TE and to 1 / (1 + c conductance / 2) for TM. The phase does not change.
 
@@ -73,7 +73,7 @@ class Legs(NamedTuple):
 
 
 class AttenuatedPaths(NamedTuple):
-    """Fields of paths without obstacles, the share of each that obstacles pass, and the legs."""
+    """Fields of paths without obstacles, the fraction that obstacles transmit, and the legs."""
 
     fields: Float[Tensor, "b n"]
     passed: Float[Tensor, "b n"]
@@ -105,10 +105,10 @@ class Crossings(NamedTuple):
 
 @dataclass(frozen=True)
 class MatterGrid:
-    """Logarithm of the density of matter [Np/m] on a grid over a box and a little beyond.
+    """Logarithm of the density of matter [Np/m] on a grid over a box and slightly beyond.
 
-    ``corner`` is the grid's first point from the middle of the room, ``pitch`` the distance of its
-    points [m].
+    ``corner`` is the grid's first point from the middle of the room [m], ``pitch`` the distance
+    between its points [m].
     """
 
     log_densities: Float[ndarray, "x y z"]
@@ -141,7 +141,7 @@ class MatterGrid:
 
 
 def measure_densities(obstacles: Obstacles, points: Float[Tensor, "k 3"]) -> Float[Tensor, "k n"]:
-    """Density of each Gaussian at points, from the middle of the room [m]; [Np/m], float64."""
+    """Density of each Gaussian [Np/m] at points from the middle of the room [m], float64."""
     weights = (-2 * obstacles.log_widths.double()).exp()
     centres = obstacles.centres.double()
     points = points.double()
@@ -154,7 +154,7 @@ def measure_densities(obstacles: Obstacles, points: Float[Tensor, "k 3"]) -> Flo
 def sample_matter(
     obstacles: Obstacles, lower: Float[ndarray, "3"], upper: Float[ndarray, "3"], voxels: int
 ) -> MatterGrid:
-    """Samples matter at about ``voxels`` points of a box, and two points beyond on each side.
+    """Samples matter at about ``voxels`` points of a box, and two more points on each side.
 
     The corners ``lower`` and ``upper`` are relative to the middle of the room [m].
     """
@@ -198,7 +198,7 @@ def find_crossings(
 
 
 def sheets_of_boxes(obstacles: Obstacles, middle: Float[ndarray, "3"]) -> list[Sheet]:
-    """A sheet for each box of the obstacles; a path crosses two faces of half the loss each."""
+    """A sheet for each box; a path crosses two faces, each with half the loss."""
     import trimesh.creation  # slow to import
 
     axes = obstacles.box_axes.cpu().double().numpy()
@@ -215,7 +215,7 @@ def sheets_of_boxes(obstacles: Obstacles, middle: Float[ndarray, "3"]) -> list[S
 def attenuate_paths(
     placement: Mirrored, obstacles: Obstacles, query: Query, options: SurfaceOptions
 ) -> AttenuatedPaths:
-    """Paths of a query's links, at most ``options.paths``, and the shares that obstacles pass."""
+    """At most ``options.paths`` paths of a query, and the fractions that obstacles transmit."""
     sequences = placement.sequences[placement.kept]
     query = query[:: math.ceil(len(query) * len(sequences) / options.paths)]
     query = query.to(placement.middle.device)
@@ -245,8 +245,8 @@ def attenuate_paths(
 def choose_densities(paths: AttenuatedPaths, count: int) -> list[float]:
     """``count`` densities of matter [Np/m] in which paths lose their fields; empty without loss.
 
-    Their logarithms are evenly spaced. A tenth of the loss happens in matter thinner than the first
-    one, and a tenth in matter denser than the last.
+    Their logarithms are evenly spaced. A tenth of the loss is in matter thinner than the first
+    density, and a tenth in matter denser than the last.
     """
     densities = paths.legs.densities
     # Each leg's loss, spread over its matter.
@@ -262,13 +262,13 @@ def choose_densities(paths: AttenuatedPaths, count: int) -> list[float]:
 
 
 class SheetFit:
-    """Fit of conductances, so that sheets attenuate paths as nearly as obstacles do.
+    """Fit of conductances, so that sheets attenuate paths like the obstacles.
 
-    The error of a link's fields is taken in decibels and averaged over links, so neither links in
-    deep shadow nor the strongest links dominate.
+    Errors of a link's fields are in decibels and averaged over links, so neither links in deep
+    shadow nor the strongest links dominate.
 
     Args:
-        paths: Fields of paths, and the shares that obstacles pass.
+        paths: Fields of paths, and the fractions that obstacles transmit.
         crossings: Crossings for each density.
     """
 
@@ -285,9 +285,9 @@ class SheetFit:
     def error(
         self, chosen: Sequence[int], logs: Sequence[Tensor], gain: Tensor
     ) -> Float[Tensor, ""]:
-        """Mean error of the links [dB], with a gain of all paths [Np].
+        """Mean error of the links [dB], with a common gain of all paths [Np].
 
-        ``logs`` has for each chosen density the logarithms of its surfaces' conductances.
+        ``logs`` has the logarithms of the surfaces' conductances, for each chosen density.
         """
         count = self.fields.numel()
         losses = self.fields.new_zeros(count)
@@ -296,18 +296,19 @@ class SheetFit:
         passed = (gain - losses).exp().view_as(self.fields)
         off = (self.fields * (passed - self.passed)).square().sum(1)
         is_reached = self.powers > 0
-        # Below -40 dB nothing is gained.
+        # Errors below -40 dB hardly count.
         return 10 * (off[is_reached] / self.powers[is_reached] + 1e-4).log10().mean()
 
     def fit(
         self, chosen: Sequence[int], sizes: Sequence[int], start: Tensor
     ) -> tuple[float, Tensor]:
-        """Conductances of least error, by L-BFGS.
+        """Conductances of the lowest error, by L-BFGS.
 
         Args:
             chosen: Numbers of densities.
-            sizes: Number of conductances of each: one for all its surfaces, or one for each.
-            start: Logarithms of all conductances, then the gain of all paths [Np].
+            sizes: Number of conductances for each density: one for all its surfaces, or one for
+                each.
+            start: Initial logarithms of all conductances, then the gain of all paths [Np].
 
         Returns:
             The error [dB], and the values in the order of ``start``.
@@ -342,11 +343,12 @@ def fit_sheets(
     upper: Float[ndarray, "3"],
     options: SurfaceOptions | None = None,
 ) -> tuple[list[Sheet], float]:
-    """Sheets that attenuate a query's paths as nearly as the learnt obstacles do.
+    """Sheets that attenuate a query's paths like the learnt obstacles.
 
     A sheet is a thin absorbing surface through matter of one density. Candidates are densities in
-    which these paths lose their fields. All sets of ``options.densities`` are fitted, each density
-    with one conductance. In the best set each surface is then fitted with its own conductance.
+    which these paths lose their fields. All sets of ``options.densities`` densities are fitted,
+    with one conductance for each density. In the best set each surface is then fitted with its own
+    conductance.
 
     Args:
         placement: The learnt room; without obstacles there are no sheets.

@@ -25,7 +25,7 @@ class Likeness(NamedTuple):
 
 
 class TilePeak(NamedTuple):
-    """Maximum of a periodogram: height, plane, and the point about which the plane turns [m]."""
+    """Maximum of a periodogram: height, plane, and pivot of the plane's rotation [m]."""
 
     height: float
     plane: Float[Tensor, "4"]
@@ -35,20 +35,20 @@ class TilePeak(NamedTuple):
 class PlanePeriodogram:
     """Search near a known plane for the plane whose reflections best match a further wave.
 
-    The gradient of the error by the covariances, times the waves of known paths, is the wave that
-    one more path should have (``FurtherWave``). The phase of a reflection follows from the path's
-    length. Within a tile of offsets and tilts lengths are linear, so the match, summed over links,
-    is a Fourier sum.
+    The gradient of the error by the covariances, times the waves of known paths, is the ideal wave
+    of one more path (``FurtherWave``). The phase of a reflection follows from the path's length.
+    Within a tile of offsets and tilts lengths are linear, so the match, summed over links, is a
+    Fourier sum.
 
     Args:
         receivers: Training links.
         wavelength: Shortest wavelength of the links [m].
         diagonal: Diagonal of the room [m].
         reach: Largest distance by which a plane is moved on either side [diagonals].
-        widest: Largest such distance [wavelengths], for the number of trials.
-        tile: Half the width of a tile [rad]: over some metres, lengths are linear within it.
-        turn: Step of a turn [wavelengths over the places' mean distance from the pivot]: about 2
-            rad.
+        widest: Largest such distance [wavelengths], which limits the number of trials.
+        tile: Half the width of a tile [rad]. Over some metres, lengths are linear within it.
+        turn: Step of a rotation [wavelengths over the places' mean distance from the pivot]: about
+            2 rad of phase.
     """
 
     def __init__(
@@ -74,12 +74,12 @@ class PlanePeriodogram:
         normal: Float[Tensor, "3"],
         plane: Float[Tensor, "4"],
     ) -> list[TilePeak]:
-        """At most six maxima whose planes are near a normal and a known plane's offset.
+        """At most six maxima near a normal and a known plane's offset.
 
         Args:
             waves: Further wave of each receiver's links.
             bandwidth: Band over which powers are averaged [Hz].
-            normal: Normal about which planes turn.
+            normal: Normal about which planes are tilted.
             plane: The known plane, which a maximum may replace.
         """
         (bounce,) = mean_bounces(self.receivers, plane[None])
@@ -115,7 +115,7 @@ class PlanePeriodogram:
         return self._distinct(peaks)
 
     def _turns(self, bounce: Float[Tensor, "3"]) -> Float[Tensor, " t"]:
-        """Turns of a tile from 0 up [rad], such that phases change by about 2 rad a step."""
+        """Rotations of a tile from 0 up [rad], with phase changes of about 2 rad in each step."""
         gaps = torch.cat([receiver.places - bounce for receiver in self.receivers])
         spread = gaps.norm(dim=1).mean().item()  # [m]
         step = max(min(self.tile / 5, self.turn * self.wavelength / spread), self.tile / 20)
@@ -180,14 +180,14 @@ def periodogram(
     moves: Float[Tensor, " m"],
     turns: Float[Tensor, " t"],
 ) -> Float[Tensor, "m 2*t-1 2*t-1"]:
-    """Sums of ``Likeness`` over links, at planes that are moved and turned.
+    """Sums of ``Likeness`` over links, for planes that are moved and rotated.
 
     Sums are Re sum_b v_b exp(j (r_b0 move + r_b1 turn + r_b2 turn')).
 
     Args:
-        values, rates: As of ``Likeness``, of one plane.
+        values, rates: From ``Likeness`` of one plane.
         moves: Moves of the plane along the normal [m].
-        turns: Turns towards two axes [rad], from 0 up; the result begins with their negatives.
+        turns: Rotations towards two axes [rad], from 0 up; the result starts with their negatives.
     """
     phases = rates[:, :1] * moves
     moved = values[:, None] * torch.polar(torch.ones_like(phases), phases)  # (b, m)

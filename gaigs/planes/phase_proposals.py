@@ -1,4 +1,4 @@
-"""Planes near a known one whose reflections have like phases at all places: a periodogram."""
+"""Planes near a known one whose reflections have equal phases at all places: a periodogram."""
 
 import math
 from typing import NamedTuple
@@ -39,7 +39,7 @@ def propose_by_phases(
     tilt: float,  # largest turn towards either side [rad]
     slabs: Float[Tensor, "m 3"],  # slabs that are tried
 ) -> list[tuple[Float[Tensor, "4"], Float[Tensor, "3"]]]:
-    """Planes near plane ``number``, with slabs, whose reflections have like phases at all places.
+    """Planes near plane ``number``, with slabs, whose reflections have equal phases at all places.
 
     Returns:
         Planes (4,) and slabs (3,): at most eight half-spaces and eight slabs, highest maxima of the
@@ -102,7 +102,7 @@ def _shifted(
     axes: tuple[Float[Tensor, "3"], Float[Tensor, "3"]],
     shift: Float[Tensor, "3"],
 ) -> Float[Tensor, "4"]:
-    """A plane moved by ``shift[0]`` [m] and turned by the other two [rad] towards two axes."""
+    """A plane moved by ``shift[0]`` [m] and rotated by ``shift[1:]`` [rad] towards two axes."""
     turned = functional.normalize(plane[:3] + shift[1] * axes[0] + shift[2] * axes[1], dim=0)
     return torch.cat((turned, (plane[3] + shift[0])[None]))
 
@@ -114,9 +114,9 @@ def _phasors(
     planes: Float[Tensor, "w 4"],
     number: int,
 ) -> Phasors:
-    """Single reflections at plane ``number``, with strengths fitted beside all other paths.
+    """Single reflections at plane ``number``, with strengths fitted together with all other paths.
 
-    Of all receivers together about 120 places stay: those where the reflection is strongest.
+    About 120 places are used, over all receivers: the places with the strongest reflections.
     """
     sequences = data.sequences(planes)
     is_single = sequences[:, :-1].lt(0).all(1) & (sequences[:, -1] == number)

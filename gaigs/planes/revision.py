@@ -23,7 +23,7 @@ Loss = Callable[[Batch], float]
 def thin_batch(batch: Batch, rows: int) -> Batch:
     """The batch with at least ``rows`` rows of its maps, and columns in proportion.
 
-    Labels without a grid of directions stay whole.
+    Labels without a grid of directions are unchanged.
     """
     labels = batch.labels
     directions = batch.directions
@@ -38,16 +38,16 @@ def thin_batch(batch: Batch, rows: int) -> Batch:
 def move_planes(
     model, batch: Batch, wavelength: float, least: float, widest: float = 50.0
 ) -> list[float]:
-    """Moves each used plane to the least error, the strongest first.
+    """Moves each used plane to the lowest error, the strongest plane first.
 
-    A plane moves along its normal, and may turn square to other planes, see ``square_normals``. In
-    a model that draws maps a trial takes long, so planes do not turn.
+    A plane moves along its normal, and may rotate perpendicular to other planes, see
+    ``square_normals``. Planes of a model that draws maps do not rotate, since a trial takes long.
 
     Args:
         model: Model with a placement ``mirrored``.
-        batch: Links whose errors count.
+        batch: Links for the errors.
         wavelength: Wavelength of the carrier [m].
-        least: Least distance searched on either side [m].
+        least: Smallest distance searched on either side [m].
         widest: Limit of this distance [wavelengths].
 
     Returns:
@@ -71,10 +71,10 @@ def move_planes(
 def move_plane(
     model, plane: int, reach: float, wavelength: float, batch: Batch, turns: bool
 ) -> float:
-    """Moves a plane to the least error of a batch; returns the move along the normal [m].
+    """Moves a plane to the lowest error of a batch; returns the move along the normal [m].
 
     The plane moves by at most ``reach`` [m], in steps of a tenth of the ``wavelength`` [m]. With
-    ``turns`` the plane may also take one of ``square_normals``.
+    ``turns`` the normals of ``square_normals`` are also tried.
     """
     placement: Mirrored = model.placement
     origin = placement.origin[plane]
@@ -103,7 +103,7 @@ def _measure_moves(
 ) -> Float[Tensor, " m"]:
     """Mean error of the links after each move of a plane along its normal [m].
 
-    Strengths of paths stay as they are; only lengths change.
+    Only path lengths change; strengths of paths are constant.
     """
     placement = model.placement
     count = len(batch.query)
@@ -139,13 +139,14 @@ def _measure_links(value: Tensor, label: Tensor) -> Float[Tensor, " b"]:
 
 
 def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: float = 1e-6) -> str:
-    """Drops planes, then paths, without which no batch's loss rises by 0.1 %, weakest first.
+    """Drops planes, then paths, weakest first, if no batch's loss rises by 0.1 % without them.
 
     Args:
         placement: Placement whose ``kept`` is changed.
-        batches: Links that count; the first sorts planes and paths by power.
+        batches: Batches for the loss; the first one sorts planes and paths by power.
         loss: Loss of the model on a batch.
-        negligible: Share of the strongest path's power below which a path is dropped untested.
+        negligible: Fraction of the strongest path's power below which a path is dropped without a
+            test.
 
     Returns:
         A sentence for the log.
@@ -155,7 +156,7 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: flo
     before = [loss(batch) for batch in batches]
 
     def suffices(kept: Bool[Tensor, " n"]) -> bool:
-        """Keeps these paths; True if no batch's loss rises by 0.1 %."""
+        """Keeps only these paths; True if no batch's loss rises by 0.1 %."""
         placement.kept.copy_(kept)
         return all(
             loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True)
@@ -197,7 +198,7 @@ def sort_by_strength(placement: Mirrored, batch: Batch) -> list[int]:
 
 
 def _path_shares(placement: Mirrored, batch: Batch) -> Float[Tensor, " n"]:
-    """Mean share of each kept path in a link's received power; 0 for a link without power."""
+    """Mean fraction of each kept path in a link's received power; 0 without power."""
     query, _ = batch.query.unique(with_receivers=True)
     powers = placement(None, query).gains.abs().square()
     total = powers.sum(1, keepdim=True)

@@ -19,10 +19,10 @@ from gaigs.splatting.placement.mirrored.paths import Mirrored
 
 
 def summarize(placement: Mirrored, query: Query) -> dict[str, list]:
-    """Tables of planes, strongest first, and of paths by their bounces, for ``metrics.json``.
+    """Tables of planes, strongest first, and of paths by their planes, for ``metrics.json``.
 
-    Shares in the received power are means of the kept paths over the links of the query.
-    ``unseen`` has a sentence for each axis that places do not span, see ``Scene.flat_axes``.
+    Fractions of the received power are means of the kept paths over the links of the query.
+    ``unseen`` has a sentence for each axis along which places do not vary, see ``Scene.flat_axes``.
     """
     traced = trace_paths(placement, query)
     facts: dict[str, list] = {
@@ -36,7 +36,7 @@ def summarize(placement: Mirrored, query: Query) -> dict[str, list]:
 
 
 def _summarize_planes(placement: Mirrored, traced: TracedPaths) -> list[dict]:
-    """Position, loss and share in the power of each plane, strongest first."""
+    """Position, loss and fraction of the power of each plane, strongest first."""
     table = tabulate_planes(placement, traced.ends)
     planes = []
     for number, share in traced.plane_shares.items():
@@ -56,7 +56,7 @@ def _summarize_planes(placement: Mirrored, traced: TracedPaths) -> list[dict]:
 
 
 def _summarize_paths(traced: TracedPaths) -> list[dict]:
-    """Number and share in the power of the kept paths with 0, 1, ... bounces."""
+    """Number and fraction of the power of the kept paths with 0, 1, ... reflections."""
     counts = (traced.sequences >= 0).sum(1)
     means = traced.shares.mean(0)
     paths = []
@@ -69,7 +69,7 @@ def _summarize_paths(traced: TracedPaths) -> list[dict]:
 
 @torch.no_grad()
 def write_room(placement: Mirrored, query: Query, folder: Path) -> None:
-    """Writes ``planes.obj``, with planes as far as paths reach, and ``obstacles.ply`` if any."""
+    """Writes ``planes.obj``, with planes cut to their paths, and ``obstacles.ply`` if any."""
     write_text(folder / "planes.obj", wavefront_obj(placement, trace_paths(placement, query)))
     blobs = placement.obstacles
     if blobs is None:

@@ -1,4 +1,4 @@
-"""One search for planes, and the score that a kind of labels brings to it."""
+"""A search for planes, and the contract of its score for one kind of labels."""
 
 from collections.abc import Callable, Iterable
 from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
@@ -15,7 +15,7 @@ from gaigs.splatting.placement.mirrored.reflections import tangents
 
 @runtime_checkable
 class SearchedRoom(Protocol):
-    """A room of a search: its planes, and what a score fits with them, such as materials."""
+    """A room in a search: planes, and further fitted quantities such as materials."""
 
     @property
     def planes(self) -> Float[Tensor, "w 4"]: ...
@@ -25,7 +25,7 @@ R = TypeVar("R", bound=SearchedRoom)
 
 
 class Candidate(NamedTuple):
-    """A plane that a room may lack."""
+    """A possible further plane of a room."""
 
     plane: Float[Tensor, "4"]
     rating: float  # what it explains, as ``Score.rate`` measures it
@@ -39,11 +39,12 @@ class GridRatings(NamedTuple):
 
 
 class Score(Generic[R]):
-    """How well planes explain labels of one kind: all that ``PlaneSearch`` knows of the labels.
+    """Quality of planes for labels of one kind: everything that ``PlaneSearch`` knows of the
+    labels.
 
-    Labels of a new kind need two classes: rooms, a NamedTuple with ``planes`` and what is fitted
-    beside them, such as materials; and a subclass of this. The subclass implements the methods of
-    the steps that its search takes, and no method changes a room:
+    Labels of a new kind need two classes. The first is a NamedTuple for rooms, with ``planes`` and
+    further fitted quantities, such as materials. The second is a subclass of this class. It
+    implements the methods for the steps that its search uses; no method changes a room:
 
     * ``PlaneSearch.sweep`` needs ``move``;
     * ``PlaneSearch.extend`` needs ``error``, ``rate`` and ``add``;
@@ -62,26 +63,26 @@ class Score(Generic[R]):
     def error(self, room: R) -> float:
         """Cost of a room, which the search minimises.
 
-        Usually the mean over links of the log of the unexplained share of a label's power. A
-        penalty for each plane avoids needless ones.
+        Usually this is the mean over links of the log of the unexplained fraction of a label's
+        power. A penalty for each plane avoids superfluous ones.
         """
         raise NotImplementedError
 
     def rate(self, room: R, grid: Float[Tensor, "n k 4"]) -> GridRatings:
-        """Ratings of planes by what one more reflection at each explains beside the room.
+        """Ratings of planes by the gain of one more reflection at each, given the room.
 
-        Ratings need no unit; 0 stands for nothing. The grid has thousands of planes, k offsets of
-        each of n normals, so its ratings may be rough; a few planes near its maxima are rated again
-        by the function.
+        Ratings have any unit; 0 means no gain. The grid has thousands of planes, k offsets of each
+        of n normals, so its ratings may be rough. The returned function rates a few planes near its
+        maxima again.
         """
         raise NotImplementedError
 
     def add(self, room: R, candidate: Candidate) -> R | None:
-        """The room with one more plane at its best place nearby; None if it explains too little."""
+        """The room with one more plane at its best position; None if it explains too little."""
         raise NotImplementedError
 
     def move(self, room: R, number: int) -> R:
-        """The room with one plane at its best place nearby, as the others are known now."""
+        """The room with one plane at its best position nearby, given all others."""
         raise NotImplementedError
 
     def remove(self, room: R, number: int) -> R:
@@ -89,7 +90,7 @@ class Score(Generic[R]):
         raise NotImplementedError
 
     def refine(self, room: R) -> R:
-        """The room after a descent with all planes."""
+        """The room after gradient descent with all planes."""
         raise NotImplementedError
 
 
@@ -98,8 +99,8 @@ class PlaneSearch(Generic[R]):
 
     Args:
         frame: Transmitters and receivers.
-        score: How well planes explain the labels.
-        turn, shift: First steps about a maximum, of normals [rad] and of offsets [diagonals].
+        score: Quality of planes for the labels.
+        turn, shift: First steps around a maximum, of normals [rad] and of offsets [diagonals].
 
     Source: Hough, Method and means for recognizing complex patterns, 1962, for the candidates.
     """
@@ -117,9 +118,9 @@ class PlaneSearch(Generic[R]):
         self.shift = shift
 
     def propose(self, room: R, lines: Float[Tensor, "n k 4"]) -> list[Candidate]:
-        """At most three candidates: the highest maxima of a grid, sharpened by a random search.
+        """At most three candidates: the highest maxima of a grid, refined by a random search.
 
-        Planes close to one of the room's, or to a better candidate, are left out.
+        Planes close to a plane of the room, or to a better candidate, are dropped.
         """
         rough = self.score.rate(room, lines)
         grid = lines.flatten(0, 1)  # (n k, 4)
@@ -185,8 +186,8 @@ class PlaneSearch(Generic[R]):
     ) -> R:
         """The room with planes ``numbers`` moved one after the other.
 
-        ``move`` takes the room with all moves so far, and a number; None: ``Score.move``. ``title``
-        names the progress bar.
+        ``move`` is a function of the room after all earlier moves and a number; None:
+        ``Score.move``. ``title`` names the progress bar.
         """
         for number in stages.track(numbers, title):
             if stages.is_up():
@@ -195,7 +196,7 @@ class PlaneSearch(Generic[R]):
         return room
 
     def prune(self, room: R, fewest: int) -> R:
-        """The room without the planes whose absence lowers the error; the first ``fewest`` stay."""
+        """The room without planes whose removal lowers the error; the first ``fewest`` stay."""
         while len(room.planes) > fewest and not stages.is_up():
             smaller = [
                 self.score.remove(room, number) for number in range(fewest, len(room.planes))
@@ -217,16 +218,16 @@ def descend(
     rate: float,
     turns: float = 0.4,
 ) -> list[Tensor]:
-    """Planes and ``others``, the further arguments of a loss, after a descent by Adam.
+    """Planes and ``others``, the further arguments of a loss, after gradient descent by Adam.
 
     Args:
-        loss: Function from planes and ``others`` to the value that is minimised.
-        receivers: Planes turn about their ``mean_bounces`` at these.
-        planes: Planes at the start.
-        others: Further tensors at the start.
+        loss: Function of planes and ``others`` to minimise.
+        receivers: Receivers whose ``mean_bounces`` are the pivots of rotations.
+        planes: Initial planes.
+        others: Initial values of the other arguments.
         steps: Number of steps, whose size falls to 3 % of the first.
         rate: First step of a plane along its normal [m].
-        turns: First turn of a plane over ``rate`` [rad/m]; 0 for none.
+        turns: First rotation of a plane over ``rate`` [rad/m]; 0 for none.
     """
     if not len(planes):
         return [planes, *others]

@@ -8,7 +8,7 @@ from torch import Tensor
 
 
 class FreeFit(NamedTuple):
-    """Strengths of waves in channels, and the residual after them."""
+    """Strengths of waves in channels, and the residual."""
 
     residual: Complex[Tensor, "b k"]
     strengths: Complex[Tensor, "b n"]
@@ -17,7 +17,7 @@ class FreeFit(NamedTuple):
 def ridged(gram: Inexact[Tensor, "b n n"], ridge: float) -> Inexact[Tensor, "b n n"]:
     """Gram matrices plus ``ridge`` times their mean power: unresolved waves share their power."""
     power = gram.diagonal(dim1=1, dim2=2).real.mean(1)  # (b,)
-    power = torch.where(power > 0, power, 1)  # without any wave strengths are 0
+    power = torch.where(power > 0, power, 1)  # without waves strengths are 0
     return gram + ridge * power[:, None, None] * torch.eye(gram.shape[-1], dtype=gram.real.dtype)
 
 
@@ -50,8 +50,8 @@ def real_strengths(
 ) -> Float[Tensor, "b n 1"]:
     """Solutions of linear systems in which only ``signed`` values may be negative.
 
-    Values that the plain solution makes negative are set to 0, and the others are solved for once
-    more: one step of an active-set method.
+    Negative values of the plain solution are set to 0, and the others are solved again: one step of
+    an active-set method.
     """
     is_active = torch.linalg.solve(gram, right) >= 0
     active = (is_active | torch.as_tensor(signed)[..., None]).to(gram)  # (b, n, 1)
@@ -70,6 +70,6 @@ def log_share(
 def align_phases(
     channels: Complex[Tensor, "b k"], known: Complex[Tensor, "b k"]
 ) -> Complex[Tensor, "b k"]:
-    """Channels, each turned to the phase of its known part; unchanged where this is 0."""
+    """Channels, each rotated to the phase of its known part; unchanged if this is 0."""
     turns = (known * channels.conj()).sum(1, keepdim=True).sgn()
     return torch.where(turns == 0, channels, channels * turns)

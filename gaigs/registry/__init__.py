@@ -40,8 +40,8 @@ class Registry:
     """The components of one kind, by name.
 
     Args:
-        kind: One of ``KINDS``: a folder of gaigs, a group of choices, and the entry-point group
-            ``gaigs.<kind>``.
+        kind: One of ``KINDS``: the name of a folder of gaigs, of a group of choices, and of the
+            entry-point group ``gaigs.<kind>``.
 
     Example:
         >>> "multiview" in gaigs.registries["tokenizer"].names()
@@ -77,7 +77,7 @@ class Registry:
                 message = f"must be a class or a function, got {component!r}"
                 raise TypeError(f"{self.kind} {name!r} {message}")
             former = self._registered.get(name)
-            # A module that is loaded anew has the same origin.
+            # A module that is loaded again has the same origin.
             if former is not None and _origin(former) != _origin(component):
                 raise self._taken(name, _origin(former), _origin(component))
             holders, _ = find_holders(self.kind, name)
@@ -92,7 +92,7 @@ class Registry:
         return decorate
 
     def get(self, name: str) -> Callable:
-        """The class or function of that name; only its module is imported."""
+        """The class or function with this name; only its module is imported."""
         holders, unreadable = find_holders(self.kind, name)
         component = self._registered.get(name)
         claims = [holder.where for holder in holders]
@@ -113,10 +113,10 @@ class Registry:
         raise ValueError(message + causes + advice)
 
     def options(self, name: str) -> dict:
-        """The options of a component with their defaults; ``???`` stands for a mandatory one.
+        """The options of a component with their defaults; ``???`` marks a mandatory option.
 
-        They are read from the source; the component is imported if the source does not tell them.
-        Options whose default a configuration cannot hold are left out.
+        They are read from the source. If the source does not show them, the component is imported.
+        Options whose default a configuration cannot store are left out.
         """
         given = GIVEN.get(self.kind, ())
         holders, _ = find_holders(self.kind, name)
@@ -134,9 +134,9 @@ class Registry:
         return {key: value for key, value in options.items() if is_plain(value)}
 
     def check_options(self, config: Mapping) -> None:
-        """Raises a ``ValueError`` for an option that the component of a configuration lacks.
+        """Raises a ``ValueError`` for an option that the configured component does not have.
 
-        The component is imported only if its source does not show the option.
+        The component is imported only if its source does not show its options.
         """
         name = config["name"]
         options = config.keys() - {"name"}
@@ -145,7 +145,7 @@ class Registry:
             check_known(f"{self.kind} {name!r}", self.get(name), sorted(options), given)
 
     def choices(self, name: str) -> dict[str, str]:
-        """The task and the split that a data reader's registration chooses, without an import."""
+        """Task and split in a data reader's registration, without an import."""
         if name in self._choices:
             return self._choices[name]
         holders, _ = find_holders(self.kind, name)
@@ -158,12 +158,12 @@ class Registry:
         Args:
             config: The name, or a mapping with the key ``name`` and options; a component itself is
                 returned.
-            context: Arguments of the caller, e.g. ``scene``; passed if the component has a
-                parameter of that name.
+            context: Arguments of the caller, e.g. ``scene``; each is passed if the component has
+                this parameter.
 
         Raises:
             TypeError: The configuration has another type.
-            ValueError: The name is missing, unknown or taken twice; an option is missing or
+            ValueError: The name is missing, unknown or registered twice; an option is missing or
                 unknown.
             ImportError: The component cannot be imported.
         """
@@ -181,12 +181,12 @@ class Registry:
         return call(f"{self.kind} {name!r}", self.get(name), options, **context)
 
     def _load(self, holder: Holder) -> Callable:
-        """Imports a component; a ``ValueError`` if its source is not the recorded one."""
+        """Imports a component; a ``ValueError`` if its source differs from the recorded one."""
         if holder.root is not None:
             self._check_recorded(holder)
             # A package in ./plugins may import another one there.
             roots = {str(root): None for root in (holder.root, *sources(Path.cwd() / "plugins"))}
-            # Last, so that nothing shadows what is installed.
+            # Last, so that nothing shadows installed packages.
             sys.path += [root for root in roots if root not in sys.path]
         try:
             return self._import(holder)
@@ -209,7 +209,7 @@ class Registry:
             raise ValueError(f"{holder.where} is not {source}\nif you trust that file, {advice}")
 
     def _import(self, holder: Holder) -> Callable:
-        """The component of a holder's module, which is imported; ``_load`` wraps its errors."""
+        """Imports a holder's module and returns its component; ``_load`` wraps errors."""
         name, _, attribute = holder.target.partition(":")
         module = importlib.import_module(name.strip())
         if holder.file is not None and not holder.file.samefile(module.__file__):
@@ -222,7 +222,7 @@ class Registry:
         return note_arguments(self.kind, holder.name, component)
 
     def _taken(self, name: str, holder: str, asker: str) -> ValueError:
-        """The error for two components of one name; both are named by file or by class."""
+        """The error for two components of one name, with the file or class of both."""
         claim = f"is held by {holder}, and {asker} asks for it"
         return ValueError(f"{self.kind} {name!r} {claim}; choose another name")
 
@@ -235,7 +235,7 @@ def registry(kind: str) -> Registry:
     """The registry of a kind.
 
     Raises:
-        ValueError: There is no such kind.
+        ValueError: The kind does not exist.
     """
     if kind not in registries:
         raise ValueError(f"unknown kind {suggest(kind, KINDS)}; there are: {listed(KINDS)}")
@@ -247,19 +247,19 @@ def register(
 ) -> Callable:
     """Decorator that registers a class or function under a name of a kind.
 
-    All arguments are literals, and the component is at the top level of its file: they are read
-    from the source before an import.
+    All arguments must be literals, and the component must be at the top level of its file. They are
+    read from the source without an import.
 
     Args:
         kind: The kind, one of the keys of ``gaigs.registries``.
         name: The name on the command line and in configurations.
-        task: Task of a data reader's labels, which ``data=<name>`` chooses, too.
-        split: Split of a data reader's links, which ``data=<name>`` chooses, too.
+        task: Task of a data reader's labels; ``data=<name>`` also selects it.
+        split: Split of a data reader's links; ``data=<name>`` also selects it.
 
     Raises:
         TypeError: The component is not callable.
-        ValueError: The kind is unknown, or another component has the name; or a component that is
-            no data reader chooses task or split.
+        ValueError: The kind is unknown, another component has the name, or a component other than a
+            data reader has a task or split.
 
     Example:
         >>> @gaigs.register("split", "every_third")
@@ -284,10 +284,10 @@ def only_recorded(recorded: Mapping[str, str] | None) -> Iterator[None]:
 
 
 def digests(*configurations: object) -> dict[str, str]:
-    """Digests of the sources of components outside gaigs that configurations name.
+    """Digests of the sources of all components outside gaigs that configurations name.
 
-    Keys are ``"kind name"``. The source of a component of a notebook or a script is the statement
-    that registers it, as a rule its class or function.
+    Keys are ``"kind name"``. The source of a component in a notebook or a script is the statement
+    that registers it, usually its class or function.
     """
     names = _texts(configurations)
     sources_by_key = {}
@@ -304,7 +304,7 @@ def digests(*configurations: object) -> dict[str, str]:
 
 
 def _texts(value: object) -> set[str]:
-    """All texts in a configuration, keys left out."""
+    """All texts in a configuration, without keys."""
     if isinstance(value, str):
         return {value}
     if isinstance(value, Mapping):

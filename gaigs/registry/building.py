@@ -8,10 +8,10 @@ from gaigs.registry.words import listed, suggest
 
 
 def call(owner: str, function: Callable, options: Mapping, /, **context):
-    """Calls a function or class with options, and with what it takes of ``context``.
+    """Calls a function or class with options, and with those items of ``context`` that it accepts.
 
     Args:
-        owner: Name in errors.
+        owner: Name of the function in errors.
     """
     if not isinstance(options, Mapping):
         raise TypeError(f"{owner} must be a mapping of options, got {options!r}")
@@ -41,7 +41,7 @@ def call(owner: str, function: Callable, options: Mapping, /, **context):
 def check_known(
     owner: str, function: Callable, options: Iterable[str], given: Container[str]
 ) -> None:
-    """Raises a ``ValueError`` for an option that a function lacks, or that its caller gives."""
+    """Raises a ``ValueError`` for an option that a function lacks, or that its caller sets."""
     named = named_parameters(function)
     takes_all = _takes_all(function)
     unknown = [key for key in options if key in given or not (takes_all or key in named)]
@@ -52,15 +52,15 @@ def check_known(
 
 
 def named_parameters(function: Callable) -> dict[str, inspect.Parameter]:
-    """Parameters that a keyword can give, without ``**keywords``."""
+    """Parameters that accept a keyword, without ``**keywords``."""
     parameters = _signature(function).parameters.items()
     return {key: p for key, p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
 
 
 def _takes_all(function: Callable) -> bool:
-    """True if a function takes any keyword.
+    """True if a function accepts any keyword.
 
-    A torch module without a constructor has the signature (*args, **kwargs), and takes nothing.
+    A torch module without a constructor has the signature (*args, **kwargs), but accepts none.
     """
     kinds = {parameter.kind for parameter in _signature(function).parameters.values()}
     parameter = inspect.Parameter
@@ -85,7 +85,7 @@ def _names_its_option(error: BaseException, function: Callable) -> bool:
 
 
 def _suspects(message: str, options: Mapping) -> str:
-    """The options that a message names by key or value, else the keys of all options."""
+    """The options that a message names by key or value; otherwise the keys of all options."""
     suspects = [
         f"{key}={value}"
         for key, value in options.items()

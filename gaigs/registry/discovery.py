@@ -38,7 +38,7 @@ ROOMS = {
 
 @dataclass(frozen=True)
 class Holder:
-    """The file or distribution that provides a named component, found without importing it."""
+    """The file or distribution of a named component, found without an import."""
 
     kind: str
     name: str
@@ -67,9 +67,10 @@ class Holder:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the sources: the component's own, and those in ./plugins that it imports.
+        """SHA-256 of the sources: the component's source, and all files in ./plugins that it
+        imports.
 
-        Its own sources are the files of its package or, outside of packages, its file.
+        The component's source is its package or, outside packages, its file.
         """
         place = self.file or self.folder
         if self.file is not None and self.root is not None:
@@ -94,7 +95,7 @@ class Holder:
         return None
 
     def read_options(self, given: tuple[str, ...]) -> dict[str, Any]:
-        """Options with their defaults, read from the source; ``given`` parameters are left out."""
+        """Options with their defaults, read from the source, without ``given`` parameters."""
         definition: str | Definition = self.target.partition(":")[2].strip()
         registration = self.registration
         if registration is not None:
@@ -116,10 +117,10 @@ class Holder:
 
 
 def find_holders(kind: str, name: str | None = None) -> tuple[list[Holder], list[str]]:
-    """Finds who provides components of a kind: gaigs, installed packages, and ./plugins.
+    """Finds the providers of components of a kind: gaigs, installed packages, and ./plugins.
 
-    With a ``name``, only its providers. The second list has the files that cannot be read, each
-    with the cause.
+    With a ``name`` only its providers are found. The second list holds the files that cannot be
+    read, each with the cause.
     """
     installed = _installed_holders(kind)
     dropped, unreadable = _dropped_holders(kind)
@@ -139,7 +140,7 @@ def plugin_packages(kinds: Iterable[str]) -> list[Path]:
     return [folder for folder in folders if folder is not None]
 
 
-@functools.cache  # gaigs's own files stay as they are
+@functools.cache  # gaigs's files do not change
 def _built_in_holders(kind: str) -> list[Holder]:
     """The components of gaigs: ``<kind>/<name>.py``, or a file in ``<kind>/<name>/``."""
     holders = []
@@ -178,7 +179,7 @@ def _entry_points(_: tuple) -> Any:
 
 
 def _dropped_holders(kind: str | None = None) -> tuple[list[Holder], list[str]]:
-    """Holders of a kind, or of all kinds, in ./plugins, and the files that cannot be read."""
+    """Holders in ./plugins, of one kind or all kinds, and the files that cannot be read."""
     holders: list[Holder] = []
     unreadable = []
     root = Path.cwd()
@@ -214,7 +215,7 @@ def _project_entry_points(file: Path, *_state: int) -> list[tuple[str, str, str]
 def _plugin_files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
     """Names and files of the modules in a folder and its packages.
 
-    A project, a folder with a pyproject.toml, gives its name and that file instead.
+    For a project (a folder with a pyproject.toml) the result is its name and this file.
     """
     for path in sorted(folder.glob("[!_.]*")):
         if path.suffix == ".py":
@@ -227,7 +228,7 @@ def _plugin_files(folder: Path, package: str) -> Iterator[tuple[str, Path]]:
 
 
 def sources(folder: Path, project: str = "[!_.]*") -> list[Path]:
-    """The folder ``src`` of each project in a folder, or the project's own if it has no ``src``."""
+    """The folder ``src`` of each project in a folder, or the project's folder without ``src``."""
     places = [file.parent for file in sorted(folder.glob(f"{project}/pyproject.toml"))]
     return [place / "src" if (place / "src").is_dir() else place for place in places]
 

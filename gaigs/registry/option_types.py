@@ -35,9 +35,9 @@ def check_instance(name: str, value: object, kind: type) -> None:
 
 
 def check_type(name: str, value: Any, annotation: Any) -> None:
-    """Raises a ``TypeError`` unless a value suits an annotation in ``PLAIN`` or a union of them.
+    """Raises a ``TypeError`` unless a value matches an annotation in ``PLAIN`` or a union of them.
 
-    Other annotations are not checked. A union with other classes accepts their objects, too.
+    Other annotations are not checked. In a union with other classes their objects also pass.
     """
     allowed = _allowed(value, annotation)
     if not allowed:
@@ -50,7 +50,7 @@ def check_type(name: str, value: Any, annotation: Any) -> None:
 
 
 def _allowed(value: Any, annotation: Any) -> list[Any]:
-    """Annotations of ``PLAIN`` that a value may suit; empty for a value that is not checked."""
+    """Annotations of ``PLAIN`` that a value may match; empty for a value that is not checked."""
     is_union = typing.get_origin(annotation) in (typing.Union, UnionType)
     allowed = [*typing.get_args(annotation)] if is_union else [annotation]
     plain = [kind for kind in allowed if isinstance(_bare(kind), type) and _bare(kind) in PLAIN]
@@ -68,7 +68,7 @@ def _bare(annotation: Any) -> Any:
 
 
 def _expectation(value: Any, kinds: list[Any]) -> str:
-    """The end of a message: what a value must be, and what it is."""
+    """The end of a message: the expected type of a value, and the value."""
     words = " or ".join(PLAIN[kind][1] for kind in kinds)
     advice = ""
     if isinstance(value, float) and not math.isfinite(value):
@@ -103,13 +103,13 @@ def _check_entries(name: str, value: object, kinds: tuple) -> None:
 
 
 def is_built(config: object) -> bool:
-    """True for a component itself, in contrast to its name or configuration."""
+    """True for a component object, in contrast to its name or configuration."""
     plain = (str, bytes, Mapping, Sequence, NoneType, numbers.Number, type)
     return not isinstance(config, plain)
 
 
 def is_plain(value: object) -> bool:
-    """True if a configuration can hold a value."""
+    """True if a configuration can store a value."""
     if isinstance(value, dict):
         return all(isinstance(key, str) and is_plain(entry) for key, entry in value.items())
     if isinstance(value, list | tuple):

@@ -1,4 +1,4 @@
-"""Plug-ins that ship with the repository, for errors where they are not installed."""
+"""Plug-ins in the repository, for errors if they are not installed."""
 
 PACKAGES = {
     "array_response": ("array_response",),

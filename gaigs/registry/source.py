@@ -35,11 +35,11 @@ class Located(NamedTuple):
 
 
 class UnclearSource(Exception):
-    """The source does not tell an option or its default; an import does."""
+    """The source does not show an option or its default; an import does."""
 
 
 def registrations(file: Path) -> list[Registration]:
-    """The components that a file registers; a ``SyntaxError`` if it is no Python."""
+    """The components registered in a file; a ``SyntaxError`` if it is not Python."""
     components = []
     for node in _parsed(file).body:
         if not isinstance(node, Definition):
@@ -57,10 +57,10 @@ def registrations(file: Path) -> list[Registration]:
 
 
 def read_options(file: Path, definition: str | Definition, given: tuple[str, ...]) -> dict:
-    """The options of a class or function with their defaults; ``???`` stands for a mandatory one.
+    """The options of a class or function with their defaults; ``???`` marks a mandatory option.
 
     Args:
-        given: Parameters that are no options.
+        given: Parameters that are not options.
 
     Raises:
         UnclearSource: The constructor is inherited from another package, or a default is computed.
@@ -91,7 +91,7 @@ def read_options(file: Path, definition: str | Definition, given: tuple[str, ...
 
 
 def registering_statement(component: Callable) -> str:
-    """The statement that now registers a component, with its definition; empty if unknown."""
+    """The present registering statement of a component, with its definition; empty if unknown."""
     frame: Any = sys._getframe()
     while frame is not None and frame.f_globals.get("__name__") != component.__module__:
         frame = frame.f_back
@@ -105,7 +105,7 @@ def registering_statement(component: Callable) -> str:
         return ""
     around = [node for node in statements if _first_line(node) <= line <= (node.end_lineno or 0)]
     innermost = [max(around, key=_first_line)] if around else []
-    # A call register(...)(Name) stands apart from the definition of Name.
+    # A call register(...)(Name) is separate from the definition of Name.
     named = [node for node in statements if getattr(node, "name", None) == component.__name__]
     chosen = dict.fromkeys([*innermost, *named[-1:]])
     return "\n".join(ast.get_source_segment(text, node) or "" for node in chosen)
@@ -118,7 +118,7 @@ def _first_line(node: ast.stmt) -> int:
 
 
 def _parsed(file: Path) -> ast.Module:
-    """The syntax tree of a file, parsed anew once the file has changed."""
+    """The syntax tree of a file, parsed again after the file has changed."""
     state = file.stat()
     return _parse(file, state.st_mtime_ns, state.st_ctime_ns, state.st_size)
 

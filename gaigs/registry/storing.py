@@ -1,4 +1,4 @@
-"""Components as configurations: components note their arguments, and files store them."""
+"""Components as configurations: components record their arguments, and files store them."""
 
 import contextlib
 import functools
@@ -29,7 +29,7 @@ def name_of(component: object) -> str:
 
 
 def configuration_of(component: object) -> dict:
-    """The configuration of a component, an argument of ``Registry.build``, as files can hold it."""
+    """The configuration of a component for files and for ``Registry.build``."""
     if not hasattr(component, "configuration"):
         kind = type(component).__name__
         advice = "put @gaigs.register(kind, name) over the class"
@@ -38,10 +38,10 @@ def configuration_of(component: object) -> dict:
 
 
 def storable(value: Any, where: str) -> Any:
-    """A value in plain dictionaries, lists, numbers and strings.
+    """A value converted to plain dictionaries, lists, numbers and strings.
 
-    The value may hold these, registered components, estimators of scikit-learn, paths, and numbers
-    of numpy or torch; another type is a ``ValueError``.
+    Accepted are these types, registered components, estimators of scikit-learn, paths, and numbers
+    of numpy or torch. Other types raise a ``ValueError``.
     """
     if isinstance(value, Mapping):
         return {key: storable(entry, f"{where}, {key}") for key, entry in value.items()}
@@ -70,14 +70,14 @@ def _target_of(estimator: Any) -> str:
 
 
 def _own_options(estimator: Any) -> dict:
-    """Options of an estimator of scikit-learn that are not its defaults."""
+    """Options of an estimator of scikit-learn that differ from its defaults."""
     known = inspect.signature(type(estimator)).parameters
     options = estimator.get_params(deep=False)
     return {key: value for key, value in options.items() if value is not known[key].default}
 
 
 def note_arguments(kind: str, name: str, component: Any) -> Any:
-    """Makes instances of a class note their arguments as ``configuration``; keeps functions."""
+    """Makes instances of a class record their arguments as ``configuration``."""
     make: Any = getattr(component, "__init__", None)
     if not isinstance(component, type) or getattr(make, "notes", None) is component:
         return component

@@ -1,4 +1,4 @@
-"""Global modes of torch, which gaigs leaves to its caller."""
+"""Global modes of torch, which gaigs restores after use."""
 
 import contextlib
 import threading
@@ -13,8 +13,8 @@ _callers: list[Any] = []  # the default dtype before each call
 def usual_modes() -> Iterator[None]:
     """Float32 as torch's default dtype, and no inference mode, while gaigs computes.
 
-    It is also a decorator. Threads share the default dtype: the first thread sets float32, and the
-    last one to end restores the caller's. Lightning changes the dtype.
+    It also works as a decorator. Threads share the default dtype: the first thread sets float32,
+    and the last one restores the caller's dtype. Lightning changes the dtype.
     """
     import torch  # slow to import
 

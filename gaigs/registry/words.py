@@ -1,4 +1,4 @@
-"""Words of error messages: lists, and the nearest of known words."""
+"""Words for error messages: lists, and the most similar known word."""
 
 import difflib
 from collections.abc import Iterable
@@ -11,9 +11,9 @@ def suggest(word: str, known: Iterable[str]) -> str:
 
 
 def similar(word: str, known: Iterable[str]) -> list[str]:
-    """The known word that is most similar to a word; empty if there is none.
+    """The known word most similar to a word, in a list; empty if no word is similar.
 
-    Words of other programs count as the names that gaigs has for them.
+    Words of other programs count as the corresponding names of gaigs.
     """
     translations = {
         "lr": "learning_rates",

@@ -32,7 +32,7 @@ from gaigs.report.table import (
 
 
 def ablation(runs: Sequence[Run]) -> tuple[list[dict], dict]:
-    """Rows of runs, then of baselines, once for each split; and the settings that all share."""
+    """Rows of runs, then of baselines, once for each split; and the settings common to all."""
     overrides = [run.overrides for run in runs]
     ended = [run.metrics for run in runs if run.metrics is not None]
     names = columns_of(overrides)
@@ -52,7 +52,7 @@ def ablation(runs: Sequence[Run]) -> tuple[list[dict], dict]:
 
 
 def _common(keys: Sequence[str], sources: Sequence[Mapping]) -> dict[str, object]:
-    """The values that all sources share, by key."""
+    """The values common to all sources, by key."""
     common = {}
     for key in keys:
         values = {source.get(key, "") for source in sources}
@@ -87,7 +87,7 @@ def _p_value(metrics: Mapping) -> float | None:
 
 
 def _baselines(metrics: Mapping | None, has_split: bool) -> list[dict]:
-    """Rows of a run's baselines. The model before its kriging, ``<model>_trend``, is left out."""
+    """Rows of a run's baselines, without ``<model>_trend``, the model before its kriging."""
     if metrics is None:
         return []
     first, *names = metrics["models"]
@@ -102,10 +102,10 @@ def _baselines(metrics: Mapping | None, has_split: bool) -> list[dict]:
 
 
 def over_seeds(runs: Sequence[Run], shared: Mapping) -> list[dict]:
-    """A row of means for each group of runs that differ in ``seed`` alone, with two seeds or more.
+    """A row of means for each group of at least two runs that differ only in ``seed``.
 
     Args:
-        shared: Settings that all runs share, which rows leave out.
+        shared: Settings that all runs share; rows omit them.
     """
     ended = [run for run in runs if run.metrics is not None]
     names = columns_of([run.overrides for run in ended])
@@ -139,13 +139,13 @@ def write_ablation(
     shared: Mapping,
     metrics: Mapping[str, Metric],
 ) -> list[Table]:
-    """Writes ``ablation.csv``, ``.md`` and, once a run has ended, ``.tex`` and a figure of speed.
+    """Writes ``ablation.csv``, ``.md`` and, after a run has ended, ``.tex`` and a figure of speed.
 
-    All columns are in the CSV file alone.
+    Only the CSV file has all columns.
 
     Args:
         rows, shared: Results of ``ablation``.
-        metrics: Metrics of the task by name; empty before a run has ended.
+        metrics: Metrics of the task by name; empty until a run has ended.
 
     Returns:
         Tables for a terminal of 80 columns.
@@ -199,7 +199,7 @@ def write_ablation(
 
 
 def _settings(run: Run, shared: Mapping) -> str:
-    """The overrides of a run that others do not share, as one text."""
+    """The specific overrides of a run, as one text."""
     pairs = run.overrides.items()
     return " ".join(f"{key}={value}" for key, value in pairs if key not in shared)
 
@@ -207,7 +207,7 @@ def _settings(run: Run, shared: Mapping) -> str:
 def _speed(
     runs: Sequence[Run], rows: Sequence[dict], shared: Mapping, titles: Mapping[str, str]
 ) -> Figure:
-    """The first metric of each run against its times."""
+    """The first metric of each run over its times."""
     metric = next(iter(titles))
     ended = [run for run in runs if run.metrics is not None]
     done = [row for row in rows if row["status"] == "done"]
@@ -227,19 +227,19 @@ def _speed(
 
 
 def _numbers(rows: Sequence[Mapping], key: str) -> Float[ndarray, " rows"]:
-    """A column as numbers; NaN where it is unknown."""
+    """A column as numbers; NaN for unknown ones."""
     return np.array([np.nan if row.get(key) is None else row[key] for row in rows], float)
 
 
 def _text(value: float | int | str | Spread | None, separator: str) -> str:
-    """A cell of a table; the least value of several seeds follows behind a separator."""
+    """A cell of a table; the lowest value of several seeds follows after a separator."""
     if isinstance(value, Spread):
         return f"{written(value)}{separator}least {written(value.least)}"
     return written(value)
 
 
 def _without_errors(row: Mapping) -> dict:
-    """A row without columns of standard errors; coverages have theirs behind ±."""
+    """A row without columns of standard errors; coverages include theirs after ±."""
     shown = {key: value for key, value in row.items() if not key.endswith("_error")}
     for key in row.keys() & {"coverage_50", "coverage_90"}:
         error = row.get(f"{key}_error")
@@ -266,8 +266,8 @@ def _latex(
     """A LaTeX table: settings and metrics of runs, or of their means over seeds, then of baselines.
 
     Args:
-        results: Rows of runs, or of groups of seeds.
-        rows: Rows with the baselines among them.
+        results: Rows of runs, or of groups of seeds, without baselines.
+        rows: All rows, which include the baselines.
         shared: Settings that all runs share, for the caption.
     """
     shown = [row for row in results if row["status"] in ("done", "seeds")]
@@ -308,7 +308,7 @@ def _latex(
 def _terminal(
     title: str, rows: Sequence[Mapping], titles: Mapping[str, str], hidden: set[str], caption: str
 ) -> Table:
-    """A table for the terminal; columns of costs are left out until it is at most 80 wide."""
+    """A table for the terminal; columns of costs are dropped until it is at most 80 wide."""
     columns = [column for column in columns_of(rows) if column not in hidden]
     styles = [{"unfinished": "red", "baseline": "dim"}.get(row["status"]) for row in rows]
     console = Console(width=1000)

@@ -61,7 +61,8 @@ class CsiFigures(TaskFigures):
 def _looks(marker: str = "") -> dict[str, dict[str, Any]]:
     """Matplotlib's options for the curves ``prediction`` and ``label``.
 
-    A thin dark line upon a broad pale one: both are visible where they coincide, in grey print too.
+    A thin dark line is drawn over a broad pale one. Both are visible where they coincide, also in
+    grey print.
     """
     broad = {"color": SKY, "linewidth": 2.4, "markersize": 5}
     thin = {"color": "0.1", "linewidth": 0.8, "markersize": 2}
@@ -72,7 +73,7 @@ def _looks(marker: str = "") -> dict[str, dict[str, Any]]:
 
 
 def magnitudes_and_phases(shown: Examples, frequencies: Float[ndarray, " s"]) -> Figure:
-    """Magnitude and phase over frequency [Hz] at the label's strongest element, a link a row."""
+    """Magnitude and phase over frequency [Hz] at the strongest element, a row for each link."""
     order = np.argsort(frequencies)
     frequencies = frequencies[order]
     unit = "GHz" if frequencies[-1] >= 1e9 else "MHz"
@@ -115,7 +116,7 @@ def front_ends(
 ) -> Figure:
     """Level and phase of receivers' responses over frequency [Hz], a line for each element.
 
-    Bands are one standard error wide to either side. Receivers without a response have no row.
+    Bands show plus and minus one standard error. Receivers without a response have no row.
     """
     rows = [number for number, error in enumerate(errors) if error.any()]
     order = np.argsort(frequencies)
@@ -153,12 +154,12 @@ def impulse_responses(shown: Examples, frequencies: Float[ndarray, " s"]) -> Fig
 
     The impulse response is the Fourier sum over the subcarriers, weighted by a Hann window over the
     band. Its period is one over the median spacing of the subcarriers. One period is drawn. It
-    begins before 0 by the width of the window's main lobe, at most a quarter of the period. A panel
-    ends where all that follows is 25 dB below the label's peak.
+    starts before 0 by the width of the window's main lobe, at most a quarter of the period. A panel
+    ends where the rest is 25 dB below the label's peak.
 
     Args:
         shown: Channels (k, elements, subcarriers) and their SNR [dB].
-        frequencies: Two subcarriers or more, in any order, evenly spaced or not [Hz].
+        frequencies: At least two subcarriers, in any order and spacing [Hz].
     """
     delays, responses = impulse_response(_pairs(shown), frequencies)
     levels = decibels(responses)  # (k, 2, delays)
@@ -213,7 +214,7 @@ def decibels(amplitudes: Inexact[ndarray, "..."]) -> Float[ndarray, "..."]:
 
 
 def _limits(levels: Float[ndarray, "... 2 n"]) -> tuple[float, float]:
-    """Range of an axis [dB]: all that is drawn, but nothing 60 dB or more below a label's peak."""
+    """Range of an axis [dB]: all curves, down to 60 dB below a label's peak."""
     highest = levels.max()
     peak = levels[..., 1, :].max()
     lowest = max(levels[np.isfinite(levels)].min(), peak - 60)
@@ -256,7 +257,7 @@ def error_against_power(
 ) -> Figure:
     """Power of each test link's error against the power of its channel [dB].
 
-    It has the run's model, the first of ``errors``, and the best baseline.
+    It shows the run's model, the first in ``errors``, and the best baseline.
     """
     model, *others = errors
     baselines = [name for name in others if name != f"{model}_trend"]

@@ -1,4 +1,4 @@
-"""Curves: distributions of scores, losses and scores over a training, scores against times."""
+"""Curves: distributions of scores, losses and scores during training, scores over times."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -40,7 +40,7 @@ def cdf(
     limits: tuple[float | None, float | None],
     higher_is_better: bool = False,
 ) -> Figure:
-    """A figure of ``draw_cdf``, with a legend, and the name of the split at the foot."""
+    """A figure of ``draw_cdf``, with a legend, and the name of the split at the bottom."""
     with rc_context(STYLE):
         figure = new_figure(COLUMN, COLUMN)
         ax = figure.subplots()
@@ -65,16 +65,16 @@ def draw_cdf(
     limits: tuple[float | None, float | None],
     higher_is_better: bool = False,
 ) -> None:
-    """Draws the share of test samples up to each value, a curve for each model with its median.
+    """Draws the cumulative distribution of a score, a curve for each model with its median.
 
-    The run's own model and the best others have a colour, see ``named_ones``; the rest is grey.
+    The run's model and the best others are coloured, see ``named_ones``; the others are grey.
 
     Args:
-        ax: Gets the curves.
-        values: Values of every test sample by model, the run's own model first.
+        ax: Axes for the curves.
+        values: Values of every test sample by model, the run's model first.
         quantity: Name of the values, with their unit.
         samples: Name of the samples, e.g. "links".
-        limits: Ends of the axis of values; None for the ends of the data.
+        limits: Ends of the axis of values; None: the range of the data.
         higher_is_better: True for similarities.
     """
     medians = {name: float(np.median(scores)) for name, scores in values.items()}
@@ -102,11 +102,11 @@ def draw_cdf(
 
 
 def plot_scores(result: Any, ax: Any = None, metric: str | None = None) -> Any:
-    """Draws how large errors are: the distribution of a score over the test links, by model.
+    """Draws the distribution of a score over the test links, by model.
 
     Args:
         result: An ``Evaluation``.
-        ax: Axes; None: a figure of its own.
+        ax: Axes; None: a new figure.
         metric: Name of the score, a key of ``result.scores``; None: the main one.
     """
     name = result.task.compared_by if metric is None else metric
@@ -125,9 +125,9 @@ def plot_scores(result: Any, ax: Any = None, metric: str | None = None) -> Any:
 
 
 def loss_curves(curves: Mapping[str, Curve]) -> Figure:
-    """Loss with its terms, penalties, and each validation score against steps, a panel each.
+    """Loss with its terms, penalties, and each validation score over steps, a panel each.
 
-    Names of curves begin with ``train/``, ``penalty/`` or ``validation/``.
+    Names of curves start with ``train/``, ``penalty/`` or ``validation/``.
     """
     panels = {}
     for group, title in (("train", "loss and its terms"), ("penalty", "penalties, unweighted")):
@@ -165,7 +165,7 @@ def loss_curves(curves: Mapping[str, Curve]) -> Figure:
 
 
 def _score_title(name: str) -> str:
-    """The title of a logged score, as "MAE [dB]" for ``mae_db``."""
+    """The title of a logged score, such as "MAE [dB]" for ``mae_db``."""
     first, *others = name.removesuffix("_db").split("_")
     return " ".join([first.upper(), *others]) + " [dB]" * name.endswith("_db")
 
@@ -191,11 +191,12 @@ def speed_against_error(
     Args:
         names: Name of each run.
         scores: Score of each run.
-        times: Times of the runs by kind, NaN if unknown. A kind that no run has, such as the
+        times: Times of the runs by kind, NaN if unknown. A kind without values, such as the
             training of look-ups, has no panel.
         score_label: Name of the score with its unit.
-        baselines: Scores of baselines, drawn as horizontal lines; names begin with the model's.
-        models: Model of each run, for colours; empty if they do not matter.
+        baselines: Scores of baselines, drawn as horizontal lines; each name starts with its model's
+            name.
+        models: Model of each run, for colours; empty for a single colour.
     """
     times = {label: values for label, values in times.items() if np.isfinite(values).any()} or times
     systems = looks(dict.fromkeys([*models, *(name.partition(" ")[0] for name in baselines)]))
@@ -231,7 +232,7 @@ def learning_curves(
 ) -> Figure:
     """Validation scores over the time of training [s], by system; baselines are horizontal.
 
-    Errors have a logarithmic axis, so that large ones at the start leave space for small ones.
+    The axis of errors is logarithmic, so that large errors at the start do not hide small ones.
     """
     last = {name: float(scores[-1]) for name, (_, scores) in curves.items()}
     named = named_ones(last, score.higher_is_better)
@@ -272,12 +273,12 @@ def _round_ticks(axis: Axis, steps: Sequence[int]) -> None:
 
 
 def _draw_smoothed(ax: Axes, steps: ndarray, values: ndarray, **line) -> None:
-    """Draws points, and over them their running mean over a fiftieth of the points."""
+    """Draws points and their running mean over a fiftieth of the points."""
     window = max(1, len(values) // 50)
     if window > 1:
         ax.plot(steps, values, color=line["color"], alpha=0.2, linewidth=0.5)
     mean = np.convolve(values, np.full(window, 1 / window), "valid")
     if len(values) <= 30:
         line["marker"] = "."
-    # The mean over a window stands at the window's middle.
+    # The mean over a window is drawn at the window's middle.
     ax.plot(steps[(window - 1) // 2 :][: len(mean)], mean, **line)

@@ -12,7 +12,7 @@ registered: dict[type[Task], type["TaskFigures"]] = {}
 
 
 class TaskFigures:
-    """Base of a task's figures. A subclass overrides the methods for which it has figures."""
+    """Base of a task's figures; subclasses override the methods for their figures."""
 
     def of_run(self, task: Any, folder: Path, links: Links) -> dict[str, Any]:
         """Figures of one run by file name, drawn from the files in its folder."""
@@ -23,14 +23,14 @@ class TaskFigures:
 
         Args:
             task: Class of the task.
-            files: ``predictions.npz`` of each system, by its name; all with the same test links.
+            files: ``predictions.npz`` of each system by name, all with the same test links.
             split: Name of the split.
         """
         return {}
 
 
 def register(task: type[Task]) -> Callable[[type[TaskFigures]], type[TaskFigures]]:
-    """A class decorator: figures of a task and of its subclasses without figures of their own.
+    """A class decorator: figures of a task, and of its subclasses without other figures.
 
     Example: docs/plugins.md, the task ``arrival``.
     """

@@ -10,7 +10,7 @@ chosen: ContextVar[tuple[str, ...]] = ContextVar("chosen", default=("png",))
 
 @contextlib.contextmanager
 def figure_formats(format: str | list[str] = "png") -> Iterator[None]:
-    """Figures within the context are written in these formats, ``png``, ``pdf`` or ``svg``."""
+    """Sets the formats of figures within the context: ``png``, ``pdf`` or ``svg``."""
     formats = [format] if isinstance(format, str) else format
     known = ("png", "pdf", "svg")
     if not formats or not {*formats} <= {*known}:

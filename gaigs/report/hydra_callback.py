@@ -17,7 +17,7 @@ class MultirunReport(Callback):
     """Requests tables, which ``main`` writes: Hydra calls no callback after a failed job."""
 
     def on_multirun_start(self, config: DictConfig, **kwargs) -> None:
-        """Remembers the folder of the multirun and the formats of its figures."""
+        """Stores the folder of the multirun and the formats of its figures."""
         plain: Any = OmegaConf.to_container(config)
         requested.append((Path(config.hydra.sweep.dir), plain["figures"]["format"]))
 

@@ -1,4 +1,4 @@
-"""Figure of a run's intervals: how often they hold, and errors against stated deviations."""
+"""Figure of a run's intervals: their coverage, and errors against predicted deviations."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,7 +18,7 @@ from gaigs.report.style import PAGE, STYLE, ask, looks, new_figure
 
 
 def intervals(folder: Path, task: Task, split: str) -> Figure | None:
-    """A figure of how often intervals hold labels, and of errors against stated deviations.
+    """A figure of the coverage of intervals, and of errors against predicted deviations.
 
     None for a run without intervals.
     """
@@ -63,7 +63,7 @@ def _magnitudes(numbers: Shaped[ndarray, "..."]) -> Float[ndarray, "k numbers"]:
 
 
 def _draw_shares(ax: Axes, shares: Mapping[str, Float[ndarray, " levels"]]) -> None:
-    """Draws the share of labels inside intervals against their level, a line for each model."""
+    """Draws the coverage of intervals over their level, a line for each model."""
     count = len(next(iter(shares.values())))
     levels = np.linspace(0, 1, count + 2)[1:-1]
     for name, (colour, dash) in looks(shares).items():
@@ -79,7 +79,7 @@ def _draw_errors(
     colour: str,
     groups: int = 12,
 ) -> int:
-    """Draws root mean square errors of groups of links, sorted by deviation.
+    """Draws root mean square errors of groups of links with similar deviations.
 
     Returns:
         The number of groups.

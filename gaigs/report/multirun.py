@@ -16,10 +16,10 @@ def report(folder: str | Path) -> Group:
     Runs of several models also get the files of ``gaigs.report.systems``.
 
     Args:
-        folder: Folder of a Hydra multirun, or one above several.
+        folder: Folder of a Hydra multirun, or a parent folder of several.
 
     Raises:
-        FileNotFoundError: The folder holds no run.
+        FileNotFoundError: The folder contains no run.
         ValueError: A file is damaged, or the runs are of several tasks.
     """
     folder = Path(folder)

@@ -1,4 +1,4 @@
-"""Paired tests of scores: does a model differ from the best baseline by more than chance?"""
+"""Paired tests of scores: does a model differ significantly from the best baseline?"""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -29,19 +29,20 @@ def paired(
     seed: int = 0,
     most: int = 25_000,
 ) -> Paired | None:
-    """A paired bootstrap over places, of each metric; None without baselines or with one place.
+    """A paired bootstrap over places, for each metric; None without baselines or with one place.
 
-    Links of one place depend on each other, so they are drawn together. A model and the baseline
-    are scored on the same drawn places.
+    Links of one place are dependent, so they are drawn together. Model and baseline are scored on
+    the same drawn places.
 
     Args:
         task: Task of the labels.
-        scores: Scores of the task for every test link (k,), by the names of model and score; the
-            run's model first.
+        scores: Scores of the task for every test link (k,), by name of the model and of the score;
+            the run's model first.
         places: A number for the place of each link (k,).
-        resamples: Number of resamples; no probability is below 2 / (resamples + 1).
+        resamples: Number of resamples; the smallest probability is 2 / (resamples + 1).
         seed: Seed of the resamples.
-        most: Number of links, about, above which resamples are of a random part of the places.
+        most: Approximate number of links; with more of them, resamples use a random part of the
+            places.
 
     Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapters 8 and 16.
     """

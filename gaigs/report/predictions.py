@@ -10,12 +10,12 @@ from numpy import ndarray
 
 
 def as_baseline(name: str) -> str:
-    """The shown name of a baseline beside a system of the same name."""
+    """The displayed name of a baseline, if a system has the same name."""
     return f"{name} (baseline)"
 
 
 def own_scores(file: Path, kind: str) -> dict[str, ndarray]:
-    """The arrays ``<kind>_<model>`` by model, the run's own model first."""
+    """The arrays ``<kind>_<model>`` by model, the run's model first."""
     start = f"{kind}_"
     with np.load(file) as run:
         return {key.removeprefix(start): run[key] for key in run.files if key.startswith(start)}
@@ -53,7 +53,7 @@ class Examples(NamedTuple):
 def read_examples(file: Path, kind: str) -> Examples:
     """The samples at the 10th percentile, the median and the 90th percentile of a score.
 
-    The score is ``<kind>_<model>`` of the run's own model.
+    The score is ``<kind>_<model>`` of the run's model.
     """
     scores = next(iter(own_scores(file, kind).values()))
     order = np.argsort(scores)

@@ -1,4 +1,4 @@
-"""Published figures of systems, and the shown names of models."""
+"""Published figures of systems, and displayed names of models."""
 
 from pathlib import Path
 
@@ -10,8 +10,9 @@ from gaigs.configuration import conf_dir, plugin_conf_dirs
 def read_published() -> dict[str, dict]:
     """The joined contents of ``published.yaml`` of gaigs and of plug-ins.
 
-    ``names`` has shown names of models in the order of the rows. ``scores`` and ``costs`` have for
-    each task a list of columns, each with ``title``, ``source``, and ``figures`` by model.
+    ``names`` maps models to displayed names, in the order of the rows. ``scores`` and ``costs``
+    have a list of columns for each task; a column has ``title``, ``source``, and ``figures`` by
+    model.
     """
     published: dict[str, dict] = {"names": {}, "scores": {}, "costs": {}}
     for folder in (conf_dir(), *plugin_conf_dirs()):

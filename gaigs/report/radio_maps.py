@@ -39,7 +39,7 @@ def map_pages(
     readings: Mapping[str, Float[ndarray, "k 3"]],
     edges: Float[ndarray, "s 2 3"],
 ) -> dict[str, Figure]:
-    """Pages of ``radio_map`` and, if deviations differ by place, ``deviation_map``, by name."""
+    """Pages of ``radio_map`` and, if deviations depend on the place, ``deviation_map``, by name."""
     pages = numbered("radio_map", radio_maps(radio_map, gateways, readings, edges))
     varied = [index for index, deviation in enumerate(_constants(radio_map)) if deviation is None]
     if radio_map.deviations is not None and varied:
@@ -49,7 +49,7 @@ def map_pages(
 
 
 def deviation_map(radio_map: RadioMap) -> RadioMap:
-    """The standard deviations as a map of their own."""
+    """The standard deviations as a map."""
     if radio_map.deviations is None:
         raise ValueError(
             "the map has no deviations, as the model has no intervals\n"
@@ -66,7 +66,7 @@ def _error_unit(unit: str) -> str:
 
 
 def _constants(radio_map: RadioMap, spread: float = 0.02) -> list[float | None]:
-    """The deviation of each receiver where it is the same everywhere, to a share ``spread``."""
+    """The deviation of each receiver if it is constant, to a fraction ``spread``."""
     constants: list[float | None] = [None] * len(radio_map.receivers)
     if radio_map.deviations is not None:
         for index, deviations in enumerate(radio_map.deviations):
@@ -77,7 +77,7 @@ def _constants(radio_map: RadioMap, spread: float = 0.02) -> list[float | None]:
 
 
 class _Drawing(NamedTuple):
-    """What the panels of a radio map share."""
+    """Common data of the panels of a radio map."""
 
     radio_map: RadioMap
     gateways: Mapping[str, Float[ndarray, "3"]]
@@ -93,7 +93,7 @@ class _Drawing(NamedTuple):
         readings: Mapping[str, Float[ndarray, "k 3"]],
         edges: Float[ndarray, "s 2 3"],
     ) -> "_Drawing":
-        """The drawing of a map, with at most 100 readings a receiver, evenly chosen."""
+        """The drawing of a map, with at most 100 readings for each receiver, evenly chosen."""
         dots = {}
         for name in radio_map.receivers:
             rows = readings.get(name, np.zeros((0, 3)))
@@ -157,10 +157,10 @@ def radio_maps(
 
     Args:
         gateways: Positions of all receivers by name [m]; empty if unknown.
-        readings: x, y [m] and label [radio_map.unit] by receiver; of each at most 100, evenly
-            chosen, are drawn.
-        edges: Edges of walls; those on the floor are drawn [m].
-        max_panels: Most panels of a figure.
+        readings: x, y [m] and label [radio_map.unit] by receiver; at most 100 for each are drawn,
+            evenly chosen.
+        edges: Edges of walls [m]; edges on the floor are drawn.
+        max_panels: Largest number of panels in a figure.
     """
     drawing = _Drawing.of(radio_map, gateways, readings, edges)
     _, lower, upper = _extent(radio_map, drawing.walls)
@@ -198,14 +198,14 @@ def plot_radio_map(
     deviation: bool = False,
     links: Links | None = None,
 ) -> Any:
-    """Draws where receivers hear a transmitter, a panel for each receiver.
+    """Draws the level of a transmitter at each place, a panel for each receiver.
 
     Args:
-        result: The map.
-        ax: Axes for one receiver; None: a figure of its own.
-        receiver: Name or index of the receiver; None: all of them.
-        deviation: Draw the standard deviations in place of the values.
-        links: Bring receivers, walls and test labels into the picture.
+        result: The radio map.
+        ax: Axes for one receiver; None: a new figure.
+        receiver: Name or index of the receiver; None: all receivers.
+        deviation: True to draw the standard deviations instead of the values.
+        links: Links whose receivers, walls and test labels are also drawn; or None.
     """
     floor = deviation_map(result) if deviation else result
     if receiver is not None:
@@ -244,7 +244,7 @@ def _title(radio_map: RadioMap, receivers: int) -> str:
 
 
 class _Extent(NamedTuple):
-    """Where a map lies and what its panel shows [m]."""
+    """Extent of a map and of its panel [m]."""
 
     image: tuple  # left, right, bottom and top of the map with its outer pixels
     lower: Float[ndarray, "2"]  # ends of a panel
@@ -252,7 +252,7 @@ class _Extent(NamedTuple):
 
 
 def _extent(radio_map: RadioMap, walls: Float[ndarray, "s 2 2"]) -> _Extent:
-    """The extent of a map, and of a panel that shows it and the walls with a rim."""
+    """The extent of a map, and of a panel with margins that includes the walls."""
     lowest = np.array((radio_map.x[0], radio_map.y[0]))
     highest = np.array((radio_map.x[-1], radio_map.y[-1]))
     rows, columns = radio_map.values.shape[1:]
@@ -276,7 +276,7 @@ class _Scale(NamedTuple):
 def _scale(
     values: Float[ndarray, "..."], readings: Float[ndarray, " k"], error_unit: str
 ) -> _Scale:
-    """A scale that holds the middle 98 % of map and readings, with round ends."""
+    """A scale for the middle 98 % of map and readings, with round ends."""
     parts = [np.quantile(part, (0.01, 0.99)) for part in (values, readings) if part.size]
     quantiles = np.concatenate(parts)
     low = quantiles.min()
@@ -291,7 +291,7 @@ def _scale(
 
 
 def _levels(values: Float[ndarray, "rows columns"], scale: _Scale) -> Float[ndarray, " k"]:
-    """Levels of the contours that cross a map, at most 20 beyond each end of the scale."""
+    """Levels of contours within a map's range, at most 20 beyond each end of the scale."""
     lowest = max(values.min(), scale.low - 20 * scale.step)
     highest = min(values.max(), scale.high + 20 * scale.step)
     first = np.floor(lowest / scale.step)

@@ -32,7 +32,7 @@ class _View(NamedTuple):
     along: int  # number of the axis along the line of sight
 
     def project(self, points: Float[ndarray, "*shape 3"]) -> Float[ndarray, "*shape 2"]:
-        """Points as the panel shows them."""
+        """Points in the panel's coordinates."""
         return points[..., [0, self.up]]
 
 
@@ -50,7 +50,7 @@ class _Views(NamedTuple):
 
 
 class _Cloud(NamedTuple):
-    """The Gaussians that are drawn, and the number of all."""
+    """The drawn Gaussians, and the number of all."""
 
     means: Float[ndarray, "k 3"]  # [m]
     covariances: Float[ndarray, "k 3 3"]  # [m²]
@@ -59,7 +59,7 @@ class _Cloud(NamedTuple):
 
 
 class _Content(NamedTuple):
-    """What is drawn of a room."""
+    """Drawn parts of a room."""
 
     links: Links | None
     cloud: _Cloud | None
@@ -68,7 +68,7 @@ class _Content(NamedTuple):
 
     @property
     def corners(self) -> Float[ndarray, "k 3"]:
-        """Points that a panel shows [m]."""
+        """Points that a panel must contain [m]."""
         corners = [plane.corners for plane in self.planes]
         if self.links is not None:
             query = self.links.query
@@ -82,7 +82,7 @@ class _Content(NamedTuple):
         return np.concatenate(corners)
 
     def draw(self, view: _View, arrow: float) -> list[AxesImage | EllipseCollection]:
-        """Draws all in a panel.
+        """Draws everything in a panel.
 
         Returns:
             Images that need a colour bar: obstacles, then Gaussians.
@@ -127,9 +127,9 @@ def room(
     """Plan (x, y) and side view (x, z) of the room, to one scale.
 
     The 600 strongest Gaussians by |signal| times opacity are drawn, as ellipses of one standard
-    deviation. The box holds transmitters, receivers, walls and the middle 80 % of these Gaussians
-    along each axis. Line widths of learnt planes grow with their share of the power. Colour shows
-    the loss by obstacles along the line of sight.
+    deviation. The drawn box contains transmitters, receivers, walls and, along each axis, the
+    middle 80 % of these Gaussians. Line widths of learnt planes grow with their fraction of the
+    power. Colour shows the loss by obstacles along the line of sight.
     """
     cloud = None if gaussians is None else _strongest(gaussians)
     matter = None if learnt is None else learnt.matter
@@ -154,14 +154,14 @@ def room(
 def plot_room(
     result: LearntRoom, ax: Any = None, links: Links | None = None, show_paths: bool = False
 ) -> Any:
-    """Draws what a model has learnt of the room.
+    """Draws the learnt room of a model.
 
     Args:
-        result: Planes, obstacles and paths, as of ``model.learnt_room(links)``.
-        ax: Axes for the plan; None: plan and side view in a figure of their own.
-        links: Bring transmitters, receivers and walls into the picture.
-        show_paths: Draw the paths of a transmitter in place of links and obstacles; they need
-            ``links``, and no ``ax``.
+        result: Planes, obstacles and paths from ``model.learnt_room(links)``.
+        ax: Axes for the plan; None: plan and side view in a new figure.
+        links: Links whose transmitters, receivers and walls are also drawn; or None.
+        show_paths: True to draw the paths of a transmitter instead of links and obstacles. This
+            needs ``links``, and no ``ax``.
     """
     if show_paths and (links is None or not result.paths or ax is not None):
         raise ValueError(
@@ -213,7 +213,7 @@ def _receivers(links: Links) -> Float[ndarray, "receivers 3"]:
 
 
 def _drawn_planes(learnt: LearntRoom | None, least: float = 0.001) -> list[LearntPlane]:
-    """Learnt planes with a share of the power that is worth a line."""
+    """Learnt planes with at least the fraction ``least`` of the power."""
     planes = [] if learnt is None else learnt.planes
     return [plane for plane in planes if plane.share >= least]
 
@@ -258,7 +258,7 @@ def _draw_links(view: _View, links: Links, arrow: float) -> None:
 
 
 def _rims(corners: Float[ndarray, "k 3"]) -> tuple[Float[ndarray, "2 3"], float]:
-    """A box about some points with a rim, and the length of arrows in it [m]."""
+    """A box around some points with margins, and the length of arrows in it [m]."""
     ends = np.stack((corners.min(0), corners.max(0)))
     arrow = 0.1 * float(np.ptp(ends, 0).max())
     return ends + 1.2 * arrow * np.array([[-1], [1]]), arrow
@@ -316,7 +316,7 @@ def _draw_gaussians(view: _View, cloud: _Cloud) -> EllipseCollection:
 
 
 def _draw_planes(view: _View, planes: Sequence[LearntPlane]) -> None:
-    """Draws planes with their share of the power, except those seen from the front."""
+    """Draws planes with their fraction of the power, except planes parallel to the panel."""
     # The limit is above 1 / sqrt(2), so that each plane is in one view at least.
     shown = [plane for plane in planes if abs(plane.normal[view.along]) < 0.77]
     if not shown:
@@ -335,7 +335,7 @@ def _draw_planes(view: _View, planes: Sequence[LearntPlane]) -> None:
         outward = normal / np.linalg.norm(normal)
         place = _free_place(view, plane, outward, taken)
         taken.append(place)
-        # Texts stand outside of the room: their anchors follow from the direction.
+        # Texts are outside the room: their anchors follow from the direction.
         across, upwards = np.round(outward).astype(int) + 1
         view.ax.annotate(
             f"{plane.number}: {100 * plane.share:.2g} %",
@@ -355,7 +355,8 @@ def _free_place(
 ) -> Float[ndarray, "2"]:
     """A place at the outer edge of a plane for its label, away from labels at ``taken`` places.
 
-    If there is none, it is the middle of the edge. ``outward`` is the plane's normal in the panel.
+    If no place is free, it is the middle of the edge. ``outward`` is the plane's normal in the
+    panel.
     """
     width = np.ptp(view.ax.get_xlim())
     height = np.ptp(view.ax.get_ylim())

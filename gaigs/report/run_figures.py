@@ -20,7 +20,7 @@ from gaigs.report.training_log import read_log
 
 
 def figures_of(task: type[Task]) -> figures.TaskFigures:
-    """Figures of a task: registered ones of its class or else of the nearest base class."""
+    """Figures of a task: registered for its class, or for the nearest base class."""
     known = {Csi: CsiFigures, Scalar: ScalarFigures, Spectrum: SpectrumFigures}
     known |= figures.registered
     for base in task.__mro__:
@@ -32,8 +32,8 @@ def figures_of(task: type[Task]) -> figures.TaskFigures:
 def write_figures(folder: Path, links: Links, model: Model) -> list[Path]:
     """Draws the room, the losses and the figures of the task into ``figures``.
 
-    The model's ``primitives`` and ``learnt_room`` are drawn if it has them. All else comes from the
-    files of the run.
+    The model's ``primitives`` and ``learnt_room`` are drawn if they exist. Everything else comes
+    from the files of the run.
     """
     learnt = model.learnt_room(links)
     drawn = {"room": room(links, model.primitives, learnt)}

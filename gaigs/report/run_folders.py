@@ -33,7 +33,7 @@ class Run(NamedTuple):
 
 
 def by_seed(runs: Sequence[Run]) -> list[list[Run]]:
-    """Groups of runs that differ in the override ``seed`` alone, in the order of first runs."""
+    """Groups of runs that differ only in the override ``seed``, in the order of first runs."""
     groups: dict[frozenset, list[Run]] = {}
     for run in runs:
         fixed = frozenset((key, value) for key, value in run.overrides.items() if key != "seed")
@@ -56,7 +56,7 @@ def read_metrics(file: Path) -> dict:
 
 
 def _check_metrics(metrics: Any) -> None:
-    """Raises an error unless the entries that tables need are there."""
+    """Raises an error unless the entries for tables are present."""
     task = metrics["task"]
     if not metrics["models"]:
         raise ValueError("no model")
@@ -71,7 +71,7 @@ def _check_metrics(metrics: Any) -> None:
 
 
 def read_runs(folder: Path) -> list[Run]:
-    """The runs at any depth of a folder, sorted by name, with numbers in names by value."""
+    """The runs at any depth of a folder, sorted by name; numbers in names by value."""
     places = [file.parents[1] for file in folder.glob("**/.hydra/overrides.yaml")]
     if not places:
         raise FileNotFoundError(
@@ -84,7 +84,7 @@ def read_runs(folder: Path) -> list[Run]:
 
 
 def _by_number(run: Run) -> list[str | int]:
-    """A key to sort runs by name, with numbers in names by value."""
+    """A key to sort runs by name; numbers in names count by value."""
     # Text and numbers alternate, so that equal types are compared.
     parts = enumerate(re.split(r"([0-9]+)", run.name))
     return [int(part) if place % 2 else part for place, part in parts]
@@ -129,8 +129,8 @@ def _read_yaml(file: Path, kind: type) -> Any:
 def _correct(overrides: dict[str, str], config: dict) -> list[str]:
     """Replaces overrides in place by the configuration's values.
 
-    Presets without a name of their own, such as experiments, are not in the configuration. A
-    tokenizer that no part reads becomes ``none``.
+    Presets without a name in the configuration, such as experiments, are not replaced. A tokenizer
+    that no part uses becomes ``none``.
 
     Returns:
         A sentence for each override that differed.
@@ -170,16 +170,15 @@ def _parsed(text: str) -> Any:
 
 
 def _has_unread_tokenizer(config: Mapping) -> bool:
-    """True for a model whose deformation takes no tokens."""
+    """True for a model whose deformation uses no tokens."""
     return (config.get("deformation") or {}).get("name") == "none"
 
 
 def _add_differing_options(runs: list[Run]) -> None:
     """Adds options in which runs of a group differ to their ``overrides``.
 
-    The runs of a group have the same overrides except the seed, so that such options come from
-    ``config.yaml`` alone. A run with another value than most of the group gets a note in
-    ``doubts``.
+    The runs of a group have the same overrides except the seed, so such differences come from
+    ``config.yaml``. A run whose value differs from most of the group gets a note in ``doubts``.
     """
     for group in by_seed(runs):
         configs = {run.folder: _compared(run.config) for run in group}
@@ -206,7 +205,7 @@ def _add_differing_options(runs: list[Run]) -> None:
 
 
 def _compared(config: Mapping) -> dict:
-    """A configuration without a model's copies of other parts, and without an unread tokenizer."""
+    """A configuration without a model's copies of other parts, and without an unused tokenizer."""
     parts = {**config}
     if _has_unread_tokenizer(config):
         parts.pop("tokenizer", None)
@@ -216,7 +215,7 @@ def _compared(config: Mapping) -> dict:
 
 
 def _failure(folder: Path) -> str | None:
-    """The last line of a job's log, if it is the error by which the job ended."""
+    """The last line of a job's log, if it is the final error of the job."""
     logs = [log for log in folder.glob("*.log") if not log.name.startswith("train_ddp")]
     last = "".join(log.read_text(errors="replace") for log in logs).rstrip().rpartition("\n")[2]
     return last.removeprefix("gaigs: ") if last.startswith("gaigs: ") else None

@@ -1,4 +1,4 @@
-"""Figures of one real number a link: predictions against labels, radio maps, errors."""
+"""Figures of scalar labels: predictions against labels, radio maps, errors."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -81,9 +81,9 @@ def predicted_against_measured(
         predictions: Predictions [task.unit].
         receiver: Receiver of each reading.
         names: Names of the receivers.
-        max_dots: Largest number of readings of a receiver that are drawn as dots, which do not hide
-            each other; more are counted in cells.
-        max_panels: Most panels of a figure.
+        max_dots: Largest number of readings of a receiver that are drawn as separate dots; more
+            readings are counted in cells.
+        max_panels: Largest number of panels in a figure.
     """
     errors = np.abs(predictions - labels)
     cells = _cells(labels, predictions, receiver, task.error_unit)
@@ -141,9 +141,10 @@ def _cells(
     receiver: Int[ndarray, " t"],
     error_unit: str,
 ) -> _Cells:
-    """Readings counted in cells of label and prediction, of a round width, that hold all labels.
+    """Readings counted in cells of label and prediction; cells have a round width and cover all
+    labels.
 
-    A prediction more than 20 cells outside the range of the labels counts as at that limit.
+    Predictions more than 20 cells outside the range of the labels are clipped to this limit.
     """
     # Equal labels have no range: the cell's width then suits their size, or is 1.
     span = float(np.ptp(labels)) or float(np.abs(labels).max()) or 1.0

@@ -1,4 +1,4 @@
-"""Scores of one run beside its baselines' scores: which ones count, a table, a sentence."""
+"""Scores of one run next to its baselines' scores: main metric, a table, a sentence."""
 
 import itertools
 from collections.abc import Mapping
@@ -40,10 +40,10 @@ def task_class(name: str) -> type[Task]:
 def headline(task: str, models: Mapping[str, Mapping]) -> tuple[str, Metric]:
     """Name and metric of a run's main score: the first metric of the task that its model has.
 
-    Channels of unknown phase, for example, have no SNR.
+    For example, channels of unknown phase have no SNR.
 
     Args:
-        models: Scores by the model's name, the run's model first.
+        models: Scores by name of the model, the run's model first.
     """
     known = task_class(task).metrics()
     scores = next(iter(models.values()))
@@ -116,7 +116,7 @@ def _texts(
 
 
 def score_frame(metrics: Mapping) -> Any:
-    """The scores as a ``pandas.DataFrame``, each beside the p value of its paired test."""
+    """The scores as a ``pandas.DataFrame``, each next to the p value of its paired test."""
     pandas = library("pandas", "to_dataframe")
     test = metrics.get("paired") or {"p": {}}
     rows: dict[str, dict] = {}
@@ -154,7 +154,7 @@ def score_latex(metrics: Mapping) -> str:
 
 
 def verdict(metrics: Mapping) -> str:
-    """A sentence on the main score of a run: its model, the best baseline, and before kriging."""
+    """A sentence on a run's main score: of its model, the best baseline, and before kriging."""
     (model, scores), *baselines = metrics["models"].items()
     name, metric = headline(metrics["task"], metrics["models"])
     quantity, _, unit = metric.title.removesuffix("]").partition(" [")

@@ -64,10 +64,11 @@ def spectra(
     azimuths: Float[ndarray, " columns"],
     polar: bool = False,
 ) -> Figure:
-    """Label, prediction and signed error over azimuth and elevation [deg], a row a transmitter.
+    """Label, prediction and signed error over azimuth and elevation [deg], a row for each
+    transmitter.
 
-    A polar figure has the zenith in the middle. Amplitudes outside [0, 1] take the colour of the
-    nearer end.
+    A polar figure has the zenith in the middle. Amplitudes outside [0, 1] have the colour of the
+    nearest bound.
     """
     labels = shown.labels.astype(np.float32)
     predictions = shown.predictions.astype(np.float32)
@@ -126,7 +127,7 @@ def side_by_side(
 def pixel_edges(
     centres: Float[ndarray, " n"], lowest: float, highest: float
 ) -> Float[ndarray, " n+1"]:
-    """Borders of the pixels, half-way between their centres, and as far outside the ends."""
+    """Borders of the pixels: midpoints of their centres, and equally far outside the ends."""
     middle = (centres[1:] + centres[:-1]) / 2
     first = 2 * centres[0] - middle[0]
     last = 2 * centres[-1] - middle[-1]
@@ -134,7 +135,7 @@ def pixel_edges(
 
 
 def _colours(limit: float | None) -> dict[str, Any]:
-    """Colours for amplitudes; or with a limit, for signed errors up to it."""
+    """Colours for amplitudes; with a limit, for signed errors up to it."""
     if limit is None:
         return {"cmap": "viridis", "vmin": 0, "vmax": 1}
     return {"cmap": "RdBu_r", "vmin": -limit, "vmax": limit}

@@ -60,7 +60,7 @@ _is_shown: ContextVar[bool] = ContextVar("is_shown", default=False)
 
 
 def _line(number: int) -> tuple:
-    """Colour and dash of a line: after six lines each colour has the next dash."""
+    """Colour and dash of a line; every six lines the dash changes."""
     colours = (BLUE, GREY, ORANGE, GREEN, PURPLE, SKY)
     dashes = ("-", "--", "-.", ":", (0, (7, 2)), (0, (4, 1, 1, 1, 1, 1)))
     return colours[number % 6], dashes[(number + number // 6) % 6]
@@ -71,7 +71,7 @@ LINES = [_line(number) for number in range(36)]
 
 
 def _marker(number: int) -> dict:
-    """Look of a point: after five points comes the next shape."""
+    """Look of a point; every five points the shape changes."""
     colour = (BLUE, ORANGE, GREEN, PURPLE, SKY)[number % 5]
     edge = {"markeredgecolor": "white", "markeredgewidth": 0.5}
     return {"marker": "os^Dv"[number // 5], "color": colour} | edge
@@ -83,7 +83,7 @@ MARKERS = [_marker(number) for number in range(25)]
 
 @contextmanager
 def shown() -> Iterator[None]:
-    """Within this context figures have the style, and ``new_figure`` makes them by pyplot."""
+    """Figures within this context have the style, and ``new_figure`` makes them by pyplot."""
     token = _is_shown.set(True)
     try:
         with rc_context(STYLE):
@@ -102,9 +102,9 @@ def new_figure(width: float, height: float, layout: str = "constrained") -> Figu
 
 
 def ask(figure: Figure, question: str, note: str = "") -> None:
-    """Gives a figure a title, the question that it answers, and a note at its foot.
+    """Gives a figure a title, which is the question that it answers, and a note at the bottom.
 
-    If the figure has a legend, the note goes into it, since the legend would cover it elsewhere.
+    If the figure has a legend, the note is part of it, since the legend could cover the note.
     """
     figure.suptitle(question, size=8, weight="bold")
     if note and figure.legends:
@@ -146,7 +146,7 @@ def numbered(name: str, pages: Sequence[Figure]) -> dict[str, Figure]:
 
 
 def even_pages(items: Sequence, most: int) -> list[Sequence]:
-    """Items of each page, at most ``most``, as evenly as possible."""
+    """Items of each page, at most ``most``, with nearly equal numbers."""
     pages = math.ceil(len(items) / most) or 1
     size = math.ceil(len(items) / pages) or 1
     return [items[first : first + size] for first in range(0, len(items), size)]
@@ -165,7 +165,7 @@ def scaled_panels(
     foot = 1.0  # inches above and below all panels
 
     def scale(columns: int) -> float:
-        """Inches for one unit, with so many columns."""
+        """Inches for one unit, with this number of columns."""
         rows = math.ceil(count / columns)
         return min((PAGE - bar) / (columns * width), 5.6 / (rows * height), 3 / height)
 
@@ -185,9 +185,10 @@ def wrapped(label: str, width: int = 48) -> str:
 def named_ones(
     scores: Mapping[str, float], higher_is_better: bool, own: str | None = None, most: int = 6
 ) -> list[str]:
-    """Names of the lines that get a colour and a label, best first; the others are grey.
+    """Names of the lines with a colour and a label, best first; all others are grey.
 
-    There are at most ``most``, as more colours are confused; ``own`` is always among them.
+    There are at most ``most``, since more colours are hard to distinguish. Line ``own`` is always
+    one of them.
     """
     ranked = sorted(scores, key=lambda name: scores[name], reverse=higher_is_better)
     first = [] if own is None else [own]
@@ -196,10 +197,11 @@ def named_ones(
 
 
 def looks(systems: Iterable[str]) -> dict[str, tuple]:
-    """Colour and dash of systems by name: the same in all figures, and all different if up to 36.
+    """Colour and dash pattern of systems by name: equal in all figures, distinct for up to 36
+    systems.
 
-    A baseline looks as the system of its name. A model without its kriging has the model's colour,
-    and dots.
+    A baseline has the look of the system with its name. A model without its kriging has the colour
+    of the model, and a dotted line.
     """
     models = _models([*systems])
     places = {**_places()}
@@ -219,9 +221,9 @@ def looks(systems: Iterable[str]) -> dict[str, tuple]:
 
 
 def distinct_looks(named: Sequence[str], systems: Iterable[str]) -> dict[str, tuple]:
-    """``looks`` of lines in one figure, of at most six colours.
+    """``looks`` of the lines in one figure, with at most six colours.
 
-    Where systems share a colour, the one that is not a known model takes a free one.
+    If a known model and another system share a colour, the system takes a free colour.
     """
     looks_by_name = looks(systems)
     models = _models(named)
@@ -240,7 +242,7 @@ def distinct_looks(named: Sequence[str], systems: Iterable[str]) -> dict[str, tu
 def _models(systems: Iterable[str]) -> dict[str, str]:
     """The model of each system by name, for its look.
 
-    A variant such as "GAI-GS split=a" counts as its model, unless the model itself is among them.
+    A variant such as "GAI-GS split=a" counts as its model, unless the model is also a system.
     """
     titles = {title: name for name, title in _titles().items()}
     models = {}
@@ -263,7 +265,7 @@ def _titles() -> dict[str, str]:
 
 @cache
 def _places() -> dict[str, int]:
-    """Place in ``LINES`` of each known model; gaigs's two predictors have unbroken lines."""
+    """Place in ``LINES`` of each known model; gaigs's two predictors have solid lines."""
     places = {
         "gaigs": 0,
         "mirrored": 26,

@@ -1,4 +1,4 @@
-"""Runs of several models as one table: published figures beside ours, times and sizes."""
+"""Runs of several models as one table: published figures next to ours, times and sizes."""
 
 import math
 import zipfile
@@ -39,13 +39,13 @@ class System(NamedTuple):
 def find_systems(
     runs: Sequence[Run], baselines: Sequence[Mapping], shared: Mapping, names: Mapping
 ) -> list[System]:
-    """Rows of the comparison table: one for runs that differ only in the seed, then baselines.
+    """Rows of the comparison table: runs (one row for all seeds), then baselines.
 
-    A baseline is left out if a run of the same model has the same printed scores.
+    A baseline is omitted if a run of the same model has the same printed scores.
 
     Args:
         baselines, shared: Results of ``gaigs.report.ablation``.
-        names: Shown names by registered ones, in the order of the rows.
+        names: Displayed names by registered names, in the order of the rows.
     """
     systems = [_system(group, shared, names) for group in by_seed(runs)]
     order = {model: place for place, model in enumerate(names)}
@@ -66,7 +66,7 @@ def find_systems(
 
 
 def _system(group: Sequence[Run], shared: Mapping, names: Mapping) -> System:
-    """The row of runs that differ in the seed alone; its name leaves out ``shared`` settings."""
+    """The row of runs that differ only in the seed; its name omits ``shared`` settings."""
     overrides = group[0].overrides
     # Of a seed that was run twice, in two multiruns, the first run counts: it is stored last.
     ended = {run.metrics["seed"]: run for run in reversed(group) if run.metrics is not None}
@@ -105,12 +105,12 @@ def _costs(metrics: Mapping) -> dict[str, float | None]:
 def _cells(
     systems: Sequence[System], published: Sequence[Mapping], titles: Mapping[str, str]
 ) -> list[dict]:
-    """Rows by title: published figures, then measured values; titles without any are left out.
+    """Rows by title: published figures, then measured values; titles without values are omitted.
 
-    Published figures belong to runs in their usual setting alone.
+    Published figures apply only to runs in their default setting.
 
     Args:
-        published: Columns as ``read_published`` gives them.
+        published: Columns from ``read_published``.
         titles: Titles of metrics or costs by name.
     """
     rows = []
@@ -139,7 +139,7 @@ def _lines(
 ) -> list[list[str]]:
     """Lines of a table as text, names first.
 
-    The best value of a metric is bold if two systems or more have the metric.
+    The best value of a metric is bold if at least two systems have the metric.
     """
     known = {metric.title: metric for metric in metrics.values()}
     columns: list[Sequence[str]] = [names]
@@ -166,8 +166,8 @@ def write_systems(
         metrics: Metrics of the task by name.
 
     Returns:
-        A table for a terminal. None, and no file is written, if fewer than two models have a
-        finished run.
+        A table for a terminal. None if fewer than two models have a finished run; no file is then
+        written.
     """
     published = read_published()
     systems = find_systems(runs, baselines, shared, published["names"])
@@ -227,7 +227,8 @@ def _figures(
 ) -> dict[str, Figure]:
     """Figures of the first seed that all systems have, if they share the split.
 
-    The task's figures need the same test links. Validation scores over time need a log of time.
+    The task's figures need the same test links. Figures of validation scores over time need a log
+    of time.
     """
     runs = _first_seeds(systems)
     splits = {run.metrics["split"] for run in runs.values()}
@@ -254,7 +255,7 @@ def _figures(
 
 
 def _first_seeds(systems: Sequence[System]) -> dict[str, Run]:
-    """A run of each system by name: with the lowest seed that all have, or else its first one."""
+    """A run of each system by name: with the lowest common seed, or else its first run."""
     counts: Counter[int] = Counter()
     for system in systems:
         counts.update({run.metrics["seed"] for run in system.runs})

@@ -14,7 +14,7 @@ from gaigs.io import tables
 
 
 class Spread(NamedTuple):
-    """A score of two runs or more."""
+    """A score of at least two runs."""
 
     mean: float
     deviation: float  # standard deviation of the sample
@@ -22,12 +22,12 @@ class Spread(NamedTuple):
 
     @classmethod
     def of(cls, values: Sequence[float]) -> "Spread":
-        """The spread of values, one a run."""
+        """The spread of values, one for each run."""
         return cls(statistics.mean(values), statistics.stdev(values), min(values))
 
 
 def written(value: float | int | str | Spread | None) -> str:
-    """A value of a table as text; empty where it is unknown."""
+    """A value of a table as text; empty if unknown."""
     if isinstance(value, Spread):
         return f"{written(value.mean)} ± {written(value.deviation)}"
     if isinstance(value, float):
@@ -42,7 +42,7 @@ def best_in_bold(
     higher_is_better: bool,
     bold: str = "[bold]{}[/bold]",
 ) -> list[str]:
-    """Values of a column as text; the best and all that print alike are in the format ``bold``."""
+    """A column as text; the best printed value has the format ``bold``, also if repeated."""
     numbers = [value.mean if isinstance(value, Spread) else value for value in values]
     known = [number for number in numbers if number is not None and not math.isnan(number)]
     best = (max if higher_is_better else min)(known, default=None)
@@ -62,11 +62,11 @@ def columns_of(rows: Iterable[Mapping]) -> list[str]:
 
 
 def write_csv(file: Path, rows: Sequence[Mapping], endings: Sequence[str] = ()) -> None:
-    """Writes rows as a CSV table with all columns that a row has.
+    """Writes rows as a CSV table; the columns are the keys of all rows.
 
     Args:
-        endings: Endings of the names of columns for the deviation and the least value of a
-            ``Spread``, which follow its mean; one ending for the deviation alone.
+        endings: Suffixes of the columns for deviation and lowest value of a ``Spread``; they follow
+            its mean. One suffix means the deviation only.
     """
     spread = set()
     for row in rows:
@@ -98,7 +98,7 @@ def terminal(
 ) -> Table:
     """A table of cells in Rich's markup for a terminal.
 
-    A head with True belongs to a column of numbers, which are not broken into lines.
+    A head with True is for a column of numbers, which are not wrapped.
     """
     table = Table(
         title=escape(title),
@@ -141,9 +141,9 @@ def latex(
 
     Args:
         lines: Cells in LaTeX.
-        texts: Number of columns of texts; numbers follow, which are flush right.
+        texts: Number of text columns; all further columns are numbers, aligned right.
         caption: The caption.
-        rules: Numbers of the lines before which a rule stands.
+        rules: Numbers of the lines after a rule.
     """
     columns = "l" * texts + "r" * (len(lines[0]) - texts)
     rows = ""
@@ -158,5 +158,5 @@ def latex(
 
 
 def stacked(title: str) -> str:
-    """The head of a narrow column, a word a line."""
+    """The head of a narrow column, one word in each line."""
     return escape(title.replace(" ", "\n").replace("_", "_\n"))

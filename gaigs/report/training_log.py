@@ -22,13 +22,13 @@ class Validation(NamedTuple):
 
 
 def read_curves(paths: Sequence[Path]) -> dict[str, Curve]:
-    """Steps and values of every quantity; empty cells are left out.
+    """Steps and values of every quantity, without empty cells.
 
-    A killed run may leave an empty file or a cut last row. Both are skipped; the next start has
-    logged them again.
+    A killed run may leave an empty file or a truncated last row. Both are skipped; the next start
+    logs them again.
 
     Args:
-        paths: One file for each start of the run; a later file replaces earlier ones from its first
+        paths: One file for each start of the run. A later file replaces earlier ones from its first
             step on.
     """
     curves: dict[str, dict[float, float]] = {}

@@ -39,7 +39,7 @@ NAME = "auto"
 
 
 class Tried(NamedTuple):
-    """A candidate and its scores at places that it has not learnt from."""
+    """A candidate and its scores at places outside its training."""
 
     label: str  # its name and options
     config: dict  # configuration of a run with it
@@ -58,7 +58,7 @@ class Tried(NamedTuple):
 
 
 class ChosenModel(NamedTuple):
-    """The chosen candidate, and why: a sentence."""
+    """The chosen candidate, and a sentence with the reason."""
 
     chosen: Tried
     reason: str
@@ -66,12 +66,13 @@ class ChosenModel(NamedTuple):
 
 
 def choose(links: Links, config: dict, folder: Path) -> Fitted:
-    """Trains candidates, and returns the simplest that no other surely leads, or a blend of those.
+    """Trains candidates, and returns the simplest one that no other clearly beats, or a blend.
 
-    The result is that of a run, under the name ``auto``. Look-ups are compared at all known places,
-    in folds of which each is predicted from the others. The best look-up is then compared with
-    trained candidates at the validation places. Each candidate is a run in ``candidates/<number>``,
-    with which a stopped choice goes on. The folder gets checkpoint and log of the chosen one.
+    A blend is a weighted mean of the candidates that no other clearly beats. Look-ups are compared
+    at all known places by cross-validation. The best look-up is then compared with trained
+    candidates at the validation places. Each candidate is a run in ``candidates/<number>``; an
+    interrupted choice resumes these runs. The folder gets checkpoint and log of the chosen
+    candidate, and results are named ``auto``.
 
     Args:
         links: Links with validation links.
@@ -121,9 +122,9 @@ def _try_each(
 ) -> list[Tried]:
     """Tries either the look-ups or the trained candidates, in their order, until the time is up.
 
-    ``work`` is ``look_up`` for candidates without a training, else ``train_candidate``. After
-    ``end``, a reading of ``time.monotonic`` [s], no other candidate starts; the first look-up is
-    always tried.
+    ``work`` is ``look_up`` for candidates without a training, otherwise ``train_candidate``. No
+    candidate starts after ``end``, a reading of ``time.monotonic`` [s]; the first look-up is always
+    tried.
     """
     tried: list[Tried] = []
     shown = stages.current().shown
@@ -179,7 +180,7 @@ def _options(
 
 
 def _with_changes(made: dict, config: dict, changes: Mapping[str, tuple]) -> dict:
-    """The configuration of a candidate with what the run with ``model=auto`` has changed."""
+    """The configuration of a candidate, with the changes of the ``model=auto`` run."""
     shared = ("loss", "training", "trainer", "ensemble", "seed")  # of all that are trained
     kept = ("data", "split", "save_every", "tensorboard", "figures")
     made |= {key: config[key] for key in kept} | {"threads": config["threads"] or made["threads"]}
@@ -189,7 +190,7 @@ def _with_changes(made: dict, config: dict, changes: Mapping[str, tuple]) -> dic
     for key in changes:
         part, _, rest = key.partition(".")
         if part in shared:
-            # Another component brings all its options along.
+            # A changed component replaces the whole part, with all its options.
             path = part if rest == "name" else key
             OmegaConf.update(ours, path, OmegaConf.select(theirs, path), force_add=True)
         elif part not in (*kept, "model", "baselines", "max_time"):
@@ -230,7 +231,7 @@ def train_candidate(label: str, config: dict, links: Links, folder: Path) -> Tri
 
 
 def _validated(look_up: Tried, links: Links) -> Tried:
-    """A look-up or a blend of them with its scores where trained candidates have theirs."""
+    """A look-up, or a blend of look-ups, with its scores at the validation places."""
     asked = links.split.validation
     if look_up.members:
         members = tuple(_validated(member, links) for member in look_up.members)
@@ -249,8 +250,9 @@ def _scored(
     values: Tensor,
     groups: Int[Tensor, " k"] | None = None,
 ) -> Tried:
-    """A candidate with predictions and its mean score of each group, or at each place: errors
-    there are alike.
+    """A candidate with predictions and its mean score of each group, by default of each place.
+
+    Errors within a group are correlated.
     """
     task = links.task
     scores = task.scores(_labels(links, asked), values)[task.monitor].double()
@@ -269,11 +271,11 @@ def _labels(links: Links, index: Int[Tensor, " k"]) -> Tensor:
 
 
 def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
-    """The chosen candidate, or a blend of the candidates that no other surely leads.
+    """The chosen candidate, or a blend of the candidates that no other clearly beats.
 
-    A blend is scored with shares fitted without each place's fold. It is chosen unless a candidate
-    surely leads, since the error of a mean is at most the mean of the errors. Complex channels of
-    unknown phase have no mean.
+    The score of a blend at a place uses weights fitted without the place's fold. A blend is chosen
+    unless a candidate clearly beats it, since the error of a mean is at most the mean of the
+    errors. Complex channels of unknown phase are not blended.
     """
     choice = pick(tried, links.task)
     level = choice.level
@@ -297,7 +299,7 @@ def settle(tried: Sequence[Tried], links: Links) -> ChosenModel:
 
 
 def _blended(tried: Sequence[Tried], weights: Sequence[float]) -> Tried:
-    """A blend of candidates by weights; a blend among them enters by its members."""
+    """A blend of candidates by weights; a blend among them is replaced by its members."""
     members: dict[str, Tried] = {}
     shares: dict[str, float] = {}
     for weight, part in zip(weights, tried, strict=True):
@@ -311,7 +313,7 @@ def _blended(tried: Sequence[Tried], weights: Sequence[float]) -> Tried:
 
 
 def _mean(values: Sequence[Any], shares: Sequence[float] | Tensor) -> Tensor:
-    """Weighted mean of predictions (k, *shape) by their shares, (c,) or of each link (c, k)."""
+    """Mean of predictions (k, *shape), weighted by (c,) or for each link (c, k)."""
     total: Any = 0.0
     for one, share in zip(values, torch.as_tensor(shares), strict=True):
         total = total + share.to(one.real).reshape(-1, *[1] * (one.ndim - 1)) * one
@@ -319,16 +321,15 @@ def _mean(values: Sequence[Any], shares: Sequence[float] | Tensor) -> Tensor:
 
 
 def pick(tried: Sequence[Tried], task: Task, unit: str = "places") -> ChosenModel:
-    """The first candidate that no other is ahead of by more than a standard error.
+    """The first candidate whose score no other one beats by more than a standard error.
 
-    A candidate whose scores are not finite is behind all others.
-
-    Scores are compared place by place, since a hard place is hard for both. A candidate is compared
-    with each other one, not with the best alone: of few places the best mean often scatters most.
+    Candidates with scores that are not finite come last. Scores are compared place by place, since
+    a hard place is hard for all. A candidate is compared with each other one, not only with the
+    best: with few places the best mean often has the largest scatter.
 
     Source: Breiman, Friedman, Olshen and Stone, Classification and regression trees, 1984, section
-    3.4.3, the rule of one standard error; of all pairs as in Hansen, Lunde and Nason, The model
-    confidence set, 2011.
+    3.4.3, for the rule of one standard error; Hansen, Lunde and Nason, The model confidence set,
+    2011, for the comparison of all pairs.
     """
     # The time limit may have left out folds of some.
     shared = set.intersection(*(set(one.gains) for one in tried))
@@ -338,7 +339,7 @@ def pick(tried: Sequence[Tried], task: Task, unit: str = "places") -> ChosenMode
     means = gains.mean(1)
     best = int(means.nan_to_num(-math.inf, -math.inf).argmax())
     leads = gains[:, None] - gains  # (c, c, p), of the first over the second
-    # One place tells no scatter: the best is taken.
+    # One place has no scatter: the best candidate is taken.
     scatter = leads.std(2) / len(shared) ** 0.5 if len(shared) > 1 else 0 * leads.mean(2)
     is_beaten = (leads.mean(2) > scatter).any(0) | ~means.isfinite()  # (c,)
     chosen = int(is_beaten.int().argmin())
@@ -370,7 +371,7 @@ def _facts(tried: Sequence[Tried], chosen: Tried, reason: str, task: Task) -> di
 
 
 def _fit(config: dict, links: Links, folder: Path) -> Fitted:
-    """The result of a candidate's run, also of one that was stopped."""
+    """The result of a candidate's run, which may be resumed."""
     folder.mkdir(parents=True, exist_ok=True)
     lightning.seed_everything(config["seed"], verbose=False)
     loss = registry("loss").build(config["loss"], task=links.task)
@@ -380,8 +381,9 @@ def _fit(config: dict, links: Links, folder: Path) -> Fitted:
 
 
 def _finish(chosen: Tried, links: Links, folder: Path, seconds: float) -> Fitted:
-    """The result of the chosen candidate's run, or the blend of several. The folder gets its
-    checkpoint and log. A look-up is fitted to all known links.
+    """The result of the chosen candidate's run, or the blend of several candidates.
+
+    The folder gets its checkpoint and log. A look-up is fitted to all known links.
     """
     parts = chosen.members or (chosen,)
     results = [one.fitted or _fit(one.config, links, one.folder) for one in parts]

@@ -1,4 +1,4 @@
-"""Evaluation of a trained model beside its baselines: scores, times, predictions."""
+"""Evaluation of a trained model and its baselines: scores, times, predictions."""
 
 import copy
 import io
@@ -54,7 +54,7 @@ Scores = dict[str, dict[str, Tensor]]
 
 
 def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> dict[str, Model]:
-    """The baselines of a run by name, not fitted, without the one named as the run's model."""
+    """The baselines of a run by name, not yet fitted, without the run's model."""
     models: dict[str, Model | None] = {}
     for config in configurations:
         config = {"name": config} if isinstance(config, str) else config
@@ -77,8 +77,8 @@ def fitted(
 ) -> Model:
     """A copy of a model without a training, fitted to the known links.
 
-    With more than ``many`` known links the copy keeps the choices of ``before``, the same model
-    fitted to most of these links.
+    With more than ``many`` known links the copy takes hyperparameters from ``before``, the same
+    model fitted to most of these links.
     """
     if before is not None and len(links.split.known) > many:
         return before.refitted(links)
@@ -89,13 +89,13 @@ def fitted(
 
 @dataclass(frozen=True)
 class Evaluation(JupyterMixin):
-    """Scores on the test links; prints as a table, in a notebook too.
+    """Scores on the test links; printed as a table, in a notebook too.
 
     Attributes:
         task: Task of the labels.
         split: Name of the split.
-        scores: Scores of every test link (k,), by the names of model and score; the evaluated model
-            first.
+        scores: Scores of every test link (k,), by name of the model and of the score; the evaluated
+            model comes first.
         device: Name of the device that computed them.
         places: A number for the place of each test link (k,); None if unknown.
     """
@@ -109,7 +109,7 @@ class Evaluation(JupyterMixin):
 
     @property
     def models(self) -> dict[str, dict[str, float]]:
-        """The numbers of the table, by the model's name and the metric's."""
+        """The numbers of the table, by name of the model and of the metric."""
         return {name: summary(self.task, values) for name, values in self.scores.items()}
 
     @cached_property
@@ -119,12 +119,13 @@ class Evaluation(JupyterMixin):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """The entries of a ``metrics.json`` that tables show."""
+        """The entries of a ``metrics.json`` for tables."""
         facts = {"task": self.task.name, "split": self.split, "device": self.device}
         return facts | {"models": self.models, "paired": self.paired and self.paired._asdict()}
 
     def to_dataframe(self) -> Any:
-        """A ``pandas.DataFrame``, models down; beside each score ``p`` of ``gaigs.report.paired``.
+        """A ``pandas.DataFrame``, one row a model; after each score the p-value of
+        ``gaigs.report.paired``.
 
         Raises:
             ImportError: Pandas is not installed.
@@ -138,8 +139,10 @@ class Evaluation(JupyterMixin):
         return score_frame(self.facts)
 
     def to_latex(self) -> str:
-        """A table for a paper, which needs no package: the best and all that print alike in bold,
-        a star at a score that differs from the best baseline's by more than chance.
+        """A LaTeX table for a paper, without further packages.
+
+        The best score is bold, and so are scores with the same printed value. A star marks a score
+        that differs significantly from the best baseline's.
         """
         return score_latex(self.facts)
 
@@ -156,21 +159,21 @@ class Evaluation(JupyterMixin):
 def evaluate(
     model: Model, links: Links, baselines: Sequence | None = None, *, progress: bool = True
 ) -> Evaluation:
-    """Scores of a model on the test links, beside baselines fitted to the other links.
+    """Scores of a model on the test links, next to baselines fitted to the other links.
+
+    A warning names test links at places that the model was trained on, unless the split is
+    official.
 
     Args:
-        model: A trained, fitted or loaded model, of the same receivers and task.
+        model: A trained, fitted or loaded model for the same receivers and task.
         links: Links with a split.
-        baselines: Names or configurations of models without a training; None: the task's own.
-        progress: False for no bars.
+        baselines: Names or configurations of models without a training; None: the task's baselines.
+        progress: False hides progress bars.
 
     Raises:
         TypeError: The model is not a ``gaigs.Model``, or the links are not ``gaigs.Links``.
         ValueError: There are no test links, the links have other receivers or another task, or a
-            baseline has to be trained.
-
-    It warns of test links at places that the model has learnt from, where those are not official
-    ones.
+            baseline needs a training.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=50)
@@ -224,7 +227,7 @@ def compare(task: Task, scores: Scores, places: Tensor) -> Paired | None:
 
 
 def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:
-    """The numbers of a table, with numbers of intervals where a model has them."""
+    """The numbers of a table, including intervals of models that have them."""
     of_task = task_scores(scores)
     of_intervals = {
         name.removeprefix(INTERVALS): score for name, score in scores.items() if name not in of_task
@@ -247,10 +250,10 @@ def score(
 ) -> Scores:
     """Scores of every test link by models and look-ups; predictions of the first in a folder.
 
-    Look-ups and models with a calibration have scores of intervals, too. If subcarriers are held
-    out, ``nearest_frequency`` takes a link's label at the nearest known subcarrier as a prediction,
-    as an uplink is taken for a downlink. ``fits`` receives the fitted look-ups, whose choices a
-    next fit may keep.
+    Models and look-ups with a calibration also have scores of intervals. If subcarriers are held
+    out, ``nearest_frequency`` predicts the label at the nearest known subcarrier, as uplink
+    channels are used for the downlink. ``fits`` receives the fitted look-ups, whose hyperparameters
+    a later fit may reuse.
     """
     test = LinkScores(links)
     look_ups = able_look_ups(look_ups, links)
@@ -307,7 +310,7 @@ def _lack(calibration: Calibration | None) -> str:
 
 
 def able_look_ups(look_ups: Mapping[str, Model], links: Links) -> dict[str, Model]:
-    """Look-ups that predict for all receivers of the test, also for ones without known links."""
+    """Look-ups that predict for all receivers of the test, also for those without known links."""
     new = links.split.by_receivers
     return {key: model for key, model in look_ups.items() if model.any_receiver or not new}
 
@@ -316,11 +319,11 @@ class LinkScores:
     """Scores of the test links, and the content of ``predictions.npz``.
 
     Attributes:
-        size: Links predicted at a time.
+        size: Number of links predicted at a time.
         index: Numbers of the test links (k,).
-        task: Task of the labels that are predicted.
+        task: Task of the predicted labels.
         labels: Labels of the test links (k, *shape).
-        scores: Scores of every test link by the names of model and score.
+        scores: Scores of every test link by name of the model and of the score.
         content: Arrays by name.
     """
 
@@ -359,7 +362,7 @@ class LinkScores:
         deviations: Tensor,
         is_main: bool,
     ) -> None:
-        """Scores the intervals of a model; the main one's deviations are stored."""
+        """Scores the intervals of a model; deviations of the main model are stored."""
         if is_main:
             parts = []
             for rows in torch.arange(len(self.index)).split(self.size):
@@ -380,7 +383,7 @@ def validate(
     links: Links,
     fits: dict[str, Model] | None = None,
 ) -> Scores:
-    """Scores of validation links by models that have not seen them; empty without any."""
+    """Scores of validation links by models trained without them; empty without such links."""
     if not len(links.split.validation):
         return {}
     split = links.split.validating()
@@ -390,7 +393,7 @@ def validate(
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
-    """The table's numbers of each receiver with test links, by names of receiver and model."""
+    """Numbers of the table for each receiver with test links, by receiver and model."""
     receivers = links.query.receivers[links.split.test]
     summaries: dict[str, dict] = {}
     for number, receiver in enumerate(links.receivers):
@@ -411,7 +414,7 @@ def inference_ms(model: Model, links: Links) -> float:
 
 
 def render_ms(model: Model, links: Links) -> float | None:
-    """Time of rendering alone [ms]; None for a model that renders nothing."""
+    """Time of only the rendering [ms]; None for a model without rendering."""
     work = model.rendering(links.batch(links.split.test[:1]).to(model.device))
     if work is None:
         return None
@@ -420,7 +423,7 @@ def render_ms(model: Model, links: Links) -> float | None:
 
 
 def median_ms(work: Callable, warm_up: int = 5, repeats: int = 25) -> float:
-    """Median duration of ``work`` [ms] in some ``repeats``, after ``warm_up`` calls."""
+    """Median duration of ``work`` [ms] in ``repeats`` calls, after ``warm_up`` calls."""
     wait = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
     seconds = []
     for _ in range(warm_up + repeats):

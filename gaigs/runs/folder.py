@@ -1,4 +1,4 @@
-"""The run folder: its claim by one configuration, and the checks before it is resumed."""
+"""The run folder: its claim by one configuration, and checks before a run is resumed."""
 
 import hashlib
 import json
@@ -24,7 +24,7 @@ ANOTHER = "choose another folder (hydra.run.dir)"
 def claim(folder: Path, config: dict) -> None:
     """Writes the configuration into a run folder, or checks that the folder's run has the same.
 
-    Other files there, or another run to resume, are a ``ValueError``.
+    Raises a ``ValueError`` if the folder holds other files or a run with another configuration.
     """
     file = folder / "config.yaml"
     files = "config.yaml software.json best.ckpt log predictions.npz gaussians.ply radio_map.npz"
@@ -35,7 +35,7 @@ def claim(folder: Path, config: dict) -> None:
     trainings = (folder, folder / "second_start", *folder.glob("members/*"))
     for place in (folder / "figures", *trainings):
         remove_parts(place)  # a killed run leaves temporary files
-    # Without a checkpoint or scores there is nothing to resume: the run starts anew.
+    # Without a checkpoint or scores there is nothing to resume: the run starts from scratch.
     if not (folder / "last.ckpt").is_file() and not (folder / "metrics.json").is_file():
         store(config, folder)
         return
@@ -70,7 +70,7 @@ def software(config: dict) -> dict[str, str]:
 
 
 def stored_software(folder: Path) -> dict[str, str]:
-    """What ``software`` was when a run began; empty if that is unknown."""
+    """``software`` at the start of a run; empty if unknown."""
     try:
         return json.loads((folder / "software.json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -78,7 +78,7 @@ def stored_software(folder: Path) -> dict[str, str]:
 
 
 def warn_of_changes(folder: Path, model: dict) -> None:
-    """Warns if sources of a model's plug-ins have changed: stored numbers mean something else."""
+    """Warns if sources of a model's plug-ins have changed, so that stored numbers are invalid."""
     there = stored_software(folder)
     changed = [key for key, digest in digests(model).items() if there.get(key, digest) != digest]
     if changed:
@@ -90,7 +90,7 @@ def warn_of_changes(folder: Path, model: dict) -> None:
 
 
 def check_software(folder: Path, config: dict) -> None:
-    """Checks that a run is resumed by the software that began it; patch versions are alike."""
+    """Checks that a run is resumed by its original software; patch versions may differ."""
     there = stored_software(folder)
     here = software(config)
     began = str(there.get("gaigs", "0.1 or earlier"))
@@ -117,7 +117,7 @@ def is_configuration(file: Path) -> bool:
 
 
 def check_same_links(there: dict, here: dict, path: Path) -> None:
-    """Raises a ``ValueError`` unless a resumed training has its own links and split."""
+    """Raises a ``ValueError`` unless a resumed training has its original links and split."""
     parts = ("train", "validation", "test")
     has_split = all(torch.equal(there["split"][part], here["split"][part]) for part in parts)
     has_scene = are_alike(there.get("scene"), here.get("scene"))

@@ -32,17 +32,17 @@ def train(
     progress: bool = True,
     **options,
 ) -> Model:
-    """Trains a model on links as the command line does, by the preset of model and task.
+    """Trains a model on links as the command line does, with the preset of model and task.
 
     Args:
-        model: Name of a registered model, or ``"auto"``, the default, which tries several and takes
-            the best by the validation links; or a model, which is trained in place, from one start.
-            Of a kriged model a copy of the trend is trained.
+        model: Name of a registered model; or ``"auto"``, the default, which tries several models
+            and returns the best by the validation links; or a model, which is trained in place,
+            from one start. For a kriged model a copy of the trend is trained.
         links: Links to learn from; validation links choose the best step. Test links are not used.
         overrides: Command-line words, e.g. ``"variant=ga"`` or ``"trainer.max_steps=300"``.
-        folder: Gets the configuration, the log and the checkpoints; the same call resumes a stopped
-            training there. None: no files.
-        progress: False for no bars, as ``enable_progress_bar=False``.
+        folder: Folder of the configuration, the log and the checkpoints. The same call resumes an
+            interrupted training there. None: no files.
+        progress: False hides progress bars, like ``enable_progress_bar=False``.
         options: Values by their keys or names, as in ``gaigs.compose``: ``max_steps=300, seed=0``.
 
     Returns:
@@ -96,7 +96,7 @@ def train(
 
 
 def _made(model: str | Model) -> Model | None:
-    """The model that is to be trained further; None for a name."""
+    """The model for further training; None for a name."""
     if isinstance(model, str):
         return None
     made = copy.deepcopy(model.trend) if isinstance(model, Kriging) else model
@@ -112,7 +112,7 @@ def _made(model: str | Model) -> Model | None:
 def _configuration(
     model: str | Model, made: Model | None, links: Links, overrides: Sequence[str], options: dict
 ) -> dict:
-    """The configuration of a training on links that exist, of a model that may exist."""
+    """The configuration of a training on existing links, of a model that may exist."""
     name = model if made is None else configuration_of(made)["name"]
     if experiments := [word for word in overrides if word.startswith("+experiment=")]:
         raise ValueError(

@@ -1,6 +1,6 @@
 """Density control: prune, clone and split Gaussians.
 
-The optimizer keeps its state of all Gaussians that stay.
+The optimizer keeps its state of the remaining Gaussians.
 
 Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2.
 """
@@ -29,10 +29,10 @@ def prune(
     """Removes Gaussians.
 
     Args:
-        gaussians: Gaussians, which lose rows in place.
+        gaussians: Gaussians, whose rows are removed in place.
         optimizer: Optimizer of the Gaussians.
         gone: True for each Gaussian to remove.
-        follower: Deformation whose parameters with a row for each Gaussian lose these rows too.
+        follower: Deformation with a parameter row for each Gaussian; the same rows are removed.
 
     Source: Kerbl et al., 2023, section 5.2.
     """
@@ -52,11 +52,11 @@ def clone(
     chosen: Bool[Tensor, " n"],
     follower: Deformation | None = None,
 ) -> None:
-    """Doubles the chosen Gaussians in place.
+    """Duplicates the chosen Gaussians in place.
 
-    Two of opacity a' = 1 - sqrt(1 - a) cover as much as one of opacity a.
+    Two Gaussians of opacity a' = 1 - sqrt(1 - a) cover as much as one of opacity a.
 
-    Source: Kerbl et al., 2023, section 5.2, which copies the opacity too.
+    Source: Kerbl et al., 2023, section 5.2. The paper copies the opacity.
     """
     copies = _append(gaussians, optimizer, chosen, follower)
     with torch.no_grad():
@@ -116,8 +116,8 @@ def _rearrange(
 
     Args:
         gaussians, optimizer, follower: As for ``prune``.
-        select: Function from a parameter's rows to its new rows.
-        select_state: The same for the optimizer's state of a row.
+        select: Function from the rows of a parameter to its new rows.
+        select_state: The same function for the optimizer's state.
     """
     owned: list[tuple[nn.Module, str]] = [(gaussians, name) for name in gaussians.PARAMETERS]
     if follower is not None:

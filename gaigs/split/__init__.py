@@ -1,8 +1,8 @@
 """Splits of links into training, validation and test.
 
-Links of one row, that is one transmission to several receivers or at several frequencies, stay in
-one part; only a split that comes with the data (``official``) may separate them. Fractions count
-places, not readings: all links of one place, receiver and carrier count as one.
+Links of one row, that is one transmission to several receivers or at several frequencies, are in
+the same part. Only the split of the data (``official``) may separate them. Fractions count places,
+not readings: all links of one place, receiver and carrier count as one.
 """
 
 from typing import NamedTuple
@@ -20,9 +20,9 @@ def rows_of(links: Links) -> Int[Tensor, " n"]:
 
 
 def places_of(links: Links) -> Int[Tensor, " n"]:
-    """Number of each link's group: links at one place, or of one row, are in one group.
+    """Number of each link's group: a group has the links at one place, or of one row.
 
-    A row is one transmission. A group has the number of its first row.
+    A row is one transmission. The number of a group is its first row.
     """
     rows = rows_of(links)
     last = rows.new_full((len(rows),), int(rows.max()))
@@ -44,18 +44,19 @@ def part(
     train: int | None = None,
     rows: Int[Tensor, " n"] | None = None,
 ) -> Split:
-    """Holds out whole groups of links, first for the test and then in the same way for validation.
+    """Holds out whole groups of links, first for the test, then in the same way for validation.
 
     Args:
-        name: Name of the split with its own options; the common ones are appended.
+        name: Name of the split with its specific options; the common options are appended.
         links: All links.
         groups: Number of each link's group.
         test: Fraction of the links to test on; 0 for none.
-        validation: Fraction of the training links to validate on; 0 for none. None: 0.1, or more of
-            few links, as intervals of 90 % need, see ``hold_out``.
+        validation: Fraction of the training links to validate on; 0 for none. None: 0.1, or more if
+            there are too few links for intervals of 90 %, see ``hold_out``.
         seed: Seed of all random numbers.
-        train: Groups to train and validate on; None for all that do not test.
-        rows: Row of each link, for an order that repeated places do not change; see ``drawn``.
+        train: Number of groups to train and validate on; None: all groups outside the test.
+        rows: Row of each link. They make the random order independent of repeated places, see
+            ``drawn``.
     """
     check("test", test, 0 <= test < 1, "in [0, 1)")
     check_validation(validation)
@@ -87,8 +88,8 @@ def drawn(
 ) -> Int[Tensor, " g"]:
     """The groups of the numbered links in random order.
 
-    With ``rows`` all rows of the links are shuffled, and a group stands where its first row comes.
-    So a place measured again does not change the order of other groups.
+    With ``rows`` all rows of the links are shuffled, and groups are in the order of their first
+    rows. A place that is measured again then does not change the order of other groups.
     """
     shuffled = groups[links] if rows is None else torch.cat((groups[links], rows[links]))
     shuffled = shuffled.unique()
@@ -97,7 +98,7 @@ def drawn(
 
 
 class Parted(NamedTuple):
-    """Links that are kept and links that are held out, ascending."""
+    """Kept links and held-out links, both ascending."""
 
     kept: Int[Tensor, " k"]
     held: Int[Tensor, " h"]
@@ -117,13 +118,13 @@ def hold_out(
     """Holds out random whole groups of links.
 
     Args:
-        name: Option that gives the fraction, for errors.
-        links: Ascending numbers of the links to divide, of two groups or more.
+        name: Option with the fraction, for errors.
+        links: Ascending numbers of the links to divide, in at least two groups.
         groups: Group of each link of the data.
         votes: Weight of each link of the data.
-        fraction: Fraction of the links' votes to hold out, as nearly as groups allow. None: 0.1.
-            Intervals of 90 % need nine links: where 0.1 gives fewer, up to 0.3.
-        at_most: True to hold out no more than the fraction, but one group at least.
+        fraction: Fraction of the links' total weight to hold out, as nearly as groups allow. None:
+            0.1, or up to 0.3 to reach the nine links that intervals of 90 % need.
+        at_most: True to hold out no more than the fraction, but at least one group.
         rows: See ``drawn``.
     """
     if fraction == 0:
@@ -158,7 +159,7 @@ def hold_out(
 
 
 def generator_of(seed: int) -> torch.Generator:
-    """The random numbers of a seed; a ``ValueError`` unless torch accepts it."""
+    """The random generator of a seed; a ``ValueError`` unless torch accepts the seed."""
     check("seed", seed, 0 <= seed < 2**63, "a whole number from 0 to 2**63 - 1")
     return torch.Generator().manual_seed(seed)
 

@@ -11,7 +11,7 @@ from gaigs.split import check, part
 def blocks(
     links: Links, edge: float, test: float = 0.2, validation: float | None = None, seed: int = 0
 ) -> Split:
-    """Splits space into cubes, of which randomly drawn ones test; nothing was measured in them.
+    """Splits space into cubes and tests on randomly drawn cubes, in which nothing was trained.
 
     Args:
         edge: Edge of a cube [m]; the first cube starts at the lower corner of all transmitters.

@@ -12,13 +12,13 @@ def official(
     """The data's own training and test links; validation links are drawn from the training links.
 
     Args:
-        length: Rows in a run that validates; more than 1 if the test is a separate run. Runs are
-            shorter where fewer than four would validate.
-        validation: Fraction of the training links to validate on; with runs, an upper bound of it.
-            0 for none. None: 0.1, or more if there are few links, see ``gaigs.split.hold_out``.
+        length: Rows in a validation run; more than 1 if the test is a separate run. Runs become
+            shorter if fewer than four would validate.
+        validation: Fraction of the training links to validate on; for runs an upper bound. 0 for
+            none. None: 0.1, or more if there are few links, see ``gaigs.split.hold_out``.
 
     Raises:
-        ValueError: The data have no such parts, or an option is out of range.
+        ValueError: The data have no official split, or an option is out of range.
     """
     if links.official is None:
         raise ValueError(

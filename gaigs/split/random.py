@@ -9,7 +9,8 @@ from gaigs.split import part, places_of, rows_of
 def random(
     links: Links, test: float = 0.2, validation: float | None = None, seed: int = 0
 ) -> Split:
-    """Random places test: interpolation, since a neighbour on a dense trajectory is always near.
+    """Random places test. This measures interpolation: on a dense trajectory a neighbour is always
+    near.
 
     Options and errors: see ``gaigs.split.part``.
     """

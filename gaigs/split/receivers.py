@@ -20,22 +20,22 @@ def receivers(
     validation: float | None = None,
     seed: int = 0,
 ) -> Split:
-    """Whole receivers test: the error where no receiver has stood.
+    """Whole receivers test. This measures the error at new positions of receivers.
 
-    Where three receivers or more are left, whole receivers validate, too; else random places.
+    If three receivers or more remain, whole receivers validate, too; otherwise random places.
 
     Args:
-        hold: Names of the receivers that test, or one; None: random ones.
-        test: Fraction of the receivers that test, at least one; for random ones.
-        fold: Fold of the receivers that tests, such as ``1/3`` for the first of three folds, in
-            place of a fraction.
-        validation: Fraction of the other receivers, or their places, that validates; 0 for none.
+        hold: Names of the test receivers, or one name; None: random receivers.
+        test: Fraction of the receivers to test on if they are random, at least one.
+        fold: Fold of the receivers to test on, such as ``1/3`` for the first of three folds;
+            replaces the fraction.
+        validation: Fraction of the other receivers, or of their places, to validate on; 0 for none.
             None: 0.2 of receivers, 0.1 of places.
         seed: Seed of all random numbers.
 
     Raises:
-        ValueError: An option is out of range, a name is unknown, or fewer than two receivers are
-            left to train on.
+        ValueError: An option is out of range, a name is unknown, or fewer than two receivers remain
+            for the training.
     """
     check_validation(validation)
     check("test", test, 0 < test < 1, "in (0, 1)")
@@ -89,10 +89,10 @@ def _held(
     test: float,
     fold: str | None,
 ) -> tuple[Int[Tensor, " h"], str]:
-    """Numbers of the receivers that test, and the name of the split.
+    """Numbers of the receivers to test on, and the name of the split.
 
     Args:
-        order: All receivers in random order, from which fraction and fold take theirs.
+        order: All receivers in random order; fraction and fold select from it.
     """
     names = [receiver.name for receiver in links.receivers]
     if hold and fold is not None:

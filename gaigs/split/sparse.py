@@ -1,4 +1,4 @@
-"""Few places train."""
+"""Only few places train."""
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
@@ -9,12 +9,12 @@ from gaigs.split import part, places_of, rows_of
 def sparse(
     links: Links, train: int, test: float = 0.2, validation: float | None = None, seed: int = 0
 ) -> Split:
-    """Few random places train and validate; the same places test as with ``random``.
+    """Few random places train and validate; test places are as with ``random``.
 
-    Fewer places are a part of more places, with the same seed.
+    With the same seed a smaller number of places is a subset of a larger one.
 
     Args:
-        train: Places to train and validate on. Other options and errors are as for
+        train: Number of places to train and validate on. Other options and errors are as for
             ``gaigs.split.part``.
     """
     return part(

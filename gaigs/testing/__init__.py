@@ -1,6 +1,6 @@
-"""Checks of the contracts that plug-ins keep, for their tests.
+"""Checks of the contracts of plug-ins, for their tests.
 
-A check raises an ``AssertionError`` with the broken rule, or returns nothing.
+A check raises an ``AssertionError`` that names the broken rule, or returns nothing.
 
 Example:
     >>> from gaigs.testing import check_task, example_links

@@ -20,13 +20,13 @@ def require(holds: object, rule: str) -> None:
 
 
 def require_empty(got: Sequence[int], shapes: Collection[Sequence[int]], rule: str) -> None:
-    """Requires that the answer to a batch without links has one of some shapes."""
+    """Requires that the result for a batch without links has one of some shapes."""
     remedy = "with b = 0, flatten(1) works and reshape(b, -1) does not"
     require(tuple(got) in shapes, f"{rule}, got {tuple(got)}; {remedy}")
 
 
 def require_refusal(call: Callable[[], object], rule: str) -> None:
-    """Requires that a call raises a ``ValueError``, or a ``TypeError`` as type checkers do."""
+    """Requires that a call raises a ``ValueError``, or a ``TypeError`` like type checkers."""
     try:
         call()
     except (ValueError, TypeError):
@@ -44,7 +44,7 @@ def require_close(actual: Tensor, expected: Tensor, tolerance: float, rule: str)
 
 
 def require_same(actual: Tensor, expected: Tensor, rule: str) -> None:
-    """Requires equal tensors; on a GPU, which adds in any order, equality but for rounding."""
+    """Requires equal tensors; on a GPU equal up to rounding, since its sums have no fixed order."""
     rounds = actual.is_floating_point() or actual.is_complex()
     if actual.device.type == "cpu" or not rounds:
         require(torch.equal(actual, expected), rule)
@@ -74,7 +74,7 @@ def require_tensor(
     dtype: torch.dtype,
     device: torch.device | str | None = None,
 ) -> None:
-    """Requires a finite tensor of that shape, dtype and type of device."""
+    """Requires a finite tensor of this shape, dtype and type of device."""
     shapes = tuple(shape), tuple(tensor.shape)
     require(shapes[0] == shapes[1], f"{name} must be of shape {shapes[0]}, got {shapes[1]}")
     rule = f"{name} must be {dtype}, got {tensor.dtype}; convert it by .to({dtype})"
@@ -88,7 +88,7 @@ def require_tensor(
 def require_independence(
     result: Any, again: Any, alone: Any, per_query: Collection[str], tolerance: float
 ) -> None:
-    """Requires that a call can be repeated, and that queries do not depend on each other.
+    """Requires that a call is repeatable, and that queries do not influence each other.
 
     Args:
         result, again: Named tuples of two equal calls.
@@ -109,9 +109,9 @@ def require_independence(
 
 
 def require_gradients(outputs: Iterable[Tensor | None], leaves: Mapping[str, Tensor]) -> None:
-    """Requires finite gradients of the outputs at the leaves, which are given by name.
+    """Requires finite gradients of the outputs with respect to the leaves, given by name.
 
-    A leaf on which no output depends needs no gradient.
+    A leaf without effect on any output needs no gradient.
     """
     sums = []
     for output in outputs:
@@ -138,7 +138,7 @@ def require_groups(groups: Mapping[str, Iterable[nn.Parameter]], module: nn.Modu
 
 
 def fixed_sum(values: Tensor) -> Tensor:
-    """A real weighted sum; its weights are all different, so that no two gradients cancel."""
+    """A real weighted sum with distinct weights, so that no two gradients cancel."""
     if values.is_complex():
         values = torch.view_as_real(values.resolve_conj())
     weights = torch.arange(values.numel(), dtype=torch.float64).cos().to(values)
@@ -157,7 +157,7 @@ def random_query(
     dtype: torch.dtype,
     device: torch.device | str,
 ) -> Query:
-    """Links from random places to the receivers in turn, at the scene's carriers in turn."""
+    """Links from random places; receivers and the scene's carriers alternate."""
     number = torch.arange(count)
     frequencies = None
     if len(scene.frequencies):

@@ -1,4 +1,4 @@
-"""Made-up links, and the check of kind ``data``."""
+"""Synthetic links, and the check of kind ``data``."""
 
 import contextlib
 import math
@@ -21,14 +21,14 @@ from gaigs.testing.checks import flat, require, require_tensor
 
 
 def example_links(task: str = "spectrum", carrier: float | None = None) -> Links:
-    """A made-up data set: 24 links to two turned receivers.
+    """A synthetic data set: 24 links to two rotated receivers.
 
     Args:
         task: ``spectrum``: random spectra of 18 x 36 pixels, each of another place. ``rssi``:
-            random levels of 12 places that both receivers hear. ``csi``: channels of 12 such places
-            at 4 elements and 5 subcarriers, the direct wave and noise.
-        carrier: Carrier of all links [Hz], with a bandwidth of 0.5 GHz; spectra then come from 3 x
-            3 patches half a wavelength apart. None if unknown.
+            random levels of 12 places at both receivers. ``csi``: channels of 12 such places at 4
+            elements and 5 subcarriers, the direct wave plus noise.
+        carrier: Carrier of all links [Hz], with a bandwidth of 0.5 GHz; spectra then come from
+            arrays of 3 x 3 elements with a pitch of half a wavelength. None if unknown.
     """
     generator = torch.Generator().manual_seed(0)
     places = torch.rand(24, 3, generator=generator) * torch.tensor([6.0, 4.0, 2.0])  # (24, 3) [m]
@@ -85,7 +85,7 @@ def _direct_waves(places: Tensor, elements: Tensor, frequencies: Tensor) -> Tens
 
 
 def check_data(links: Links) -> None:
-    """Checks links: shapes, ranges, repeatable labels, disjoint parts, a scene that can be stored.
+    """Checks links: shapes, ranges, repeatable labels, disjoint parts, a storable scene.
 
     The contract is in ``gaigs.data.Links``.
     """
@@ -111,7 +111,7 @@ def check_data(links: Links) -> None:
 
 
 def check_parts(parts: dict[str, Tensor], n: int) -> None:
-    """Checks the parts of n links: ascending, without repetition, with links to train and test."""
+    """Checks the parts of n links: ascending, no repetition, links to train and to test."""
     for name, part in parts.items():
         is_index = part.ndim == 1 and part.dtype == torch.long
         rule = f"{name} must be the numbers of links, got {part.dtype}"
@@ -174,7 +174,7 @@ def _check_rows(links: Links) -> None:
 
 
 def _check_labels(links: Links) -> None:
-    """Checks that labels can be read twice, alone and as a batch, and that each has a score."""
+    """Checks that labels can be read twice, singly and as a batch, and that each has a score."""
     task = links.task
     index = torch.linspace(0, len(links) - 1, 9).long().flip(0)
     labels = links.labels[index]

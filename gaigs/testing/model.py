@@ -28,7 +28,7 @@ def check_model(
     The contract is in ``gaigs.model.Model``.
 
     Args:
-        build: Makes the model for a scene.
+        build: Function that makes the model for a scene.
         links: Links with a split.
         device: Device of the model.
     """
@@ -60,7 +60,7 @@ def check_model(
 
 
 def _hard_query(links: Links, query: Query) -> Query:
-    """A query with two places more, the receiver's own and one a kilometre from it on each axis."""
+    """A query with two more places: the receiver's, and one a kilometre away on each axis."""
     receiver = links.receivers[query.receivers[0]].pose.position[None]
     places = torch.cat((query.transmitters, receiver, receiver + 1e3))
     count = len(places)
@@ -77,7 +77,7 @@ def _predict(model: Model, query: Query, places: Tensor, **options: Any) -> Tens
 
 
 def _check_predictions(model: Model, links: Links, query: Query) -> None:
-    """Checks predictions for a query; for its positions one by one and as a grid; and for none."""
+    """Checks predictions for a query; for its positions one by one and as a grid; for none."""
     task = links.task
     places = query.transmitters
     values = model.train().predict(query)
@@ -98,7 +98,7 @@ def _check_predictions(model: Model, links: Links, query: Query) -> None:
 
 
 def _check_arguments(model: Model, links: Links, query: Query) -> None:
-    """Checks directions and subcarriers as arguments, and that impossible ones are refused."""
+    """Checks directions and subcarriers as arguments, and errors of impossible ones."""
     task = links.task
     places = query.transmitters
     values = model.predict(query)
@@ -172,7 +172,7 @@ def _check_directions(model: Model, batch: Batch) -> None:
 
 
 def _check_report(model: Model, batch: Batch) -> None:
-    """Checks attributes and optional methods that a run reads."""
+    """Checks attributes and optional methods that runs use."""
     facts = model.facts()
     is_table = isinstance(facts, dict)
     require(is_table, f"facts must be a dictionary, got {type(facts).__name__}")

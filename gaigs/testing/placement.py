@@ -17,8 +17,8 @@ from gaigs.testing.checks import PRECISION, require, require_close, require_same
 def check_placement(placement: nn.Module, scene: Scene, device: torch.device | str = "cpu") -> None:
     """Checks a placement: shapes, dtype, gradients, independence of the batch.
 
-    It is built for the scene and 2 channels. A placement that makes Gaussians itself is also called
-    without any others. The contract is in ``gaigs.splatting.placement.Placement``.
+    The placement must be built for the scene and 2 channels. A placement that makes Gaussians is
+    also called without free ones. The contract is in ``gaigs.splatting.placement.Placement``.
     """
     generator = torch.Generator().manual_seed(0)
     cases = [(40, 3, torch.float32), (40, 3, torch.float64)]
@@ -45,7 +45,7 @@ def example_gaussians(scene: Scene, count: int) -> Gaussians:
 
 
 def _check_call(placement: nn.Module, gaussians: Gaussians | None, query: Query) -> None:
-    """Checks the placed Gaussians of a query, and that queries do not depend on each other."""
+    """Checks the placed Gaussians of a query, and that queries are independent."""
     count = 0 if gaussians is None else len(gaussians)
     placed = placement(gaussians, query)
     is_placed = isinstance(placed, Placed)

@@ -34,14 +34,14 @@ def check_pooling(
 ) -> None:
     """Checks a pooling: values, finite gradients, independence of the batch.
 
-    The pooling is fitted to the links, and a second one is given its state. Silent maps and paths
-    are among the inputs. A pooling of maps without a grid is given maps over the label's directions
-    and over a list of some of them; any other is called with such a list. A pooling of maps to one
-    real number must also take maps that are constant, span 12 decades or are of half precision. The
-    contract is in ``gaigs.splatting.pooling.Pooling``.
+    The pooling is fitted to the links, and a second one gets its state. Inputs include silent maps
+    and paths. A pooling of maps without a grid is called with the label's directions, as a grid and
+    as a list of some directions. Other poolings are called with such a list. A pooling of maps to
+    one real number must also accept maps that are constant, span 12 decades or have half precision.
+    The contract is in ``gaigs.splatting.pooling.Pooling``.
 
     Args:
-        build: Makes the pooling for a scene.
+        build: Function that makes the pooling for a scene.
         links: Links of its task, with a split.
         device: Device of the pooling and its inputs.
     """
@@ -80,7 +80,7 @@ class _PoolingInputs(NamedTuple):
 def _map_inputs(
     channels: int, grid: Grid | None, query: Query, dtype: torch.dtype
 ) -> _PoolingInputs:
-    """Random maps over a grid, one a link."""
+    """Random maps over a grid, one for each link."""
     generator = torch.Generator().manual_seed(0)
     image = torch.randn(len(query), channels, *grid.shape, generator=generator)
     image = image.to(query.transmitters.device, dtype).requires_grad_()
@@ -116,7 +116,7 @@ def _check_attributes(pooling: Pooling, task: Task) -> Grid | None:
 
 
 def _check_values(pooling: Pooling, task: Task, inputs: _PoolingInputs, query: Query) -> Tensor:
-    """Checks values and gradients for all queries, the last one, none, and silence.
+    """Checks values and gradients for all queries, the last one, no query, and silence.
 
     Returns:
         The values for all queries.
@@ -163,7 +163,7 @@ def _check_directions(
 def _check_hard_maps(
     pooling: Pooling, image: Float[Tensor, "b c rows columns"], query: Query
 ) -> None:
-    """Checks that extreme maps give finite levels and gradients, in single precision at least."""
+    """Checks that extreme maps give finite levels and gradients, at least in single precision."""
     decades = torch.linspace(-6, 6, image[0].numel()).reshape(image.shape[1:]).to(image)
     maps = {
         "a silent map": 0 * image,

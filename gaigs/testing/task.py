@@ -16,7 +16,7 @@ from gaigs.testing.checks import flat, require, require_close, require_refusal
 
 
 def check_task(task: Task, *thinnings: Mapping) -> None:
-    """Checks a task: its state, its scores, what it refuses, its thinning.
+    """Checks a task: its state, its scores, its errors, its thinning.
 
     True values must score best. The contract is in ``gaigs.core.task.Task``.
 
@@ -124,7 +124,7 @@ def _check_summaries(
 
 
 def _check_refusals(task: Task, labels: Tensor, values: Tensor) -> None:
-    """Checks that wrong shapes and numbers are refused, and that no samples have no scores."""
+    """Checks that wrong shapes and numbers raise errors, and that no samples have no scores."""
     broken = torch.arange(labels.numel()).view_as(labels) == 1
     wrong = {
         "of different number": (labels, values[1:]),

@@ -7,7 +7,7 @@ from gaigs.core.task import Task
 
 
 def seeded(*numbers: int) -> torch.Generator:
-    """A random generator that follows from numbers alone, such as a seed and a step."""
+    """A random generator seeded by some numbers, such as a seed and a step."""
     return torch.Generator().manual_seed(hash(numbers) % 2**63)
 
 
@@ -20,14 +20,14 @@ class MeanScores:
         self.count = 0
 
     def add(self, batch: Batch, values: torch.Tensor) -> None:
-        """Adds the scores of a batch, weighted by the batch's share of links."""
+        """Adds the scores of a batch, weighted by the batch's fraction of links."""
         share = batch.shares[0]
         self.count += share * len(batch)
         for name, scores in self.task.scores(batch.labels, values).items():
             self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
 
     def over_processes(self, strategy) -> dict[str, float]:
-        """The mean of each score, as ``Task.logged`` gives it; every process has to call it."""
+        """Means of all scores by ``Task.logged``; every process must call it."""
         numbers = [self.count, *self.sums.values()]
         totals = torch.tensor(numbers, dtype=torch.float64, device=strategy.root_device)
         count, *sums = strategy.reduce(totals, reduce_op="sum").tolist()

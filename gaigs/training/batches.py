@@ -20,17 +20,16 @@ def process() -> tuple[int, int]:
 
 
 class Batches:
-    """Batches of a fixed number of places with all their links, in an order that follows from seed
-    and step alone.
+    """Batches of a fixed number of places with all their links, in an order fixed by seed and step.
 
-    A place is a transmitter's position and frequency: its excitation is computed once for all
-    receivers. Every pass goes through all places once, in a new order. Each process gets every
-    ``world_size``-th place of the batch, with the weights (``Batch.shares``) that make the mean
-    over processes the mean over the batch.
+    A place is a transmitter's position and frequency. Its excitation is computed once for all
+    receivers. Every pass visits all places once, in a new order. Each process gets every
+    ``world_size``-th place of the batch. The weights ``Batch.shares`` make the mean over processes
+    equal to the mean over the batch.
 
     Args:
         index: Links to draw from.
-        size: Places a batch, of all processes together; the last batch of a pass may hold fewer.
+        size: Places in a batch, of all processes together; the last batch of a pass may be smaller.
         seed: Seed of the order.
         steps: Number of batches.
     """
@@ -85,7 +84,7 @@ class Batches:
 
 
 class InOrder:
-    """One pass over links in order, ``size`` a batch; each process gets every ``world_size``-th."""
+    """One pass over links in order; processes get every ``world_size``-th link of each batch."""
 
     def __init__(self, links: Links, index: Int[Tensor, " k"], size: int):
         self.links = links

@@ -1,4 +1,4 @@
-"""The budget of a training: steps, wall time, or both; and how much of it is spent."""
+"""The budget of a training, in steps, wall time, or both, and its spent part."""
 
 import contextlib
 import math
@@ -19,23 +19,24 @@ resumption misses.
 
 
 class Budget(Callback):
-    """Measures the time of a training, ends the training in time, and sets times of validation.
+    """Measures the time of a training, ends it in time, and schedules validations.
 
-    The clock of the first process decides for all, after each step. The clock starts with the
-    search for planes and runs during validations. In a resumed training the time spent before
-    counts. Lightning's own ``max_time`` gives each process its own clock.
+    The clock of the first process decides for all, after each step. Lightning's ``max_time`` would
+    give each process its own clock. The time includes the search for planes, validations, and
+    earlier parts of a resumed training.
 
     Args:
-        max_time: Limit of search and training together [s]. The training gets at least half,
-            however long the search. None: steps alone end the training.
-        every: Least time between validations [s]; these take at most a fifth of the training. None:
-            by steps.
+        max_time: Limit of search and training together [s]. At least half of it is for the
+            training, after a search of any duration. None: only steps end the training.
+        every: Smallest time between validations [s]; they take at most a fifth of the training.
+            None: steps schedule validations.
         searched: Duration of the search before the training [s], by the first process's clock.
 
     Attributes:
         end: Time at which the limit of the run ends the training, at least a second after the
-            search [s]; or infinite.
-        share: Share of the training's time spent, the same in all processes; 0 without a limit.
+            search [s]; infinite without a limit.
+        share: Fraction of the training's time that is spent, equal in all processes; 0 without a
+            limit.
     """
 
     def __init__(
@@ -59,7 +60,7 @@ class Budget(Callback):
 
     @property
     def limit(self) -> float:
-        """Time at which the training ends [s]; infinite if steps alone end it."""
+        """Time at which the training ends [s]; infinite if only steps end it."""
         limit = math.inf
         if self.max_time is not None:
             limit = max(self.max_time, self.searched + self.max_time / 2)
@@ -116,27 +117,27 @@ class Budget(Callback):
         self.start = None
 
     def _measure_time(self, trainer) -> float:
-        """The first process's time [s]; stops the training when it is up."""
+        """The first process's time [s]; stops the training when the time is up."""
         elapsed = trainer.strategy.broadcast(self.seconds)
         self.share = (elapsed - self.searched) / (self.limit - self.searched)
         self._stop_in_time(trainer)
         return elapsed
 
     def _stop_in_time(self, trainer) -> None:
-        """Asks Lightning to stop after this step once the whole time is spent."""
+        """Asks Lightning to stop after this step if the whole time is spent."""
         trainer.should_stop = trainer.should_stop or self.share >= 1
 
 
 def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
-    """Options of Lightning's trainer without the budget's, and the budget itself.
+    """Options of Lightning's trainer without the budget's options, and the budget.
 
-    The budget takes ``max_time`` and a ``val_check_interval`` that is a time. ``searched`` is the
-    duration of the search before [s].
+    The budget takes ``max_time``, and a ``val_check_interval`` given as a time. ``searched`` is the
+    duration of the search before the training [s].
 
     Raises:
         TypeError: A number of steps is not a whole number.
-        ValueError: A time is not as Lightning reads it, or less than a second; nothing ends the
-            training; or an option counts in epochs.
+        ValueError: A time is not in Lightning's format, or below a second; nothing ends the
+            training; or an option counts epochs.
     """
     options = dict(options)
     max_time = options.pop("max_time", None)
@@ -167,7 +168,7 @@ def make_budget(options: Mapping, searched: float = 0.0) -> tuple[dict, Budget]:
 
 
 def seconds(option: str, duration: object) -> float:
-    """A duration [s] as Lightning's ``Timer`` reads it: DD:HH:MM:SS, or ``{minutes: 3}``."""
+    """A duration [s] in the format of Lightning's ``Timer``: DD:HH:MM:SS, or ``{minutes: 3}``."""
     length = None
     with contextlib.suppress(MisconfigurationException, TypeError):
         if isinstance(duration, str | dict):
@@ -180,13 +181,13 @@ def seconds(option: str, duration: object) -> float:
 
 
 def watched(config: Mapping) -> contextlib.AbstractContextManager[stages.Timekeeper]:
-    """The timekeeper of a run: its limit is ``max_time``; it draws bars if the trainer does."""
+    """The timekeeper of a run with the limit ``max_time``; with bars if the trainer has bars."""
     limit = math.inf if config.get("max_time") is None else seconds("max_time", config["max_time"])
     return stages.watched(limit, is_first() and config["trainer"].get("enable_progress_bar", True))
 
 
 def time_share(trainer) -> float | None:
-    """The spent share of the time, the same in all processes; None without a limit of time."""
+    """The spent fraction of the time, equal in all processes; None without a time limit."""
     shares = (budget.share for budget in _budgets(trainer) if math.isfinite(budget.limit))
     return next(shares, None)
 
@@ -198,12 +199,12 @@ def is_time_up(trainer) -> bool:
 
 
 def _budgets(trainer) -> list[Budget]:
-    """The trainer's callbacks that are a ``Budget``: one or none."""
+    """The callbacks of the trainer that are a ``Budget``: one or none."""
     return [callback for callback in trainer.callbacks if isinstance(callback, Budget)]
 
 
 def share_done(trainer) -> Callable[[int], float]:
-    """A function of the step: share of the training's steps done, or of its time if larger."""
+    """A function of the step: the fraction of steps that is done, or of the time if larger."""
 
     def share(step: int) -> float:
         by_steps = step / trainer.max_steps if trainer.max_steps > 0 else 0.0

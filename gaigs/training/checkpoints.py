@@ -1,4 +1,4 @@
-"""Checkpoints of a training: the best one, and the last one, from which it goes on."""
+"""Checkpoints of a training: the best one, and the last one for resumption."""
 
 import logging
 import math
@@ -21,11 +21,11 @@ log = logging.getLogger(__name__)
 
 
 class KeepBest(Checkpoint):
-    """Writes the checkpoint of the best validation score (``Task.monitor``), or of the last step
-    without validation.
+    """Writes the checkpoint of the best validation score (``Task.monitor``).
 
-    The training stops after ``patience`` validations without a better score. It also stops if
-    scores, rising on as between the last two validations, would end below a ``rival`` score.
+    Without validation it is the checkpoint of the last step. The training stops after ``patience``
+    validations without a better score. The training also stops if a linear extrapolation of the
+    last two scores ends below a ``rival`` score.
     """
 
     def __init__(self, path: Path, patience: int | None, rival: float | None = None):
@@ -46,11 +46,11 @@ class KeepBest(Checkpoint):
         return {name: getattr(self, name) for name in names}
 
     def load_state_dict(self, state: dict) -> None:
-        for name, value in state.items():  # fewer in checkpoints of before
+        for name, value in state.items():  # fewer in checkpoints of earlier versions
             setattr(self, name, value)
 
     def on_train_start(self, trainer, module) -> None:
-        """Scores the start of a model that predicts untrained, too."""
+        """Scores also the start of a model that predicts untrained."""
         self._stop_without_progress(trainer)  # a run that was killed once it had stopped
         if trainer.enable_validation and self.best == -math.inf and module.model.predicts_untrained:
             self._validate(trainer, module)
@@ -70,7 +70,7 @@ class KeepBest(Checkpoint):
         self._stop_without_progress(trainer)
 
     def on_train_end(self, trainer, module) -> None:
-        """Scores the last step too, if no validation was due at it."""
+        """Scores also the last step, if no validation was due."""
         if trainer.enable_validation and trainer.global_step % trainer.val_check_batch:
             self._validate(trainer, module)
 
@@ -100,7 +100,7 @@ class KeepBest(Checkpoint):
         return is_better
 
     def _stop_without_progress(self, trainer) -> None:
-        """Asks Lightning to stop behind the rival, or ``patience`` validations after the best."""
+        """Asks Lightning to stop below the rival, or ``patience`` validations after the best."""
         if self.is_behind or (self.patience is not None and self.waited >= self.patience):
             trainer.should_stop = True
 
@@ -108,11 +108,11 @@ class KeepBest(Checkpoint):
 class KeepLast(Checkpoint):
     """Writes the checkpoint to resume from: ``every`` [s], at a signal to stop, and at the end.
 
-    The checkpoint is written between two steps, after a due validation and all other callbacks. So
-    a resumed training equals an uninterrupted one. At the first signal the training stops there, at
-    the second at once. Several processes follow the clock of the first, and stop together whichever
-    of them got the signal. (Lightning's ``ModelCheckpoint`` saves before a due validation, by each
-    process's own clock.)
+    The checkpoint is written between two steps, after a due validation and all other callbacks, so
+    a resumed training equals an uninterrupted one. At the first signal the training stops at this
+    point, at the second signal immediately. Several processes follow the clock of the first, and
+    stop together after a signal to any of them. (Lightning's ``ModelCheckpoint`` saves before a due
+    validation, by each process's clock.)
     """
 
     def __init__(self, path: Path, every: float | int):
@@ -160,7 +160,7 @@ class KeepLast(Checkpoint):
         save(trainer, self.path)
 
     def _save_if_due(self, trainer) -> None:
-        """Writes a checkpoint between two steps if it is time; at a signal the training stops."""
+        """Writes a checkpoint between two steps if it is due; a signal stops the training."""
         any_of = partial(trainer.strategy.reduce_boolean_decision, all=False)
         is_due = trainer.is_global_zero and time.monotonic() >= self.saved + self.every
         if not any_of(is_due or self.received is not None):
@@ -174,7 +174,7 @@ class KeepLast(Checkpoint):
 
 
 class Interrupted(Exception):
-    """A signal that stops a run; at a KeyboardInterrupt Lightning would end the process."""
+    """A signal that stops a run; Lightning would end the process at a KeyboardInterrupt."""
 
     def __init__(self, message: str, number: int):
         super().__init__(message)
@@ -182,8 +182,9 @@ class Interrupted(Exception):
 
 
 def save(trainer, path: Path) -> None:
-    """Writes a checkpoint atomically, after the log of the steps before it; every process has to
-    call it.
+    """Writes a checkpoint atomically, after the log of all earlier steps.
+
+    Every process must call this function.
     """
     for logger in trainer.loggers:
         logger.save()

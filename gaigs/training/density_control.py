@@ -1,4 +1,4 @@
-"""Density control: Gaussians are pruned, cloned and split while a model trains."""
+"""Density control: Gaussians are pruned, cloned and split during training."""
 
 import torch
 from lightning.pytorch.callbacks import Callback
@@ -11,17 +11,17 @@ class DensityControl(Callback):
     """Prunes, clones and splits Gaussians on a schedule.
 
     The pull at a Gaussian is the mean gradient of the loss by its position since the last round,
-    times its distance to the receivers' middle. Where it exceeds ``gradient``, a wide Gaussian is
-    split and a narrow one is cloned.
+    times its distance from the receivers' middle. If the pull exceeds ``gradient``, a wide Gaussian
+    is split and a narrow one is cloned.
 
     Args:
         every: Steps between two rounds.
         start, stop: First and last step of a round.
         gradient: Bound on the pull [loss/rad].
-        split_angle: Largest standard deviation over distance beyond which a Gaussian is wide [rad].
+        split_angle: Largest standard deviation over distance of a narrow Gaussian [rad].
         opacity: Opacity below which Gaussians are pruned.
-        max_count: Largest number of Gaussians to grow to.
-        seed: Seed of the halves' random positions.
+        max_count: Largest number of Gaussians.
+        seed: Seed of the random positions after a split.
 
     Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2; thresholds in docs/methods.md.
     """

@@ -23,24 +23,26 @@ class Descent(lightning.LightningModule):
     """A loss with the model's penalties, and a learning rate for each group of parameters.
 
     Args:
-        identity: Entry of a checkpoint beside the weights: scene, configuration and split.
+        identity: Entries of a checkpoint besides the weights: scene, configuration and split.
         seed: Seed of the training's random numbers.
-        batch_size: Places a step.
+        batch_size: Places in a step.
         thinning: Options of the task's thinning: the part of each label in a step.
-        jitter: Standard deviation of each place's random shift along each axis in every step [m].
-        penalties: Weights of penalties by name, in place of ``Model.penalty_weights``.
-        learning_rates: Initial rates by parameter group, in place of ``Model.learning_rates``.
-        optimizer, schedule: As ``gaigs.training.schedule`` takes them.
-        patience: Validations without a better score until the training stops; None: it goes on to
-            the last step.
+        jitter: Standard deviation of a random shift of each place in every step, along each axis
+            [m].
+        penalties: Weights of penalties by name; they replace ``Model.penalty_weights``.
+        learning_rates: Initial rates by parameter group; they replace ``Model.learning_rates``.
+        optimizer, schedule: Arguments of ``gaigs.training.schedule``.
+        patience: Validations without a better score before the training stops; None: the training
+            runs to the last step.
         density: Options of ``gaigs.training.density_control.DensityControl``; None: a fixed number
             of Gaussians.
-        links: Most links a step, drawn at random from the links of its places; None: all.
+        links: Largest number of links in a step, drawn at random from the links of its places;
+            None: all.
 
     Raises:
         ValueError: An option is out of range, or the model lacks a parameter group or penalty.
 
-    Source: optimiser and schedules after the released configuration.
+    Source: optimizer and schedules as in the released configuration of GAI-GS.
     """
 
     name = "descent"
@@ -108,7 +110,7 @@ class Descent(lightning.LightningModule):
         return self.add_up(loss, terms, penalties, batch)
 
     def prepare(self, batch: Batch) -> Batch:
-        """A batch as a step trains on it: with fewer links, thinned labels and moved places."""
+        """A batch as input of a step: fewer links, thinned labels, shifted places."""
         generator = seeded(self.seed, self.global_step)
         if self.links is not None and len(batch) > self.links:
             order = torch.randperm(len(batch), generator=generator)
@@ -146,9 +148,9 @@ class Descent(lightning.LightningModule):
         return total
 
     def _log_now(self, terms: dict[str, Tensor]) -> None:
-        """Logs means over processes.
+        """Logs means over processes, now.
 
-        Lightning would log after the step's callbacks, and a checkpoint written there would lack
+        Lightning would log after the step's callbacks, and a checkpoint written by them would lack
         the row.
         """
         values = torch.stack([*terms.values()]).detach()
@@ -158,7 +160,7 @@ class Descent(lightning.LightningModule):
             logger.log_metrics(row, step=self.global_step)
 
     def _diverged(self, total: Tensor, terms: dict[str, Tensor], batch: Batch) -> ValueError:
-        """The error of a step without a finite loss: the first broken quantity, and the remedy."""
+        """The error of a step with an infinite or NaN loss: first broken quantity, and advice."""
         if not is_finite(batch.labels):
             cause = "the data's labels; check the files"
         else:
@@ -189,7 +191,7 @@ class Descent(lightning.LightningModule):
 def _overridden(
     option: str, defaults: Mapping[str, float], values: Mapping[str, float]
 ) -> dict[str, float]:
-    """A model's defaults with ``values`` in their place; errors name the values' ``option``."""
+    """A model's defaults replaced by ``values``; errors name their ``option``."""
     for name, value in values.items():
         if name not in defaults:
             listed = ", ".join(sorted(defaults)) or "none"

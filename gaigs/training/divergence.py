@@ -14,7 +14,7 @@ from gaigs.model import Model
 def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
     """The name of the first quantity in a step's loss that is not finite.
 
-    The search is in this order: places, parameters, outputs of the model's parts (by hooks), the
+    The search order is: places, parameters, outputs of the model's parts (by hooks), the
     prediction, penalties, terms of the loss.
     """
     if not is_finite(batch.query.transmitters):

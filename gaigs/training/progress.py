@@ -9,14 +9,14 @@ from gaigs.training.budget import share_done
 
 
 class ProgressLine(ProgressBar):
-    """Steps, their rate, the time left, loss and validation score in one line of the first
-    process's terminal.
+    """One line in the terminal of the first process: steps, rate, time left, loss, validation
+    score.
 
-    Lightning's progress bars count the batches of an epoch, and a run counts steps.
+    Lightning's progress bars count batches of an epoch; a run counts steps.
     """
 
     def disable(self) -> None:
-        """Called by Lightning in all other processes, whose lines are hidden from the start."""
+        """Called by Lightning in all other processes; their lines are always hidden."""
 
     def on_train_start(self, trainer, module) -> None:
         self.line = stages.make_bars(disable=not trainer.is_global_zero)
@@ -36,7 +36,7 @@ class ProgressLine(ProgressBar):
         self.line.update(self.task, **self._done(trainer), scores=scores)
 
     def _done(self, trainer) -> dict:
-        """The line's fields after a step: share of the training, count and rate of steps."""
+        """Fields of the line after a step: fraction of the training, count and rate of steps."""
         step = trainer.global_step
         last = trainer.max_steps
         count = f"{step:{len(str(last))}d}/{last}" if last > 0 else f"{step} steps"

@@ -1,4 +1,4 @@
-"""Revisions: changes that a model makes to itself between two steps."""
+"""Revisions: changes of a model by itself between two steps."""
 
 import contextlib
 import functools
@@ -27,7 +27,7 @@ class _TimeUp(Exception):
 def _stopping_when_time_is_up(trainer, model: nn.Module) -> Iterator[None]:
     """Raises ``_TimeUp`` at the first call of a submodule after the training's time is up.
 
-    ``stages.is_up`` tells it to searches that call none.
+    Searches that call no submodule ask ``stages.is_up``.
     """
 
     def look(*_) -> None:
@@ -46,17 +46,17 @@ def _stopping_when_time_is_up(trainer, model: nn.Module) -> Iterator[None]:
 
 
 class Revision(Callback):
-    """Calls ``Model.revise`` after the shares of the training in ``Model.revisions``.
+    """Calls ``Model.revise`` after the fractions of the training in ``Model.revisions``.
 
-    Shares are of the training's steps or of its time, whichever comes first. If the training's time
-    ends during a revision, the model stays as before the revision. All processes choose the same
-    links by the seed, so that all decide alike.
+    A fraction is of the training's steps or of its time, whichever comes first. If the time ends
+    during a revision, the model stays as before the revision. All processes draw the same links
+    from the seed, so their decisions are equal.
 
     Args:
         links: Links with a split.
         seed: Seed of the choice of links.
-        max_links: Most training links, and validation links, of a revision: a search evaluates them
-            hundreds of times.
+        max_links: Largest number of training links, and of validation links, in a revision: a
+            search evaluates them hundreds of times.
     """
 
     def __init__(self, links: Links, seed: int, max_links: int = 48):
@@ -80,7 +80,7 @@ class Revision(Callback):
 
     @torch.no_grad()
     def _revise(self, trainer, module) -> None:
-        """Makes the revisions whose share of the training is over."""
+        """Makes the revisions whose fraction of the training is over."""
         for number, share in enumerate(module.model.revisions):
             if number in self.made or not _is_due(trainer, share):
                 continue
@@ -117,7 +117,7 @@ class Revision(Callback):
 
 
 def _is_due(trainer, share: float) -> bool:
-    """True once a share of the training is over: at its step, or from its time on."""
+    """True once a fraction of the training is over, in steps or in time."""
     if trainer.max_steps > 0 and trainer.global_step == round(share * trainer.max_steps):
         return True
     spent = time_share(trainer)

@@ -18,9 +18,9 @@ def make_optimizer(
     """An optimizer of ``torch.optim`` with a learning rate for each group.
 
     Args:
-        config: ``_target_``, a class of ``torch.optim``, and its options. A weight decay acts on
-            the group ``network`` alone: positions, scales and opacities have no reason to be small.
-            On a CPU a step is fused if the class can do it and no option says otherwise.
+        config: ``_target_``, a class of ``torch.optim``, and its options. Weight decay acts on the
+            group ``network`` only: positions, scales and opacities need not be small. On a CPU a
+            step is fused by default if the class supports it.
         groups: Parameters by name.
         rates: Learning rate of each group.
     """
@@ -50,14 +50,14 @@ def make_optimizer(
 def make_schedule(
     config: Mapping, optimizer: Optimizer, share_done: Callable[[int], float]
 ) -> LRScheduler:
-    """A schedule of all of an optimizer's rates, to be stepped once a step.
+    """A schedule of all rates of an optimizer, with one call for each step.
 
     Args:
         config: Options of ``warmup_and_decay``; or ``_target_``, a class of
             ``torch.optim.lr_scheduler``, with the options of that class.
         optimizer: The optimizer.
-        share_done: Share of the training that is done after a number of steps. Classes of torch do
-            not use it: they count steps.
+        share_done: Fraction of the training that is done after a number of steps. Classes of torch
+            count steps instead.
     """
     if "_target_" not in config:
         given = {"optimizer": optimizer, "share_done": share_done}
@@ -69,9 +69,9 @@ def make_schedule(
 def warmup_and_decay(
     optimizer: Optimizer, share_done: Callable[[int], float], warmup: int, final: float
 ) -> LRScheduler:
-    """A schedule of rates that rise linearly over ``warmup`` steps, and also fall exponentially.
+    """A schedule of rates that rise linearly over ``warmup`` steps and decay exponentially.
 
-    At the end of the training a rate is the fraction ``final`` of the optimizer's.
+    The final rate is the fraction ``final`` of the optimizer's rate.
     """
     if not 0 < final <= 1:
         raise ValueError(f"training.schedule.final must be in (0, 1], got {final}")
@@ -86,7 +86,7 @@ def warmup_and_decay(
 
 
 def _target(option: str, config: Mapping, module: ModuleType, base: type) -> tuple[type, dict]:
-    """The class that ``_target_`` names, and the other options; a ``ValueError`` for another."""
+    """The class in ``_target_``, and the other options; a ``ValueError`` for another base."""
     options = dict(config)
     target = str(options.pop("_target_", None))
     start = f"{module.__name__}."

@@ -1,4 +1,4 @@
-"""Agreement of labels with each other, by the distance of their places and order of measurement."""
+"""Agreement between labels, by the distance of their places and the order of measurement."""
 
 import logging
 from pathlib import Path

@@ -23,16 +23,16 @@ def on_split(
     baselines: list[Mapping],
     looked_up: int = 30_000_000,
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
-    """Expected metrics on the split's test links and the baselines' metrics, by row; and remarks.
+    """Expected metrics of the split's test links, the baselines' metrics, and remarks.
 
-    Each test link and its nearest known link, of the same receiver and carrier, fall into a cell of
-    ``agreement``. The scores of pairs compared in these cells are the expected ones. There are none
-    if no such cell has a pair.
+    Cells of ``agreement`` classify pairs of labels by distance and separation. Each test link forms
+    a pair with its nearest known link of the same receiver and carrier. Expected scores are the
+    scores of compared pairs in the same cells. Cells without compared pairs are skipped.
 
     Args:
         random: Draws the pairs.
         baselines: Configurations of the baselines to fit.
-        looked_up: Largest number of numbers in all labels together with which baselines are fitted.
+        looked_up: Largest number of values in all labels together for which baselines are fitted.
     """
     rows: dict[str, dict[str, float]] = {}
     remarks = []
@@ -107,12 +107,14 @@ def drawn_scores(
     random: np.random.Generator,
     fewest: int = 20_000,
 ) -> dict[str, Tensor]:
-    """Scores of random pairs by name: ``fewest`` of them, or one a test link if these are more.
+    """Scores of random pairs, by name of the score.
+
+    The number of pairs is ``fewest``, or the number of test links if larger.
 
     Args:
         cells: Cell of each test link; cells are drawn from them with replacement.
         score: Name of the score by which pairs were compared.
-        random: Draws the cells, and then a pair of each.
+        random: Draws a cell, then a pair of this cell.
     """
     numbers, counts = np.unique(random.choice(cells, max(fewest, len(cells))), return_counts=True)
     by_cell = []

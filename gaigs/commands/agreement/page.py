@@ -16,7 +16,7 @@ from gaigs.report.table import markdown
 
 
 class Cell(NamedTuple):
-    """Pairs of labels whose places, and whose numbers of measurement, are similarly far apart."""
+    """Pairs of labels with similar distances between places and similar separations in time."""
 
     # Distance of their places, from and to below [m]; 0 and 0 for one place.
     distance: tuple[float, float]
@@ -27,7 +27,7 @@ class Cell(NamedTuple):
     quantiles: tuple[float, float, float]
 
     def text(self, score: str) -> str:
-        """The cell as a table shows it: median, percentiles and number of pairs."""
+        """The cell as shown in a table: median, percentiles and number of pairs."""
         low, median, high = (_number(value, score) for value in self.quantiles)
         return f"{median} ({low} to {high}), {self.pairs:,}"
 

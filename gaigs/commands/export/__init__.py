@@ -39,26 +39,28 @@ def export(
     interval: float = 0.9,
     receiver: object = None,
 ) -> list[Path]:
-    """Writes what a model knows into a file for other programs; the suffix chooses what, and how.
+    """Writes predictions or the learnt room into a file for other programs.
+
+    The suffix of the file chooses the content and the format.
 
     Args:
         model: A fitted or loaded model.
         file: ``.tif``, ``.geojson``, ``.nc``, ``.png`` or ``.pdf`` for the radio map, with
-            deviations where the model states them; ``.csv`` or ``.nc`` for predictions at places;
-            ``.glb``, ``.gltf``, ``.obj`` or ``.xml`` (a scene of Mitsuba for Sionna RT) for the
-            learnt room; ``.deepmimo`` for the paths of mirrored channels, a folder with a scenario
-            of DeepMIMO v4.
-        places: Positions (n, 3) [m] of transmitters in predictions and scenarios, for each
-            receiver; a query; or links, whose test is predicted and written beside its labels.
+            deviations if the model has intervals; ``.csv`` or ``.nc`` for predictions at places;
+            ``.glb``, ``.gltf``, ``.obj`` or ``.xml`` (a Mitsuba scene for Sionna RT) for the learnt
+            room; ``.deepmimo`` for the paths of mirrored channels, a folder with a DeepMIMO v4
+            scenario.
+        places: Positions (n, 3) [m] of transmitters, each for all receivers; or a ``Query``; or
+            ``Links``, of which the test links are predicted and written beside their labels.
         pitch, height: Grid of a radio map [m], as for ``gaigs.radio_map``.
         frequency: Carrier of radio map, places and materials of the room [Hz]; None: the training
             links' carrier.
         interval: Probability with which the intervals of predictions hold the label.
-        receiver: A receiver in place of the model's own: a position [m], ``Pose`` or ``Receiver``,
-            as for ``Model.predict``; None: the model's own.
+        receiver: A new receiver that replaces the model's: a position [m], ``Pose`` or
+            ``Receiver``, as for ``Model.predict``; None: the model's receivers.
 
     Returns:
-        The files: the figures of many receivers, and a scene with its meshes, are several.
+        Paths of the files. A figure for each receiver, or a scene with meshes, are several.
 
     Raises:
         TypeError: The model is not a ``gaigs.Model``.
@@ -103,7 +105,7 @@ def suffixes() -> tuple[str, ...]:
 
 
 def check_suffix(file: Path) -> str:
-    """The suffix of a file to be written; a ``ValueError`` for an unknown one."""
+    """The suffix of an output file; a ``ValueError`` for an unknown one."""
     if (suffix := file.suffix.lower()) not in suffixes():
         raise ValueError(
             f"an exported file must end with one of {', '.join(suffixes())}, got {file.name!r}"
@@ -112,7 +114,7 @@ def check_suffix(file: Path) -> str:
 
 
 def run(config: dict, folder: Path) -> None:
-    """Exports from a finished run, as ``config["export"]`` says, into a folder."""
+    """Exports from a finished run into a folder, with the options of ``config["export"]``."""
     options = dict(config["export"])
     form, places = options.pop("format"), options.pop("places")
     if form is None:

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 def layers(floor: RadioMap) -> dict[str, RadioMap]:
-    """Maps of the ``value`` and, if the model states them, of the ``deviation``."""
+    """Maps of the ``value`` and, if the model has intervals, of the ``deviation``."""
     kinds = {"value": floor}
     if floor.deviations is not None:
         kinds["deviation"] = deviation_map(floor)
@@ -42,7 +42,7 @@ def title(floor: RadioMap) -> str:
 
 
 def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
-    """Writes a GeoTIFF with a band of value and deviation for each receiver, north up.
+    """Writes a GeoTIFF, north up, with two bands for each receiver: value and deviation.
 
     Coordinates are in the frame's projected system.
 
@@ -84,8 +84,8 @@ def write_geotiff(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 def write_geojson(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
     """Writes a GeoJSON point for each place, with value and deviation at each receiver.
 
-    Keys for a receiver ``ap`` are ``ap`` and ``ap deviation``; if another receiver has such a name,
-    they are ``ap value`` and ``ap deviation``.
+    Keys of a receiver ``ap`` are ``ap`` and ``ap deviation``. If another receiver has one of these
+    names, the first key is ``ap value``.
 
     Source: RFC 7946: longitudes and latitudes of WGS 84. Without a frame, coordinates are metres.
     """
@@ -168,7 +168,7 @@ def write_figures(file: Path, floor: RadioMap, scene: Scene) -> list[Path]:
 
 
 def axes_on_map(file: Path, floor: RadioMap, frame: Frame | None) -> tuple[ndarray, ndarray]:
-    """Coordinates x and y of the map's places [m], in the system of the frame or the data's own."""
+    """Coordinates x and y of the map's places [m], in the frame's system or the data's."""
     if frame is None:
         log.warning("%s has no coordinate system: x and y are metres in the data's own frame", file)
         return floor.x, floor.y

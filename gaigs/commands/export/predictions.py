@@ -32,7 +32,7 @@ class Labels(NamedTuple):
     query: Query
     task: Task  # task of the values; of held-out subcarriers their own
     measured: Tensor | None  # labels of links' test; None for places
-    subcarriers: Tensor | None  # held-out subcarriers [Hz]; None without any
+    subcarriers: Tensor | None  # held-out subcarriers [Hz]; None if there are none
 
 
 def write_predictions(
@@ -41,11 +41,11 @@ def write_predictions(
     """Writes predictions with their deviations and intervals, ``.csv`` or ``.nc``.
 
     Args:
-        places: Positions (n, 3) [m], from which each receiver hears; a query; or links, whose test
-            is predicted and written beside its labels.
-        frequency: Carrier of positions [Hz]; None: the only known one.
-        interval: Probability with which an interval holds the label. A model without intervals
-            gives values alone.
+        places: Positions (n, 3) [m] of transmitters, each for all receivers; or a ``Query``; or
+            ``Links``, of which the test links are predicted and written beside their labels.
+        frequency: Carrier for positions [Hz]; None: the only known one.
+        interval: Probability with which an interval holds the label. Files of a model without
+            intervals have no deviations and intervals.
     """
     scene = model.scene
     query, task, measured, subcarriers = _to_predict(scene, places, frequency)
@@ -85,7 +85,7 @@ def write_predictions(
 
 
 def _to_predict(scene: Scene, places: object, frequency: float | None) -> Labels:
-    """What to predict at ``places``; if they are links, their test at any held-out subcarriers."""
+    """The links to predict at ``places``; of ``Links`` the test links, at held-out subcarriers."""
     query = query_of("predictions", scene, places, frequency)
     if not isinstance(places, Links):
         return Labels(query, scene.task, None, None)
@@ -97,7 +97,7 @@ def _to_predict(scene: Scene, places: object, frequency: float | None) -> Labels
 
 
 def _blank(part: Tensor | None, absent: Bool[Tensor, " n *shape"]) -> Tensor | None:
-    """Channels with NaN at elements that a receiver's array lacks; numbers of links as they are."""
+    """Channels with NaN at missing elements of an array; other labels unchanged."""
     if part is None or part.ndim < 3:
         return part
     return part.cpu().masked_fill(absent, math.nan)
@@ -130,10 +130,10 @@ def tabulate(
 ) -> dict[str, Variable]:
     """The variables of a file of predictions, by name.
 
-    Places, receivers and carriers have a number for each link (n,). Each axis of the labels is a
-    variable of its own, such as ``subcarrier``. Values, deviations, bounds of intervals, radii of
-    complex intervals, and ``measured`` labels have the links and these axes; complex ones are two
-    variables, ``_real`` and ``_imag``.
+    Places, receivers and carriers have one entry a link (n,). Each axis of a label is a variable,
+    such as ``subcarrier``. The axes of the links and of a label are the axes of all other
+    variables: values, deviations, bounds of intervals, radii of complex intervals, and ``measured``
+    labels. A complex variable is stored as two, ``_real`` and ``_imag``.
     """
     axes = {}
     for name, axis in task.axes().items():
@@ -214,5 +214,5 @@ def _rows(
 
 
 def _shown(value: Any, digits: int = 7) -> str:
-    """A text as it is, and a number with so many digits."""
+    """A text unchanged, or a number with ``digits`` digits."""
     return value if isinstance(value, str) else f"{value:.{digits}g}"

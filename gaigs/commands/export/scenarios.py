@@ -29,8 +29,8 @@ def write_scenario(
 ) -> list[Path]:
     """Writes the paths of mirrored channels from places to all receivers, without kriging.
 
-    The receivers become the scenario's base stations, and ``places`` its users; they are given as
-    for ``gaigs.commands.export.predictions.write_predictions``. The folder is missing or empty.
+    Receivers become the scenario's base stations, and ``places`` its users. Arguments are as for
+    ``gaigs.commands.export.predictions.write_predictions``. The folder must be missing or empty.
     """
     mirrored = mirrored_of("a scenario", model)
     if not mirrored.has_margins:

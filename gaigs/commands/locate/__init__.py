@@ -1,6 +1,6 @@
-"""Localisation: where a transmitter is, by what the receivers receive of its transmissions.
+"""Localisation: places of transmitters from the labels of all receivers.
 
-A fingerprint holds what all receivers received of one transmission.
+A fingerprint holds the labels of one transmission at all receivers.
 """
 
 from gaigs.commands.locate.command import run

@@ -16,7 +16,7 @@ from gaigs.kriging.links import distances, folds_of
 
 
 class Candidates(NamedTuple):
-    """Candidate places, before anything is received."""
+    """Candidate places and their prior."""
 
     places: Float[Tensor, "g 3"]  # [m]
     prior: Float[Tensor, " g"]  # logarithm of each candidate's probability
@@ -38,7 +38,7 @@ def even_candidates(
 
 @dataclass(frozen=True)
 class PlaceDensity:
-    """Prior density of transmitters: normal about each known place, and even in their box."""
+    """Prior density of transmitters: normal about each known place, plus uniform in their box."""
 
     places: Float[Tensor, "k 3"]  # known places [m]
     folds: Int[Tensor, " k"]  # fold of each of them
@@ -62,8 +62,8 @@ class PlaceDensity:
 
         Args:
             width: Standard deviation of the normal density about each known place [m].
-            folds: Fold of each of ``places``, if they are known ones: the known places of the same
-                fold do not count. None: all count.
+            folds: Fold of each of ``places``, if they are known places. Known places of the same
+                fold are then excluded. None: all known places count.
         """
         axes = self.has_extent
         squares = distances(places[:, axes], self.places[:, axes]).square_()  # (g, k)
@@ -80,11 +80,11 @@ class PlaceDensity:
         return torch.logaddexp(near, (self.elsewhere / volume).log())
 
     def likeliest_width(self, spacing: float, most: int = 1000, tried: int = 24) -> float:
-        """The width [m] under which known places have the highest density, given the other folds.
+        """The width [m] with the highest likelihood of known places, each given the other folds.
 
         Args:
             spacing: Median distance from a known place to the next [m].
-            most: Largest number of places whose density counts.
+            most: Largest number of places in the likelihood.
             tried: Number of widths, from a quarter of the spacing to the diagonal of the box.
         """
         rows = evenly(torch.arange(len(self.places)), most)
@@ -107,13 +107,14 @@ def near_candidates(
     links: Links,
     known: Int[Tensor, " k"],
 ) -> Candidates:
-    """Candidates of the prior ``PlaceDensity``: a quarter on a grid, the others near known places.
+    """Candidates drawn from the prior ``PlaceDensity``: a quarter on a grid, the others near known
+    places.
 
     Args:
         box: Corners of the box of the grid [m].
         points: Number of candidates.
-        floors: Heights of separate floors [m]; empty for one.
-        known: Known links, whose transmitters are the known places.
+        floors: Heights of separate floors [m]; empty for a single floor.
+        known: Numbers of the known links, whose transmitters are the known places.
     """
     places, which = links.query.transmitters[known].double().unique(dim=0, return_inverse=True)
     folds = torch.zeros(len(places), dtype=torch.long)

@@ -25,9 +25,10 @@ from gaigs.runs import links_of, load
 
 
 def run(config: dict, folder: Path) -> None:
-    """Locates the transmitters of a file of received values, or of a finished run's test.
+    """Locates the transmitters of a file of received values, or a finished run's test transmitters.
 
-    Writes ``locate.csv``, ``locate.png`` and, for a test, ``locate.json`` into a folder.
+    Writes ``locate.csv`` and ``locate.png`` into a folder, for test transmitters also
+    ``locate.json``.
     """
     model = load(config["folder"], config["trust"])
     links = links_of(config["folder"], config["trust"])
@@ -61,7 +62,7 @@ def run(config: dict, folder: Path) -> None:
 def locate_test(
     prints: Fingerprints, links: Links, options: Mapping, folder: Path, map_seconds: float
 ) -> Location:
-    """Locates the test transmitters of a run, beside their nearest neighbours."""
+    """Locates the test transmitters of a run, by predictions and by nearest neighbours."""
     test = at_carrier(links, prints.frequency, "test")
     if not len(test):
         raise ValueError(
@@ -119,9 +120,8 @@ def summary(
 ) -> dict[str, Any]:
     """Scores of located test transmitters by the name of the estimate, for ``locate.json``.
 
-    There are the median and mean error of each estimate [m]; the mean place goes by the name
-    ``locate``, with the share of transmitters inside their regions and the mean prior probability
-    of a region.
+    Each estimate has its median and mean error [m]. The mean place is named ``locate``. It also has
+    the fraction of transmitters inside their regions, and the mean prior probability of a region.
 
     Args:
         errors: Errors by the estimate's name, such as ``median`` or ``knn`` [m].

@@ -48,7 +48,7 @@ class Cells(NamedTuple):
 
 
 def posterior_figure(location: Location, level: float | None = None) -> Figure:
-    """Where the transmitters are from above: the probability of cells."""
+    """Map of the transmitters from above: the probability of cells."""
     with rc_context(style.STYLE):
         drawn = style.new_figure(0.6 * style.PAGE, 0.66 * style.PAGE, "compressed")
         axis = drawn.subplots()
@@ -62,7 +62,7 @@ def posterior_figure(location: Location, level: float | None = None) -> Figure:
 
 
 def draw_posterior(axis: Axes, location: Location, label: str) -> None:
-    """Draws the probability of cells; a single transmission also gets its region with ``label``."""
+    """Draws the probability of cells; for a single transmission also its region with ``label``."""
     cells = Cells.around(location.places[:, :2].double().numpy())
     # Smooth over neighbouring cells: they hold different numbers of candidates.
     chances = gaussian_filter(cells.sums(location.probabilities.mean(0).double().numpy()), 1)
@@ -77,7 +77,7 @@ def draw_posterior(axis: Axes, location: Location, label: str) -> None:
 
 
 def plot_location(result: Location, ax: Any = None) -> Any:
-    """Draws where the transmitters are from above, on ``ax`` or in a figure of its own."""
+    """Draws a map of the transmitters from above, on ``ax`` or in a new figure."""
     if ax is None:
         return posterior_figure(result).axes[:1]
     draw_posterior(ax, result, "region")
@@ -102,14 +102,14 @@ def error_figure(
     errors: Mapping[str, Float[Tensor, " n"]],
     most: int = 150,
 ) -> Figure:
-    """Transmitters from above with their estimates, and the shares of errors below a distance.
+    """Map of transmitters and their estimates, and cumulative distribution of errors.
 
     Args:
         truth: Places of the transmitters [m].
-        mean: Estimates of them [m].
+        mean: Estimated mean places [m].
         known: Known places [m].
-        errors: Errors by the names of the estimates, with "mean" and "knn" [m].
-        most: Largest number of transmitters from above.
+        errors: Errors by name of the estimate, with "mean" and "knn" [m].
+        most: Largest number of transmitters on the map.
     """
     with rc_context(style.STYLE):
         drawn = style.new_figure(style.PAGE, 0.52 * style.PAGE, "compressed")

@@ -1,4 +1,4 @@
-"""Fingerprints: what all receivers receive of a transmission, by which places are compared."""
+"""Fingerprints: labels of a transmission at all receivers, which identify its place."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from gaigs.split import rows_of
 
 
 class LocatedFold(NamedTuple):
-    """Held-out fingerprints of a fold, located in the map of a model that does not know them."""
+    """Held-out fingerprints of a fold, located in the map of a model trained without them."""
 
     candidates: Candidates  # candidates of this map
     # Log likelihoods at them, with known and with unknown power. Their degrees and temper are
@@ -30,22 +30,22 @@ class LocatedFold(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Fingerprints:
-    """The map of ``locate``: fingerprints that a model predicts at candidate places.
+    """The map of ``locate``: predicted fingerprints at candidate places.
 
-    ``locate`` compares received fingerprints with these.
+    ``locate`` compares received fingerprints with the predictions.
 
     Attributes:
         task: Task of the labels.
         frequency: Carrier [Hz]; None if unknown.
         receivers: Names of the r receivers.
-        candidates: The g places of the predictions.
-        axes: Axes (m, k) along which the errors of a label's m numbers are independent and of the
-            same size.
+        candidates: The g places of the predictions, with their prior.
+        axes: Axes (m, k) along which the errors of a label's m numbers are independent, with equal
+            variances.
         values: Predictions at the candidates along these axes (g, r, k).
-        deviations: Standard deviations of labels of one number (g, r); else 1.
+        deviations: Standard deviations of scalar labels (g, r); 1 for other labels.
         reception_probabilities: Probability that each receiver receives a transmission from each
-            candidate (g, r); without links a half.
-        degrees, temper: Degrees of freedom and power of Student's t in ``log_likelihood``.
+            candidate (g, r); 0.5 without links.
+        degrees, temper: Degrees of freedom and exponent of Student's t in ``log_likelihood``.
         held: Held-out fingerprints of each fold, which calibrate regions; empty without links.
         frame: Place of x and y on a map; None if unknown.
 
@@ -83,8 +83,8 @@ class Fingerprints:
     def drops(self, unknown_power: bool = False, step: float | None = None) -> Float[Tensor, " h"]:
         """Log ratios of the highest posterior density to the density at the true place, ascending.
 
-        There is one for each held-out fingerprint. With a ``step`` [m] they are sorted into a
-        ``walk`` and located as a track. Results are cached, as a track takes long.
+        Each held-out fingerprint gives one ratio. With a ``step`` [m] the fingerprints are sorted
+        into a ``walk`` and located as a track. Results are cached, since a track takes long.
         """
         if (unknown_power, step) not in self._drops:
             drops = [torch.zeros(0, dtype=torch.float64)]
@@ -112,7 +112,7 @@ class Transmissions(NamedTuple):
 
 
 def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor, " k"]:
-    """Links of some parts of the split at a carrier [Hz]."""
+    """Links at a carrier [Hz], of some parts of the split."""
     index = torch.cat([getattr(links.split, part) for part in parts])
     if frequency is None or links.query.frequencies is None:
         return index
@@ -120,7 +120,7 @@ def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor
 
 
 def transmissions(links: Links, index: Int[Tensor, " k"]) -> Transmissions:
-    """The transmissions that links belong to, with the labels of these links alone."""
+    """The transmissions of some links, with the labels of these links only."""
     rows, which = rows_of(links)[index].unique(return_inverse=True)
     labels = torch.cat([links.task.fingerprint(links.labels[part]) for part in index.split(256)])
     values = labels.new_full((len(rows), len(links.receivers), labels.shape[1]), math.nan)
@@ -133,7 +133,7 @@ def transmissions(links: Links, index: Int[Tensor, " k"]) -> Transmissions:
 def receptions(
     links: Links, index: Int[Tensor, " k"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n r"]]:
-    """Places of the transmissions that links belong to [m]; and 1 for each receiver with a link."""
+    """Places of the transmissions of some links [m], and 1 for each receiver with a link."""
     rows, which = rows_of(links)[index].unique(return_inverse=True)
     places = torch.zeros(len(rows), 3)
     places[which] = links.query.transmitters[index]

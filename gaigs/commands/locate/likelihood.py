@@ -16,8 +16,8 @@ from gaigs.core.query import ROUNDING, evenly
 def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor, "m k"]:
     """Axes along which errors of a label's numbers are independent.
 
-    Along these axes the squares of a label's errors sum to 1 on average. At most ``most`` labels
-    are used, chosen at even steps.
+    Squared errors of a label along these axes sum to 1 on average. At most ``most`` labels are
+    used, at even steps.
 
     Source: Ledoit and Wolf, A well-conditioned estimator for large-dimensional covariance matrices,
     2004.
@@ -41,7 +41,7 @@ class Mismatch(NamedTuple):
 
     squares: Float[Tensor, "n g"]  # sum of squared errors over squared deviations
     log_deviations: Float[Tensor, "n g"]  # sum of the logarithms of the deviations
-    counts: Float[Tensor, " n"]  # number of receivers that tell of the place
+    counts: Float[Tensor, " n"]  # number of receivers that give evidence of the place
     # Logarithm of the probability that these receivers receive the value and no other does; 0 for
     # unknown power.
     reception: Float[Tensor, "n g"]
@@ -57,8 +57,8 @@ def mismatch(
         received: Fingerprints of n transmissions along ``prints.axes``; NaN where a receiver has
             received nothing.
         unknown_power: True if the power of each transmission is unknown. The error is then the
-            least over all offsets of its levels, or over all factors of the predicted spectra or
-            channels. Who receives the transmission then tells nothing of its place.
+            minimum over a common offset of the levels, or a common factor of predicted spectra or
+            channels. Reception is then not used.
     """
     is_received = ~received[..., 0].isnan()  # (n, r)
     if prints.task.shape:
@@ -84,7 +84,7 @@ def _level_squares(
     is_received: Bool[Tensor, "n r"],
     unknown_power: bool,
 ) -> tuple[Float[Tensor, "n g"], Float[Tensor, "n g"]]:
-    """``Mismatch.squares`` and ``Mismatch.log_deviations`` of labels of one number."""
+    """``Mismatch.squares`` and ``Mismatch.log_deviations`` of scalar labels."""
     total = torch.zeros(len(received), len(prints.values))
     log_deviations = torch.zeros_like(total)
     errors_sum = torch.zeros_like(total)
@@ -132,13 +132,14 @@ def _array_squares(
 
 
 def log_likelihood(difference: Mismatch, freedom: float, temper: float) -> Float[Tensor, "n g"]:
-    """Log likelihood of candidates: Student's t of all receivers together, and their reception.
+    """Log likelihood of candidates: Student's t over all receivers, plus the log probability of
+    reception.
 
     Args:
         difference: Errors of the received fingerprints.
-        freedom: Degrees of freedom. The fewer there are, the less a large error counts.
-        temper: Power of Student's t. It is below 1 where receivers' errors are correlated: their
-            evidence counts less than independent errors would.
+        freedom: Degrees of freedom. With fewer of them a large error counts less.
+        temper: Exponent of Student's t, below 1 if the errors of receivers are correlated: together
+            they are less evidence than independent errors.
     """
     exponent = (freedom + difference.counts[:, None]) / 2
     together = exponent * torch.log1p(difference.squares / freedom) + difference.log_deviations
@@ -146,7 +147,7 @@ def log_likelihood(difference: Mismatch, freedom: float, temper: float) -> Float
 
 
 class UnseenPrints(NamedTuple):
-    """Held-out fingerprints, compared with the map of a model that does not know them."""
+    """Held-out fingerprints, compared with the map of a model trained without them."""
 
     prints: Fingerprints  # the map
     differences: Sequence[Mismatch]  # with known and with unknown power
@@ -180,19 +181,19 @@ def choose_likelihood(
     half_octaves: Iterable[int] = range(-8, 17),
     fewest: int = 20,
 ) -> Fingerprints:
-    """The map with the degrees of freedom and the temper of the least energy score.
+    """The map with the degrees of freedom and the exponent of the lowest energy score.
 
-    The fingerprints in ``held``, which calibrate regions, must have no part in this choice. So in
-    each fold their likelihoods are those that the other folds choose.
+    The fingerprints in ``held`` calibrate regions, so they must not influence their own likelihood.
+    The likelihood of each fold is therefore chosen by the other folds.
 
     Args:
         prints: The map of the model that knows all training links.
         trials: Held-out fingerprints of each fold.
         freedoms: Degrees of freedom to choose from, the heaviest tails first.
-        half_octaves: Integers i; the tempers to choose from are 2^(i / 2).
-        fewest: Number of fingerprints below which the degrees of freedom are not chosen: so few
-            hardly show whether one of twenty is an outlier. Levels then keep the likelihood of
-            ``prints``, and other labels take the heaviest tails.
+        half_octaves: Integers i; the exponents to choose from are 2^(i / 2).
+        fewest: Smallest number of fingerprints that choose the degrees of freedom: fewer rarely
+            contain an outlier. With fewer, levels keep the likelihood of ``prints``, and other
+            labels take the heaviest tails.
     """
     tempers = [2.0 ** (power / 2) for power in half_octaves]
     if sum(len(trial.truth) for trial in trials) >= fewest:

@@ -16,19 +16,19 @@ from gaigs.kriging.links import distances
 
 @dataclass(frozen=True, repr=False)
 class Location:
-    """Where transmitters may be, from ``locate``.
+    """Posterior of the places of transmitters, from ``locate``.
 
     Attributes:
         places: Candidate places (g, 3) [m].
         probabilities: Probability of each candidate for each transmission (n, g).
-        mean: Mean place by these probabilities (n, 3) [m].
+        mean: Posterior mean (n, 3) [m].
         median: Place with the least expected distance from the transmitter (n, 3) [m].
-        likeliest: Candidate of the highest density (n, 3) [m].
+        likeliest: Candidate with the highest posterior density (n, 3) [m].
         region: True for candidates in the region that holds the transmitter with probability
             ``level`` of ``locate`` (n, g).
         sizes: Prior probability of each region (n,), a measure of its size.
-        calibrated: True if held-out fingerprints set the size of regions; else the posterior does,
-            and regions are often too small.
+        calibrated: True if held-out fingerprints set the size of regions. Otherwise the posterior
+            sets it, and regions are often too small.
         frame: Place of x and y on a map; None if unknown.
 
     Example:
@@ -69,8 +69,8 @@ class Location:
     def save(self, path: str | Path) -> None:
         """Writes a CSV table with a row for each transmission.
 
-        Columns are the mean, median and likeliest place [m], with a ``frame`` also their eastings
-        and northings, and ``region_share``, the prior probability of the region.
+        Columns are the mean, median and likeliest place [m], and ``region_share``, the prior
+        probability of the region. With a ``frame`` the table also has eastings and northings.
         """
         write_columns(path, self.columns())
 
@@ -87,7 +87,7 @@ class Location:
 
 
 def joined(parts: Sequence[Location]) -> Location:
-    """The transmissions of several locations of the same candidates, one after another."""
+    """Several locations of the same candidates joined into one."""
     fields = {}
     for name in ("probabilities", "mean", "median", "likeliest", "region", "sizes"):
         fields[name] = torch.cat([getattr(part, name) for part in parts])

@@ -1,4 +1,4 @@
-"""The nearest known fingerprints: the yardstick of ``locate``."""
+"""The nearest known fingerprints: the baseline of ``locate``."""
 
 import torch
 from jaxtyping import Float, Int
@@ -9,7 +9,7 @@ from gaigs.model.knn import COUNTS
 
 
 def without_power(values: Float[Tensor, "n r m"]) -> Float[Tensor, "n r m"]:
-    """Fingerprints less their mean level, or over their norm, across receivers."""
+    """Fingerprints minus their mean level, or divided by their norm, over all receivers."""
     if values.shape[2] == 1:
         return values - values.nanmean(1, keepdim=True)
     norms = values.nan_to_num(0).flatten(1).norm(dim=1)
@@ -23,14 +23,15 @@ def neighbours(
     groups: Int[Tensor, " k"],
     most: int = 500,
 ) -> Float[Tensor, "n 3"]:
-    """Places of fingerprints: means of known places, weighted by 1 / distance of fingerprints.
+    """Places of fingerprints by their nearest known fingerprints.
 
-    The known places are those of the nearest fingerprints. Their number is the member of ``COUNTS``
-    with the least mean error at known transmissions, each located without its own group.
+    A place is the mean of known places, weighted by 1 / distance between fingerprints. The number
+    of neighbours is the one in ``COUNTS`` with the lowest mean error of known transmissions, each
+    located without its own group.
 
     Args:
-        values: Fingerprints to locate. Where a receiver has received nothing, the least known level
-            stands in, or 0 for labels of several numbers.
+        values: Fingerprints to locate. The lowest known level replaces missing levels; 0 replaces
+            missing labels of several numbers.
         known: Fingerprints at the known ``places`` [m].
         groups: Group of each known fingerprint, such as its place.
         most: Largest number of known transmissions that choose the number of neighbours.
@@ -55,7 +56,7 @@ def weighted_mean(
     """Means of the ``count`` nearest places, weighted by 1 / distance.
 
     Args:
-        apart: Distance of each of n fingerprints from the fingerprint at each of k places.
+        apart: Distances of n fingerprints from the fingerprints at k places.
     """
     nearest = apart.topk(min(count, apart.shape[1]), largest=False)
     weights = 1 / nearest.values.clamp_min(1e-6)

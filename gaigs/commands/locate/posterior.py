@@ -1,4 +1,4 @@
-"""The posterior over candidate places, and the places and regions that it gives."""
+"""The posterior over candidate places, and places and regions from it."""
 
 import math
 import warnings
@@ -37,29 +37,31 @@ def locate(
     *,
     progress: bool = True,
 ) -> Location:
-    """Places where transmitters may be, by what the receivers receive of them.
+    """Places where transmitters may be, from their labels at the receivers.
 
     Args:
-        model: A model with intervals; or its ``fingerprints``, with which a transmission takes a
+        model: A model with intervals, or its ``fingerprints``. With these a transmission takes a
             few milliseconds.
-        value: A label of each of r receivers (r, *shape), or of n transmissions (n, r, *shape), in
+        value: A label for each of r receivers (r, *shape), or of n transmissions (n, r, *shape), in
             the unit of the training labels; with one receiver also (*shape) or (n, *shape). A
-            mapping gives labels (*shape) or (n, *shape) by the receivers' names. A receiver has
-            received nothing where its label is NaN, or zero in a channel, or its name is missing.
-            In a track all receivers may have missed a transmission.
+            mapping gives labels (*shape) or (n, *shape) by receiver name. A receiver has received
+            nothing if its label is NaN, a channel of zeros, or missing in the mapping. Only in a
+            track may all receivers have missed a transmission.
         links, region: As for ``fingerprints``.
-        unknown_power: True if all labels of a transmission share an unknown offset [dB], or factor
-            of amplitudes. Channels are always compared without their power and phase.
-        step: Standard deviation of a transmitter's move along each axis from one transmission to
-            the next [m], if they are a track; None: they are independent.
-        level: Probability with which the region holds the transmitter. Held-out fingerprints set
-            the region, with ``step`` those of a walk among their places; a level of 0.9 takes 9 of
-            them. With fewer, or without links, the posterior sets it, often too small.
-        progress: False for no bars.
+        unknown_power: True if the power of each transmission is unknown: its labels share an offset
+            [dB] or a factor of amplitudes. Channels are always compared without their power and
+            phase.
+        step: Standard deviation of the move along each axis between transmissions of a track [m];
+            None: transmissions are independent.
+        level: Probability with which the region holds the transmitter. Held-out fingerprints
+            calibrate the region, with ``step`` as a walk among their places. A level of 0.9 needs 9
+            of them. With fewer, or without links, the posterior sets the region, which is often too
+            small.
+        progress: False hides progress bars.
 
     Raises:
         ValueError: ``value`` has another shape than the labels, all receivers have missed a
-            transmission that is no part of a track, or an option is impossible.
+            transmission outside a track, or an option is impossible.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -96,11 +98,12 @@ def locate(
 def excess_of(
     values: Float[Tensor, "n r 1"], prints: Fingerprints, deviations: float = 5.0
 ) -> float | None:
-    """How far received levels lie outside the range of all predictions, at most; None if plausible.
+    """Largest distance of received levels from the range of all predictions; None if plausible.
 
     Args:
-        values: Levels of n transmissions at r receivers, in the label's unit, as the result.
-        deviations: Largest plausible excess, in standard deviations of the predictions; half the
+        values: Levels of n transmissions at r receivers, in the label's unit. The result has this
+            unit.
+        deviations: Largest plausible distance, in standard deviations of the predictions. Half the
             range of the predictions is plausible, too.
     """
     lowest, highest = prints.values.aminmax()
@@ -118,7 +121,7 @@ def posterior(
 ) -> Location:
     """The location of fingerprints ``values``, by the options of ``locate``.
 
-    Each of n transmissions has m numbers a receiver, by ``Task.fingerprint``.
+    Each of the n transmissions has m numbers a receiver, from ``Task.fingerprint``.
 
     Raises:
         ValueError: ``level`` or ``step`` is out of range.
@@ -148,10 +151,10 @@ def posterior(
 def conformal_drop(
     prints: Fingerprints, unknown_power: bool, step: float | None, level: float
 ) -> Float[Tensor, ""] | None:
-    """How far below its maximum the log density is at the edge of a region.
+    """Drop of the log density from its maximum to the edge of a region.
 
-    A region has all candidates that are denser than its edge. With this drop it holds the
-    transmitter with probability ``level``, as held-out fingerprints show; None without these.
+    A region has all candidates within this drop. Held-out fingerprints show which drop holds the
+    transmitter with probability ``level``. None without held-out fingerprints.
     """
     drops = prints.drops(unknown_power, step)
     count = prints.held_out_count
@@ -174,8 +177,9 @@ def located(
     Args:
         logarithms: Logarithms of the posteriors, up to a constant for each transmission.
         level: Probability with which a region holds the transmitter.
-        drop: Edge of the regions, from ``conformal_drop``; None: the posterior sets it.
-        is_calibrated: True if the drop alone sets a region; else the posterior may widen it.
+        drop: Drop of the log density to the edge of a region, from ``conformal_drop``; None: the
+            posterior sets the edge.
+        is_calibrated: True if the drop alone sets a region; otherwise the posterior may enlarge it.
     """
     places = candidates.places
     probabilities = torch.softmax(logarithms, 1)
@@ -208,11 +212,11 @@ def geometric_median(
     tolerance: float = 1e-3,
     steps: int = 100,
 ) -> Float[Tensor, "n 3"]:
-    """Places with the least mean distance from the candidates, for each row of probabilities.
+    """Places with the lowest mean distance from the candidates, for each row of probabilities.
 
     Args:
-        tolerance: Largest last change of a coordinate, and least distance that counts: a candidate
-            may be the place itself [m].
+        tolerance: Largest change of a coordinate in the last step [m]. Smaller distances count as
+            this distance, since a candidate may coincide with the median.
 
     Source: Weiszfeld, Sur le point pour lequel la somme des distances de n points donnés est
     minimum, 1937.

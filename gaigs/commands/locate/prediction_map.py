@@ -1,4 +1,4 @@
-"""The map of a model's predictions, with which ``locate`` compares what was received."""
+"""The map of a model's predictions, which ``locate`` compares with received labels."""
 
 import time
 import warnings
@@ -40,21 +40,23 @@ def fingerprints(
     *,
     progress: bool = True,
 ) -> Fingerprints:
-    """The map of predictions with which ``locate`` compares; one serves many transmissions.
+    """The map of predictions that ``locate`` compares with received labels.
+
+    One map serves many transmissions.
 
     Args:
-        model: Trained, fitted or loaded, with intervals.
-        links: Links that the model was trained on. Transmitters are then likely where known ones
-            are dense, and held-out ones set the width of the likelihood and the size of regions.
-            None: all places are equally likely, and the errors of a label's numbers count as
-            independent, which makes regions too small.
+        model: A trained, fitted or loaded model with intervals.
+        links: Links that the model was trained on. Transmitters are then likely where known places
+            are dense. Held-out links calibrate the likelihood and the size of regions. None: all
+            places are equally likely, and errors of a label's numbers count as independent, which
+            makes regions too small.
         region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m] in which all places are equally
             likely; None: the box of the training transmitters.
-        frequency: Carrier [Hz], one of the training links' unless there is a ``region``; None: that
-            of the training links, or the middle one of several.
-        points: Number of candidate places; None: 20,000, fewer where the model takes more than a
-            minute for them.
-        progress: False for no bars.
+        frequency: Carrier [Hz]. Without a ``region`` it must be a carrier of the training links.
+            None: their carrier; of several the middle one.
+        points: Number of candidate places. None: 20,000, or as many as the model predicts in a
+            minute.
+        progress: False hides progress bars.
 
     Raises:
         ValueError: The model has no intervals, or an option is impossible.
@@ -95,7 +97,7 @@ def fingerprints(
 
 
 def box_of(model: Model, region: object) -> Float[Tensor, "2 3"]:
-    """Corners of a region [m]; without one, of the box of the training transmitters."""
+    """Corners of a region [m]; without a region, of the box of the training transmitters."""
     if region is None:
         return torch.stack((model.scene.lower, model.scene.upper))
     box = as_positions("region", region).reshape(-1, 3)
@@ -114,7 +116,7 @@ def affordable_points(
     fewest: int = 1000,
     seconds: float = 60.0,
 ) -> int:
-    """Number of candidate places, ``fewest`` to ``most``, that a model predicts in ``seconds``."""
+    """Number of candidate places, ``fewest`` to ``most``, that take a model ``seconds``."""
     places = even_places(box[0], box[1], 512)
     predicted(model, places[:2], frequency)  # the first prediction compiles and loads
     start = time.perf_counter()
@@ -158,7 +160,7 @@ def predicted(model: Model, places: Float[Tensor, "g 3"], frequency: float | Non
 
 @dataclass(frozen=True)
 class MapMaker:
-    """Makes maps of models that know all or some of the same links."""
+    """Makes maps of models trained on all or on some of the links."""
 
     box: Float[Tensor, "2 3"]  # corners of the box of the candidates [m]
     is_region: bool  # True if all places in the box are equally likely
@@ -167,7 +169,7 @@ class MapMaker:
     links: Links | None = None  # links with a split; None for a map of the model alone
 
     def make(self, model: Model, known: Int[Tensor, " k"]) -> Fingerprints:
-        """The map of a model that knows some links; its axes are the numbers of a label."""
+        """The map of a model that was trained on ``known`` links; axes are the label's numbers."""
         scene = model.scene
         if self.is_region:
             candidates = even_candidates(self.box, self.points)
@@ -193,9 +195,9 @@ class MapMaker:
         )
 
     def has_whole_transmissions(self) -> bool:
-        """True if no transmission of a known link has a link in the test.
+        """True if no transmission has both known links and test links.
 
-        Then a receiver without a known link of a transmission has not received this transmission.
+        A missing link then means that the receiver has not received the transmission.
         """
         rows = rows_of(self.links)
         known = rows[at_carrier(self.links, self.frequency, "train", "validation")]
@@ -217,7 +219,7 @@ class PrintFold(NamedTuple):
     errors: Float[Tensor, "k r m"]
 
     def half(self, number: int) -> "PrintFold":
-        """Every second fingerprint, from the first (0) or the second (1) on."""
+        """Every second fingerprint, starting with the first (0) or the second (1)."""
         return PrintFold(self.prints, *(part[number::2] for part in self[1:]))
 
 
@@ -229,9 +231,9 @@ def held_out_folds(
     located: int = 200,  # largest number of them that are located
     enough: int = 300,  # number of located fingerprints after which no fold is added
 ) -> list[PrintFold]:
-    """Held-out fingerprints by fold, each with the map of a model that does not know them.
+    """Held-out fingerprints by fold, each with the map of a model trained without them.
 
-    A single fold is divided in two, so that each half can calibrate the other.
+    A single fold is halved, so that each half calibrates the other.
     """
     links = maker.links
     folds: list[PrintFold] = []
@@ -271,11 +273,11 @@ def trials_of(folds: Sequence[PrintFold], most: int = 200) -> list[UnseenPrints]
 
 
 def along(prints: Fingerprints, errors: Sequence[Float[Tensor, "_ r m"]]) -> Fingerprints:
-    """The map with its predictions along axes on which errors of a label's numbers are independent.
+    """The map with predictions along axes on which errors of a label's numbers are independent.
 
     Args:
-        errors: Errors of held-out fingerprints by fold, NaN where nothing was received. Without
-            any, the deviations of the predictions from their mean stand in for errors.
+        errors: Errors of held-out fingerprints by fold, NaN where nothing was received. If empty,
+            the deviations of predictions from their mean replace errors.
     """
     if not prints.task.shape:
         return replace(prints, axes=torch.eye(1))

@@ -1,4 +1,4 @@
-"""Tracks: places of consecutive transmissions, between which a transmitter moves little."""
+"""Tracks: places of consecutive transmissions of a slowly moving transmitter."""
 
 import itertools
 import math
@@ -12,11 +12,11 @@ from gaigs.kriging.links import distances
 
 
 def walk(places: Float[Tensor, "n 3"], step: float, most: int = 10) -> Int[Tensor, " k"]:
-    """Numbers of the places in the order of a walk, always to the nearest place not yet visited.
+    """Numbers of the places in the order of a walk, always to the nearest unvisited place.
 
-    Each number is repeated as often as a transmitter with moves of ``step`` would send on its way
-    to the next place. Errors of fingerprints received near each other have much in common, and so
-    the repeated ones have the same.
+    Each number is repeated as often as a transmitter with moves of ``step`` would transmit on its
+    way to the next place. Repeated fingerprints have equal errors, like fingerprints received close
+    together.
 
     Args:
         step: Standard deviation of a move along each axis [m].
@@ -43,16 +43,16 @@ def track(
     is_received: Bool[Tensor, " n"],
     spread: int = 75,
 ) -> tuple[Candidates, Float[Tensor, "n j"]]:
-    """The posterior of a track, over every m-th candidate: ``smoothed`` takes only few.
+    """The posterior of a track over every m-th candidate, since ``smoothed`` takes few candidates.
 
     Args:
         logarithms: Log posterior of each transmission alone.
         step, is_received: See ``smoothed``.
-        spread: Number of the j candidates over which the posterior of one transmission spreads; it
-            sets m. Regions of tracks reach far beyond the likeliest candidates.
+        spread: Number of the j candidates over which the posterior of one transmission spreads; m
+            follows from it. Regions of tracks reach far beyond the likeliest candidates.
 
     Returns:
-        The j candidates, and the logarithms of the track's posterior at them.
+        The j candidates, and the log posterior of the track at them.
     """
     # The inverse sum of squared probabilities: among c equally likely candidates it is c.
     posteriors = torch.softmax(logarithms[is_received], 1)
@@ -92,7 +92,7 @@ class Moves:
     def _densities(self, start: Int[Tensor, " k"], end: Int[Tensor, " k"]) -> Float[Tensor, "k k"]:
         """Densities of moves from candidates ``start`` (columns) to ``end`` (rows).
 
-        They are divided by the density of staying.
+        The unit is the density of not moving.
         """
         if self._last is not None:  # a walk may stay
             first, second, densities = self._last
@@ -120,11 +120,10 @@ def smoothed(
         logarithms: Log posterior of each place given each transmission alone.
         places: The g candidates [m].
         step: Standard deviation of a move along each axis [m].
-        is_received: True for transmissions that a receiver has received. The track is near
-            ``straight_lines`` where it is False.
-        most: Largest number of candidates of a transmission that are linked to those of the one
-            before and the one after.
-        jump: Density of a move to any place over the density of no move: a track may jump.
+        is_received: True for transmissions that a receiver has received. Other transmissions are
+            near ``straight_lines`` between them.
+        most: Largest number of candidates of a transmission that have moves to the next one.
+        jump: Density of a move to any place over the density of not moving: a track may jump.
 
     Source: Rabiner, A tutorial on hidden Markov models, 1989, the forward-backward algorithm.
     """
@@ -157,8 +156,8 @@ def straight_lines(
 ) -> Float[Tensor, "n 3"]:
     """Places of all transmissions on straight lines between the received ones [m].
 
-    A received transmission is at its likeliest candidate. One that no receiver has received divides
-    the line from the received one before to the next by its number.
+    A received transmission is at its likeliest candidate. Missed transmissions divide the line
+    between the two received ones around them into equal parts.
     """
     received = is_received.nonzero()[:, 0]
     numbers = torch.arange(len(is_received))

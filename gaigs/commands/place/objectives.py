@@ -1,7 +1,7 @@
-"""What sets of receivers are worth at places, and the greedy choice of a set.
+"""Objectives of sets of receivers at places, and the greedy choice of a set.
 
-Readings of receivers are independent normal variables, so a set is worth what a product over its
-receivers tells.
+Readings of different receivers are independent normal variables. Each objective is therefore a
+function of a product over receivers, whose factors are computed once.
 """
 
 import torch
@@ -14,7 +14,7 @@ from gaigs.core.stages import track
 class Coverage:
     """Probability that the best receiver's reading is above a threshold [%].
 
-    Readings are independent: the product of their probabilities to be below is that of all.
+    The probability that all independent readings are below it is the product over receivers.
 
     Args:
         values: Expected readings of r receivers at g places [dBm].
@@ -32,7 +32,7 @@ class Coverage:
         self.thresholds = values.new_tensor([threshold])  # (t,)
 
     def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g t"]:
-        """Probability that each reading is below each threshold; a set has the product."""
+        """Probability that each reading is below each threshold; these multiply over a set."""
         above = self.thresholds - self.values[index, :, None]  # (k, g, t)
         return torch.special.ndtr(above / self.deviations[index, :, None])
 
@@ -42,10 +42,10 @@ class Coverage:
 
 
 class MeanLevel(Coverage):
-    """Expected reading of the best receiver [dBm]; arguments as for ``Coverage``.
+    """Expected reading of the best receiver [dBm]; arguments are as for ``Coverage``.
 
-    For a level a below all readings it is a + integral from a on of P(best reading > t) dt, over
-    ``steps`` levels t.
+    For a level a below all readings it is a + the integral of P(best reading > t) over t from a on.
+    The integral runs over ``steps`` levels.
     """
 
     def __init__(
@@ -63,15 +63,15 @@ class MeanLevel(Coverage):
 class LocationError:
     """Root mean square error of a location by the readings of all receivers [m].
 
-    Readings at a place y give a place y' an expected likelihood: a normal density of the difference
-    of the means, a product over receivers (Jebara, Kondor and Howard, Probability product kernels,
-    2004). Half the mean square distance by these weights is the variance of the location. Where
-    readings are linear in the place, this is the Cramér-Rao bound. Distant places that give the
-    same readings count too, which the bound does not know.
+    The expected likelihood of a place y' for readings at y is a product over receivers of normal
+    densities of the difference of means (Jebara, Kondor and Howard, Probability product kernels,
+    2004). With these likelihoods as weights, half the mean square distance is the variance of the
+    location. If readings are linear in the place, this is the Cramér-Rao bound. Distant places with
+    the same readings also count, unlike in the bound.
 
     Args:
-        values, deviations: As of ``Coverage``.
-        places: Possible places, equally likely (g, 3) [m].
+        values, deviations: As for ``Coverage``.
+        places: The possible places (g, 3) [m], equally likely.
     """
 
     sign = -1  # lower is better
@@ -87,7 +87,7 @@ class LocationError:
         self.squares = torch.cdist(places, places).square().to(values)  # (g, g)
 
     def factors(self, index: Int[Tensor, " k"]) -> Float[Tensor, "k g g"]:
-        """Likeness of the readings at each two places, at each receiver; a set has the product."""
+        """Expected likelihood between two places at each receiver; these multiply over a set."""
         means, variances = self.values[index], self.deviations[index].square()
         variances = variances[:, :, None] + variances[:, None]  # (k, g, g)
         apart = means[:, :, None] - means[:, None]
@@ -96,25 +96,25 @@ class LocationError:
         return (scale / variances).sqrt() * torch.exp(-apart.square() / (2 * variances))
 
     def quality(self, products: Float[Tensor, "*sets g g"]) -> Float[Tensor, "*sets g"]:
-        """Quality of each place, by products of factors."""
+        """Quality of each place, from products of factors [m]."""
         return ((products * self.squares).sum(-1) / products.sum(-1) / 2).sqrt()
 
 
 def choose(
     rule: Coverage | LocationError, standing: int, count: int
 ) -> tuple[Int[Tensor, " n"], Float[Tensor, "n1 g"]]:
-    """Chooses ``count`` receivers beside the first ``standing`` ones of a rule.
+    """Chooses ``count`` receivers in addition to the first ``standing`` ones of a rule.
 
-    Each is the best beside those before it; then single ones are exchanged as long as that helps.
-    Coverage and mean level are monotone and submodular, so they gain at least 1 - 1/e of what the
-    best set gains (Nemhauser, Wolsey and Fisher, An analysis of approximations for maximizing
-    submodular set functions, 1978, which has both steps).
+    The greedy choice adds the best receiver, ``count`` times. Then single receivers are exchanged
+    while the score improves. Coverage and mean level are monotone and submodular, so they gain at
+    least 1 - 1/e of the gain of the best set. Source of both steps: Nemhauser, Wolsey and Fisher,
+    An analysis of approximations for maximizing submodular set functions, 1978.
 
     Args:
-        rule: The objective, with standing receivers first and then the possible ones.
+        rule: The objective, with existing receivers first and possible ones after them.
 
     Returns:
-        The chosen receivers, and the quality of each place before and after each of them.
+        The chosen receivers, and the quality of each place before and after each choice.
     """
     rows = torch.arange(len(rule.values))
     before, candidates = rows[:standing], rows[standing:]
@@ -137,15 +137,15 @@ def extend(
     count: int,
     most: int = 4_000_000,
 ) -> tuple[Int[Tensor, " n"], float]:
-    """Adds ``count`` candidates to a set, each the best beside those before it.
+    """Adds ``count`` candidates to a set of receivers, each time the one with the best score.
 
     Args:
-        members: Numbers of the set's receivers.
+        members: Numbers of the receivers in the set.
         candidates: Numbers of the receivers that may be added.
-        most: Largest number of factors in memory at a time.
+        most: Largest number of values of ``rule.factors`` in memory at a time.
 
     Returns:
-        The larger set and its score, the mean quality over places, higher for better.
+        The larger set and its score, the mean quality over places; higher is better.
     """
     score = -torch.inf
     for _ in track(range(count), "receivers to place"):

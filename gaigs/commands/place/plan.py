@@ -1,4 +1,4 @@
-"""Where to put access points: candidates that are chosen one by one, by predicted levels."""
+"""Places for access points: candidates chosen one by one, by predicted levels."""
 
 import math
 from collections.abc import Callable
@@ -25,16 +25,16 @@ from gaigs.registry import check_type, suggest
 
 @dataclass(frozen=True, repr=False)
 class SitePlan:
-    """Places for access points, and what is expected of each.
+    """Places for access points, and the expected quality after each.
 
     Attributes:
         places: Chosen candidates, the first choice first (n, 3) [m].
-        standing: Receivers that stand already (k, 3) [m].
+        standing: Existing receivers (k, 3) [m].
         area: Places of transmitters (g, 3) [m].
-        qualities: The objective at each of them, before and after each choice (n + 1, g). The mean
-            level of no receivers is NaN.
+        qualities: The objective at each place of ``area``, before and after each choice (n + 1, g).
+            The mean level without receivers is NaN.
         objective: ``coverage`` [%], ``mean`` in the unit of the labels, or ``locate`` [m].
-        threshold: Level that ``coverage`` asks for.
+        threshold: Level for ``coverage``.
         unit: Unit of the labels.
         frame: Place of x and y on a map; None if unknown.
 
@@ -81,7 +81,7 @@ class SitePlan:
         return f"{subject} the {what} {start}to {last} {self.score_unit}".rstrip()
 
     def save(self, path: str | Path) -> None:
-        """Writes a CSV table: receivers that stand, then places, each with the score after it."""
+        """Writes a CSV table: existing receivers, then new places, each with the score after it."""
         rows = [("stands", place, None) for place in self.standing.tolist()]
         pairs = zip(self.places.tolist(), self.scores[1:].tolist(), strict=True)
         rows += [("place", *pair) for pair in pairs]
@@ -102,22 +102,24 @@ def place(
     *,
     progress: bool = True,
 ) -> SitePlan:
-    """Places for new access points, each the best beside those that stand or were chosen before.
+    """Places for new access points, chosen one by one for the best quality with all earlier ones.
 
     Args:
         model: A trained model of levels with intervals, which predicts receivers at any place.
-        candidates: Possible places (c, 3) [m]; or their distance [m] along the walls, the sides of
-            the box of training transmitters and receivers, at the receivers' median height; None:
-            64 along the walls.
+        candidates: Possible places (c, 3) [m], or the distance [m] between places along the walls.
+            Walls are the sides of the box of training transmitters and receivers, at the receivers'
+            median height. None: 64 places along the walls.
         count: Number of access points.
-        objective: ``coverage``: chance of a reading above the threshold at one receiver or more;
-            ``mean``: reading of the best receiver; ``locate``: error of a location by all readings.
-        threshold: Level that ``coverage`` asks for, in the unit of the labels.
-        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the objective is the
-            mean; None: the box of the training transmitters, or a box for each of several floors.
-        known: True: the model's receivers stand already; False: they are ignored.
+        objective: ``coverage``: probability that a reading is above the threshold at one receiver
+            or more; ``mean``: reading of the best receiver; ``locate``: error of a location by all
+            readings.
+        threshold: Level for ``coverage``, in the unit of the labels.
+        region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m] over which the objective is
+            averaged. None: the box of the training transmitters, or a box for each of several
+            floors.
+        known: True: the model's receivers stay; False: they are ignored.
         frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
-        progress: False for no bars.
+        progress: False hides progress bars.
 
     Raises:
         ValueError: The model has no levels, no intervals or no new receivers; an option is out of
@@ -173,11 +175,11 @@ def place(
 
 
 def candidate_places(scene: Scene, candidates: object, usual: int = 64) -> Float[Tensor, "c 3"]:
-    """The candidates [m] that the argument of ``place`` means: places, or points along the walls.
+    """Places [m] of the ``candidates`` argument of ``place``: given, or points along the walls.
 
     Args:
-        candidates: Places, a distance [m], or None.
-        usual: Number of points along the walls without a distance.
+        candidates: Places, a distance between them [m], or None.
+        usual: Number of points along the walls for None.
     """
     if candidates is not None and np.ndim(candidates):
         return as_positions("candidates", candidates).reshape(-1, 3)

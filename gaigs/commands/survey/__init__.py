@@ -1,4 +1,4 @@
-"""Survey planning: where to measure next, and which measured places could have been left out."""
+"""Survey planning: places to measure next, and superfluous measured places."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from gaigs.runs import load
 
 
 def run(config: dict, folder: Path) -> None:
-    """Plans a survey, by a finished run if there is one, in ``survey.csv`` and ``survey.png``."""
+    """Plans a survey, with a finished run if given; writes ``survey.csv`` and ``survey.png``."""
     model = None if config["folder"] is None else load(config["folder"], config["trust"])
     options = dict(config["survey"])
     if isinstance(options["candidates"], str):
@@ -31,7 +31,7 @@ def run(config: dict, folder: Path) -> None:
 
 
 def figure(plan: SurveyPlan) -> Figure:
-    """Places from above and, if it falls, the expected error after each new one."""
+    """Places from above and, if it falls, the expected error after each new place."""
     with rc_context(style.STYLE):
         drawn = style.new_figure(style.PAGE, 0.52 * style.PAGE, "compressed")
         # A flat curve says no more than the text.
@@ -48,7 +48,7 @@ def figure(plan: SurveyPlan) -> Figure:
 
 
 def plot_plan(result: SurveyPlan, ax: Any = None) -> Any:
-    """Draws the places on ``ax``; without it a figure of its own, with the errors too."""
+    """Draws the places on ``ax``, or in a new figure together with the errors."""
     if ax is None:
         return figure(result).axes
     draw_places(ax, result)
@@ -78,7 +78,7 @@ def draw_places(axis: Axes, plan: SurveyPlan) -> None:
 
 
 def draw_errors(axis: Axes, plan: SurveyPlan) -> None:
-    """Draws the expected error after each new place, at least 5 % of it from end to end."""
+    """Draws the expected error after each new place; the axis spans at least 5 % of it."""
     label = f"expected mean error [{plan.unit}]" if plan.unit else "expected mean error"
     axis.plot(plan.errors.numpy(), color=style.BLUE)
     first, last = plan.errors.max().item(), plan.errors.min().item()

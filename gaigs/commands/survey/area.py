@@ -1,4 +1,4 @@
-"""Places within areas that were drawn on a map, as candidates of a survey."""
+"""Places within areas drawn on a map, as candidates of a survey."""
 
 import itertools
 from pathlib import Path
@@ -24,11 +24,11 @@ def read_candidates(file: Path, model: Model | None) -> object:
 
 
 def read_area(file: Path, model: Model | None, count: int = 1000) -> Float[Tensor, "c 3"]:
-    """About ``count`` even places [m] within the polygons of a GeoJSON file.
+    """About ``count`` evenly spread places [m] within the polygons of a GeoJSON file.
 
-    Positions are longitude and latitude, or easting and northing, if the model knows its place on
-    the map; else metres of the room. The height is the third number of the positions, or from
-    the model's training transmitters: each floor, or half-way between the lowest and the highest.
+    If the model has a frame, positions are longitude and latitude, or easting and northing;
+    otherwise metres of the room. The height is the third coordinate. Without one it is the height
+    of each floor of the training transmitters, or of the middle of a single floor.
 
     Source: RFC 7946.
     """
@@ -53,7 +53,7 @@ def read_area(file: Path, model: Model | None, count: int = 1000) -> Float[Tenso
 def _places_inside(
     polygons: list[Rings], corners: Float[ndarray, "k 2"], count: int
 ) -> Float[ndarray, "g 2"]:
-    """About ``count`` even places within polygons; one of their corners if none is inside."""
+    """About ``count`` evenly spread places within polygons; if none is inside, a corner."""
     lower = torch.tensor([*corners.min(0), 0.0])
     upper = torch.tensor([*corners.max(0), 0.0])
     tried = count

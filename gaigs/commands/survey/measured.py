@@ -1,4 +1,4 @@
-"""Measured places: what each of them is worth, and which could have been left out."""
+"""Measured places: their effect on the error, and superfluous ones."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from gaigs.kriging.links import distances
 
 
 class Measured(NamedTuple):
-    """Measured places and their worth."""
+    """Measured places and their effect on the error."""
 
     places: Float[Tensor, "k 3"]  # [m]
     error: float  # mean error with all of them
@@ -24,7 +24,7 @@ class Measured(NamedTuple):
 
 
 class ReceiverReadings(NamedTuple):
-    """Readings of one receiver, and its process at g places, over which the error is the mean."""
+    """Readings of one receiver, and its process at the g places of the mean error."""
 
     process: Process
     rows: Int[Tensor, " n"]  # numbers of the readings
@@ -64,11 +64,11 @@ def measured_places(
 
     Args:
         processes: Process of each receiver, with its readings.
-        evaluated: Coordinates of the places over which the error is the mean.
+        evaluated: Coordinates of the places over which the error is averaged.
         factor: Mean absolute error of a label over its standard deviation.
-        most: Largest number of readings of a receiver that count, evenly chosen.
+        most: Largest number of readings of a receiver, evenly chosen.
         tolerated: Largest ratio of the mean error without the superfluous places to the error with
-            all. Superfluous are the places that lower the error least.
+            all. The places with the smallest effect on the error are superfluous.
     """
     rows = []
     places = []
@@ -86,7 +86,7 @@ def measured_places(
         readings.append(ReceiverReadings(process, index, which, torch.cat(variances), chance))
 
     def error(is_kept: Bool[Tensor, " k"]) -> float:
-        """Mean standard deviation with readings of the kept places alone."""
+        """Mean standard deviation with readings of the kept places only."""
         deviations = []
         for receiver in readings:
             rows = receiver.rows[is_kept[receiver.places]]

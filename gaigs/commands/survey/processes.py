@@ -1,4 +1,4 @@
-"""Gaussian processes over places, as survey plans use them."""
+"""Gaussian processes over places, for survey plans."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,7 +15,7 @@ from gaigs.registry import name_of
 
 
 def processes_of(model: Model) -> list[Process]:
-    """The processes of a model's receivers; a ``ValueError`` for a model that has none."""
+    """The processes of a model's receivers; a ``ValueError`` for a model without processes."""
     processes = []
     for receiver in range(len(model.scene.receivers)):
         process = model.process_at(receiver)
@@ -32,7 +32,7 @@ def processes_of(model: Model) -> list[Process]:
 def default_process(
     points: Float[Tensor, "g 3"], length: float = 0.25, nugget: float = 0.6
 ) -> Process:
-    """A process without readings, for a survey before which nothing is measured.
+    """A process without readings, for a survey before the first measurement.
 
     Its mean is unknown, so that a plan spreads places evenly over the points' box.
 
@@ -51,11 +51,11 @@ def default_process(
 
 
 def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process:
-    """The process with an unknown trend, which readings have to determine, too.
+    """The process with an unknown trend, which readings also have to determine.
 
     The trend is a constant and, with a receiver's position [m], a slope over the decimal logarithm
-    of the distance. Both have twice the standard deviation of a reading: as much as receivers of
-    one survey may differ.
+    of the distance. Both have twice the standard deviation of a reading, a typical difference
+    between receivers of one survey.
     """
     first = process.places[:1]
     variance = float(process.covariances(first, first)[0, 0] + process.noise)
@@ -77,7 +77,7 @@ def with_trend(process: Process, receiver: Float[Tensor, "3"] | None) -> Process
 
 
 def posterior(process: Process, places: Float[Tensor, "g d"]) -> Float[Tensor, "g g"]:
-    """Covariances of the process at places, given its readings; ``LIMIT`` of them at most."""
+    """Covariances of the process at places, given its readings, at most ``LIMIT`` of them."""
     rows = evenly(torch.arange(len(process.places)), LIMIT).to(process.places.device)
     whitened, _ = process.whitened(places, rows)
     return process.covariances(places, places) - whitened.mT @ whitened
@@ -86,9 +86,9 @@ def posterior(process: Process, places: Float[Tensor, "g d"]) -> Float[Tensor, "
 def reception_chances(
     processes: Sequence[Process], points: Float[Tensor, "g d"]
 ) -> Float[Tensor, "r g"]:
-    """Probability that each receiver receives a point, by the measured places around it.
+    """Probability that each receiver receives a point, from the measured places around it.
 
-    Of measured places, those at the carrier of the points count, or at the nearest carrier.
+    Only measured places at the carrier of the points count, or else at the nearest carrier.
     """
     places = torch.cat([process.places for process in processes])  # (k, d)
     if not len(places):
@@ -107,5 +107,5 @@ def reception_chances(
 
 
 def mean_of_received(values: Float[Tensor, "r g"], chances: Float[Tensor, "r g"]) -> float:
-    """Mean over links, weighted by the probability that they are received."""
+    """Mean over links, weighted by their probability of reception."""
     return ((values * chances).sum() / chances.sum()).item()

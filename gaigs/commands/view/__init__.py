@@ -27,10 +27,10 @@ from gaigs.runs import configuration_of, links_of, load
 
 @dataclass(frozen=True)
 class View:
-    """A picture of one model or of two side by side; in a notebook it shows itself.
+    """An interactive picture of one model, or of two side by side. Notebooks display it.
 
     Attributes:
-        contents: What is shown of each model.
+        contents: Displayed contents of each model.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -42,7 +42,7 @@ class View:
 
     @cached_property
     def facts(self) -> list[dict]:
-        """Facts that do not depend on the transmitter, for each model."""
+        """Facts of each model that do not depend on the transmitter."""
         return [contents.facts() for contents in self.contents]
 
     def save(self, path: str | Path) -> None:
@@ -56,11 +56,12 @@ class View:
         write_text(path, self.page(self.stored()))
 
     def serve(self, port: int = 8080) -> None:
-        """Serves the page on this machine until Ctrl-C; the model predicts wherever the transmitter
-        is dragged.
+        """Serves the page on this machine until Ctrl-C.
+
+        The model predicts for every place to which the transmitter is dragged.
 
         Args:
-            port: Port of http://127.0.0.1; 0 for any free one.
+            port: Port of http://127.0.0.1; 0 for any free port.
 
         Raises:
             OSError: The port cannot be opened.
@@ -93,11 +94,12 @@ class View:
         return page.replace("@content@", base64.b64encode(packed).decode())
 
     def stored(self, places: int = 96, fewest: int = 12, maps: int = 24, step: int = 3) -> dict:
-        """Predictions at even places in the box of the training transmitters, for all receivers.
+        """Predictions at evenly spread places in the box of the training transmitters, for all
+        receivers.
 
         Args:
-            places: Number of stored predictions of a model, about, shared by its receivers.
-            fewest: Least number of places, however many receivers there are.
+            places: Approximate number of stored predictions of a model, over all receivers.
+            fewest: Smallest number of places, for any number of receivers.
             maps: Largest number of slices of radio maps, over all heights and receivers.
             step: Rows and columns from one stored pixel of a spectrum to the next.
         """
@@ -124,16 +126,16 @@ class View:
 
 
 def view(model: Model, links: Links | None = None, other: Model | None = None) -> View:
-    """A picture of a model in a browser: its room, and its predictions for a transmitter to drag.
+    """A model in a browser: its room, and predictions for a transmitter that can be dragged.
 
     Args:
         model: A trained, fitted or loaded model.
-        links: Its data; None: no true walls and no test links are shown.
-        other: A second model of the same receivers, beside the first.
+        links: Data of the model; None: true walls and test links are not shown.
+        other: A second model of the same receivers, shown beside the first.
 
     Raises:
         TypeError: A model is not a ``gaigs.Model``.
-        ValueError: The links, or the other model, have other receivers; or the links have another
+        ValueError: The links or the other model have different receivers, or the links another
             task.
 
     Example:
@@ -187,7 +189,7 @@ def run(config: dict) -> None:
 def show(
     folder: str, trust: bool, other: str | None = None, out: str | None = None, port: int = 8080
 ) -> None:
-    """Shows one run, or two side by side: in a file ``out``, or by a server if it is None."""
+    """Shows one run, or two side by side, in a file ``out`` or, without it, by a server."""
     sources = [folder] if other is None else [folder, other]
     shown = View(side_by_side([contents_of(source, trust) for source in sources]))
     if out is None:

@@ -1,4 +1,4 @@
-"""What the viewer shows of one model, in plain numbers for its page."""
+"""Contents of the viewer for one model, in plain numbers for its page."""
 
 import base64
 import math
@@ -41,9 +41,9 @@ class Contents:
 
     Args:
         model: A trained, fitted or loaded model.
-        links: Its data; None: no true walls and no test links are shown.
+        links: Data of the model; None: true walls and test links are not shown.
         title: Name above the picture.
-        points: Points along the longer side of a slice of the radio map; so many places are also
+        points: Points along the longer side of a slice of the radio map, and number of places
             predicted at a time.
         compared: Largest number of test links that are shown with their errors.
 
@@ -85,13 +85,13 @@ class Contents:
 
     @cached_property
     def compared(self) -> tuple[Tensor, Tensor]:
-        """Labels and predictions of the shown test links."""
+        """Labels and predictions of the displayed test links."""
         with self.lock:
             batches = self.model.predict_batches(self.links.query[self.tests])
             return self.links.labels[self.tests], torch.cat([part.cpu() for part in batches])
 
     def facts(self) -> dict:
-        """Axes, units, room, Gaussians, receivers and errors of links, whatever the transmitter."""
+        """Axes, units, room, Gaussians, receivers and errors of links, for any transmitter."""
         quantity = with_unit(self.task.quantity, self.task.unit)
         with self.lock:
             gaussians = self.model.primitives
@@ -128,7 +128,7 @@ class Contents:
         return facts
 
     def test_facts(self) -> dict:
-        """Places and scores of the shown test links."""
+        """Places and scores of the displayed test links."""
         query = self.links.query[self.tests]
         labels, values = self.compared
         scores = self.task.scores(labels, values)[self.task.monitor]
@@ -145,7 +145,7 @@ class Contents:
 
     @torch.no_grad()
     def answer(self, place: list[float], receiver: int, step: int = 1) -> dict:
-        """Prediction, its deviation, and paths, of a transmitter at a place [m].
+        """Prediction, its deviation, and paths, for a transmitter at a place [m].
 
         Args:
             place: Position [m].
@@ -181,10 +181,10 @@ class Contents:
         return answer | {"place": plain(place)}
 
     def moved(self, receiver: int, position: list[float]) -> "Contents":
-        """The model with one receiver alone, which stands at another position [m].
+        """The model with a single receiver, moved to another position [m].
 
         Raises:
-            ValueError: The model predicts for its own receivers alone.
+            ValueError: The model predicts only for its training receivers.
         """
         key = receiver, *position
         if self.last is None or self.last[0] != key:
@@ -197,7 +197,7 @@ class Contents:
         return self.last[1]
 
     def answer_at(self, place: list[float], receiver: int, position: list[float]) -> dict:
-        """``answer`` with a receiver at another position [m]; the others stay."""
+        """``answer`` with one receiver moved to another position [m]."""
         answer = self.moved(receiver, position).answer(place, 0)
         if self.kind == "level":
             unmoved = self.answer(place, receiver)
@@ -228,7 +228,7 @@ class Contents:
         return {"x": plain(x), "y": plain(y), "height": plain(height), "values": plain(values)}
 
     def comparison(self, number: int, step: int = 1) -> dict:
-        """Label and prediction of a shown test link; ``step`` as for ``answer``."""
+        """Label and prediction of a displayed test link; ``step`` is as for ``answer``."""
         labels, values = self.compared
         value = values[number]
         label = self.task.align(labels[number : number + 1], values[number : number + 1])[0]
@@ -260,8 +260,9 @@ class Contents:
         return Shown(*(None if part is None else part.cpu() for part in parts))
 
     def _curve(self, channel: Tensor, element: int) -> dict:
-        """Curve of a channel: |h| [dB] over delay [ns] at an element, or with one subcarrier over
-        the elements.
+        """Curve of a channel: |h| [dB] over delay [ns] at an element.
+
+        A channel with one subcarrier is drawn over the elements.
         """
         if channel.shape[1] == 1:
             x = np.arange(1, len(channel) + 1)
@@ -279,7 +280,7 @@ class Contents:
 
 
 def kind_of(task: Task) -> str | None:
-    """How the page draws labels: as a spectrum, a level or a channel; None: not at all."""
+    """The page's kind of labels: spectrum, level or channel; None if it cannot draw them."""
     if task.directions is not None:
         return "spectrum"
     if task.is_scalar:
@@ -298,7 +299,7 @@ def receiver_facts(receiver: Receiver) -> dict:
 
 
 def plane_facts(plane: LearntPlane) -> dict:
-    """Number, share of the received power, and corners of a learnt plane."""
+    """Number, fraction of the received power, and corners of a learnt plane."""
     return {
         "number": plane.number,
         "share": plain(plane.share),
@@ -307,7 +308,7 @@ def plane_facts(plane: LearntPlane) -> dict:
 
 
 def gaussian_splats(gaussians: Gaussians, most: int = 3000) -> dict:
-    """The ``most`` strongest Gaussians as the page draws them, and the number of all."""
+    """The ``most`` strongest Gaussians in the page's form, and the number of all."""
     with torch.no_grad():
         strengths = gaussians.opacities * SH_DC * gaussians.signal[..., 0].norm(dim=-1)
         strongest = strengths.topk(min(most, len(strengths))).indices
@@ -317,7 +318,7 @@ def gaussian_splats(gaussians: Gaussians, most: int = 3000) -> dict:
 
 
 def obstacle_splats(matter: Matter) -> dict:
-    """Obstacles as the page draws them: the opacity is the power that a central path loses."""
+    """Obstacles in the page's form; opacity is the power that a central path loses."""
     widths = matter.widths
     losses = matter.densities * math.sqrt(2 * math.pi) * np.exp(np.log(widths).mean(1))  # [dB]
     covariances = widths[:, :, None] ** 2 * np.eye(3)
@@ -341,10 +342,10 @@ def plain(values: Any) -> Any:
 
 
 def grey(image: Float[Tensor, "rows columns"], step: int = 1) -> dict:
-    """Every ``step``-th row and column of an image, as the page decodes them.
+    """Every ``step``-th row and column of an image, in the page's encoding.
 
-    Pixels are bytes, 255 for an amplitude of 1. Each is stored as the change from the pixel before,
-    since changes pack well.
+    Pixels are bytes, 255 for an amplitude of 1. Each is stored as the difference from the pixel
+    before, since differences compress well.
     """
     levels = (255 * image[::step, ::step].clamp(0, 1)).round().to(torch.uint8).numpy()
     changes = np.diff(levels.ravel(), prepend=np.uint8(0))
@@ -361,7 +362,7 @@ def splats(
     opacities: Float[ndarray, " n"],
     strengths: Float[ndarray, " n"],
 ) -> dict:
-    """Gaussians as the page draws them; covariances [m²] by their upper triangles."""
+    """Gaussians in the page's form; covariances [m²] by their upper triangles."""
     rows, columns = np.triu_indices(3)
     parts = {"means": means, "covariances": covariances[:, rows, columns], "opacities": opacities}
     parts["strengths"] = strengths

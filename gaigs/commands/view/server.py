@@ -1,4 +1,4 @@
-"""The viewer's server on this machine: a page, and a model's answers to it."""
+"""The viewer's server on this machine: a page, and answers of a model."""
 
 import json
 import logging
@@ -14,10 +14,10 @@ log = logging.getLogger(__name__)
 
 
 def server(page: str, contents: list[Contents], port: int) -> ThreadingHTTPServer:
-    """A server, not started, of the page at ``/`` and of answers.
+    """A server of the page at ``/`` and of answers, not yet started.
 
-    The answers are at ``/answer``, ``/slice`` and ``/comparison``. The server answers to names of
-    this machine alone: a page under a foreign name that resolves to this machine reads nothing.
+    Answers are at ``/answer``, ``/slice`` and ``/comparison``. The server accepts only host names
+    of this machine: a foreign name that resolves to this machine gets no data.
     """
 
     class Handler(BaseHTTPRequestHandler):
@@ -58,9 +58,10 @@ def respond(contents: list[Contents], path: str, query: dict[str, Any]) -> str:
     """The JSON answer to a request; a ``ValueError`` for an unknown path.
 
     Args:
-        contents: What is shown of each model.
-        query: Values of the URL: numbers of ``run`` and ``receiver``; ``at``, the place where the
-            receiver was dragged [m]; and what the path needs, ``place``, ``height`` or ``number``.
+        contents: Displayed contents of each model.
+        query: Values of the URL: numbers of ``run`` and ``receiver``; ``at``, the new place of a
+            dragged receiver [m]; and the arguments of the path, ``place``, ``height`` or
+            ``number``.
     """
     run = contents[int(query["run"])]
     receiver = int(query.get("receiver", 0))

@@ -1,4 +1,4 @@
-"""Tasks: shape, unit and scores of a label, and the part of a batch that a step reads."""
+"""Tasks: shape, unit and scores of a label, and the part of a batch that a step uses."""
 
 import math
 from abc import ABC, abstractmethod
@@ -17,12 +17,12 @@ Thinning = Callable[[Batch, torch.Generator], Batch]
 
 
 class Metric(NamedTuple):
-    """A number of a table.
+    """A column of a table of scores.
 
     Attributes:
         title: Name in tables and figures, with the unit in brackets.
         higher_is_better: True for a similarity, False for an error.
-        is_brief: True if a terminal's table shows it too.
+        is_brief: True if the terminal's table shows the column, too.
 
     Example:
         >>> gaigs.registries["task"].get("rssi").metrics()["mae_db"]
@@ -52,13 +52,13 @@ class Task(ABC):
         unit: Unit of a label; empty for a ratio.
         higher_is_better: True if ``monitor`` is a similarity, False for an error.
         dtype: Type of labels and predictions.
-        is_noisy: True if labels of one place scatter, so that fine detail cannot be learnt.
-        directions: Directions of a label's pixels; None for a label without.
+        is_noisy: True if labels at one place scatter, so that fine detail cannot be learnt.
+        directions: Directions of a label's pixels; None if labels have none.
         elements: Elements of an array, the first axis of channels; 1 for other labels.
         frequencies: Subcarriers [Hz], the last axis of channels; None for other labels.
-        phase: What is unknown of a channel's phase, see ``Csi``.
+        phase: Unknown part of a channel's phase, see ``Csi``.
         lowest: Least possible number of a real label.
-        limits: Bounds of labels that are read; numbers beyond them have another unit, or mean "not
+        limits: Bounds of labels in files. Numbers beyond them have another unit, or mean "not
             received".
         beyond: Advice in errors on numbers beyond these bounds.
     """
@@ -147,10 +147,10 @@ class Task(ABC):
         return means
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor] | None:
-        """Scores that the mean of many labels at a place would reach; None if unknown, by default.
+        """Scores of a prediction that is the mean of many labels at the place; by default None.
 
-        Two labels of a place, with independent noise of variance s², differ by 2 s² in the mean
-        square; a label differs from the mean of many by half of that.
+        Two labels with independent noise of variance s² have a mean square difference of 2 s². A
+        label and the mean of many differ by s².
 
         Args:
             scores: Scores of one label as the prediction of another at the same place.
@@ -160,10 +160,10 @@ class Task(ABC):
     @classmethod
     @abstractmethod
     def metrics(cls) -> dict[str, Metric]:
-        """The numbers that ``summarise`` may give; runs are compared by the first that it gives."""
+        """Possible columns of ``summarise``; runs are compared by the first one present."""
 
     def axes(self) -> dict[str, Axis]:
-        """The axes of a label by name: its directions, or by default numbers."""
+        """The axes of a label by name: its directions, or by default numbered entries."""
         if self.directions is not None:
             elevations = np.degrees(self.directions.elevations.double().numpy()).round(6)
             azimuths = np.degrees(self.directions.azimuths.double().numpy()).round(6)
@@ -186,13 +186,13 @@ class Task(ABC):
         return {}
 
     def state(self) -> dict:
-        """The task as a checkpoint stores it: ``registry("task").build(state)`` makes it anew."""
+        """The task in a checkpoint's form; ``registry("task").build(state)`` rebuilds it."""
         return {"name": self.name, **self.options()}
 
     def align(self, labels: Tensor, values: Tensor) -> Tensor:
-        """Labels with all that is unknown of each link, such as a phase, fitted to predictions.
+        """Labels with their unknown part, such as a phase for each link, fitted to predictions.
 
-        By default they stay as they are. Losses, kriging and look-ups compare the result with the
+        By default labels are unchanged. Losses, kriging and look-ups compare the result with the
         predictions. Shapes are (k, *shape); either k may be 1.
         """
         return labels
@@ -202,27 +202,28 @@ class Task(ABC):
         return 0
 
     def fingerprint(self, values: Tensor) -> Tensor:
-        """Real numbers (k, m) of labels or predictions that change steadily with the place.
+        """Real numbers (k, m) of labels or predictions that change smoothly with the place.
 
-        By default at most 512 of a label's own numbers, evenly spread: arrays resolve fewer.
+        By default these are at most 512 evenly spread numbers of the label: an array resolves
+        fewer.
         """
         return thin_labels(values, 512).float()
 
     def thinning(self) -> Thinning:
-        """The part of a batch that a step reads, by default all.
+        """The part of a batch that a training step uses; by default all of it.
 
-        Parameters of a subclass are options of ``training.thinning``.
+        Parameters of a subclass's method are the options of ``training.thinning``.
         """
         return lambda batch, generator: batch
 
     def packed(self, values: Tensor) -> np.ndarray:
-        """Labels or predictions for ``predictions.npz``; by default as they are."""
+        """Labels or predictions for ``predictions.npz``; by default unchanged."""
         return values.numpy()
 
     def stored(
         self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]
     ) -> dict[str, np.ndarray]:
-        """Arrays for ``predictions.npz``, where the model ends each name; by default all scores."""
+        """Arrays for ``predictions.npz``, by default all scores; the model's name is appended."""
         return {name: score.numpy() for name, score in scores.items()}
 
 

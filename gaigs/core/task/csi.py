@@ -21,25 +21,25 @@ A perfect prediction has no finite SNR.
 
 @register("task", "csi")
 class Csi(Task):
-    """Complex channels (elements, subcarriers), linear amplitudes in the data's own unit.
+    """Complex channels (elements, subcarriers), linear amplitudes in the unit of the data.
 
     Scores of a link, with error e = h - h' over its elements and subcarriers:
 
     - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is the SNR after the best global phase of
       the prediction, for a receiver and a transmitter without a common clock. Where ``phase`` is
-      not known, it is the only SNR, and all scores take the aligned error.
+      not known, the aligned SNR is the only one, and all scores use the aligned error.
     - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²), at least 0. Its mean is monitored: a few links in
       deep shadow, with an SNR of -50 dB, would dominate a mean SNR.
 
-    All links together have an NMSE [dB], 10 log10(sum |e|² / sum |h|²), in which strong links count
-    most.
+    All links together have an NMSE [dB], 10 log10(sum |e|² / sum |h|²). Strong links dominate it.
 
     Args:
-        elements: Number of elements of the receivers' largest array; 1 for single antennas. Labels
-            are 0 at elements that a smaller array lacks.
+        elements: Number of elements of the largest array; 1 for single antennas. Labels are 0 at
+            the missing elements of a smaller array.
         frequencies: Absolute frequencies of the subcarriers (s,) [Hz].
-        phase: ``known``; ``per_link`` where each link has a phase of its own, which its elements
-            and subcarriers share; ``per_link_and_delay`` where it also has its own delay and gain.
+        phase: ``known``; ``per_link`` if each link has its own random phase; ``per_link_and_delay``
+            if each link also has its own delay and gain. Elements and subcarriers of a link share
+            them.
 
     Raises:
         ValueError: There is no element or subcarrier, a frequency is not positive and finite, or
@@ -110,11 +110,10 @@ class Csi(Task):
     def align(
         self, labels: Complex[Tensor, "#k e s"], values: Complex[Tensor, "#k e s"]
     ) -> Complex[Tensor, "k e s"]:
-        """Labels with what ``phase`` says is unknown fitted to the predictions.
+        """Labels aligned to predictions: unknown phases, delays and gains are removed.
 
-        With ``per_link`` this is a phase; with ``per_link_and_delay`` also a delay and the power. A
-        gradient flows through this power, so that no loss of the result depends on the scale of the
-        predictions.
+        ``per_link`` aligns the phase of each link, ``per_link_and_delay`` also its delay and power.
+        The gradient includes this power, so losses do not depend on the scale of the predictions.
         """
         if self.phase == "known":
             return labels
@@ -130,7 +129,7 @@ class Csi(Task):
     def fingerprint(self, values: Complex[Tensor, "k e s"]) -> Float[Tensor, "k m"]:
         """Correlations over elements and over subcarriers, relative to the link's power.
 
-        Both change slowly with the place, unlike phases.
+        Both change slowly with the place; phases do not.
         """
         power = values.abs().square().sum((1, 2), keepdim=True)  # (k, 1, 1)
         covariances = values @ values.mH / power  # (k, e, e)
@@ -163,13 +162,13 @@ class Csi(Task):
 
     @property
     def _rates(self) -> Float[Tensor, " s"] | None:
-        """Frequencies by which unknown delays turn phases [Hz]; None if delays are known."""
+        """Frequencies that multiply unknown delays in phases [Hz]; None if delays are known."""
         return self.frequencies if self.phase == "per_link_and_delay" else None
 
     def _turns(
         self, labels: Complex[Tensor, "#k e s"], values: Complex[Tensor, "#k e s"]
     ) -> Complex[Tensor, "k 1 s"]:
-        """Factors of ``alignment`` that turn labels onto predictions."""
+        """Factors of ``alignment`` that rotate labels onto predictions."""
         return alignment(labels, values, self._rates)
 
     @classmethod
@@ -188,12 +187,12 @@ class Csi(Task):
         }
 
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
-        """SNR, SNR with the phase removed and SINAD [dB], and the powers of error and label.
+        """SNR, aligned SNR and SINAD [dB], and the powers of error and label.
 
-        The plain SNR is left out where ``phase`` is not known.
+        The plain SNR is missing unless ``phase`` is known.
 
         Raises:
-            ValueError: A label is zero throughout, and so has no SNR.
+            ValueError: A label is zero throughout, so its SNR is undefined.
         """
         check_values(labels, values, self.shape, "channels")
         h = labels.detach().cpu().to(torch.complex128)  # (k, e, s)
@@ -242,14 +241,14 @@ class Csi(Task):
         return {name: numbers[name] for name in self.metrics() if name in numbers}
 
     def logged(self, means: dict[str, float]) -> dict[str, float]:
-        """The mean scores, with the NMSE in place of the powers."""
+        """The mean scores, with the NMSE instead of the powers."""
         error = torch.tensor(means["error_power"], dtype=torch.float64)
         power = torch.tensor(means["label_power"], dtype=torch.float64)
         scores = {name: mean for name, mean in means.items() if not name.endswith("_power")}
         return scores | {"nmse_db": decibels(error, power).item()}
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The scores at half of the error's power, which is an SNR higher by 3 dB."""
+        """The scores at half the error power, an SNR higher by 3 dB."""
         error = scores["error_power"] / 2
         power = scores["label_power"]
         ratios = {
@@ -265,5 +264,5 @@ class Csi(Task):
 
 
 def decibels(error: Float[Tensor, "*k"], power: Float[Tensor, "*k"]) -> Float[Tensor, "*k"]:
-    """An error's power over a label's [dB]; at least -``HIGHEST``."""
+    """Ratio of an error's power to a label's power [dB]; at least -``HIGHEST``."""
     return 10 * (error / power).clamp(min=10 ** (-HIGHEST / 10)).log10()

@@ -1,4 +1,4 @@
-"""Received signal strength: one level a link."""
+"""Received signal strength: one level for each link."""
 
 from gaigs.core.task.scalar import Scalar
 from gaigs.registry import register

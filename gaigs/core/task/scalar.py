@@ -1,4 +1,4 @@
-"""The base of tasks whose label is one real number a link."""
+"""The base of tasks with scalar labels: one real number for each link."""
 
 import math
 
@@ -11,8 +11,8 @@ from gaigs.core.task import Metric, Task, check_values, need_samples
 class Scalar(Task):
     """One real number a link, with a unit.
 
-    A subclass gives ``name``, ``quantity``, ``unit`` and ``error_unit``, the unit of a difference
-    of labels. Its lower case ends the names of scores and metrics.
+    A subclass sets ``name``, ``quantity``, ``unit`` and ``error_unit``, the unit of a difference of
+    labels. Names of scores and metrics end in ``error_unit`` in lower case.
     """
 
     error_unit: str

@@ -24,13 +24,13 @@ MIN_MAX = "min-max of each spectrum's amplitude"
 
 @register("task", "spectrum")
 class Spectrum(Task):
-    """Amplitudes in [0, 1], one a pixel: row = elevation, column = azimuth.
+    """Spectra of amplitudes in [0, 1], with rows of elevation and columns of azimuth.
 
     Args:
         elevations: Elevations of the rows in the array's frame [rad].
         azimuths: Azimuths of the columns in the array's frame [rad].
-        normalisation: Scale of the labels, in words of docs/data.md; by default each spectrum has a
-            pixel of 0 and one of 1.
+        normalisation: Scale of the labels, in words of docs/data.md. By default each spectrum is
+            scaled to a minimum of 0 and a maximum of 1.
 
     Source: the protocol of GAI-GS, "Evaluation"; Wang et al., Image Quality Assessment, 2004.
     """
@@ -80,9 +80,11 @@ class Spectrum(Task):
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
         """SSIM and mean absolute error of each predicted spectrum.
 
-        SSIM is scikit-image's with its default window and ``data_range=1``, in float64; the
-        training loss uses another window. Values outside [0, 1] are scored as they are. Spectra
-        below the window's size are a ``ValueError``.
+        SSIM is scikit-image's with its default window and ``data_range=1``, in float64. The
+        training loss has another window. Values outside [0, 1] are not clipped.
+
+        Raises:
+            ValueError: Spectra are smaller than the window.
         """
         if min(self.shape) < SSIM_WINDOW:
             window = f"{SSIM_WINDOW} x {SSIM_WINDOW}"
@@ -98,11 +100,12 @@ class Spectrum(Task):
         }
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Scores that the mean of many spectra would reach as a prediction of each.
+        """Scores of the mean of many spectra as a prediction of each.
 
-        An SSIM of s becomes 2 s / (1 + s), and one below 0 becomes 0. Absolute errors fall by the
-        root of 2. For two labels with the same mean that scatter about a pattern, SSIM is the
-        pattern's share s of the variance; for the pattern and one label it is 2 s / (1 + s).
+        An SSIM of s becomes 2 s / (1 + s), an SSIM below 0 becomes 0, and absolute errors fall by
+        the root of 2. Reason: the SSIM of two noisy labels with the same mean is the fraction s of
+        their variance that the common pattern has. The SSIM of the pattern and one label is 2 s /
+        (1 + s).
         """
         shares = scores["ssim"].clamp(min=0)
         return {"ssim": 2 * shares / (1 + shares), "mae": scores["mae"] / math.sqrt(2)}
@@ -119,10 +122,10 @@ class Spectrum(Task):
         return dict(zip(self.metrics(), numbers, strict=True))
 
     def thinning(self, stride: int = 1, rays: int | None = None) -> Thinning:
-        """Every ``stride``-th row and column, or ``rays`` random pixels for all links alike.
+        """Every ``stride``-th row and column, or ``rays`` random pixels, the same for all links.
 
-        The first row and column are random. Neighbouring pixels of a spectrum are far closer than
-        the array resolves. At least three rows and columns of a small grid stay.
+        The first row and column are random. Neighbouring pixels are much closer than the resolution
+        of the array. A small grid keeps at least three rows and columns.
         """
         rows, columns = self.shape
         if stride < 1:

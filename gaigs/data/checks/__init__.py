@@ -13,7 +13,7 @@ __all__ = ["Finding", "check"]
 
 
 def check(links: Any) -> Iterator[Finding]:
-    """What is probably wrong with ``Links``, with or without a split."""
+    """Suspected faults of ``Links``, with or without a split."""
     yield from check_places(links)
     yield from check_edges(links)
     yield from check_arrays(links)

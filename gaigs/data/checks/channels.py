@@ -34,7 +34,7 @@ class Measure(NamedTuple):
     """A measure of how well geometry explains channels."""
 
     measure: Callable[[Sample], float]  # share of a sample that geometry explains, 0 to 1
-    least: float  # smallest share that tells a convention
+    least: float  # smallest fraction that identifies a convention
     enough: float  # share above which the data need no other convention
     sentence: str  # sentence for users, with {} for the share
     meaning: str  # what the share is of, in short
@@ -74,11 +74,11 @@ def check_signs(sample: Sample) -> Iterator[Finding]:
 
 
 def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterator[Finding]:
-    """Findings if phases of channels do not follow the geometry, or are not as ``data.phase`` says.
+    """Findings if phases of channels do not follow the geometry, or contradict ``data.phase``.
 
     Args:
         train: Numbers of the sample's links in ``links``.
-        sample: These links.
+        sample: The links with these numbers.
     """
     task = links.task
     few = sample.thinned(192)
@@ -169,8 +169,8 @@ def _strange_findings(name: str, parts: StrangeParts) -> Iterator[Finding]:
 def best_convention(sample: Sample, score: Measure) -> Finding | None:
     """A finding about the conventions by which geometry explains channels clearly better.
 
-    Conventions that explain them equally well are named together. ``score`` is the measure, with
-    the bounds of what is clear.
+    Conventions that explain the channels equally well are named together. ``score`` is the measure,
+    with the bounds for "clearly".
     """
     read = score.measure(sample)
     if read > score.enough or len(sample.labels) < MANY:
@@ -181,7 +181,7 @@ def best_convention(sample: Sample, score: Measure) -> Finding | None:
     for convention in conventions(few, score.measure):
         changed = convention.change(few)
         share = score.measure(changed)
-        # Channels that are alike at all links fit any convention under which distances hardly
+        # Channels that are similar at all links fit any convention under which distances hardly
         # differ.
         is_telling = share > max(read, score.least / 2) and has_extent(changed)
         if is_telling and share > 1.1 * score.measure(without_geometry(changed)) + 0.02:

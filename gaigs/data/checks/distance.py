@@ -1,4 +1,4 @@
-"""Levels against the distance: the law that they follow, and how well under another convention."""
+"""The law of distance of levels, and its fit under other conventions."""
 
 import math
 from typing import NamedTuple
@@ -18,19 +18,19 @@ class Law(NamedTuple):
 
 
 class Gain(NamedTuple):
-    """How much better levels follow the distance under another convention."""
+    """Improvement of the law of distance under another convention."""
 
     read: float  # mean error of the data as read [dB]
     fits: float  # mean error under the other convention [dB]
     evidence: float  # gain of the log likelihood
 
     def is_clear(self, share: float = 0.85, evidence: float = 8.0) -> bool:
-        """True if the error falls below a share of it, and the evidence exceeds a bound."""
+        """True if the error falls below a fraction of itself, and the evidence exceeds a bound."""
         return self.fits < share * self.read and self.evidence > evidence
 
 
 def decades(sample: Sample) -> Float[Tensor, " n"]:
-    """Decimal logarithm of each link's distance in metres, as of ``decades_of``."""
+    """Decimal logarithm of each link's distance in metres, from ``decades_of``."""
     return decades_of((sample.transmitters - sample.positions[sample.receivers]).norm(dim=1))
 
 
@@ -41,12 +41,13 @@ def decades_of(distances: Float[Tensor, "*h n"]) -> Float[Tensor, "*h n"]:
 
 
 def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = False) -> Law:
-    """The law of distance of each receiver, by Huber's weights, so that wrong levels count little.
+    """The law of distance of each receiver, by Huber's weights, which limit the effect of wrong
+    levels.
 
     Args:
-        logarithms: Decimal logarithms of the links' distances, under h conventions at once.
+        logarithms: Decimal logarithms of the links' distances, for h conventions at once.
         sample: Receivers and levels of the links.
-        patterns: True to fit a harmonic of the azimuth, too, for receivers with a main direction;
+        patterns: True to fit also a harmonic of the azimuth, for directional receivers;
             ``logarithms`` are then (n,).
 
     Source: Huber, Robust estimation of a location parameter, 1964.
@@ -58,7 +59,7 @@ def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = 
         others = torch.stack((torch.ones_like(x), azimuths.cos(), azimuths.sin()), 1)
     levels = sample.labels.expand_as(logarithms)
     weights = torch.ones_like(logarithms)
-    # Least squares, weighted anew each time: an error beyond 1.345 deviations counts linearly.
+    # Reweighted least squares: an error beyond 1.345 deviations counts linearly.
     for _ in range(5):
         x = _without(others, logarithms, weights, sample)
         y = _without(others, levels, weights, sample)
@@ -73,7 +74,7 @@ def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = 
 
 
 def explained(sample: Sample) -> float:
-    """Share of the levels' mean absolute deviation that the law of distance explains."""
+    """Fraction of the levels' mean absolute deviation that the law of distance explains."""
     law = fit_law(decades(sample), sample)
     mean = fit_law(torch.zeros_like(law.errors), sample)
     return max(0.0, 1 - (law.errors.abs().mean() / mean.errors.abs().mean().clamp_min(1e-9)).item())
@@ -82,11 +83,12 @@ def explained(sample: Sample) -> float:
 def compare(
     read: Float[Tensor, " n"], fits: Float[Tensor, " n"], sample: Sample, cells: int = 6
 ) -> Gain:
-    """How much smaller the errors ``fits`` of another law are than the errors ``read`` [dB].
+    """Comparison of the errors ``read`` of one law with the errors ``fits`` of another law [dB].
 
-    An error above 30 dB counts as 30 dB. Shadowing is alike at near places: all links of a receiver
-    in a cell of the plan, with at most ``cells`` cells along x and along y, are one observation.
-    The log likelihood of m observations with a mean error of s is -m log(s), up to a constant.
+    Errors above 30 dB count as 30 dB. Shadowing is similar at nearby places, so all links of a
+    receiver in a cell of the floor plan are one observation. There are at most ``cells`` cells
+    along x and along y. The log likelihood of m observations with a mean error of s is -m log(s),
+    up to a constant.
     """
     before = read.abs().clamp_max(30).mean().item()
     after = fits.abs().clamp_max(30).mean().item()
@@ -111,7 +113,7 @@ def _without(
     weights: Float[Tensor, "*h n"],
     sample: Sample,
 ) -> Float[Tensor, "*h n"]:
-    """Values less their weighted least-squares fit by the columns ``others`` at each receiver."""
+    """Values minus their weighted least-squares fit by the columns ``others``, at each receiver."""
     if others.shape[-1] == 1:
         means = _sums(weights * values, sample) / _sums(weights, sample).clamp_min(1e-9)
         return values - means[..., sample.receivers]

@@ -1,19 +1,19 @@
-"""What a check finds in data."""
+"""Findings of checks of data."""
 
 from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault that data probably have.
+    """A probable fault of the data.
 
     Attributes:
         fault: Short name, such as "order of the quaternion".
-        text: What was found, and by how much.
-        mend: Correction of the data, an option or a line of numpy; empty if there is none.
-        read: Score of the data as they were read; None if nothing was compared.
-        fits: The same score under the convention that fits.
-        score: Meaning of both scores with their unit.
+        text: Description of the fault, with its size.
+        mend: Correction of the data, an option or a line of numpy; empty if unknown.
+        read: Score of the data as read; None without a comparison.
+        fits: Score under the convention that fits.
+        score: Meaning and unit of both scores.
 
     Example:
         >>> str(Finding("unit of levels", "levels are positive", "levels = 10 * np.log10(levels)"))

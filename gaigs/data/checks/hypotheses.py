@@ -1,4 +1,4 @@
-"""Conventions under which data may have been written, and how well each explains the labels."""
+"""Possible conventions of data, and how well each explains the labels."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from gaigs.core.query import evenly
 
 @dataclass(frozen=True)
 class Sample:
-    """Links, evenly spread over the data, in the form that hypotheses change."""
+    """Links, evenly spread over the data, in a form that hypotheses change."""
 
     index: Int[Tensor, " n"]  # numbers of the links among all
     transmitters: Float[Tensor, "n 3"]  # positions of the links' transmitters [m]
@@ -32,7 +32,7 @@ class Sample:
         return torch.einsum("nw,nwa->na", offsets, self.rotations[self.receivers])
 
     def at(self, index: Int[Tensor, " k"]) -> "Sample":
-        """The links of these numbers within the sample."""
+        """The links of the sample with these numbers."""
         return replace(
             self,
             index=self.index[index],
@@ -47,7 +47,7 @@ class Sample:
 
 
 class Hypothesis(NamedTuple):
-    """A convention under which the data may have been written."""
+    """A possible convention of the data."""
 
     name: str
     change: Callable[[Sample], Sample]  # gives the sample as read by the convention
@@ -61,7 +61,7 @@ def sample_of(links: Any, most: int) -> Sample:
 
 
 def sample_at(links: Any, index: Int[Tensor, " n"]) -> Sample:
-    """The links of these numbers as a sample, in double precision."""
+    """The links with these numbers as a sample, in double precision."""
     poses = [receiver.pose for receiver in links.receivers]
     labels = links.labels[index]
     return Sample(

@@ -62,13 +62,14 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 
 
 def _linear_unit(sample: Sample | None, text: str, median: float) -> Finding:
-    """The finding that positive levels are volts, watts, mW or less instead of decibels.
+    """The finding that positive levels are in volts, watts, mW or less instead of decibels.
 
-    By 10 log10, amplitudes fall by 10 dB a decade of distance, and powers by 20: such a slope tells
-    volts. Else the size of the levels tells watts from mW.
+    Amplitudes fall with 1 / distance: 10 log10 of them falls by 10 dB a decade, 10 log10 of powers
+    by 20 dB. A slope near 10 dB therefore means volts. Otherwise the size of the levels
+    distinguishes watts from mW.
 
     Args:
-        sample: Links of the receivers whose places are given, for the slope; None: no place is.
+        sample: Links of the receivers with given places, for the slope; None without given places.
         text: Start of the finding's text.
         median: 10 log10 of the median level.
     """
@@ -116,7 +117,7 @@ def check_signs(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 
 
 def check_columns(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
-    """Findings about receivers with one level throughout, or with the levels of another one."""
+    """Findings about receivers with a constant level, or with the levels of another receiver."""
     names = [receiver.name for receiver in links.receivers]
     _, place = links.query.place_keys.unique(return_inverse=True)
     count = int(place.max()) + 1
@@ -140,7 +141,7 @@ def check_columns(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 
 
 def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterator[Finding]:
-    """Findings about levels far from near places' levels, and about an order of rows."""
+    """Findings about levels that differ from nearby levels, and about a wrong order of rows."""
     sample = sample_of(replace(links, split=None), most)
     excess = above_neighbours(sample)
     is_placed = torch.ones(len(links.receivers), dtype=torch.bool)
@@ -173,9 +174,10 @@ def check_neighbours(links: Any, most: int = 100_000, shown: int = 3) -> Iterato
 
 
 def above_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, " n"]:
-    """Each level less the median of its neighbours' levels [dB].
+    """Difference of each level from the median of its neighbours' levels [dB].
 
-    Neighbours are the nearest links of the same receiver; a receiver with under 6 links gives 0.
+    Neighbours are the nearest links of the same receiver. The result is 0 for receivers with fewer
+    than 6 links.
     """
     excess = torch.zeros_like(sample.labels)
     for number in range(len(sample.positions)):
@@ -194,12 +196,12 @@ def above_neighbours(sample: Sample, neighbours: int = 8) -> Float[Tensor, " n"]
 def check_places_of_levels(
     sample: Sample, excess: Float[Tensor, " n"], is_placed: Bool[Tensor, " r"]
 ) -> Iterator[Finding]:
-    """A finding if levels follow neither distance nor neighbours, as in a wrong order of rows.
+    """A finding if levels follow neither distance nor neighbours, as with a wrong order of rows.
 
     Args:
         sample: Links of all receivers.
-        excess: Levels above their neighbours [dB], as of ``above_neighbours``.
-        is_placed: True for receivers at given places; links of the others do not count.
+        excess: Differences of levels from their neighbours [dB], from ``above_neighbours``.
+        is_placed: True for receivers at given places; links of other receivers do not count.
     """
     counts = is_placed[sample.receivers] & (excess != 0)
     # A law of equal distances leaves levels less their receiver's mean.
@@ -221,7 +223,7 @@ def check_places_of_levels(
 
 
 def _scale(errors: Float[Tensor, " n"], sample: Sample) -> Float[Tensor, " r"]:
-    """Robust standard deviation at each receiver, or of all at a receiver with under 10 links."""
+    """Robust standard deviation at each receiver; with under 10 links, of all receivers."""
     scales = (1.4826 * errors.abs().median()).expand(len(sample.positions)).clone()
     for number in range(len(scales)):
         at_receiver = errors[sample.receivers == number]

@@ -1,4 +1,4 @@
-"""Checks of places, walls and arrays: other units, other frames, receivers in twos."""
+"""Checks of places, walls and arrays: other units, other frames, receivers at one place."""
 
 import math
 from collections.abc import Iterator
@@ -73,7 +73,7 @@ def check_extent(links: Any) -> Iterator[Finding]:
 
 
 def scale_of(places: Float[Tensor, "n 3"]) -> str:
-    """How places seem to be scaled, such as to 0..1, or standardised; empty if not."""
+    """Apparent scaling of places, such as to 0..1, or standardised; empty if not scaled."""
     low, high = places.min().item(), places.max().item()
     for lower, upper in ((0.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)):
         margin = 0.15 * (upper - lower)  # places seldom reach the walls of the room that was scaled
@@ -86,7 +86,7 @@ def scale_of(places: Float[Tensor, "n 3"]) -> str:
 
 
 def sites_of(query: Query) -> Float[Tensor, "k 3"]:
-    """The different places of transmitters."""
+    """The distinct places of transmitters."""
     _, which = query.place_keys.unique(return_inverse=True)
     sites = query.transmitters.new_zeros((int(which.max()) + 1, 3))
     sites[which] = query.transmitters
@@ -137,7 +137,7 @@ def check_arrays(links: Any) -> Iterator[Finding]:
 
 
 def check_walls(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> Iterator[Finding]:
-    """A finding if walls, from above, are in another unit or elsewhere than the places."""
+    """A finding if walls, from above, are in another unit or area than the places."""
     across = _diagonal(walls[:, :2])
     room = _diagonal(places[:, :2])
     if across and room and not 1 / 50 < across / room < 50:  # millimetres differ by 1000
@@ -147,7 +147,7 @@ def check_walls(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> It
     lower, upper = walls[:, :2].amin(0), walls[:, :2].amax(0)
     gaps = torch.maximum(lower - places[:, :2].amax(0), places[:, :2].amin(0) - upper)  # (2,)
     apart = gaps.clamp_min(0).norm().item()
-    if apart > 0.1 * (across + room):  # a single wall stands apart, too
+    if apart > 0.1 * (across + room):  # a single wall may also be some distance away
         text = f"the walls are {apart:.3g} m from all transmitters and receivers"
         yield Finding("frame of walls", text, "are both in one frame?")
 
@@ -169,7 +169,7 @@ def check_constant(links: Any) -> Iterator[Finding]:
 
 
 def _measured(links: Any) -> list[int]:
-    """Receivers whose place was measured, and not estimated from levels."""
+    """Receivers with a measured place, not one estimated from levels."""
     numbers = range(len(links.receivers))
     return [k for k in numbers if links.uncertainties is None or not links.uncertainties[k]]
 

@@ -19,9 +19,10 @@ from gaigs.io.tables import shortened
 
 
 def check_receivers(links: Any) -> Iterator[Finding]:
-    """Findings about places of receivers that levels contradict.
+    """Findings about places of receivers that contradict the levels.
 
-    The first explanation counts: another convention or order, another origin, or single receivers.
+    Possible faults are tried in this order, and the first one that explains the levels counts:
+    another convention or order, another origin, single receivers at wrong places.
     """
     placed = sample_of_given(links)
     if placed is None:
@@ -36,7 +37,7 @@ def check_receivers(links: Any) -> Iterator[Finding]:
 
 
 def check_power(links: Any) -> Iterator[Finding]:
-    """A finding if no usual transmitter has such levels at such distances, as with mm or km."""
+    """A finding if the levels need an impossible transmit power, as with distances in mm or km."""
     placed = sample_of_given(links)
     if placed is None or links.frame is not None:
         return
@@ -47,12 +48,12 @@ def check_power(links: Any) -> Iterator[Finding]:
     carrier = None if carriers is None else carriers.median().item()
 
     def powers(supposed: float) -> Float[Tensor, " n"]:
-        """Transmitted powers in free space [dBm], by the carrier or a supposed one [Hz]."""
+        """Transmit powers in free space [dBm], at the carrier or a supposed one [Hz]."""
         wavelength = speed_of_light / (carrier or supposed)
         # Friis: the loss is 20 log10(4 pi d / wavelength).
         return sample.labels + 20 * (4 * math.pi * distances / wavelength).log10()
 
-    # A low carrier supposes a small loss: even so the power may be too high; and the reverse.
+    # If the carrier is unknown: 100 MHz gives the smallest power, 6 GHz the largest.
     strong = powers(1e8).quantile(0.95).item()
     weak = powers(6e9).quantile(0.95).item()
     usual = f"levels of {sample.labels.median():.3g} dBm at {distances.median():.3g} m"
@@ -101,7 +102,7 @@ def check_conventions(sample: Sample) -> Iterator[Finding]:
 
 
 def check_order(sample: Sample, names: Sequence[str]) -> Iterator[Finding]:
-    """A finding if levels of some receivers follow the distance from one another's places."""
+    """A finding if levels of some receivers fit the places of other receivers."""
     count = len(names)
     if not 2 <= count <= 64:
         return
@@ -174,9 +175,10 @@ def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain
 
 
 def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) -> Gain | None:
-    """The gain of another law's errors ``fits``; None if chance or directional antennas explain it.
+    """The gain of a law with the errors ``fits`` over the law of the data as read.
 
-    With ``is_fitted`` the places of the law were fitted to the levels: the bounds are higher.
+    None if chance or directional antennas explain the gain. ``is_fitted`` means that places were
+    fitted to the levels; the bounds for chance are then higher.
     """
     logarithms = decades(sample)
     gain = compare(fit_law(logarithms, sample).errors, fits, sample)
@@ -189,7 +191,7 @@ def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) ->
 
 
 def _finding(fault: str, subject: str, gain: Gain, under: str, mend: str) -> Finding:
-    """The finding that levels of a subject follow the distance better under another convention."""
+    """The finding that levels fit the law of distance better under another convention."""
     text = (
         f"{subject} follow the distance to {gain.fits:.2g} dB instead of {gain.read:.2g} dB {under}"
     )
@@ -199,12 +201,12 @@ def _finding(fault: str, subject: str, gain: Gain, under: str, mend: str) -> Fin
 
 
 def _share(finding: Finding) -> float:
-    """Error of the fit over the error of the data as read."""
+    """Ratio of the error of the fit to the error of the data as read."""
     return (finding.fits or 0.0) / (finding.read or 1.0)
 
 
 def _only(sample: Sample, numbers: Int[Tensor, " k"]) -> Sample:
-    """The links of some receivers, numbered anew."""
+    """The links of some receivers, renumbered."""
     links = sample.at(torch.isin(sample.receivers, numbers).nonzero()[:, 0])
     _, receivers = links.receivers.unique(return_inverse=True)
     return replace(

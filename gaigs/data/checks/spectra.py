@@ -26,9 +26,10 @@ from gaigs.data.checks.places import scale_of
 
 
 def check_extremes(links: Any) -> Iterator[Finding]:
-    """Findings that count constant spectra, and min-max scaled ones without a pixel of 0 or of 1.
+    """Findings that count constant spectra, and min-max scaled spectra without a pixel of 0 or 1.
 
-    A ``ValueError`` if all spectra are constant, or too small for SSIM.
+    Raises:
+        ValueError: All spectra are constant, or too small for SSIM.
     """
     task, labels = links.task, links.labels
     if min(task.shape) < SSIM_WINDOW:
@@ -63,7 +64,7 @@ class Limits:
     """Limits of the check of directions."""
 
     fewest: int = 16  # fewest spectra that are checked
-    near: int = 32  # fewest spectra that show whether near places are alike
+    near: int = 32  # fewest spectra that show whether nearby places have similar ones
     most: int = 160  # most spectra that are read
     # Most rows and columns that are compared; an array resolves fewer.
     pixels: tuple[int, int] = (45, 90)
@@ -78,12 +79,12 @@ class Limits:
 
 
 def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Finding]:
-    """The convention by which spectra are bright towards their transmitters, if not the one read.
+    """A finding if spectra are bright towards their transmitters only under another convention.
 
-    A link's score says how few pixels are as bright as the one towards its transmitter, less the
-    same in the other spectra of the receiver. So what is bright in every spectrum adds nothing, and
-    a link behind walls scores about 0 by every convention. The strongest pixel need not be the
-    direct path.
+    The score of a link is the rareness of pixels as bright as the pixel towards its transmitter,
+    less the mean of the same over all spectra of the receiver. Pixels that are bright in every
+    spectrum therefore add nothing, and a link behind walls scores about 0 under every convention.
+    The score does not need the strongest pixel to be the direct path.
     """
     limits = limits or Limits()
     sample = sample_of(links, limits.most)
@@ -134,13 +135,13 @@ class Trials(NamedTuple):
 def trials(
     links: Any, sample: Sample, directions: "Directions", is_known: bool, limits: Limits
 ) -> Iterator[Trials]:
-    """Rounds of conventions to compare: single ones, then axes, then pairs of both.
+    """Rounds of conventions to compare: single changes, then axes, then pairs of changes.
 
     Args:
         directions: Brightness of the sample's spectra.
         is_known: True if the data as read score well. Two faults at once are then impossible, and
-            the round of pairs is left out.
-        limits: Errors by which a round must be better.
+            the round of pairs is skipped.
+        limits: Significance, in standard errors, that each round requires.
     """
     axes = [*of_axes(sample, [("tx",), ("rx",), ("tx", "rx")])]
     units = [*of_units([("tx",), ("rx",)])]  # in any unit of both, directions are the same
@@ -191,7 +192,7 @@ def best_directions(
 
 
 def near_likeness(sample: Sample) -> float:
-    """Mean correlation of each spectrum with that of the nearest place, both less the mean."""
+    """Mean correlation of each spectrum with the nearest place's, after removal of the mean."""
     pixels = sample.labels.flatten(1)
     likeness = torch.corrcoef(pixels - pixels.mean(0))  # (n, n)
     apart = torch.cdist(sample.transmitters, sample.transmitters).fill_diagonal_(math.inf)
@@ -199,13 +200,13 @@ def near_likeness(sample: Sample) -> float:
 
 
 class Directions:
-    """How bright spectra are towards the transmitters of a sample.
+    """Brightness of spectra towards the transmitters of a sample.
 
     Attributes:
-        grid: Directions of the pixels that are compared.
+        grid: Directions of the compared pixels.
         ranks: Rank of each pixel, 0 for the darkest and 1 for the brightest (n, rows, columns).
-        places: Number of independent places: those within a sixth of the room count as one, since
-            their spectra are alike.
+        places: Number of independent places. Places within a sixth of the room count as one, since
+            their spectra are similar.
     """
 
     def __init__(self, grid: Grid, sample: Sample, pixels: tuple[int, int]):
@@ -220,7 +221,7 @@ class Directions:
         self.places = len(cells.unique(dim=0))
 
     def scores(self, sample: Sample) -> Float[Tensor, " n"]:
-        """The score of each link; a transmitter beyond the grid's elevations counts as dark."""
+        """The score of each link; transmitters beyond the grid's elevations count as dark."""
         azimuths, elevations, _ = to_spherical(sample.local.float())
         rows = (elevations[:, None] - self.grid.elevations).abs().argmin(1)
         columns = torch.cos(azimuths[:, None] - self.grid.azimuths).argmax(1)
@@ -267,7 +268,7 @@ def column_changes(grid: Grid) -> list[Hypothesis]:
     """Other azimuths of the spectra's columns."""
 
     def moved(turn: float, sign: int) -> Callable[[Sample], Sample]:
-        """A function that reads columns at azimuths ``turn`` + ``sign`` * (the azimuths read)."""
+        """A function that reads columns at azimuths ``turn`` + ``sign`` * azimuth."""
         azimuths = sign * (grid.azimuths - turn)
         source = torch.cos(azimuths[:, None] - grid.azimuths).argmax(1)  # (columns,)
         return lambda read: replace(read, labels=read.labels[:, :, source])
@@ -315,7 +316,7 @@ def order_changes(links: Any) -> list[Hypothesis]:
 
 
 def scaling_changes(sample: Sample, grid: Grid) -> list[Hypothesis]:
-    """Transmitters that were scaled, with the scales and offsets that suit the spectra best."""
+    """Transmitters that were scaled, with scales and offsets that suit the spectra best."""
     scale = scale_of(sample.transmitters)
     if not scale:
         return []
@@ -324,17 +325,17 @@ def scaling_changes(sample: Sample, grid: Grid) -> list[Hypothesis]:
 
 
 def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sample], Sample]]:
-    """Functions that undo a scaling of the transmitters, each by another guess of the scaling.
+    """Functions that undo a scaling of the transmitters, each for one guess of the scaling.
 
-    A stored place p stands at s p + t from the receiver, with a scale s and an offset t for each
-    axis. Seen from there it is in the direction u of the link's brightest pixel, so that
-    (s p + t) x u = 0: two independent linear equations in the six unknowns (s, t). Three links
-    solve them, up to a common factor that no direction shows. Triples are drawn at random, since a
-    link's brightest pixel may be a reflection.
+    A stored place p is at s p + t from the receiver, with a scale s and an offset t for each axis.
+    The brightest pixel of the link has the direction u, so (s p + t) x u = 0. These are two
+    independent linear equations in the six unknowns (s, t). Three links determine them, up to a
+    common factor without effect on directions. Triples are drawn at random, since the brightest
+    pixel may be a reflection.
 
     Args:
-        sample: Spectra as ranks; the receiver with the most links counts.
-        draws: Triples of links, each with one guess; only positive scales are returned.
+        sample: Spectra as ranks; only the receiver with the most links is used.
+        draws: Number of triples, each with one guess; only positive scales are returned.
     """
     receiver = int(sample.receivers.bincount().argmax())
     links = (sample.receivers == receiver).nonzero()[:, 0]

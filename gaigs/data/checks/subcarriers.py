@@ -1,4 +1,4 @@
-"""Checks of subcarriers without geometry: those that are no channel, and their order."""
+"""Checks of subcarriers without geometry: guards and nulls, and the order."""
 
 import math
 from collections.abc import Iterator
@@ -16,9 +16,10 @@ from gaigs.io.tables import shortened
 
 
 def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
-    """True for each guard or null subcarrier: at each element all links have one value there.
+    """True for each guard or null subcarrier: all links have the same value there, at each element.
 
-    Values that are 0 but for rounding count as one. With fewer than five links none is constant.
+    Values that differ from 0 only by rounding count as equal. With fewer than five links no
+    subcarrier is constant.
     """
     count = len(links.task.frequencies)
     chosen = torch.arange(count)
@@ -42,7 +43,7 @@ def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
 
 
 def constant_sentence(constant: Bool[Tensor, " s"], frequencies: Float[Tensor, " s"]) -> str:
-    """The sentence about constant subcarriers, with {} for what they are or become."""
+    """The sentence about constant subcarriers, with {} for a verb."""
     named = shortened([f"{carrier / 1e9:.6g}" for carrier in frequencies[constant].tolist()])
     return (
         f"{int(constant.sum())} of {len(constant)} subcarriers have one value in every link, {{}}: "
@@ -61,7 +62,7 @@ def check_constant_subcarriers(links: Any) -> Iterator[Finding]:
 
 
 def check_powers(sample: Sample) -> Iterator[Finding]:
-    """A finding about subcarriers 30 dB from the usual one: guards, pilots or unscaled ones."""
+    """A finding about subcarriers 30 dB from the median: guards, pilots or unscaled ones."""
     powers = sample.labels.abs().square().mean((0, 1)).clamp_min(1e-300)  # (s,)
     odd = (10 * (powers / powers.median()).log10()).abs() > 30
     if len(sample.labels) >= 5 and odd.any():
@@ -76,9 +77,10 @@ def check_powers(sample: Sample) -> Iterator[Finding]:
 
 
 def order_of_subcarriers(sample: Sample) -> Finding | None:
-    """A finding if channels jump within the band, and go on from its last to its first subcarrier.
+    """A finding if channels jump within the band, and continue from its last to its first
+    subcarrier.
 
-    A low correlation of neighbouring subcarriers is a jump. A phase and a delay of each link do not
+    A jump is a low correlation of neighbouring subcarriers. Phases and delays of links do not
     change this correlation.
     """
     order = sample.frequencies.argsort()

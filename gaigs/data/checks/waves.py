@@ -19,7 +19,7 @@ from gaigs.data.checks.hypotheses import Sample
 class FewWaves(NamedTuple):
     """Channels of unit power at few elements and subcarriers, and the direct wave there.
 
-    The wave is exp(-j 2 pi f d / c), of the distance d alone.
+    The wave is exp(-j 2 pi f d / c) at distance d, without the loss of free space.
     """
 
     channels: Complex[Tensor, "n e s"]
@@ -32,7 +32,7 @@ class FewWaves(NamedTuple):
 
 
 def direct_distances(sample: Sample) -> Float[Tensor, "n e"]:
-    """Distances from transmitters to elements [m]; to the array's middle for missing elements."""
+    """Distances from transmitters to elements [m]; for missing elements to the array's middle."""
     elements = pad_sequence([*sample.elements], batch_first=True)  # (r, e, 3)
     places = sample.positions[:, None] + torch.einsum("rwa,rea->rew", sample.rotations, elements)
     return (sample.transmitters[:, None] - places[sample.receivers]).norm(dim=-1)
@@ -66,17 +66,18 @@ def has_extent(sample: Sample) -> bool:
 
 
 def without_geometry(sample: Sample) -> Sample:
-    """The same channels with all transmitters and elements in the middle of their receiver."""
+    """The same channels with all transmitters and elements at the middle of their receiver."""
     points = tuple(torch.zeros_like(array) for array in sample.elements)
     return replace(sample, transmitters=sample.positions[sample.receivers], elements=points)
 
 
 def shares(sample: Sample, is_calibrated: bool = False) -> Float[Tensor, "2 r"]:
-    """Share of power that each receiver's mean channel keeps without the direct wave's phase.
+    """Fraction of power in each receiver's mean channel, after division by the direct wave.
 
-    There is a row for either sign of this phase. The mean is over links, and the share expected by
-    chance is subtracted. Elements and subcarriers have a mean each, as they may have unknown phases
-    that all links share; with ``is_calibrated`` they have one mean together.
+    The two rows are for the two signs of the wave's phase. The mean is over links, and the fraction
+    expected by chance is subtracted. Each element and subcarrier has its own mean, since it may
+    have an unknown phase that all links share. ``is_calibrated`` takes one mean over all elements
+    and subcarriers.
     """
     counts = sample.receivers.bincount(minlength=len(sample.positions))
     by_sign = []
@@ -92,15 +93,15 @@ def shares(sample: Sample, is_calibrated: bool = False) -> Float[Tensor, "2 r"]:
 
 
 def coherence(sample: Sample, is_calibrated: bool = False) -> float:
-    """Mean of ``shares`` over the links, with the sign that suits better."""
+    """Mean of ``shares`` over the links, with the better sign."""
     counts = sample.receivers.bincount(minlength=len(sample.positions)).double()
     return (shares(sample, is_calibrated) @ counts / counts.sum()).max().item()
 
 
 def likeness(sample: Sample) -> float:
-    """Share of the power that the direct wave explains after the best phase of each link.
+    """Fraction of power that the direct wave explains after the best phase of each link.
 
-    Each element and subcarrier may have a phase of its own, the same in all links.
+    Each element and subcarrier may have a further phase, the same in all links.
     """
     by_sign = []
     for unwound in waves_at_few(sample).without_waves():
@@ -119,7 +120,7 @@ def likeness(sample: Sample) -> float:
 
 
 def aligned_likeness(sample: Sample) -> float:
-    """Share of power that the direct wave explains after each link's best phase and delay."""
+    """Fraction of power that the direct wave explains after each link's best phase and delay."""
     few = waves_at_few(sample, subcarriers=16)
     by_sign = []
     for unwound in few.without_waves():
@@ -129,6 +130,6 @@ def aligned_likeness(sample: Sample) -> float:
 
 
 def level_share(sample: Sample) -> float:
-    """Share of the spread of the channels' mean powers that the law of distance explains."""
+    """Fraction of the variance of the channels' mean powers that the law of distance explains."""
     powers = sample.labels.abs().square().mean((1, 2)).clamp_min(1e-300)
     return explained(replace(sample, labels=10 * powers.log10()))

@@ -36,7 +36,7 @@ WEAK = -20.0
 
 
 class Columns(NamedTuple):
-    """Columns of gateways and what else the table has."""
+    """Columns of gateways and facts of the other columns."""
 
     gateways: list[int]  # numbers of the gateways' columns
     marks: list[float]  # values that mean "not heard"
@@ -60,9 +60,9 @@ class Axes(NamedTuple):
 
 
 def plain_name(name: str) -> tuple[str, float | None]:
-    """A heading's name, in small letters and digits, and its unit in metres: ("x", 0.01) of X [cm].
+    """Name of a heading, in lower-case letters and digits, and its unit [m].
 
-    The unit is None if there is none, or if it is no length.
+    "X [cm]" gives ("x", 0.01). The unit is None if it is missing or not a length.
     """
     metres = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "km": 1e3, "ft": 0.3048, "feet": 0.3048}
     unit = r"[\s_]*[\[(]?\s*(mm|cm|km|m|ft|feet|deg|°)?\s*[\])]?"
@@ -73,8 +73,8 @@ def plain_name(name: str) -> tuple[str, float | None]:
 def units_of(table: tables.Table, axes: Axes, epsg: int | None) -> list[float]:
     """Factors from the units in the headings of x, y and z to metres.
 
-    If the system ``epsg`` does not count in metres, x and y stay in its unit. A ``ValueError`` if
-    a heading then has another unit.
+    If the unit of the system ``epsg`` is not the metre, x and y stay in this unit. Raises a
+    ``ValueError`` if a heading then has another unit.
     """
     columns = [axes.x, axes.y, axes.z if axes.z >= 0 else axes.x]
     units = [plain_name(table.names[column])[1] for column in columns]
@@ -148,7 +148,7 @@ def find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) -> 
 def refuse_cells(
     table: tables.Table, columns: Sequence[int], wrong: Bool[ndarray, "rows c"], expected: str
 ) -> None:
-    """Raises a ``ValueError`` that names the first wrong cell of each row."""
+    """Raises a ``ValueError`` with the first wrong cell of each row."""
     cells = {}
     for row in np.flatnonzero(wrong.any(1)).tolist():
         cells[row] = table.cell(row, columns[int(wrong[row].argmax())])
@@ -164,9 +164,9 @@ def find_gateways(
 ) -> Columns:
     """The columns of gateways, and the values that mean "not heard" in them.
 
-    A gateway is a column of mostly low levels, or one named in ``placed``, the gateways with a
-    given place. A column without a level is left out. A ``ValueError`` if there is no gateway, or
-    if one of its cells is no level.
+    A gateway is a column of mostly low levels, or a column in ``placed``, the gateways with a given
+    place. Columns without a level are dropped. Raises a ``ValueError`` if there is no gateway, or
+    if a cell of a gateway is not a level.
     """
     reserved = {axes.x, axes.y, axes.z, *(table.column(name) for name in ignore)}
     free = [k for k in range(len(table.names)) if k not in reserved]
@@ -219,7 +219,7 @@ def find_gateways(
 
 
 def _is_weak(table: tables.Table, column: int) -> bool:
-    """True if half of a column's distinct numbers are low levels, and its name is no coordinate."""
+    """True if half of a column's distinct numbers are low levels, and it is not a coordinate."""
     if plain_name(table.names[column])[0] in HEIGHTS.union(*PAIRS[0], *PAIRS[1], *PAIRS[2]):
         return False
     numbers = table.numbers[:, column]

@@ -1,4 +1,4 @@
-"""Coordinates of a table's rows, and of gateways that a file, a mapping or a table gives."""
+"""Coordinates of a table's rows, and of gateways from a file, a mapping or a table."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,14 +21,14 @@ from gaigs.io.yaml import read_mapping, to_vector
 
 
 def name_of_gateways(gateways: str | Path | Mapping | tables.Table | None) -> str:
-    """Word for the gateways' origin in messages: their file, or ``receivers`` in memory."""
+    """Word for the source of gateways in messages: their file, or ``receivers`` in memory."""
     return Path(gateways).name if isinstance(gateways, str | Path) else "receivers"
 
 
 def read_points(
     table: tables.Table, axes: Axes, height: float, storey: float, epsg: int | None
 ) -> Float[ndarray, "rows 3"]:
-    """Coordinates of all rows; NaN where they are empty."""
+    """Coordinates of all rows; NaN for empty cells."""
     columns = axes.columns
     if len({*columns}) < len(columns):
         names = [table.names[column] for column in columns]
@@ -113,7 +113,7 @@ def _listed_gateways(
     storey: float,
     epsg: int | None,
 ) -> dict[str, list[float]]:
-    """Coordinates of gateways by their names, from a table with a gateway a row."""
+    """Coordinates of gateways by their names, from a table with a row for each gateway."""
     given_axes = find_axes(given)
     if given_axes.is_global != axes.is_global:
         raise ValueError(

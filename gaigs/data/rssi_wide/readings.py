@@ -1,4 +1,4 @@
-"""Readings of a table: from a row each to a gateway a column, and averaged at each place."""
+"""Readings of a table: rearranged from one in each row, and averaged at each place."""
 
 import math
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from gaigs.io import tables
 
 
 class Pivoted(NamedTuple):
-    """A table of readings, rearranged to a place a row and a gateway a column."""
+    """A table of readings, rearranged to a row for each place and a column for each gateway."""
 
     table: tables.Table  # coordinates first; a place with repeated readings has several rows
     axes: Axes  # its columns of coordinates
@@ -22,7 +22,7 @@ class Pivoted(NamedTuple):
 
 
 def pivoted(table: tables.Table, axes: Axes, receiver: str | None, level: str | None) -> Pivoted:
-    """Rearranges a table with a reading a row into one with a place a row and a gateway a column.
+    """Rearranges a table with one reading in each row: places become rows, gateways become columns.
 
     Args:
         receiver: Column of the gateways' names.
@@ -84,9 +84,9 @@ def pivoted(table: tables.Table, axes: Axes, receiver: str | None, level: str | 
 
 
 def refuse_readings(table: tables.Table, columns: Columns) -> None:
-    """Raises a ``ValueError`` if the table seems to have a reading a row.
+    """Raises a ``ValueError`` if each row of the table seems to be one reading.
 
-    It then has a single column of levels, and another that names the gateway of each.
+    Such a table has a single column of levels, and a column with the gateways' names.
     """
     if len(columns.gateways) > 1:
         return

@@ -38,7 +38,7 @@ TABULATED = {
 
 @dataclass(frozen=True)
 class Box:
-    """A piece of furniture: a cuboid along the room's axes that dims waves passing through it."""
+    """A piece of furniture: a box along the room's axes that attenuates waves through it."""
 
     name: str
     # Opposite corners, world frame [m].
@@ -82,7 +82,8 @@ def conductivity(material: str, frequency: float) -> float:
 def cells(order: int) -> Int[Tensor, "p 3"]:
     """Numbers i along x, j along y and k along z of the mirrored copies of the room.
 
-    A path to a copy has |i| + |j| + |k| reflections, at most ``order``; fewer ones come first.
+    A path to a copy has |i| + |j| + |k| reflections, at most ``order``. Copies with fewer
+    reflections come first.
     """
 
     def reflections(cell: tuple[int, ...]) -> int:
@@ -106,10 +107,10 @@ def passes(
     lower: Float[Tensor, "*#batch 3"],
     upper: Float[Tensor, "*#batch 3"],
 ) -> Tensor:
-    """True for segments from ``start`` to ``end`` that pass through cuboids along the axes.
+    """True for segments from ``start`` to ``end`` that pass through boxes along the axes.
 
-    The inside lies between the last entry and the first exit. A segment within a face has 0 / 0,
-    hence NaN, and does not pass.
+    The part inside a box is between the last entry and the first exit. A segment within a face
+    gives 0 / 0 = NaN, which counts as not passing.
     """
     ray = end - start
     # Shares of the segment at which it crosses the planes of the faces.
@@ -122,7 +123,7 @@ def passes(
 
 @dataclass(frozen=True)
 class Paths:
-    """Paths from transmitters to one receiver point, each straight from an image."""
+    """Paths from transmitters to one receiver position, each straight from an image."""
 
     # Mirrored transmitters, world frame [m]; the first is the transmitter itself.
     images: Float[Tensor, "b p 3"]
@@ -139,9 +140,9 @@ def trace(
 ) -> Paths:
     """Every path with at most ``order`` reflections between positions [m].
 
-    Gains are those at a frequency [Hz]. The field is vertically polarised: TE at the four walls, TM
-    at floor and ceiling. The furniture is mirrored with the room, so a path is the straight line
-    from the receiver to an image.
+    Gains are at a frequency [Hz]. The field is vertically polarised: TE at the four walls, TM at
+    floor and ceiling. The furniture is mirrored with the room, so a path is the straight line from
+    the receiver to an image.
 
     Source: Allen and Berkley, Image method for efficiently simulating small-room acoustics, 1979;
     ITU-R P.2040-3.
@@ -185,10 +186,10 @@ def trace(
 def bounces(
     room: Room, images: Float[Tensor, "b p 3"], receiver: Float[Tensor, "3"], order: int
 ) -> Float[Tensor, "b p order 3"]:
-    """Points at which paths are reflected, from the receiver on [m]; NaN after the last one.
+    """Reflection points of paths [m], in order from the receiver; NaN after the last one.
 
-    The walls of all mirrored copies are planes of a lattice. A straight line to an image crosses
-    one at each reflection; the crossings are folded back into the room.
+    The walls of all mirrored copies are planes of a lattice. A straight line to an image crosses a
+    plane at each reflection. The crossings are folded back into the room.
     """
     start = receiver.to(images)
     size = images.new_tensor(room.size)
@@ -221,11 +222,11 @@ def frequency_offsets(room: Room, bandwidth: float, order: int) -> Float[Tensor,
 def respond(
     paths: Paths, receiver: Receiver, frequency: float, offsets: Float[Tensor, " f"]
 ) -> Complex[Tensor, "b elements f"]:
-    """Field at each element of a receiver's array along paths from unit-power transmitters.
+    """Field at each element of a receiver's array, along paths from unit-power transmitters.
 
-    The phase follows a spherical wave from each image to each element. Gains and the elements'
-    pattern belong to paths to the array's centre at the carrier; ``offsets`` are relative to it
-    [Hz].
+    The phase is of a spherical wave from each image to each element. Gains and the elements'
+    pattern are computed at the array's centre and the carrier; ``offsets`` are relative to the
+    carrier [Hz].
     """
     frequencies = frequency + offsets.double()
     if frequencies.min() <= 0:

@@ -1,4 +1,4 @@
-"""Deformations predict from the tokens how each Gaussian changes for a query."""
+"""Deformations predict the change of each Gaussian for a query from the tokens."""
 
 from abc import ABC, abstractmethod
 from typing import NamedTuple
@@ -18,9 +18,9 @@ class Residuals(NamedTuple):
         delta_scales: d_scaling, added to the standard deviations [m].
         delta_signal: d_signal, added to the coefficients of the signal.
         delta_opacities: d_attn, added to the opacities.
-        attenuations: delta in (0, 1], the share of the field that passes a Gaussian.
+        attenuations: delta in (0, 1], the fraction of the field that a Gaussian transmits.
 
-    Source: GAI-GS, "Scene Mapping Network"; delta is of eq. (11).
+    Source: GAI-GS, "Scene Mapping Network"; eq. (11) for delta.
     """
 
     delta_quats: Float[Tensor, "b n 4"] | None = None
@@ -34,12 +34,12 @@ class Deformation(nn.Module, ABC):
     """The contract of kind ``deformation``.
 
     A constructor may take ``scene``; ``channels``, the number of signal channels;
-    ``tokenizer_widths``; and ``count``, the number of Gaussians, which is None where a placement
-    adds further ones.
+    ``tokenizer_widths``; and ``count``, the number of Gaussians. ``count`` is None if a placement
+    adds further Gaussians.
 
     Attributes:
         reads_tokens: True if it needs tokens; if False, no tokenizer is built.
-        sees_receivers: True if the change depends on the receiver.
+        sees_receivers: True if the residuals depend on the receiver.
         follows: Names of parameters with a row for each Gaussian; density control prunes and copies
             their rows.
         learning_rate: Rate of the parameter group ``network``; None: the model's default.
@@ -52,7 +52,7 @@ class Deformation(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
-        """Predicts the changes for each query.
+        """Predicts the residuals for each query.
 
         Args:
             tokens: Tokens of the queries and Gaussians; None if ``reads_tokens`` is False.

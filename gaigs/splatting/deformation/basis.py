@@ -1,4 +1,4 @@
-"""A network of the transmitter alone, whose features each Gaussian weighs for itself."""
+"""A network of the transmitter only; each Gaussian has its weights of the network's features."""
 
 import torch
 from jaxtyping import Float
@@ -17,28 +17,28 @@ from gaigs.splatting.gaussians import Placed, Tokens
 class Basis(Deformation):
     """Residuals of signal and opacity as sums of features of the transmitter.
 
-    A network F turns a transmitter's tokens into features h = F(E(P_TX), CLS). The residual of
-    Gaussian n is w_n h, and w_n is a parameter of this Gaussian. The network runs once for a
-    transmitter, and not for every pair of a transmitter and a Gaussian, so a step of b transmitters
-    and n Gaussians costs n times less.
+    A network F computes features h = F(E(P_TX), CLS) from a transmitter's tokens. The residual of
+    Gaussian n is w_n h, with trainable weights w_n. The network runs once for each transmitter
+    instead of each pair of a transmitter and a Gaussian, which divides its cost by the number of
+    Gaussians.
 
     Args:
-        scene: Its number of training places sets the width.
+        scene: The number of its training places sets the width.
         count: Number of Gaussians.
-        tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens; the
-            Gaussians' tokens are not read.
+        tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens. Tokens of
+            Gaussians are not used.
         channels: Signal channels of a Gaussian.
         width: Width of the network; None: ``suitable_width`` of the training places.
         layers: Residual layers after the first layer.
 
     Attributes:
-        weights: w_n, for the signal's channels and last the opacity (n, channels + 1, width).
+        weights: w_n (n, channels + 1, width), for the signal's channels, then the opacity.
 
     Raises:
         ValueError: An option is out of range, or the number of Gaussians is not fixed.
 
-    Source: ours, in place of GAI-GS, "Scene Mapping Network", eq. (11) and (12); the form is
-    DeepONet's (Lu et al., 2021), with free weights for its branch network.
+    Source: ours, instead of GAI-GS, "Scene Mapping Network", eq. (11) and (12). The form is
+    DeepONet's (Lu et al., 2021) with free weights instead of its branch network.
     """
 
     follows = ("weights",)
@@ -90,9 +90,9 @@ class Basis(Deformation):
 
 
 def suitable_width(places: int) -> int:
-    """Width of the network for this many training places.
+    """Width of the network for this number of training places.
 
-    Chosen on validation parts of sets of 42, 252 and 4,408 places (docs/results.md).
+    The rule was chosen on validation links of sets of 42, 252 and 4,408 places (docs/results.md).
     """
     if places < 100:
         return 128

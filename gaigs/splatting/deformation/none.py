@@ -1,4 +1,4 @@
-"""No deformation: every transmitter excites the Gaussians alike."""
+"""No deformation: the Gaussians are equal for all transmitters."""
 
 from gaigs.core.query import Query
 from gaigs.registry import register

@@ -23,8 +23,8 @@ LEAST_ATTENUATION = 1e-6
 class TokenLinear(nn.Module):
     """A linear layer on [hidden, E(P_x), E(P_TX), CLS] of every pair of transmitter and Gaussian.
 
-    The layer is the sum of one linear map for each part. Only the map of ``hidden`` is computed for
-    all b x n pairs.
+    The layer is a sum of four linear maps, one for each part of the input. Only the map of
+    ``hidden`` is computed for all b x n pairs.
 
     Args:
         tokens: Widths of (scene, gaussians, transmitters); a part of width 0 has no map.
@@ -64,7 +64,7 @@ def _linear(inputs: int, width: int) -> nn.Linear | None:
 
 
 class ResidualLayer(nn.Module):
-    """h + GELU(W h), which keeps the geometry of earlier layers.
+    """h + GELU(W h), a residual layer that preserves the geometry of earlier layers.
 
     Source: GAI-GS, "Scene Mapping Network": "residual connections to stabilize training and
     preserve geometric information".
@@ -80,19 +80,19 @@ class ResidualLayer(nn.Module):
 
 @register("deformation", "two_branch")
 class TwoBranch(Deformation):
-    """The paper's two branches, from the tokens of b queries and n Gaussians to residuals.
+    """The two branches of the paper, from the tokens of b queries and n Gaussians to residuals.
 
-    Attenuation branch: f = residual layers on [E(P_x), E(P_TX), CLS]; heads for the opacity
-    residual and delta. Signal branch: h = residual layers on [f, E(P_x), E(P_TX), CLS]. Heads on
-    [f, h]: rotation, scale, signal. Heads other than the signal's start at zero residual, delta at
-    ``INITIAL_ATTENUATION``.
+    Attenuation branch: f = residual layers on [E(P_x), E(P_TX), CLS], with heads for the opacity
+    residual and delta. Signal branch: h = residual layers on [f, E(P_x), E(P_TX), CLS], with heads
+    on [f, h] for rotation, scale and signal. At the start delta is ``INITIAL_ATTENUATION``, and the
+    residuals of all other heads except the signal's are 0.
 
     Args:
         tokenizer_widths: Widths of (scene, gaussians, transmitters) in the tokens.
         channels: Signal channels of a Gaussian.
         width: Width of both branches.
         attenuation_layers, signal_layers: Residual layers of each branch after its first layer.
-        heads: Heads in use, of ``all_heads``; branches that no head needs have no parameters.
+        heads: Used heads, of ``all_heads``. Branches without a used head have no parameters.
 
     Attributes:
         all_heads: Names of the heads, in the order of ``Residuals``.
@@ -136,13 +136,13 @@ class TwoBranch(Deformation):
         self._start_heads()
 
     def _add_heads(self, heads: Sequence[str], sizes: dict[str, int], width: int) -> None:
-        """Adds the ``heads`` in use, with their ``sizes`` of outputs, on features of ``width``."""
+        """Adds the used ``heads``, with ``sizes`` outputs each, on features of ``width``."""
         for name, size in sizes.items():
             if name in heads:
                 self.heads[name] = nn.Linear(width, size)
 
     def _start_heads(self) -> None:
-        """Sets all heads but the signal's to zero residual, and delta to its initial value."""
+        """Sets all heads except the signal's to zero residual, and delta to its initial value."""
         for name, head in self.heads.items():
             if name != "signal":
                 nn.init.zeros_(head.weight)

@@ -28,4 +28,4 @@ class MeanError(ABC):
 
     @abstractmethod
     def mean(self, values: Tensor, labels: Tensor) -> Tensor:
-        """The loss alone."""
+        """Only the loss."""

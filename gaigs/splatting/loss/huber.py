@@ -10,10 +10,10 @@ from gaigs.splatting.loss.errors import MeanError
 
 @register("loss", "huber")
 class Huber(MeanError):
-    """The mean of half the squared error up to ``delta``, and of a line beyond.
+    """The mean of half the squared error up to ``delta``, and a linear function of larger errors.
 
     Args:
-        delta: Error at which the square turns into a line, in the label's unit (dB for RSSI).
+        delta: Error at which the loss becomes linear, in the label's unit (dB for RSSI).
 
     Raises:
         ValueError: ``delta`` is not positive, or the labels are complex.

@@ -16,8 +16,8 @@ from gaigs.registry import register
 class L1Ssim:
     """(1 - ssim) L_MAE + ssim (1 - SSIM) on the label's grid or a thinned one.
 
-    The SSIM window has uniform weights. On a thinned grid its edge spans about the angle of 7
-    pixels of the label's own grid, as in the reported score; it has 3 pixels or more.
+    The SSIM window has uniform weights. On the label's own grid its edge is 7 pixels, as in the
+    reported score. On a thinned grid it covers about the same angle, at least 3 pixels.
 
     Args:
         task: Task of the labels, which has directions.
@@ -26,7 +26,7 @@ class L1Ssim:
     Raises:
         ValueError: The weight is out of range, or the labels have no directions.
 
-    Source: GAI-GS, "Results", eq. (15). Its penalty on d_attn is a penalty of the model.
+    Source: GAI-GS, "Results", eq. (15). The model, not the loss, has the paper's penalty on d_attn.
     """
 
     def __init__(self, task: Task, ssim: float = 0.2):
@@ -43,8 +43,7 @@ class L1Ssim:
         """The loss, and its terms ``l1`` and ``ssim``.
 
         Raises:
-            ValueError: The batch's directions are a list, which has no windows, or fewer than 3 x
-                3.
+            ValueError: The batch's directions are a list without windows, or a grid below 3 x 3.
         """
         window = find_window("l1_ssim", batch.directions, self.pitch, SSIM_WINDOW)
         similarity = structural_similarity(values, batch.labels, window)
@@ -54,7 +53,8 @@ class L1Ssim:
 
 
 def find_window(loss: str, directions: Directions | None, pitch: float, pixels: int) -> int:
-    """Edge of an SSIM window on a thinned grid [pixels], odd, of the same angle as on the full one.
+    """Edge of an SSIM window on a thinned grid [pixels], odd, with the same angle as on the full
+    grid.
 
     Args:
         loss: Name of the loss, for errors.
@@ -80,8 +80,8 @@ def structural_similarity(
 ) -> Float[Tensor, ""]:
     """Mean SSIM over all windows within the images.
 
-    Weights are uniform, covariances divide by n - 1, and the data range is 1. A window of 7 on
-    the full grid gives the reported score, scikit-image's, with gradients.
+    Weights are uniform, covariances divide by n - 1, and the data range is 1. With a window of 7 on
+    the full grid this is scikit-image's SSIM, the reported score, with gradients.
 
     Args:
         values, labels: Spectra in [0, 1].
@@ -109,16 +109,16 @@ def structural_similarity(
 def window_means(
     images: Float[Tensor, "*batch rows columns"], window: int
 ) -> Float[Tensor, "*batch r c"]:
-    """Means over every square window within an image, as ``avg_pool2d`` with stride 1 gives them.
+    """Means over every square window within an image, equal to ``avg_pool2d`` with stride 1.
 
-    On a CPU ``avg_pool2d`` adds window² pixels for each mean; here whole images are added along
-    rows, then columns.
+    On a CPU ``avg_pool2d`` adds window² pixels for each mean. This function adds whole images along
+    rows, then columns, which is faster.
     """
     return _WindowMeans.apply(images, window)
 
 
 class _WindowMeans(torch.autograd.Function):
-    """``window_means`` with its gradient, which spreads each mean's over the window."""
+    """``window_means`` with its gradient, which spreads the gradient of a mean over its window."""
 
     @staticmethod
     def forward(ctx, images, window):

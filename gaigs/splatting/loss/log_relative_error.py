@@ -12,13 +12,14 @@ from gaigs.splatting.loss.relative_error import RelativeError
 class LogRelativeError(RelativeError):
     """The mean over the links of ln((1 + r / floor) / (1 + r floor)), r = |h - h'|² / |h|².
 
-    -10 log10 r is a link's SNR [dB]. Between the bounds -10 log10(floor) and 10 log10(floor) dB the
-    loss is linear in the SNR, so all links have equal weight. Beyond the bounds a link has less and
-    less weight.
+    The SNR of a link is -10 log10 r [dB]. Between the bounds -10 log10(floor) and 10 log10(floor)
+    dB the loss is linear in the SNR, so all links have equal weight. Outside the bounds the weight
+    of a link falls.
 
     Args:
         task: Task of the labels, which are complex.
-        floor: Relative error at the upper bound; its inverse is at the lower one. 1e-3 is 30 dB.
+        floor: Relative error at the upper bound, and inverse of the relative error at the lower
+            bound. 1e-3 is 30 dB.
 
     Raises:
         ValueError: The floor is not in (0, 1), or the labels are real.

@@ -13,10 +13,10 @@ from gaigs.registry import register
 class RelativeError:
     """The mean over the links of r = |h - h'|² / |h|².
 
-    Labels are aligned by ``Task.align``, which takes off a phase or delay that nobody knows.
+    ``Task.align`` removes unknown phases and delays of labels.
 
-    A link in deep shadow outweighs all others: predictions near zero minimise this mean over a
-    room. ``log_relative_error`` does not have that fault.
+    A link in deep shadow outweighs all others, so predictions near zero minimise this mean over a
+    room. ``log_relative_error`` does not have this fault.
 
     Args:
         task: Task of the labels, which are complex.

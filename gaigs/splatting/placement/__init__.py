@@ -12,14 +12,14 @@ from gaigs.splatting.gaussians import Gaussians, Placed
 
 
 class Placement(nn.Module, ABC):
-    """The contract of kind ``placement``; a constructor is offered ``scene`` and ``channels``.
+    """The contract of kind ``placement``; a constructor may take ``scene`` and ``channels``.
 
     Attributes:
         sees_receivers: True if the Gaussians of a transmitter depend on the receiver.
-        model: Name of the only model that may have this placement, so that results named GAI-GS are
-            of the paper's placement; None: any model.
-        has_own: True if the placement makes Gaussians itself, so that the free (trainable) ones of
-            ``Gaussians`` may be left out.
+        model: Name of the only model that may use this placement, so that results named GAI-GS
+            always have the paper's placement; None: any model.
+        has_own: True if the placement makes Gaussians, so that the free (trainable) ones of
+            ``Gaussians`` may be missing.
         learning_rates: Default learning rate of each parameter group; ``training.learning_rates``
             overrides it.
         penalty_weights: Default weight of each penalty; ``training.penalties`` overrides it.
@@ -36,13 +36,12 @@ class Placement(nn.Module, ABC):
         """The Gaussians of each query.
 
         Args:
-            gaussians: The free Gaussians; where ``has_own`` is True, None if there are no free
-                ones.
+            gaussians: The free Gaussians; None if there are none, which requires ``has_own``.
             query: The links.
         """
 
     def fit(self, links: Links) -> None:
-        """Computes its state from the links before the training; by default nothing."""
+        """Computes the placement's state from the links before training; by default nothing."""
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """Parameters by the names in ``learning_rates``."""

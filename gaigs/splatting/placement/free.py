@@ -8,7 +8,7 @@ from gaigs.splatting.placement import Placement
 
 @register("placement", "free")
 class Free(Placement):
-    """Gaussians at their own means, whatever the query.
+    """Gaussians at their trainable means, for every query.
 
     Source: GAI-GS, section "Framework".
     """

@@ -1,4 +1,4 @@
-"""Poolings turn a map over directions, or propagation paths, into the label of a receiver."""
+"""Poolings convert a map over directions, or propagation paths, into the label of a receiver."""
 
 import math
 from abc import ABC, abstractmethod
@@ -15,12 +15,12 @@ class Pooling(nn.Module, ABC):
     """The contract of kind ``pooling``. A pooling reads maps; a ``PathPooling`` reads paths.
 
     Attributes:
-        channels: Real numbers that a Gaussian sends: channels of the map, or real and imaginary
+        channels: Real numbers that a Gaussian emits: channels of the map, or real and imaginary
             part of a path.
-        grid: Directions of the map that it sums over. None: the map is rendered in the label's
+        grid: Directions of the map that it sums. None: the map is rendered in the label's
             directions.
-        zone: Lowest and highest elevation from which the receiver gets power [rad]; used where
-            ``grid`` is set.
+        zone: Lowest and highest elevation from which the receiver gets power [rad]; used with
+            ``grid``.
 
     Source: the final step of GAI-GS, "Projection and Render Module".
     """
@@ -30,7 +30,7 @@ class Pooling(nn.Module, ABC):
     zone: tuple[float, float] = (-math.pi / 2, math.pi / 2)
 
     def fit(self, links: Links) -> None:
-        """Computes its state from the training links before the training; by default nothing."""
+        """Computes the state of the pooling from training links; by default nothing."""
 
     @abstractmethod
     def forward(self, received, query: Query, directions: Directions | None = None) -> Tensor:
@@ -38,17 +38,17 @@ class Pooling(nn.Module, ABC):
 
         Args:
             received: Maps (b, c, rows, columns), or ``ReceivedPaths``.
-            query: The link of each map or set of paths; all to one receiver.
-            directions: Wanted directions, where the label has any and they are not the map's; None:
-                the task's.
+            query: The link of each map or set of paths. All links are to one receiver.
+            directions: Requested directions of labels with directions, if different from the map's;
+                None: the task's.
         """
 
 
 def sphere(option: str, shape: Sequence[int]) -> Grid:
-    """A pooling's own grid from its option [rows, columns].
+    """The grid of a pooling from its option [rows, columns].
 
     Args:
-        option: The option, for errors.
+        option: Name of the option, for errors.
         shape: Rows and columns of the map over the full sphere.
     """
     if len(shape) != 2:

@@ -1,4 +1,4 @@
-"""The spatial spectrum as an array sees a map."""
+"""The spatial spectrum of an array from a map."""
 
 import math
 from collections.abc import Sequence
@@ -20,14 +20,15 @@ from gaigs.splatting.pooling.beamformer import Beamformer
 class ArrayResponsePooling(Pooling):
     """The conventional beamformer on the fields of a map at the array's elements.
 
-    A field is the sum of the complex map over the solid angle, times the element's pattern.
+    The field at an element is the integral of the complex map over the solid angle, weighted by the
+    element's pattern.
 
     Args:
-        scene: Its task has the directions, its receivers the arrays.
+        scene: Scene with the directions of the task and the receivers' arrays.
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
 
     Raises:
-        ValueError: The labels are no spectra scaled to [0, 1], or an array has a single element.
+        ValueError: The labels are not spectra scaled to [0, 1], or an array has a single element.
 
     Source: Van Trees, Optimum Array Processing, 2002, section 2.2, for the fields; ``Beamformer``
     for the rest.

@@ -25,17 +25,18 @@ class LagFit(NamedTuple):
 
 
 class Beamformer:
-    """The amplitude of the conventional beamformer, scaled as the labels are.
+    """The amplitude of the conventional beamformer, scaled like the labels.
 
         s(u) = sqrt(sum_D n_D R(D) exp(-j 2 pi D . u / lambda))
         label = (s - min s) / (max s - min s)
 
-    with u the direction cosines of a pixel, and R(D) the mean covariance of the n_D pairs of
-    elements that are D apart, a lag. s is the root of the paper's |a^H y|², eq. (4).
+    u are the direction cosines of a pixel. D is a lag, a vector between two elements. R(D) is the
+    mean covariance of the n_D pairs of elements with this vector. s is the root of the paper's |a^H
+    y|², eq. (4).
 
     Args:
         owner: Component named in errors.
-        scene: Its task has the directions and the normalisation, its receivers the arrays.
+        scene: Scene with directions and normalisation of the task, and the receivers' arrays.
 
     Source: GAI-GS, eq. (4); Bartlett, Smoothing periodograms from time series with continuous
     spectra, 1948; the spectra of NeRF².
@@ -77,19 +78,19 @@ class Beamformer:
 
         Args:
             lags: Mean covariance of the pairs of elements at each of ``array.lags``.
-            query: The link of each row; all to one receiver.
-            directions: Wanted directions; None: the task's.
+            query: The link of each row. All links are to one receiver.
+            directions: Requested directions; None: the task's.
         """
         grid = self.scene.task.directions
         asked = grid if directions is None else directions
         # Labels are scaled by the least and largest amplitude over the task's grid: where only some
         # of its directions are asked, the coarse grid shows these extremes.
         has_extremes = asked is grid or grid.matches(asked)
-        # The lags are symmetric: the middle one is the power, the later half determines the rest.
+        # The lags are symmetric: the middle one is the power, the second half determines the first.
         middle = lags.shape[1] // 2
         power = lags[:, middle].real  # (b,)
-        # Relative to the power, so that no scale of the fields overflows; silence has no spectrum,
-        # and 0 stands for it.
+        # Relative to the power, so that no scale of the fields overflows; silence has the spectrum
+        # 0.
         relative = lags[:, middle:] / torch.where(power < FAINTEST, 1, power)[:, None]
         parts = torch.cat((relative.real, relative.imag), 1)  # (b, m)
         spectra = [parts.new_zeros(0, math.prod(asked.shape))]
@@ -109,14 +110,14 @@ class Beamformer:
         return values.unflatten(1, asked.shape)
 
     def lags(self, labels: Float[Tensor, "b rows columns"], query: Query) -> LagFit:
-        """Fits covariances to labels by least squares, float64: the inverse of a call.
+        """Fits covariances to labels by least squares, in float64: the inverse of a call.
 
-        The scale of a label stays unknown. A label of zeros has covariances of 0.
+        The scale of a label is unknown. A label of zeros has covariances of 0.
 
-        Up to a factor a label is y = s - m, with m the least amplitude. So s² = y² + 2 m y + m² is
-        linear in the covariances, which are fitted with m. Combinations of lags that hardly change
-        the spectrum are set to 0 (``rtol``): closely spaced elements have many such combinations,
-        and a fit would find noise there.
+        Up to a factor a label is y = s - m, with m the lowest amplitude. So s² = y² + 2 m y + m² is
+        linear in the covariances and m, which are fitted together. Combinations of lags with hardly
+        any effect on the spectrum are set to 0 (``rtol``). Closely spaced elements have many such
+        combinations, and a fit would fill them with noise.
         """
         grid = self.scene.task.directions
         # At least 40 x 40 pixels.
@@ -154,7 +155,7 @@ class Beamformer:
         return self.scene.receivers[int(query.receivers[0]) if len(query) else 0].array
 
     def by_carrier(self, query: Query) -> Iterator[tuple[float, Int[Tensor, " k"]]]:
-        """Yields the different carriers [Hz], and the links of each."""
+        """Yields the distinct carriers [Hz], and the links of each."""
         frequencies = carriers(self.scene, query)
         for carrier in frequencies.unique().tolist():
             yield carrier, (frequencies == carrier).nonzero()[:, 0]
@@ -172,9 +173,9 @@ class Beamformer:
     def _stored_basis(
         self, parts: Tensor, carrier: float, query: Query, directions: Directions
     ) -> Float[Tensor, "m k"]:
-        """``_basis`` in the dtype and on the device of ``parts``, stored for grids.
+        """``_basis`` in the dtype and on the device of ``parts``, cached for grids.
 
-        A training asks for the same few thinned grids again and again. Lists of rays hardly repeat.
+        A training uses the same few thinned grids repeatedly. Lists of rays rarely repeat.
         """
         if not isinstance(directions, Grid):
             return self._basis(carrier, query, directions).to(parts)
@@ -191,13 +192,13 @@ class Beamformer:
     def _basis(self, carrier: float, query: Query, directions: Directions) -> Float[Tensor, "m k"]:
         """Contribution of each covariance to the power in each direction, float64.
 
-        Rows are the real and then the imaginary parts of the later half of the lags; the other half
+        Rows are the real, then the imaginary parts of the second half of the lags. The first half
         is their conjugate.
         """
         array = self.array(query)
         steps, _, counts = array.lags
         middle = len(steps) // 2
-        # Of two opposite lags, which are each other's conjugates, one stands for both.
+        # Opposite lags are conjugates of each other, so one of them counts twice.
         pairs = torch.where(torch.arange(len(steps) - middle) > 0, 2, 1)
         weights = (counts[middle:] / len(array) * pairs)[:, None]  # (half, 1)
         vectors = directions.to(steps).flatten().vectors()  # (k, 3)
@@ -206,11 +207,11 @@ class Beamformer:
 
 
 def _scaled(amplitudes: Float[Tensor, "b k"], shown: Float[Tensor, "b j"]) -> Float[Tensor, "b k"]:
-    """Amplitudes on the scale from the least of ``shown``, 0, to the largest, 1.
+    """Amplitudes scaled so that the range of ``shown`` becomes [0, 1].
 
-    A pass over the many pixels in memory costs as much as the beamformer. Gradients of ``amin`` and
-    ``amax`` take four passes, those of ``min`` and ``max`` hardly one. Without gradients ``amin``
-    and ``amax`` are faster.
+    Reading all pixels from memory takes as long as the beamformer. Gradients of ``amin`` and
+    ``amax`` read them four times, gradients of ``min`` and ``max`` hardly once. Without gradients
+    ``amin`` and ``amax`` are faster.
     """
     if shown.requires_grad:
         low = shown.min(1, keepdim=True).values  # (b, 1)

@@ -1,4 +1,4 @@
-"""Base of poolings that give complex channels: their strength and the signs of their phases."""
+"""Base of poolings to complex channels: their strength and the signs of their phases."""
 
 import math
 
@@ -15,10 +15,11 @@ from gaigs.splatting.pooling import Pooling
 
 
 class ChannelPooling(Pooling):
-    """Fits the level and the phase convention of the training channels.
+    """Base of poolings to channels; fits the level and the phase convention of the training
+    channels.
 
     Args:
-        scene: Its task has the subcarriers, its receivers the elements.
+        scene: Scene with the task's subcarriers and the receivers' elements.
         name: Registered name, for errors.
     """
 
@@ -46,9 +47,9 @@ class ChannelPooling(Pooling):
     def received(
         self, query: Query, channels: Complex[Tensor, "b e s"]
     ) -> Complex[Tensor, "b most s"]:
-        """Channels behind the receivers' front ends, padded to the largest array.
+        """Channels after the receivers' front ends, padded to the largest array.
 
-        They are 0 at elements that the receiver's array lacks, and outside its band.
+        Channels are 0 at missing elements of a smaller array, and outside the receiver's band.
         """
         missing = self.task.elements - channels.shape[1]
         channels = torch.nn.functional.pad(channels, (0, 0, 0, missing))
@@ -65,6 +66,6 @@ class ChannelPooling(Pooling):
         waves = direct_waves(self.scene, query, self.frequencies)  # (b, e, s)
         self.strength.fill_(strength(labels, waves, query.receivers))
         self.sign.fill_(self.task.phase_sign(labels, waves, query.receivers))
-        # Without a common clock the phases of a link's own entries still tell the convention.
+        # Without a common clock the phases within a link still show the convention.
         relative = torch.tensor(array_sign(labels, waves)) if self.sign == 0 else self.sign
         self.array_sign.copy_(relative)

@@ -22,18 +22,19 @@ class ElementSum(ChannelPooling):
 
         h(e, f) = g F(d, f) sum_u w(u) a(u) m_f(u) exp(-s j 2 pi f / c x_e . u)
 
-    m_f is the map at subcarrier f, complex: its real parts are the map's channels before all
-    imaginary ones. x_e is an element's place, a its pattern, w the share of the direction's solid
-    angle. F is the wave of free space over the direct distance d (without a common clock its
-    amplitude), g the channels' ``strength`` over it. s is ``array_sign``. At other subcarriers than
-    the labels' the map of the nearest one is used.
+    m_f is the complex map at subcarrier f; the map's channels are first all real parts, then all
+    imaginary parts. x_e is the position of an element and a its pattern. w is the direction's
+    fraction of the solid angle. F is the wave of free space over the direct distance d; without a
+    common clock only its amplitude. g is the channels' ``strength`` relative to F, and s is
+    ``array_sign``. For other subcarriers than the labels' the map of the nearest subcarrier is
+    used.
 
     Args:
-        scene: Its task has the subcarriers, its receivers the elements.
+        scene: Scene with the task's subcarriers and the receivers' elements.
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
 
     Raises:
-        ValueError: The labels are no channels.
+        ValueError: The labels are not channels.
 
     Source: ours; Van Trees, Optimum Array Processing, 2002, section 2.2, for the phases.
     """

@@ -1,4 +1,4 @@
-"""RSSI by physics: the power that arrives from all directions together."""
+"""RSSI by physics: the total power from all directions."""
 
 from collections.abc import Sequence
 
@@ -16,9 +16,9 @@ from gaigs.splatting.pooling import Pooling, sphere
 class MeanPower(Pooling):
     """The mean power over all directions plus the power of the receiver's noise, in dB.
 
-    The power of a pixel is |C_0|^2, or |C_0|^2 + |C_1|^2, eq. (3). Powers add, so paths do not
-    cancel: RSSI is averaged over bandwidth and time. The receiver's noise is there even if nothing
-    arrives, so an empty map is at the floor, with a gradient of 0.
+    The power of a pixel is |C_0|², or |C_0|² + |C_1|², eq. (3). RSSI is averaged over bandwidth and
+    time, so powers add and paths do not cancel. The noise is independent of the arriving power: an
+    empty map gives the noise floor, with a gradient of 0.
 
     Args:
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
@@ -51,7 +51,7 @@ class MeanPower(Pooling):
         query: Query,
         directions: Directions | None = None,
     ) -> Float[Tensor, " b"]:
-        """Level relative to the model's trend [dB]; float32 where the map is of half precision."""
+        """Level relative to the model's trend [dB]; float32 for a map of half precision."""
         pixels = tuple(image.shape[2:])
         if pixels != tuple(self.weights.shape):
             raise ValueError(f"maps must have {tuple(self.weights.shape)} pixels, got {pixels}")
@@ -64,7 +64,7 @@ class MeanPower(Pooling):
 
 
 def noise_amplitude(floor_db: float) -> float:
-    """Amplitude of a receiver's noise from its level [dB], which is checked."""
+    """Amplitude of a receiver's noise, from its level [dB] after a check."""
     if not -300 <= floor_db <= 0:
         raise ValueError(f"pooling option floor_db must lie between -300 and 0 dB, got {floor_db}")
     return 10 ** (floor_db / 20)

@@ -16,16 +16,16 @@ from gaigs.splatting.pooling.paths import PathPooling, ReceivedPaths, element_fi
 
 @register("pooling", "path_csi")
 class PathCsi(ChannelPooling, PathPooling):
-    """h(e, f) = g lambda / (4 pi) y(e, f), with y the field of the paths [1/m].
+    """h(e, f) = g lambda / (4 pi) y(e, f), with the gain g and the field y of the paths [1/m].
 
-    Source: GAI-GS, eq. (2), for the sum; Friis' lambda / (4 pi); ``element_fields``.
+    Source: GAI-GS, eq. (2), for the sum; Friis for lambda / (4 pi); ``element_fields`` for y.
     """
 
     def __init__(self, scene: Scene):
         super().__init__(scene, "path_csi")
 
     def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b e s"]:
-        """Field at each element and subcarrier over the unit of 1 / distance."""
+        """Field at each element and subcarrier [1/m]."""
         offsets = self.frequencies.to(paths.carriers)[None] - paths.carriers[:, None]  # (b, s) [Hz]
         return element_fields(paths, offsets)
 

@@ -13,10 +13,10 @@ from gaigs.splatting.pooling.paths import LagPooling
 
 @register("pooling", "path_rssi")
 class PathRssi(LagPooling):
-    """The mean power at the elements and the receiver's noise, in dB relative to a path of 1 m.
+    """The mean power at the elements plus the receiver's noise, in dB relative to a path of 1 m.
 
     Args:
-        scene: Its receivers have planar arrays.
+        scene: Scene whose receivers have planar arrays.
         floor_db: Power of the noise relative to the model's trend, between -300 and 0 [dB].
 
     Raises:

@@ -1,4 +1,4 @@
-"""The spatial spectrum as an array sees propagation paths."""
+"""The spatial spectrum of an array from propagation paths."""
 
 from jaxtyping import Complex, Float
 from torch import Tensor
@@ -16,10 +16,10 @@ class PathSpectrum(LagPooling):
     """The conventional beamformer on the covariance of the array's elements.
 
     Args:
-        scene: Its task has the directions, its receivers the arrays, which are planar.
+        scene: Scene with the directions of the task and the receivers' planar arrays.
 
     Raises:
-        ValueError: The labels are no spectra scaled to [0, 1], or an array is a point or not
+        ValueError: The labels are not spectra scaled to [0, 1], or an array is a point or not
             planar.
 
     Source: ``LagPooling`` for the covariance, ``Beamformer`` for the spectrum.

@@ -22,16 +22,16 @@ from gaigs.splatting.pooling import Pooling
 class ReceivedPaths:
     """Propagation paths to one receiver.
 
-    A path arrives from a Gaussian, whose extent is the path's angular spread.
+    A path arrives from a Gaussian, whose extent is the angular spread of the path.
 
     Attributes:
         means: Centres of the Gaussians, world frame (b, n, 3) [m].
-        semi_axes: Axes of the Gaussians, world frame, a column each (1 or b, n, 3, 3) [m].
+        semi_axes: Axes of the Gaussians in columns, world frame (1 or b, n, 3, 3) [m].
         amplitudes: Complex field of each path at the carrier, in the middle of the array (b, n).
-        lengths: Way from the transmitter to the middle of the array (b, n) [m].
-        coherences: Share of each path's field whose phase is known, in [0, 1] (n,). The rest adds
-            as power.
-        bandwidth: Band over which powers are averaged, a scalar [Hz]; None for the carrier alone.
+        lengths: Path length from the transmitter to the middle of the array (b, n) [m].
+        coherences: Fraction of each path's field with a known phase, in [0, 1] (n,). The power of
+            the rest is added without interference.
+        bandwidth: Band over which powers are averaged, a scalar [Hz]; None: a single carrier.
         receiver: Pose and array of the receiver.
         carriers: Frequency of each query (b,) [Hz].
     """
@@ -47,11 +47,11 @@ class ReceivedPaths:
 
 
 class PathPooling(Pooling):
-    """Base of poolings that read paths, so that nothing is projected or rasterized.
+    """Base of poolings that read paths, without projection and rasterizer.
 
     Attributes:
-        is_same_for_all: True if no receiver's pose or array matters, so that paths to several may
-            be summed at once.
+        is_same_for_all: True if poses and arrays of receivers have no effect, so that paths to
+            several receivers may be summed at once.
     """
 
     is_same_for_all = False
@@ -69,14 +69,14 @@ class PathPooling(Pooling):
     def read(
         self, received: Complex[Tensor, "b ..."], query: Query, directions: Directions | None = None
     ) -> Tensor:
-        """Computes the label from the result of ``sum_paths``; arguments as for ``forward``."""
+        """Computes the label from the result of ``sum_paths``; arguments are as for ``forward``."""
 
 
 class LagPooling(PathPooling):
-    """Base of poolings that read covariances of the array's elements, in which powers may add.
+    """Base of poolings that read covariances of the array's elements, where powers may add.
 
     Args:
-        scene: Its receivers have planar arrays.
+        scene: Scene whose receivers have planar arrays.
 
     Source: Van Trees, Optimum Array Processing, 2002, section 5.2, for covariances by lags; the
     partial coherence is ours.
@@ -91,7 +91,7 @@ class LagPooling(PathPooling):
         self.take_receivers(scene)
 
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
-        """Takes a scene, whose receivers may be others."""
+        """Takes a scene, possibly with other receivers."""
         self.is_same_for_all = all(receiver.array.is_point for receiver in scene.receivers)
         for receiver in scene.receivers:
             height = receiver.array.elements[:, 2].abs().max()
@@ -103,17 +103,18 @@ class LagPooling(PathPooling):
                 )
 
     def sum_paths(self, paths: ReceivedPaths) -> Complex[Tensor, "b l"]:
-        """Mean covariance of the pairs of elements that are ``array.lags`` apart.
+        """Mean covariance of the pairs of elements at each of ``array.lags``.
 
-        At lag 0 the covariance is the power. Where powers add, elements that are D apart
-        [wavelengths] have the covariance
+        At lag 0 the covariance is the power. If powers add, elements at a lag D [wavelengths] have
+        the covariance
 
             sum |A|² exp(-(2 pi)² D' S D / 2 + j 2 pi D . u)
 
-        with u a path's direction cosines, which shrink to 0 within ``NEAREST`` of the array's
-        middle, and S their covariance: the Gaussian's, and the one of ``least_spread``. Two paths
-        interfere by the product of their coherences, and over a band by sinc(bandwidth (t - t')),
-        with t their delays: the mean over the band of cos(2 pi f (t - t')).
+        u are a path's direction cosines, which shrink to 0 within ``NEAREST`` of the array's
+        middle. S is the covariance of direction cosines, from the Gaussian and from
+        ``least_spread``. The interference of two paths has the product of their coherences as a
+        factor, and over a band also sinc(bandwidth (t - t')), with their delays t and t': the mean
+        over the band of cos(2 pi f (t - t')).
         """
         array = paths.receiver.array
         amplitudes = paths.amplitudes  # (b, n)
@@ -144,7 +145,7 @@ class LagPooling(PathPooling):
 
 
 class _Steering:
-    """Responses of an array to paths, by steps D in its plane from the middle.
+    """Responses of an array to paths, at vectors D in the array's plane, from its middle.
 
     Args:
         paths: The paths.
@@ -171,7 +172,7 @@ class _Steering:
 
 
 class _Seen(NamedTuple):
-    """Gaussians as an array sees them."""
+    """Gaussians in the frame of an array."""
 
     points: Float[Tensor, "b n 3"]  # centres in the array's frame [m]
     wavenumbers: Float[Tensor, "b 1 1"]  # 2 pi / lambda of each query [rad/m]
@@ -180,7 +181,7 @@ class _Seen(NamedTuple):
 
 
 def _see(paths: ReceivedPaths) -> _Seen:
-    """The paths' Gaussians as their receiver's array sees them."""
+    """The paths' Gaussians in the frame of their receiver's array."""
     pose = paths.receiver.pose.to(paths.means)
     points = pose.local(paths.means)  # (b, n, 3)
     semi_axes = pose.rotation.mT @ paths.semi_axes  # (1 or b, n, 3, 3)
@@ -201,9 +202,9 @@ def _spreads(
 
 
 def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Complex[Tensor, "b e s"]:
-    """Field at each element and frequency, all paths interfering.
+    """Field at each element and frequency, with interference of all paths.
 
-    The wave of a path is spherical about the path's Gaussian; the array may have any shape and
+    The wave of a path is spherical about the path's Gaussian. The array may have any shape and
     orientation. At an element x the field of a path with the amplitude A is
 
         A exp(-(2 pi)² x' S x / 2 - j 2 pi (|p - x| - |p|)) |p| / |p - x|
@@ -213,7 +214,7 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
 
     Args:
         paths: Paths to one receiver.
-        offsets: Frequencies over the carrier [Hz].
+        offsets: Frequencies relative to the carrier [Hz].
 
     Source: GAI-GS, eq. (2), for the sum; the Fourier transform of a Gaussian; Van Trees, Optimum
     Array Processing, 2002, section 2.2. Their combination is ours.
@@ -236,7 +237,7 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
 
 
 class _PathDifferences(NamedTuple):
-    """Distances to the elements compared with the distance to the middle of the array."""
+    """Distances to the elements minus the distance to the middle of the array."""
 
     differences: Float[Tensor, "b n e"]  # |p - x| - |p| [m]
     ratios: Float[Tensor, "b n e"]  # |p| / |p - x|, each at least ``NEAREST``
@@ -245,7 +246,7 @@ class _PathDifferences(NamedTuple):
 def _path_differences(
     points: Float[Tensor, "b n 3"], elements: Float[Tensor, "e 3"]
 ) -> _PathDifferences:
-    """Distances of points to elements minus those to the array's middle, without loss of digits."""
+    """Distances from points to elements minus those to the array's middle, without cancellation."""
     to_middle = points.norm(dim=-1, keepdim=True)  # |p|, (b, n, 1)
     # Plain differences: by the matrix product an element far from a near point would lose its
     # digits.
@@ -268,11 +269,11 @@ def _sum_by_series(
     reach: float,  # largest delay over the array [s]
     widest: float,  # largest phase of the band over the array [rad]
 ) -> Complex[Tensor, "b e s"]:
-    """Sum over the paths by one product of matrices, without a wave of each path and frequency.
+    """Sum over the paths by one matrix product, without a wave for each path and frequency.
 
         exp(j rate (t + dt)) = exp(j rate t) sum_k (j rate dt)^k / k!
 
-    |dt| is at most the reach. Up to 3 rad the terms of the series stay small.
+    |dt| is at most ``reach``. Terms of the series are small while rate dt is at most 3 rad.
     """
     terms = [waves]
     size = widest

@@ -1,4 +1,4 @@
-"""RSSI by attention: the brightest directions of the map count most."""
+"""RSSI by attention: the brightest directions of the map have the most weight."""
 
 import math
 from collections.abc import Sequence
@@ -15,18 +15,17 @@ from gaigs.splatting.pooling import Pooling, sphere
 
 @register("pooling", "softmax_attention")
 class SoftmaxAttention(Pooling):
-    """The attention-weighted average of a map of levels [bel]; the label in dB is ten times this.
+    """The attention-weighted mean of a map of levels [bel]; the label in dB is ten times this mean.
 
-    Each pixel weighs (1 - prior) softmax((m - mean m) / temperature) + prior / pixels. The prior is
-    uniform over pixels, and so over the sphere where their solid angles are equal, as on
-    ``Grid.sphere``.
+    The weight of a pixel is (1 - prior) softmax((m - mean m) / temperature) + prior / pixels. The
+    prior is uniform over pixels. On ``Grid.sphere`` it is also uniform over the sphere.
 
     Args:
         grid: Rows and columns of the map over the full sphere, ``Grid.sphere``.
-        temperature: How far below the brightest pixel a pixel still counts, between 1e-6 and 1e6
-            [bel]; far below the map's range the attention finds the maximum, far above it the mean.
-        prior: Share of the uniform weights, between 0 and 1; with 1 the average is the plain mean.
-        learn: True to train both, as logarithm and logit, which keeps both in range.
+        temperature: Depth below the brightest pixel within which pixels count [bel], between 1e-6
+            and 1e6. Far below the map's range the result is the maximum, far above it the mean.
+        prior: Weight of the uniform part, between 0 and 1; with 1 the result is the plain mean.
+        learn: True to train both, as logarithm and logit, so that both stay in range.
 
     Raises:
         ValueError: An option is out of range.
@@ -72,7 +71,7 @@ class SoftmaxAttention(Pooling):
 
     @property
     def prior(self) -> Float[Tensor, ""]:
-        """Share of the uniform weights."""
+        """Weight of the uniform part."""
         return self.prior_logit.sigmoid()
 
     def forward(
@@ -81,7 +80,7 @@ class SoftmaxAttention(Pooling):
         query: Query,
         directions: Directions | None = None,
     ) -> Float[Tensor, " b"]:
-        """Level relative to the model's trend [dB]; float32 where the map is of half precision."""
+        """Level relative to the model's trend [dB]; float32 for a map of half precision."""
         bels = image.to(torch.promote_types(image.dtype, torch.float32)).flatten(1)  # (b, pixels)
         # The paper subtracts the mean, and later the maximum, in which the mean cancels.
         # Subtracting the maximum alone is the same, and exact for the pixels that count, where one

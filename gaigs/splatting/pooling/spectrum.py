@@ -18,9 +18,9 @@ class SpectrumPooling(Pooling):
         channels: 1 (real) or 2 (complex).
 
     Raises:
-        ValueError: There are other channels.
+        ValueError: The number of channels is neither 1 nor 2.
 
-    Source: GAI-GS, eq. (14), whose R_k is the map; ours are its channels and the magnitude.
+    Source: GAI-GS, eq. (14), where R_k is the map; channels and magnitude are ours.
     """
 
     def __init__(self, channels: int = 2):
@@ -37,7 +37,7 @@ class SpectrumPooling(Pooling):
         query: Query,
         directions: Directions | None = None,
     ) -> Float[Tensor, "b rows columns"]:
-        """The predicted spectrum; where the map is 0, so is its gradient."""
+        """The predicted spectrum, with a gradient of 0 where the map is 0."""
         if self.channels == 1:
             return image[:, 0].abs()
         real, imaginary = image.unbind(1)

@@ -1,4 +1,4 @@
-"""Projections lay Gaussians on the receiver's perception plane."""
+"""Projections map Gaussians to the receiver's perception plane."""
 
 import math
 from abc import ABC, abstractmethod
@@ -22,11 +22,11 @@ class Splats:
     """Gaussians on the perception plane of one receiver.
 
     Attributes:
-        means2d: Centres (u, v), (n, 2), or (b, n, 2) where they differ from query to query.
-        factors: p, q and r of the lower triangular factor [[p, 0], [q, r]] of each covariance, p
-            and r above 0 (1 or b, n, 3).
+        means2d: Centres (u, v), (n, 2), or (b, n, 2) if they depend on the query.
+        factors: p, q and r of the lower triangular factor [[p, 0], [q, r]] of each covariance, with
+            p and r above 0 (1 or b, n, 3).
         depths: Distances to the receiver [m].
-        visible: False where a Gaussian sits on the receiver and so has no direction.
+        visible: False for a Gaussian at the receiver, which has no direction.
     """
 
     means2d: Float[Tensor, "*b n 2"]
@@ -36,7 +36,7 @@ class Splats:
 
     @property
     def covariances2d(self) -> Float[Tensor, "b n 2 2"]:
-        """Covariances, the factor times its transpose; less exact for long and thin splats."""
+        """Covariances, the factor times its transpose; less exact for long, thin splats."""
         p, q, r = self.factors.unbind(-1)  # (b, n) each
         entries = torch.stack((p * p, p * q, p * q, q * q + r * r), -1)  # (b, n, 4)
         return entries.unflatten(-1, (2, 2))
@@ -47,9 +47,9 @@ class Plane:
     """The label's pixel centres on the perception plane.
 
     Attributes:
-        u: (1, columns), or (rows, columns) where the projection mixes azimuth and elevation.
+        u: (1, columns), or (rows, columns) if the projection mixes azimuth and elevation.
         v: (rows, 1), or (rows, columns).
-        period: u repeats after this; a splat acts at the nearest of its images. None: no wrap.
+        period: Period of u; a splat acts at its nearest periodic image. None: no period.
     """
 
     u: Float[Tensor, "r columns"]
@@ -65,10 +65,10 @@ class Plane:
 class Projection(ABC):
     """The contract of kind ``projection``.
 
-    A projection is a smooth map from directions to the plane, ``coordinates``. A Gaussian's
-    footprint there follows from the map linearised at its centre, ``jacobian`` (EWA splatting),
-    plus the variance of a square pixel: a splat narrower than a pixel is not lost between two pixel
-    centres. docs/methods.md has the limits.
+    A projection is a smooth map ``coordinates`` from directions to the plane. The footprint of a
+    Gaussian follows from the map linearised at its centre, ``jacobian`` (EWA splatting). The
+    variance of a square pixel is added, so that a narrow splat is not lost between two pixel
+    centres. docs/methods.md states the limits.
 
     Args:
         pixel: Edge of that pixel, the pitch of the label's grid [rad].
@@ -86,19 +86,19 @@ class Projection(ABC):
 
     @abstractmethod
     def coordinates(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2"]:
-        """Plane coordinates (u, v) of points in the array's frame, of any distance but zero."""
+        """Plane coordinates (u, v) of points in the array's frame, at any distance except zero."""
 
     @abstractmethod
     def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
-        """Derivative of ``coordinates`` [1/m]; finite everywhere but at the origin."""
+        """Derivative of ``coordinates`` [1/m]; finite everywhere except at the origin."""
 
     @property
     @abstractmethod
     def period(self) -> float | None:
-        """u repeats after this; None: it does not."""
+        """Period of u; None without one."""
 
     def check_sees(self, directions: Directions) -> None:
-        """Raises a ``ValueError`` for directions below the array's plane that are folded up."""
+        """Raises a ``ValueError`` for directions below the array's plane if they are folded up."""
         if not self.sees_below and directions.elevations.min() < 0:
             raise ValueError(
                 f"the grid reaches below the array's plane, which {name_of(self)} folds up; "
@@ -119,8 +119,8 @@ class Projection(ABC):
         """Gaussians as the receiver sees them.
 
         Args:
-            means: Centres, world frame [m]; one set, or one a transmitter.
-            semi_axes: A column for each axis, world frame [m]; one set (b = 1), or one a
+            means: Centres, world frame [m]; one set, or one for each transmitter.
+            semi_axes: Semi-axes in columns, world frame [m]; one set (b = 1), or one for each
                 transmitter.
             receiver: Pose of the antenna array.
         """
@@ -128,7 +128,7 @@ class Projection(ABC):
         points = receiver.local(means)  # (*b, n, 3) [m]
         depths = points.norm(dim=-1)  # [m]
         visible = ~(depths < NEAR)  # NaN stays visible
-        # A Gaussian on the receiver has no direction: a stand-in keeps values and gradients finite,
+        # A Gaussian at the receiver has no direction: a stand-in keeps values and gradients finite,
         # `visible` hides it.
         stand_in = points.new_tensor([1.0, 0.0, 0.0])
         points = torch.where(visible[..., None], points, stand_in)
@@ -154,14 +154,14 @@ def project(
 
     Args:
         means: Centres, world frame (n, 3) [m].
-        quats: Orientations, the columns of whose rotation matrices are the Gaussians' axes in the
-            world frame (n, 4).
+        quats: Orientations (n, 4). The columns of their rotation matrices are the Gaussians' axes
+            in the world frame.
         scales: Standard deviations along these axes (n, 3) [m].
         receiver: A ``gaigs.Pose``, or a ``gaigs.Receiver`` with one.
         grid: Directions of the pixels in the receiver's frame [rad].
         projection: Name, configuration or object.
-        pixel: Edge of the pixel by whose variance footprints are widened [rad]. None: the pitch of
-            a ``gaigs.Grid``. Ignored where the projection is an object.
+        pixel: Edge of the pixel whose variance is added to footprints [rad]. None: the pitch of a
+            ``gaigs.Grid``. Ignored if the projection is an object.
 
     Returns:
         The splats, and the pixels on the plane; differentiable in means, quaternions and scales.
@@ -221,8 +221,7 @@ def factor(
     """p, q and r of the lower triangular factor of [across; along] [across; along]' + variance I.
 
     With e = across / p: q = e . along and r² = variance + |e x along|² + variance |along|² / p².
-    Roots are of sums of squares alone, so no digit is lost to a difference, however long and thin
-    the ellipse is.
+    All roots are of sums of squares, so no difference cancels, even for a long, thin ellipse.
     """
     p = (across.square().sum(-1) + variance).sqrt()  # (...)
     unit = across / p[..., None]  # e, (..., k)

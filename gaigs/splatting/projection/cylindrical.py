@@ -15,8 +15,8 @@ class Cylindrical(Projection):
 
     Args:
         pixel: As for ``Projection`` [rad].
-        limit_deg: Largest absolute elevation [deg], in (0, 90), to which others are clamped:
-            towards the pole the azimuth of a small step diverges as 1 / cos(elevation).
+        limit_deg: Largest absolute elevation [deg], in (0, 90); higher elevations are clamped. Near
+            the pole the azimuth of a small step diverges as 1 / cos(elevation).
     """
 
     period = 2 * math.pi

@@ -12,10 +12,10 @@ from gaigs.splatting.projection import Projection
 class DirectionCosine(Projection):
     """(u, v) = (cos(el) cos(az), cos(el) sin(az)), the direction cosines l and m.
 
-    The response of a planar array is shift-invariant in u and v. There is no seam and no pole: the
-    map is smooth on the whole hemisphere. As with a planar array, a direction below the array's
-    plane and its mirror image above are one. u and v depend on both angles, so a ``Plane`` has a
-    pair (u, v) for each pixel, not one u a column and one v a row.
+    The response of a planar array is shift-invariant in u and v. The map is smooth on the whole
+    hemisphere, without seam and pole. As with a planar array, a direction below the array's plane
+    coincides with its mirror image above. u and v depend on both angles, so a ``Plane`` has u and v
+    for each pixel, not u for each column and v for each row.
 
     Source: Van Trees, Optimum Array Processing, 2002, chapter 4.
     """

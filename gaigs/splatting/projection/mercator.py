@@ -14,11 +14,9 @@ class Mercator(Cylindrical):
     """u = azimuth, v = alpha log tan(pi / 4 + elevation / 2).
 
     v is computed as alpha asinh(tan(elevation)), which is equal, and exact near the horizon. alpha
-    maps the elevation limit to the plane's edge v = pi, so that the plane is as high as it is wide.
-    At the default limit, atan(sinh(pi)) = 85.0511 degrees, alpha is 1 and the projection conformal:
-    a small round Gaussian stays round wherever it lies.
-
-    Options: see ``Cylindrical``.
+    maps the elevation limit to the plane's edge v = pi, so height and width of the plane are equal.
+    At the default limit, atan(sinh(pi)) = 85.0511 degrees, alpha is 1 and the projection is
+    conformal: small round Gaussians stay round everywhere. Options are as for ``Cylindrical``.
 
     Source: GAI-GS, "Projection and Render Module".
     """

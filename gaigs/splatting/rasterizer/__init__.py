@@ -40,16 +40,16 @@ class Rasterizer(Protocol):
 
     over splats i front to back by ``depths`` (ties by index), with
 
-    * G_i = exp(-x' C^-1 x / 2), the footprint: x is the pixel minus the splat's centre, taken to
-      the nearest image where the plane is periodic;
+    * G_i = exp(-x' C^-1 x / 2), the footprint: x leads from the splat's centre to the pixel, on a
+      periodic plane from the nearest image of the centre;
     * A_i = min(a_i G_i, ALPHA_MAX), or 0 below ALPHA_MIN, with the opacity a_i;
     * d_i, the attenuation in [0, 1].
 
-    Splats that are not ``visible`` do nothing. Every input but depths and visible is
-    differentiable.
+    Splats that are not ``visible`` have no effect. The map is differentiable in every input except
+    depths and visible.
 
     Attributes:
-        used: Name of the rasterizer that drew the last map, and its device where there is a choice,
+        used: Name of the rasterizer that drew the last map, with its device if there are several,
             for a run's metrics.
 
     Source: GAI-GS, "Mapping, Projection and Render Module", eq. (13) and (14); the area over which
@@ -91,25 +91,26 @@ def rasterize(
 
     Args:
         means: Centres, world frame (n, 3) [m].
-        quats: Orientations (n, 4). Columns of their rotation matrices are the Gaussians' axes in
-            the world frame.
+        quats: Orientations (n, 4). The columns of their rotation matrices are the Gaussians' axes
+            in the world frame.
         scales: Standard deviations along these axes (n, 3) [m].
         opacities: In [0, 1] (n,).
-        signal: Any number of real channels of each Gaussian (n, c); a complex channel is two, real
-            and imaginary part.
-        attenuations: Share of the field from behind that each lets through, in [0, 1] (n,). None:
-            1.
+        signal: Any number of real channels of each Gaussian (n, c). A complex channel is two real
+            channels, real and imaginary part.
+        attenuations: Fraction of the field from behind that each Gaussian transmits, in [0, 1]
+            (n,). None: 1.
         receiver, grid, projection, pixel: As for ``gaigs.splatting.projection.project``.
         rasterizer: Name, configuration or object.
 
     Returns:
-        The map (c, rows, columns), and the share that passes all Gaussians (rows, columns); of k
-        rays (c, k) and (k,). Where an input has a leading axis b of transmitters, both have it.
-        Differentiable in all tensors. ``opencl`` and ``torch`` agree to 2e-6 of the map's maximum
-        in float32.
+        The map (c, rows, columns) and the fraction transmitted by all Gaussians (rows, columns);
+        for k rays (c, k) and (k,). If an input has a leading axis b of transmitters, both have it.
+        They are differentiable in all tensors. ``opencl`` and ``torch`` agree to 2e-6 of the map's
+        maximum in float32.
 
     Raises:
-        TypeError, ValueError: An input is no tensor of its shape and dtype, or is out of range.
+        TypeError, ValueError: An input is not a tensor of the right shape and dtype, or out of
+            range.
 
     Source: GAI-GS, "Projection and Render Module", eq. (13) and (14); Zwicker et al., EWA
     Splatting, 2002.
@@ -151,7 +152,7 @@ def rasterize(
     opacities = opacities.expand(b, n)
     if attenuations is not None:
         attenuations = attenuations.expand(b, n)
-    # Gaussians that stand still are drawn for all transmitters at once, others one by one.
+    # Gaussians that do not move are drawn for all transmitters at once, others one by one.
     moves = means.ndim == 3
     maps = []
     transmittances = []
@@ -174,7 +175,7 @@ def rasterize(
 
 
 def _rows(values: Tensor, row: slice) -> Tensor:
-    """Values of a few transmitters, or those that all transmitters share."""
+    """Rows of some transmitters, or the single row shared by all."""
     return values[row] if values.ndim == 3 and len(values) > 1 else values
 
 
@@ -182,7 +183,7 @@ def _check_shapes(tensors: Mapping[str, Tensor]) -> set[int]:
     """Checks types and shapes of the inputs by name.
 
     Returns:
-        Numbers of transmitters in leading axes: none if no input has such an axis.
+        Numbers of transmitters in leading axes; empty if no input has such an axis.
     """
     if not all(isinstance(values, Tensor) and values.ndim for values in tensors.values()):
         raise TypeError(
@@ -211,7 +212,7 @@ def _check_shapes(tensors: Mapping[str, Tensor]) -> set[int]:
 
 
 def _check_range(name: str, values: Tensor, most: float, advice: str) -> None:
-    """Raises a ``ValueError`` for values outside [0, most]; NaN passes, and shows in the map."""
+    """Raises a ``ValueError`` for values outside [0, most]; NaN passes, to show in the map."""
     wrong = values[(values < 0) | (values > most)]
     if len(wrong):
         raise ValueError(f"{name} must lie in [0, {most:g}], got {wrong[0]:.3g}; {advice} first")

@@ -12,23 +12,23 @@ def devices() -> list[str]:
 
 
 def default_device() -> str:
-    """The device of ``devices`` that is used unless another is named."""
+    """The default device, one of ``devices``."""
     return name_of(_choose(os.environ.get("GAIGS_OPENCL_DEVICE")))
 
 
 @functools.cache
 def _process() -> int:
-    """Number of the process that was the first to use OpenCL."""
+    """Number of the process that first used OpenCL."""
     return os.getpid()
 
 
 def is_forked() -> bool:
-    """True in a fork of a process with OpenCL, which lacks the driver's threads."""
+    """True in a fork of a process with OpenCL, where the driver's threads are missing."""
     return _process() != os.getpid()
 
 
 def _devices() -> list:
-    """The devices of all drivers; a broken driver is an error only if no other lists a device."""
+    """The devices of all drivers; a broken driver is an error only if no other has a device."""
     _process()  # drivers start threads here, too
     devices = []
     causes = []
@@ -49,7 +49,7 @@ def _devices() -> list:
 
 
 def name_of(device) -> str:
-    """The name of a device, as ``devices`` lists it."""
+    """The name of a device in ``devices``."""
     kinds = []
     for kind in ("CPU", "GPU", "ACCELERATOR"):
         if device.type & getattr(cl.device_type, kind):
@@ -58,7 +58,7 @@ def name_of(device) -> str:
 
 
 def open_queue(name: str | None) -> cl.CommandQueue:
-    """The queue of a device, made once.
+    """The command queue of a device, cached.
 
     Args:
         name: As for ``OpenCLRasterizer``.
@@ -84,7 +84,7 @@ def _open(name: str | None) -> cl.CommandQueue:
 
 
 def _choose(name: str | None):
-    """The first device with this part of a name; for None the first CPU, else the first device."""
+    """The first device with this part of a name; for None the first CPU, or the first device."""
     devices = _devices()
     if name:
         chosen = [device for device in devices if name.lower() in name_of(device).lower()]
@@ -100,9 +100,9 @@ def _choose(name: str | None):
 
 @functools.cache
 def find_fault(queue: cl.CommandQueue) -> str | None:
-    """The driver's reason why a device builds no kernels, or None.
+    """The driver's reason why a device cannot build kernels, or None.
 
-    One reason is a processor that the driver's compiler does not know.
+    One such reason is a processor unknown to the driver's compiler.
     """
     try:
         cl.Program(queue.context, "kernel void probe(global int *value) { value[0] = 1; }").build()
@@ -112,7 +112,7 @@ def find_fault(queue: cl.CommandQueue) -> str | None:
 
 
 def cause_of(error: cl.Error) -> str:
-    """The first error in a build's log, or else its last line."""
+    """The first error in a build's log, or its last line."""
     lines = [line.strip() for line in str(error).splitlines()]
     # Lines in brackets are pyopencl's notes on options and source.
     lines = [line for line in lines if line and not line.startswith("(")]

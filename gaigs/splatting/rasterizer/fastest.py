@@ -1,4 +1,4 @@
-"""The fastest rasterizer that takes the tensors."""
+"""The fastest rasterizer for the given tensors."""
 
 import logging
 
@@ -12,10 +12,10 @@ log = logging.getLogger(__name__)
 
 @register("rasterizer", "fastest")
 class FastestRasterizer:
-    """``opencl`` for float32 on the CPU where a driver builds kernels, else ``torch``.
+    """``opencl`` for float32 on the CPU if a driver builds kernels, otherwise ``torch``.
 
-    A forked process uses ``torch``. The two agree to 2e-6 of the image's maximum, so a checkpoint
-    may be rendered by either.
+    A forked process uses ``torch``. The two agree to 2e-6 of the image's maximum, so either can
+    render a checkpoint.
     """
 
     used: str | None = None

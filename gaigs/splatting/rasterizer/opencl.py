@@ -22,7 +22,7 @@ from gaigs.splatting.rasterizer.devices import cause_of, find_fault, is_forked, 
 
 @dataclass(frozen=True)
 class KernelLayout:
-    """Sizes that the kernels have too, and the largest shares of a work-item."""
+    """Sizes that the kernels also have, and limits of a work-item."""
 
     # Edges of a tile [pixels].
     rows: int = 16
@@ -43,22 +43,21 @@ LAYOUT = KernelLayout()
 
 @register("rasterizer", "opencl")
 class OpenCLRasterizer:
-    """A rasterizer by tiles of 16 rows of 8 pixels; a work-item draws a tile, row by row.
+    """A rasterizer with tiles of 16 rows of 8 pixels. A work-item draws a tile, row by row.
 
-    Splats are sorted by depth once. Each tile has a list of the splats whose ellipses reach it.
-    Where all transmitters share covariances, they share lists and footprints, too. The gradient is
-    written by hand. A CPU device reads tensors without a copy. Two runs give the same bits.
+    Splats are sorted by depth once. Each tile has a list of the splats whose ellipses reach it. If
+    transmitters share covariances, they also share lists and footprints. The gradient is written by
+    hand. A CPU device reads tensors without a copy. Two runs give the same bits.
 
     Args:
-        device: Part of a name that ``devices`` lists, e.g. "cpu" or "pocl". None: the environment
-            variable GAIGS_OPENCL_DEVICE, and without it the first CPU, for which the kernels are
-            made.
+        device: Part of a name in ``devices``, e.g. "cpu" or "pocl". None: the environment variable
+            GAIGS_OPENCL_DEVICE, otherwise the first CPU; the kernels are optimised for CPUs.
 
     Attributes:
-        too_many: Number of splats that is too large for the 24 bits of an entry of a list.
+        too_many: Number of splats that exceeds the 24 bits of a list entry.
 
     Raises:
-        RuntimeError: No driver works, or the device builds no kernels.
+        RuntimeError: No driver works, or the device cannot build kernels.
         ValueError: No device has this name.
 
     Source: tiles of Kerbl et al., 3D Gaussian Splatting, 2023, section 6; GAI-GS, "Projection and
@@ -90,7 +89,7 @@ class OpenCLRasterizer:
         attenuations: Tensor | None,
         plane: Plane,
     ) -> bool:
-        """True if dtypes, devices and counts suit, and OpenCL works in this process."""
+        """True if dtypes, devices and counts match, and OpenCL works in this process."""
         floats = [splats.means2d, splats.factors, splats.depths, signal, opacities]
         floats += [plane.u, plane.v]
         if attenuations is not None:
@@ -135,7 +134,7 @@ class OpenCLRasterizer:
         attenuations: Tensor | None,
         plane: Plane,
     ) -> None:
-        """Raises where tensors do not fit: kernels check nothing."""
+        """Raises an error for wrong tensors, since kernels check nothing."""
         b, n, c = signal.shape
         height, width = plane.shape
         tensors: dict[str, tuple[Tensor, list[tuple[int, ...]]]] = {
@@ -172,12 +171,12 @@ class OpenCLRasterizer:
 
 @functools.cache
 def _pool(queue: cl.CommandQueue) -> cl.tools.MemoryPool:
-    """Buffers that live from call to call: fresh memory would cost a page fault every 4 KiB."""
+    """Buffers reused by all calls: fresh memory would cost a page fault every 4 KiB."""
     return cl.tools.MemoryPool(cl.tools.ImmediateAllocator(queue))
 
 
 def _source() -> str:
-    """All kernels, in the order in which they use each other's functions."""
+    """All kernels, ordered so that functions precede their use."""
     folder = Path(__file__).parent / "kernels"
     names = ("footprint", "bin", "composite", "gradient")
     return "\n".join((folder / f"{name}.cl").read_text() for name in names)
@@ -202,7 +201,8 @@ def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel
 class _CompositeByKernels(torch.autograd.Function):
     """``_Render`` with its gradient.
 
-    Autograd differentiates by the tensors of the splats, which ``forward`` takes once more.
+    Autograd needs the tensors of the splats as arguments of ``forward``, although ``_Render`` has
+    them.
     """
 
     @staticmethod
@@ -237,10 +237,10 @@ class _Sizes(ctypes.Structure):
 
 
 class _Render:
-    """One call: splats in depth order, the tiles' lists of them, and the kernels over both.
+    """One call: splats in depth order, the tiles' lists of splats, and the kernels over both.
 
-    Lists come in sets: one for all transmitters where covariances are shared, else one a
-    transmitter. A work-item composites a group of transmitters at once.
+    If covariances are shared, one set of lists serves all transmitters; otherwise each transmitter
+    has its own set. A work-item composites a group of transmitters at once.
     """
 
     def __init__(self, queue, splats, signal, opacities, attenuations, plane):
@@ -263,7 +263,7 @@ class _Render:
         self.loudest = self._share(np.abs(signal.detach().numpy()).max((1, 2), initial=0))
 
     def _macros(self, period: float | None) -> dict[str, str | int]:
-        """Macros with which the kernels are built."""
+        """Macros for building the kernels."""
         macros: dict[str, str | int] = {
             "CHANNELS": self.channels,
             "ATTENUATION": int(self.attenuates),
@@ -318,7 +318,7 @@ class _Render:
         """Draws the map and the transmittance.
 
         Args:
-            differentiate: True to keep checkpoints for the way back.
+            differentiate: True to store checkpoints for the backward pass.
         """
         sizes = self.sizes
         shape = (sizes.transmitters, self.channels, sizes.height, sizes.width)
@@ -358,12 +358,12 @@ class _Render:
         return gradients
 
     def _run(self, kernel, items, *buffers):
-        """Queues a kernel, by its name, on so many work-items."""
+        """Queues a kernel by its name, on ``items`` work-items."""
         if items:  # OpenCL cannot run 0 items
             self.kernels[kernel](self.queue, (items,), (1,), self.sizes, *buffers)
 
     def _share(self, values):
-        """The host's memory as the device sees it; the null pointer for no values."""
+        """The host's memory as a buffer of the device; the null pointer for no values."""
         if isinstance(values, Tensor):
             values = values.detach().numpy()
         if values is None or not values.size:
@@ -372,7 +372,7 @@ class _Render:
         return cl.Buffer(self.queue.context, flags, hostbuf=np.ascontiguousarray(values))
 
     def _empty(self, size):
-        """Four-byte values that stay on the device; no buffer of OpenCL is empty."""
+        """Four-byte values on the device; at least one, since OpenCL has no empty buffers."""
         return _pool(self.queue).allocate(4 * max(1, int(size)))
 
     def _finish(self, *buffers):
@@ -404,17 +404,17 @@ def _measure(splats: Splats, signal: Tensor, plane: Plane) -> _Sizes:
 
 
 def _literal(value: float) -> str:
-    """A float32 as the kernels' compiler reads it."""
+    """A float32 in the syntax of the kernels' compiler."""
     return float(np.float32(value)).hex() + "f"
 
 
 def _content(tensor: Tensor) -> tuple[bytes, tuple[int, ...]]:
-    """A tensor's bytes and shape, as a key by which ``_tiling`` stores its results."""
+    """A tensor's bytes and shape, as the cache key of ``_tiling``."""
     return tensor.detach().numpy().tobytes(), tuple(tensor.shape)
 
 
 def _front_to_back(depths: Tensor) -> np.ndarray:
-    """Indices by depth, ties by index: sorted as integers, whose low half is the index."""
+    """Indices by depth, ties by index: sorted as integers whose low half is the index."""
     bits = np.ascontiguousarray(depths.detach().numpy()).view(np.int32)
     # Integers in the order of the floats, negative ones too.
     bits = bits ^ (bits >> 31 & 0x7FFFFFFF)
@@ -431,7 +431,7 @@ def _tiling(
     v_content: tuple[bytes, tuple],
     period: float | None,
 ) -> list[cl.Buffer | None]:
-    """A plane in whole tiles, as the kernels read it.
+    """A plane in whole tiles, in the form that the kernels read.
 
     Args:
         queue: Command queue of the device.
@@ -439,9 +439,9 @@ def _tiling(
         period: As in ``Plane``.
 
     Returns:
-        Buffers: u and v, filled up by repetition, one u a column and one v a row where the plane is
-        separable; spans (centre, half size) of u, then of v; and for each span of v the least and
-        the largest v of its rows, as edges.
+        Buffers of u and v, filled up by repetition; a separable plane has one u for each column and
+        one v for each row. Then spans (centre, half size) of u and of v. Then the lowest and
+        highest v of the rows in each span of v.
     """
     u, v = (
         np.frombuffer(data, np.float32).reshape(shape) for data, shape in (u_content, v_content)

@@ -16,16 +16,16 @@ from gaigs.splatting.rasterizer import ALPHA_MAX, ALPHA_MIN, OPAQUE, STEEPEST
 class TorchRasterizer:
     """A rasterizer by tiles of 16 x 16 pixels, each drawn from the splats that reach it.
 
-    Splats are sorted by depth once, for all transmitters. A tile keeps the splats whose bounding
-    box, at the opacity ``ALPHA_MIN`` and over all transmitters, meets the tile. Tiles with lists of
+    Splats are sorted by depth once, for all transmitters. The list of a tile has the splats whose
+    bounding box meets it, at the opacity ``ALPHA_MIN`` and for any transmitter. Tiles with lists of
     similar length are composited together, in small chunks. The backward pass, written by hand,
-    computes chunks anew, so memory does not grow with the number of (splat, pixel) pairs.
+    recomputes chunks, so memory does not grow with the number of (splat, pixel) pairs.
 
     Attributes:
-        chunk: (transmitter, splat, pixel) triples worked on at a time on the CPU: an array of
-            float32 then has 4 MiB, which a core's cache holds. Some sixteen arrays live at a time.
-        large_chunk: Triples on other devices, 64 MiB, since a GPU takes as long to start an
-            operation as to compute a million triples.
+        chunk: (transmitter, splat, pixel) triples processed at a time on the CPU. A float32 array
+            of them has 4 MiB, which fits a core's cache. About sixteen arrays exist at a time.
+        large_chunk: Triples on other devices, 64 MiB: a GPU starts an operation in the time of
+            computing a million triples.
 
     Source: tiles of Kerbl et al., 3D Gaussian Splatting, 2023, section 6; GAI-GS, "Projection and
     Render Module", eq. (13) and (14).
@@ -74,7 +74,7 @@ class _Tiles:
     Attributes:
         edge: Edge of a tile [pixels].
         u, v: Coordinates of the tiles' pixels (t, y or 1, x or 1).
-        chunks: Tiles (t,), and the splats of each (t, k), where n fills the lists up.
+        chunks: Tiles (t,), and the splats of each tile (t, k), filled up with the number n.
     """
 
     edge = 16
@@ -98,7 +98,7 @@ class _Tiles:
     def _find_touched(self, means: Tensor, factors: Tensor, opacities: Tensor) -> Tensor:
         """True where a splat reaches a tile (tiles, n).
 
-        It is True for NaN as well, so that the map shows the fault.
+        NaN also gives True, so that the fault shows in the map.
         """
         # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box
         # has these halves.
@@ -121,7 +121,7 @@ class _Tiles:
     def _cut(self, coordinate: Tensor) -> Tensor:
         """Cuts a plane coordinate (rows or 1, columns or 1) into tiles (t, y or 1, x or 1).
 
-        Repetition fills the last tiles up.
+        Repetition fills the last tiles.
         """
         for axis, tiles in enumerate((self.down, self.across)):
             size = self.shape[axis]
@@ -134,7 +134,7 @@ class _Tiles:
         return cut.expand(self.down, self.across, y, x).reshape(-1, y, x)
 
     def _chunks(self, touches: Tensor, pairs: int) -> list[tuple[Tensor, Tensor]]:
-        """Lists tiles with their splats in chunks of so many pairs, longest lists first."""
+        """Tiles with their splats in chunks of ``pairs`` pairs, longest lists first."""
         counts = touches.sum(1)  # (tiles,)
         n = touches.shape[1]
         # Sorting the indices with "not touched" pushed behind keeps the depth order in front.
@@ -173,7 +173,7 @@ class _Tiles:
 
 
 def _nearest(a: Tensor, b: Tensor, period: _Period | None) -> Tensor:
-    """a - b, less the whole number of periods that brings it nearest to 0.
+    """a - b, minus the number of whole periods that brings it nearest to 0.
 
     The period is subtracted from the exact a - b = offset + rest (Knuth's two-sum), so no digit is
     lost at the seam.
@@ -200,7 +200,7 @@ class _SplatParts(NamedTuple):
     def filled(
         cls, means: Tensor, factors: Tensor, signal: Tensor, opacities: Tensor, logs: Tensor | None
     ) -> "_SplatParts":
-        """Adds a splat that does nothing behind all others, to fill the tiles' lists up."""
+        """Adds a splat without effect behind all others, which fills up the tiles' lists."""
         pad = torch.nn.functional.pad
         row = (0, 0, 0, 1)
         return cls(
@@ -213,7 +213,7 @@ class _SplatParts(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """One chunk composited, for b transmitters, t tiles, k splats a tile, y x pixels a tile."""
+    """One composited chunk, for b transmitters, t tiles, k splats a tile, y x pixels a tile."""
 
     # (du, dv) of the pixels, in units of the splat's factor (1 or b, t, k, y or 1, x or 1).
     s: Tensor
@@ -258,11 +258,11 @@ def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _SplatParts) -> _We
 
 
 class _Composite(torch.autograd.Function):
-    """Composites sorted splats, with the gradient by hand.
+    """Composites sorted splats, with a gradient written by hand.
 
-    With R the transmittance behind all splats, D_i = signal_i . image gradient and S_i = sum_{j>i}
-    D_j A_j T_j + R (gradient of R), the derivative by A_i is T_i D_i - S_i / (1 - A_i), and the
-    derivative by log T behind splat i is S_i.
+    Let R be the transmittance behind all splats, D_i = signal_i . image gradient and S_i =
+    sum_{j>i} D_j A_j T_j + R (gradient of R). The derivative by A_i is T_i D_i - S_i / (1 - A_i).
+    The derivative by log T behind splat i is S_i.
     """
 
     @staticmethod
@@ -343,10 +343,9 @@ def _differentiate(
 
 
 def _moments(d_exponent: Tensor, s: Tensor, y: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
-    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from exponents' gradients.
+    """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from the exponents' gradients.
 
-    Sums run over s and y themselves: those over du and dv would cancel where a splat is long and
-    thin.
+    Sums run over s and y. Sums over du and dv would cancel for a long, thin splat.
 
     Args:
         d_exponent: Gradients of the exponents (b, t, k, y, x).

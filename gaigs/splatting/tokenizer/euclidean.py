@@ -27,15 +27,15 @@ class EuclideanTokenizer(nn.Module):
     """Position embeddings E(P_x) and E(P_TX), and no scene token.
 
     E(P_x) are Fourier features of the Gaussian's centre. E(P_TX) are Fourier features of the
-    transmitter through a two-layer network. For data with several carriers the network's input
-    also has the carrier's position in the band.
+    transmitter after a two-layer network. For data with several carriers the network also gets the
+    carrier's position in the band.
 
     Args:
-        scene: The middles of the transmitters' box and of the receivers are the origins of
-            positions.
+        scene: Positions of Gaussians and transmitters are relative to the middles of the receivers
+            and of the transmitters' box.
         gaussian_octaves: Lowest and highest octave k of the Gaussians' features, 2^k cycles a
             metre.
-        transmitter_octaves: The same for the transmitter; None: see ``learnable_octaves``.
+        transmitter_octaves: The same for the transmitter; None: ``learnable_octaves``.
         hidden: Width of the transmitter network's hidden layer.
         width: Width of E(P_TX). If ``hidden`` and ``width`` are None, there is no network, and
             E(P_TX) are the features themselves.
@@ -105,10 +105,10 @@ class EuclideanTokenizer(nn.Module):
 def learnable_octaves(scene: Scene) -> tuple[int, int]:
     """Lowest and highest octave of the transmitter's features that suit the training transmitters.
 
-    Periods range from twice the box's longest edge down to 16 distances between neighbouring
-    transmitters. The network's output has multiples of the input's frequencies, so these must be
-    well below the sampling limit. For noisy labels periods are at least 16 m: an RSSI scatters by
-    decibels at any distance, and the network can still learn a sharp shadow.
+    Periods range from twice the box's longest edge to 16 distances between neighbouring
+    transmitters. The output of the network has multiples of its input frequencies, so input
+    frequencies must be well below the sampling limit. Periods for noisy labels are at least 16 m:
+    neighbouring RSSI labels differ by decibels, and longer periods still allow a sharp shadow.
     """
     neighbours = 16  # chosen on validation parts of rfid-s23-200 and the built-in room
     highest = min(round(-math.log2(neighbours * scene.spacing)), MAX_OCTAVE)
@@ -123,11 +123,11 @@ def octaves(option: str, *limits: int) -> Float[Tensor, " octaves"]:
     """Angular frequencies 2 pi 2^k [rad/m] for k from the lowest to the highest limit.
 
     Args:
-        option: The option that sets the limits, for errors.
+        option: Name of the option with the limits, for errors.
         limits: Lowest and highest k.
 
     Raises:
-        ValueError: There are not two limits in order, or they are out of range.
+        ValueError: There are not two limits in ascending order, or they are out of range.
     """
     if len(limits) != 2 or not -MAX_OCTAVE <= limits[0] <= limits[1] <= MAX_OCTAVE:
         bounds = f"{-MAX_OCTAVE}..{MAX_OCTAVE}"

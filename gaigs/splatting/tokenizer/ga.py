@@ -1,4 +1,4 @@
-"""A scene token by geometric-algebra attention between transmitter and most opaque Gaussians."""
+"""A scene token from geometric-algebra attention between transmitter and opaque Gaussians."""
 
 import torch
 from jaxtyping import Float
@@ -17,26 +17,26 @@ from gaigs.splatting.gaussians import Placed, Tokens
 class GATokenizer(nn.Module):
     """CLS of a Geometric Algebra Transformer (GATr) over CLS, transmitter and anchors.
 
-    Tokens are [TX, CLS, anchors]: CLS is a learnable point; anchors are the centres of the most
-    opaque Gaussians, chosen at every call, without a gradient. Each is a multivector with two
-    scalars for its type; for data with several carriers a third scalar has the carrier's position
-    in the band. There are no position embeddings.
+    Tokens are [TX, CLS, anchors]. CLS is a learnable point. Anchors are the centres of the most
+    opaque Gaussians, chosen at every call, without a gradient. Each token is a multivector with two
+    scalars for its type. For data with several carriers a third scalar is the carrier's position in
+    the band. There are no position embeddings.
 
-    Positions are relative to the middle of the box around transmitters and receivers, and divided
-    by half its longest edge, so that they are of order one and motions remain motions.
+    Positions are relative to the middle of the box around transmitters and receivers, in units of
+    half its longest edge. They are of order one, and rigid motions stay rigid motions.
 
     Args:
-        scene: Its box and receivers set that middle and scale.
+        scene: Its box and receivers set middle and unit.
         anchors: Number of anchors, at most all Gaussians; the paper's M, 16 as released.
-        blocks: GATr blocks; one as released.
+        blocks: GATr blocks; 1 as released.
         multivectors: Multivector channels within the blocks, even and a multiple of ``heads``; 16
             as released.
         scalars: Scalar channels within the blocks, a multiple of ``heads``; 4 as released.
-        heads: Attention heads of a block; ours.
+        heads: Attention heads of a block; the number is ours.
         width: Width of the scene token; 16 as released.
-        algebra: ``projective``, G(3,0,1) with rotations, translations and mirrors (GATr's); or
+        algebra: ``projective``, G(3,0,1) with rotations, translations and mirrors (as in GATr); or
             ``spacetime``, G(3,1,0) with rotations, boosts and mirrors about the middle (the paper's
-            preliminaries), whose points are events at time zero.
+            preliminaries), with points as events at time zero.
 
     Raises:
         ValueError: An option is out of range, or all transmitters and receivers are at one point.
@@ -144,7 +144,8 @@ class GATokenizer(nn.Module):
         Args:
             query: The links.
             transmitters, anchors: Positions relative to the box, of order one.
-            is_shared: True if links share CLS and anchors: b + 1 + m tokens, else (b, 2 + m).
+            is_shared: True if links share CLS and anchors. The tokens are then (b + 1 + m),
+                otherwise (b, 2 + m).
         """
         b, m = len(query), anchors.shape[1]
         cls, transmitter, anchor = self.types.split(1)  # (1, 2) each

@@ -13,11 +13,11 @@ from gaigs.splatting.gaussians import Placed, Tokens
 
 @register("tokenizer", "multiview")
 class MultiviewTokenizer(nn.Module):
-    """The scene token of ``ga`` beside the position embeddings of ``euclidean``.
+    """The scene token of ``ga`` together with the position embeddings of ``euclidean``.
 
     Args:
         ga: Tokenizer of the scene token: its name, configuration or the object.
-        euclidean: Tokenizer of the position embeddings, likewise.
+        euclidean: Tokenizer of the position embeddings, in the same forms.
 
     Source: GAI-GS, "Multi-view Tokenizer", eq. (10).
     """

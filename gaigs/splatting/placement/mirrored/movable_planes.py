@@ -1,4 +1,4 @@
-"""Planes that a placement learns: their start, their moves, and the paths that use them."""
+"""Planes that a placement learns: their start, their moves, and their paths."""
 
 import logging
 from pathlib import Path
@@ -24,30 +24,30 @@ log = logging.getLogger(__name__)
 class MovablePlanes(Placement):
     """Planes about the middle of the room, and the sequences in which paths meet them.
 
-    Offsets are from the middle, so neither rounding nor a turn of a plane depends on the world's
-    origin.
+    Offsets of planes are measured from the middle of the room. Rounding and rotations of a plane
+    therefore do not depend on the world's origin.
 
     Attributes:
         middle: Middle of the room [m].
         diagonal: Diagonal of the box that holds transmitters and receivers [m].
         turn: Rotation from the world's axes to the first planes' axes.
-        origin: Normals and offsets (w, 4) to which ``shifts`` are added: those at the start, or at
-            the last change of ``step``. Offsets are from ``middle`` [m].
-        first: ``origin`` before any training, by which ``fit`` sees whether planes are new.
+        origin: Normals and offsets (w, 4) to which ``shifts`` are added: the first planes, or the
+            planes at the last change of ``step``. Offsets are from ``middle`` [m].
+        first: ``origin`` before any training; ``fit`` compares it to find new planes.
         shifts: Learnt changes of normals and offsets (w, 4), in units of ``step`` for normals, and
             of ``step`` times ``unit`` diagonals for offsets.
         step: Size of a unit of ``shifts``; it follows the wavelength once phases count.
         sequences: Planes of each path, -1 for no plane (n, order).
-        kept: True for paths in use (n,); pruning drops the others.
+        kept: True for paths in use (n,); pruning drops paths.
         most: Number of paths in use at the start.
-        is_new: True until the planes have learnt anything; set by ``fit``.
+        is_new: True until the planes have been trained; set by ``fit``.
 
     Args:
         scene: Its box and receivers give the first planes.
         planes: Largest number of planes; ``faces`` at the start.
         order: Largest number of reflections of a path.
         walls: File of the first planes, see ``read_planes``. None: the faces of the box.
-        fixed: True if planes stay at the start.
+        fixed: True if planes are not trained.
     """
 
     faces = 6
@@ -108,7 +108,7 @@ class MovablePlanes(Placement):
 
         Args:
             planes: Number of planes w.
-            half: Half of the box's edges [m].
+            half: Half of the box's edge lengths [m].
         """
         further = planes - self.faces
         axes = torch.eye(3)
@@ -120,10 +120,10 @@ class MovablePlanes(Placement):
         return torch.cat((normals, offsets[:, None]), 1)
 
     def _first_paths(self) -> Bool[Tensor, " n"]:
-        """True for the paths in use at the start: those that meet faces of the box alone.
+        """True for the paths in use at the start: paths that meet only faces of the box.
 
-        Faces across an axis are left out if all transmitters and receivers stand at one coordinate
-        of it, such as one height: then no label shows how far away such a face is.
+        Faces across an axis are left out if all transmitters and receivers share a coordinate on
+        this axis, such as the height. Labels then do not depend on the distance of such a face.
         """
         axes = [flat.axis for flat in self.scene.flat_axes if flat.is_common]
         # Planes 0 to 5 are the faces +x, +y, +z, -x, -y, -z.
@@ -133,7 +133,7 @@ class MovablePlanes(Placement):
         return is_face & ~torch.isin(self.sequences, blind).any(1)
 
     def fit(self, links: Links) -> None:
-        """Starts from the user's walls, or turns the faces of the box as the places lie."""
+        """Starts from the user's walls, or rotates the box's faces to the axes of the places."""
         if self.walls is not None:
             self._place_walls(Path(self.walls))
             return
@@ -148,7 +148,7 @@ class MovablePlanes(Placement):
             self.origin[: self.faces, 3] = farthest + self.margin * self.diagonal
 
     def _place_walls(self, file: Path) -> None:
-        """Starts from the largest planes of a file; only paths by way of these stay."""
+        """Starts from the largest planes of a file, with paths at only these planes."""
         planes = read_planes(file, *self.box).to(self.origin)
         most = len(self.origin)
         if len(planes) > most:
@@ -176,7 +176,7 @@ class MovablePlanes(Placement):
 
     @property
     def planes(self) -> Float[Tensor, "w 4"]:
-        """Normals and offsets of all planes in the world's frame [m]."""
+        """Normals and offsets of all planes in the world frame [m]."""
         return seen_from(torch.cat((self.normals, self.offsets[:, None]), 1).double(), -self.middle)
 
     @property
@@ -186,19 +186,19 @@ class MovablePlanes(Placement):
         return numbers[numbers >= 0]
 
     def sequences_of(self, planes: Int[Tensor, " k"]) -> Bool[Tensor, " n"]:
-        """True for each sequence of these planes alone, the direct path included."""
+        """True for each sequence of only these planes, including the direct path."""
         planes = torch.cat((planes, planes.new_tensor([-1]))).to(self.sequences.device)
         return torch.isin(self.sequences, planes).all(1)
 
     @torch.no_grad()
     def place(self, number: int, plane: Float[Tensor, "4"]) -> None:
-        """Replaces a plane by one in the world's frame (normal, offset [m])."""
+        """Replaces a plane by one in the world frame (normal, offset [m])."""
         self.origin[number] = seen_from(plane.double(), self.middle)
         self.shifts[number] = 0
 
     @property
     def room_axes(self) -> Float[Tensor, "3 3"]:
-        """Axes of an upright room in the columns, the first square to its first upright plane."""
+        """Axes of an upright room in columns; the first is normal to the first vertical plane."""
         normals = self.normals[self.used]
         upright = normals[normals[:, 2].abs() < 0.1]
         first = upright[0] if len(upright) else normals.new_tensor([1.0, 0.0, 0.0])
@@ -218,16 +218,16 @@ class MovablePlanes(Placement):
 def upright_turn(
     places: Float[Tensor, "n 3"], smaller: float = 0.85, width: float = 0.25, enough: int = 40
 ) -> Float[Tensor, "3 3"]:
-    """Rotation about z to the axes of the upright box that holds all places and has the least area.
+    """Rotation about z to the axes of the upright box of least area around all places.
 
     Args:
         places: Transmitters [m].
-        smaller: Largest ratio of the box's area to the area of the box along the world's axes;
-            above it there is no rotation.
-        width: Least ratio of the box's width to its length: places along a line do not show how
-            the walls stand.
-        enough: Least number of places for a rotation. In a room along the world's axes, chance
-            hardly ever gives one with 40 places, and in a quarter of cases with 10.
+        smaller: Largest ratio of the box's area to the area of the box along the world's axes. With
+            a larger ratio there is no rotation.
+        width: Smallest ratio of the box's width to its length: places along a line do not show the
+            orientation of walls.
+        enough: Smallest number of places for a rotation. In a room along the world's axes, a false
+            rotation is very rare with 40 places, and occurs in a quarter of cases with 10.
     """
     turn = torch.eye(3, dtype=torch.float64)
     if len(places.unique(dim=0)) < enough:

@@ -18,11 +18,11 @@ class Obstacles(nn.Module):
         depth = rho length sqrt(pi / (2 A)) exp(-(C - B²/A) / 2) (erf((A + B) / sqrt(2 A)) - erf(B /
         sqrt(2 A)))
 
-    Boxes have sharp edges. A box adds one depth to all segments through it, however long the way
-    inside. A search finds boxes (``place_boxes``); descent then learns their depths alone.
+    Boxes have sharp edges. A box adds the same depth to all segments through it, for any length
+    inside. A search finds boxes (``place_boxes``); gradient descent then trains their depths only.
 
-    Matter also slows waves. With ``has_phases`` each obstacle has a learnt ratio of phase lag to
-    attenuation, the same at all frequencies, and the depth is complex. ``lower`` and ``upper`` are
+    Matter also delays waves. With ``has_phases`` each obstacle has a learnt ratio of phase lag to
+    attenuation, equal at all frequencies, and the depth is complex. ``lower`` and ``upper`` are
     corners of the box around transmitters and receivers [m].
 
     Source: Wilson and Patwari, Radio Tomographic Imaging, 2010, for the idea.
@@ -70,7 +70,7 @@ class Obstacles(nn.Module):
     def place_boxes(
         self, axes: Float[Tensor, "3 3"], boxes: Float[Tensor, "k 2 3"], depths: Float[Tensor, " k"]
     ) -> None:
-        """Puts boxes with their depths [Np]; Gaussians are as faint as at the start again."""
+        """Sets boxes with their depths [Np], and resets Gaussians to their faint start."""
         self.box_axes.copy_(axes)
         self.boxes.zero_()
         self.boxes[: len(boxes)] = boxes
@@ -97,7 +97,7 @@ class Obstacles(nn.Module):
 
     @property
     def used(self) -> Bool[Tensor, " k"]:
-        """True for boxes in use, those that a search has found."""
+        """True for used boxes, found by a search."""
         return self.boxes[:, 1, 0] > self.boxes[:, 0, 0]
 
     @property
@@ -113,7 +113,7 @@ class Obstacles(nn.Module):
         end: Float[Tensor, "*batch 3"],
         counts: Bool[Tensor, "*batch k"] | None = None,
     ) -> Inexact[Tensor, "*batch"]:
-        """Optical depth along segments [Np]; with phases their lag is the imaginary part [rad].
+        """Optical depth along segments [Np]; with phases the imaginary part is the phase lag [rad].
 
         Used boxes count where ``counts`` is true; None: everywhere.
         """
@@ -137,9 +137,9 @@ class Obstacles(nn.Module):
         return depths.view(start.shape[:-1])
 
     def are_outside(self, sites: Float[Tensor, "b e 3"]) -> Bool[Tensor, "b k"]:
-        """True for links and used boxes that hold no end of the link.
+        """True for links (b) and used boxes (k) if no end of the link is inside the box.
 
-        Transmitters and receivers stand in the open: a box about one is wrong there.
+        Transmitters and receivers are in the open, so a box around one of them is wrong there.
         """
         along = (sites @ self.box_axes)[:, :, None]  # (b, e, 1, 3)
         low, high = self.boxes[self.used].unbind(1)
@@ -166,7 +166,7 @@ class Obstacles(nn.Module):
 def passes_box(
     start: Float[Tensor, "s 3"], end: Float[Tensor, "s 3"], corners: Float[Tensor, "2 3"]
 ) -> Bool[Tensor, " s"]:
-    """True for segments through a box along the axes: the last entry lies before the first exit."""
+    """True for segments through a box along the axes: the last entry is before the first exit."""
     ray = end - start
     inverse = 1 / torch.where(ray.abs() < 1e-9, 1e-9, ray)
     first = (corners[0] - start) * inverse  # (s, 3)
@@ -248,8 +248,8 @@ class _Depth(torch.autograd.Function):
 class _Legs(NamedTuple):
     """Symbols of ``_Depth`` for each segment and obstacle (s, k), and lengths of segments (s,) [m].
 
-    ``near`` is g, the field of an obstacle where the line is closest to it; ``inside`` is E, the
-    part of the line's integral that lies between the ends of the segment.
+    ``near`` is g, the value of an obstacle where the line is closest to it. ``inside`` is E, the
+    part of the line's integral between the ends of the segment.
     """
 
     a: Tensor

@@ -22,32 +22,32 @@ from gaigs.splatting.placement.mirrored.reflections import fold, images
 class Mirrored(PathFields):
     """Gaussians at the images p_k = V_k x ~V_k of the transmitter x in up to ``order`` planes.
 
-    V_k is the product of a sequence of planes: in projective geometric algebra a plane is a vector,
-    and the sandwich product with it mirrors. All paths and receivers share the planes, so
-    direction, path length and spreading follow from geometry; ``PathFields`` has their fields.
+    V_k is the product of a sequence of planes. In projective geometric algebra a plane is a vector,
+    and the sandwich product with it is a reflection. All paths and receivers share the planes, so
+    direction, path length and spreading follow from geometry. ``PathFields`` computes the fields.
 
-    Paths add as powers until ``enable_phases``. Channels start from free space until
+    Powers of paths add until ``enable_phases``. Channels start from free space until
     ``enable_reflections``.
 
     Attributes:
         coherent: True once paths interfere.
         is_bare: True while channels have only the direct path.
-        planned: True for paths in use once ``is_bare`` ends (n,).
+        planned: True for paths in use after ``is_bare`` ends (n,).
         found: True once a search has found the planes.
         held: Strengths of the first query within ``holding``.
-        tried: Offsets that replace the planes' within ``holding``.
+        tried: Offsets that replace the planes' offsets within ``holding``.
 
     Args:
         scene: Its box and receivers give the first planes.
         channels: Channels of the signal, 1 (amplitude) or 2 (complex).
-        planes: Largest number of planes. Six are used at the start; searches in spectra and
+        planes: Largest number of planes. The first six are the box's faces; searches in spectra and
             channels find others.
         order: Largest number of reflections of a path; at most 100,000 sequences of planes.
-        obstacles: Number of Gaussians of matter in the room; with 0 no boxes are searched either.
+        obstacles: Number of Gaussians of matter in the room; 0 also disables the search for boxes.
         walls: File whose largest planes are the first ones: a floor plan ``.csv`` of consecutive
-            vertices x,y [m], or a Wavefront ``.obj`` [m]. None: the box's faces. A checkpoint does
-            not need the file.
-        fixed: True if planes stay at the start.
+            vertices x,y [m], or a Wavefront ``.obj`` [m]. None: the faces of the box. A checkpoint
+            does not need the file.
+        fixed: True if planes are not trained.
 
     Source: ours; Allen and Berkley, Image method for efficiently simulating small-room acoustics,
     1979, for images; Roelfs and De Keninck, Graded Symmetry Groups: Plane and Simple, 2023, for
@@ -98,7 +98,7 @@ class Mirrored(PathFields):
 
     @property
     def _is_blurred(self) -> Bool[Tensor, " n"]:
-        """True for paths that add as power."""
+        """True for paths whose powers add."""
         return self.log_blurs > (self.known_blur + self.unknown_blur) / 2
 
     @property
@@ -110,9 +110,9 @@ class Mirrored(PathFields):
 
     @torch.no_grad()
     def locate(self, *planes: int) -> None:
-        """Lets paths at these planes and at ``located`` ones interfere.
+        """Lets paths interfere if all their planes are in ``planes`` or located before.
 
-        All other paths add as powers. Without an argument no plane is located any longer, and only
+        Powers of all other paths add. Without an argument no plane is located any longer, and only
         the direct path has a phase.
         """
         located = self.located if planes else self.located & False
@@ -124,10 +124,10 @@ class Mirrored(PathFields):
 
     @torch.no_grad()
     def start_from_free_space(self, gains: Complex[Tensor, " receivers"]) -> None:
-        """Reduces the model to the direct path, without obstacles and without angular spread.
+        """Reduces the model to the direct path, without obstacles and angular spread.
 
         ``enable_reflections`` restores the other paths. ``gains`` are the complex gains of the
-        receivers over the pooling's unit; none is 0.
+        receivers, in the pooling's unit; all differ from 0.
         """
         self.planned.copy_(self.kept)
         self.kept.copy_(self.sequences_of(self.used[:0]))
@@ -142,13 +142,13 @@ class Mirrored(PathFields):
         receivers: Int[Tensor, " r"],
         receiver_gains: Complex[Tensor, " r"],
     ) -> None:
-        """Sets the paths' strengths to products of gains of the first planes.
+        """Sets the paths' strengths to products of the gains of the first planes.
 
         Args:
-            gains: Complex gains of the first planes, in each of ``bands``, which multiply the
-                reflections of their slabs.
-            receivers: Numbers of receivers.
-            receiver_gains: Gains of these receivers over the pooling's unit.
+            gains: Complex gains of the first planes in each of ``bands``. They multiply the
+                reflection coefficients of the planes' slabs.
+            receivers: Numbers of the receivers.
+            receiver_gains: Gains of these receivers, in the pooling's unit.
         """
         least = 1e-3  # a logarithm needs some gain
         ones = gains.new_ones(len(gains), len(self.origin) + 1 - gains.shape[1])
@@ -171,8 +171,8 @@ class Mirrored(PathFields):
     def holding(self) -> Iterator[None]:
         """Keeps the first query's strengths within the context, while images follow the planes.
 
-        The strengths are in ``held``. Offsets of the planes for each transmitter (b, w) [m] may be
-        set as ``tried``.
+        The strengths are in ``held``. ``tried`` may hold offsets of the planes for each transmitter
+        (b, w) [m].
         """
         self.holds = True
         try:
@@ -229,7 +229,7 @@ class Mirrored(PathFields):
         gains: Complex[Tensor, "b n"],
         coherences: Float[Tensor, " n"],
     ) -> Placed:
-        """Round Gaussians at the images, as wide as the paths' angular spread at their lengths."""
+        """Round Gaussians at the images; their widths are angular spread times path length."""
         count = lengths.shape[1]
         signal = lengths.new_zeros(count, self.channels, 1)
         signal[:, 0] = 1

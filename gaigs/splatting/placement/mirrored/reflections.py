@@ -11,11 +11,11 @@ from torch.nn import functional
 
 
 class Folded(NamedTuple):
-    """Paths of n sequences of planes through the room; a leg is a straight piece of a path.
+    """Paths of n sequences of planes through the room. A leg is a straight piece of a path.
 
-    Legs stand in the order of folding, from the receiver back: the legs that start at the last
-    bounces of all sequences, then those that start at the last but one, and so on; at last the n
-    legs that start at the transmitter. Each leg but these starts at a bounce.
+    Legs are in the order of folding, from the receiver to the transmitter: first the legs from the
+    last bounce of each sequence, then the legs from the last but one, and so on. The final n legs
+    start at the transmitter. All other legs start at a bounce.
     """
 
     # Ends of all legs [m].
@@ -38,7 +38,7 @@ class Folded(NamedTuple):
     def reflected(
         self, strengths: Complex[Tensor, "b n *s"], coefficients: Complex[Tensor, "b w *s"]
     ) -> Complex[Tensor, "b n *s"]:
-        """Strengths of the sequences times the reflection coefficients at all their bounces."""
+        """Strengths of the sequences times the reflection coefficients at all their reflections."""
         for first, part in self.parts(coefficients):
             strengths = torch.cat((strengths[:, :first], strengths[:, first:] * part), 1)
         return strengths
@@ -46,9 +46,11 @@ class Folded(NamedTuple):
     def parts(
         self, values: Inexact[Tensor, "b w *s"]
     ) -> Iterator[tuple[int, Inexact[Tensor, "b k *s"]]]:
-        """Splits values of bounces: first the last bounce of every path, then the last but one.
+        """Splits values of bounces into parts: the last bounce of every path, then the last but
+        one, ....
 
-        Each part comes with the number of its first sequence; it has all sequences from there on.
+        Each part comes with the number of its first sequence; it covers this and all later
+        sequences.
         """
         counts = [self.exists.shape[1] - first for first in self.firsts]
         return zip(self.firsts, values.split(counts, 1), strict=True)
@@ -61,7 +63,7 @@ def seen_from(planes: Float[Tensor, "*w 4"], origin: Float[Tensor, "3"]) -> Floa
 
 
 def largest_order(planes: int, most: int) -> int:
-    """Largest order at which ``planes``, two or more, have at most ``most`` sequences."""
+    """Largest order at which ``planes`` (two or more) have at most ``most`` sequences."""
     order = 0
     count = 1
     longest = planes  # sequences of the next order
@@ -75,7 +77,7 @@ def largest_order(planes: int, most: int) -> int:
 def all_sequences(planes: int, order: int) -> Int[Tensor, "n order"]:
     """All sequences of at most ``order`` planes in the order in which a wave meets them.
 
-    No plane comes twice in a row. Shorter sequences come first, and have -1 in front.
+    No plane is repeated directly. Shorter sequences come first, and start with -1.
     """
     sequences = []
     for length in range(order + 1):
@@ -105,7 +107,7 @@ def images(
 ) -> list[Float[Tensor, "b n 3"]]:
     """Images of transmitters [m] in the first 0, 1, ..., order planes of each sequence.
 
-    Sequences come from ``all_sequences``. Each transmitter may have offsets of its own.
+    Sequences come from ``all_sequences``. ``offsets`` may differ between transmitters.
     """
     seen = [points[:, None].expand(-1, len(sequences), -1)]
     for first, column in zip(_firsts(sequences), sequences.unbind(1), strict=True):
@@ -116,7 +118,7 @@ def images(
 
 
 def _firsts(sequences: Int[Tensor, "n order"]) -> list[int]:
-    """Number of the first sequence with a plane, not -1, in each column."""
+    """Number of the first sequence with a plane (not -1), for each column."""
     return (sequences < 0).sum(0).tolist()
 
 
@@ -129,9 +131,9 @@ def fold(
 ) -> Folded:
     """Folds straight lines from the receivers to the last images back into the room.
 
-    A path whose line does not cross its plane does not exist; the line is then bent at the end
+    A path does not exist if its line does not cross its plane; its line is then bent at the end
     nearer to the plane. A path with an end on the plane does not exist either, so no path meets two
-    coincident planes in a row.
+    coincident planes in succession.
     """
     # Where each path has arrived on its way back from the receiver (b, n, 3).
     here = receivers[:, None].expand(-1, len(sequences), -1)
@@ -185,7 +187,7 @@ def fold(
 
 
 def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "3"]]:
-    """Normals, of parallel ones the first alone; parallel is a cosine within ``least`` of 1."""
+    """Normals without repetition; normals with a cosine within ``least`` of 1 are parallel."""
     apart: list[Tensor] = []
     for normal in normals:
         if all((normal @ other).abs() < 1 - least for other in apart):
@@ -194,11 +196,10 @@ def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, 
 
 
 def square_normals(normals: Float[Tensor, "w 3"], plane: int) -> list[Float[Tensor, "3"]]:
-    """A plane's normal, and normals within 18 degrees of it that would make the room square.
+    """The normal of a plane, and normals within 18 degrees of it that would make the room square.
 
-    The further ones are level, upright, or square to another plane. They are tried because a fit of
-    powers leaves tilts wrong by some degrees, and with a wrong tilt phases agree at few places
-    only.
+    Such normals are horizontal, vertical, or perpendicular to another plane. Reason: a fit of
+    powers leaves tilt errors of some degrees, and with a wrong tilt phases fit at few places only.
     """
     up = normals.new_tensor([0.0, 0.0, 1.0])
     normal = normals[plane]
@@ -211,7 +212,7 @@ def square_normals(normals: Float[Tensor, "w 3"], plane: int) -> list[Float[Tens
 
 
 def tangents(normal: Float[Tensor, "3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Two unit vectors at right angles to a normal and to each other."""
+    """Two unit vectors perpendicular to a normal and to each other."""
     other = torch.zeros_like(normal)
     other[normal.abs().argmin()] = 1
     first = functional.normalize(torch.linalg.cross(normal, other), dim=0)
@@ -223,7 +224,7 @@ def reflection_points(
 ) -> Float[Tensor, "b w 3"]:
     """Points at which planes reflect waves from starts to ends [m].
 
-    Where start and end are on two sides of a plane, the point is as if both were on one side.
+    If start and end are on opposite sides of a plane, one of them is first mirrored in the plane.
     """
     normals, offsets = planes[:, :3], planes[:, 3]
     start_heights = starts @ normals.T - offsets  # (b, w)
@@ -241,7 +242,7 @@ def polarised(
 ) -> Complex[Tensor, "*n"]:
     """Reflection coefficients for vertical polarisation.
 
-    They are TE at upright planes, TM at level ones, and a mean weighted by n_z² between.
+    They are TE at vertical planes, TM at horizontal ones, and a mean weighted by n_z² otherwise.
     """
     level = normals[..., 2].square()
     return (1 - level) * te + level * tm

@@ -30,9 +30,9 @@ def read_planes(
     Args:
         file: ``.csv`` with consecutive vertices x,y of a floor plan [m], whose walls are upright,
             or ``.obj`` with the faces of a mesh [m].
-        lower, upper: Corners of the box of transmitters and receivers [m]. A floor plan gets its
-            floor and ceiling there, unless all stand at one height.
-        shortest: Least length of a wall and of the edges of a face [m].
+        lower, upper: Corners of the box of transmitters and receivers [m]. They place floor and
+            ceiling of a floor plan, unless the box has no height.
+        shortest: Smallest length of a wall, and of an edge of a face [m].
     """
     if not file.is_file():
         raise FileNotFoundError(
@@ -84,9 +84,9 @@ def _faces(vertices: Float[Tensor, "v 3"], faces: Iterable[Face], shortest: floa
 def _merged(
     normals: Float[Tensor, "f 3"], points: Float[Tensor, "f 3"], sizes: Float[Tensor, " f"]
 ) -> Float[Tensor, "k 4"]:
-    """Planes of faces, largest total size first.
+    """Planes of faces, sorted by decreasing total size.
 
-    Faces within 0.02 rad and 0.02 m of the largest one take its plane.
+    Faces within 0.02 rad and 0.02 m of the largest face belong to its plane.
     """
     sizes, order = sizes.sort(descending=True, stable=True)
     normals = functional.normalize(normals[order], dim=1)
