@@ -98,13 +98,13 @@ def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float
 
 
 def fit_law(
-    errors: Sequence[Float[Tensor, " k"]], places: Sequence[Float[Tensor, "k 3"]], most: int = 100
+    errors: Sequence[Float[Tensor, " _"]], places: Sequence[Float[Tensor, "_ 3"]], most: int = 100
 ) -> Float[Tensor, "4"]:
     """The most likely law of ``gaigs.model.adapted`` for receivers, each predicted as a new one.
 
     Args:
-        errors: Errors of each receiver's links.
-        places: Their transmitters [m].
+        errors: Errors of each receiver's links, (k,) of k links.
+        places: Their transmitters (k, 3) [m].
         most: Largest number of links of a receiver.
     """
     parts = []

@@ -156,8 +156,10 @@ class MeshRoom:
 
     def is_furnished(self, points: Float[Tensor, "k 3"]) -> Bool[Tensor, " k"]:
         """True for points [m] in furniture, or less than a margin from it."""
-        inside = [cuboid.contains(points, FURNITURE_MARGIN) for cuboid in self.furniture]
-        return torch.stack(inside).any(0)
+        is_inside = torch.zeros(len(points), dtype=torch.bool)
+        for cuboid in self.furniture:
+            is_inside |= cuboid.contains(points, FURNITURE_MARGIN)
+        return is_inside
 
 
 def facing(position: Sequence[float], target: Sequence[float], turn: float = 0.0) -> Pose:
