@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import minimize
 from scipy.special import stdtrit
 from torch import Tensor
-from torch.distributions import MultivariateNormal
+from torch.nn.utils.rnn import pad_sequence
 
 from gaigs.core.geometry import FAINTEST
 from gaigs.core.query import evenly
@@ -107,23 +107,28 @@ def fit_law(
         places: Their transmitters (k, 3) [m].
         most: Largest number of links of a receiver.
     """
-    parts = []
-    for own, there in zip(errors, places, strict=True):
-        rows = evenly(torch.arange(len(own)), most)
-        ways = there[rows, None].double() - there[rows].double()  # (k, k, 3)
-        parts.append((own[rows].double(), ways.norm(dim=-1)))
-    mean = torch.cat([own for own, _ in parts]).square().mean().clamp_min(1e-9)
-    size = torch.stack([apart.max() for _, apart in parts]).median().clamp_min(1e-6)
+    rows = [evenly(torch.arange(len(part)), most) for part in errors]
+    parts = [part[row].double() for part, row in zip(errors, rows, strict=True)]
+    spots = [part[row].double() for part, row in zip(places, rows, strict=True)]
+    mean = torch.cat(parts).square().mean().clamp_min(1e-9)
+    # Receivers with fewer links are filled up with errors of 0 that correlate with nothing.
+    exists = pad_sequence([torch.ones(len(part)) for part in parts], batch_first=True)  # (r, k)
+    padded = pad_sequence(parts, batch_first=True)[..., None]  # (r, k, 1)
+    there = pad_sequence(spots, batch_first=True)  # (r, k, 3)
+    apart = torch.cdist(there, there)  # (r, k, k)
+    pairs = exists[:, :, None] * exists[:, None]
+    size = (pairs * apart).amax((1, 2)).median().clamp_min(1e-6)
     units = torch.stack((mean, mean, mean, size))
 
     def cost(logarithms: np.ndarray) -> float:
-        """Negative log likelihood."""
+        """Mean negative log likelihood, but for a constant."""
         level, noise, field, length = torch.from_numpy(logarithms).exp() * units
-        total = 0.0
-        for own, apart in parts:
-            covariances = level + field * (-apart / length).exp() + noise * torch.eye(len(own))
-            total -= MultivariateNormal(torch.zeros_like(own), covariances).log_prob(own).item()
-        return total / sum(len(own) for own, _ in parts)
+        covariances = pairs * (level + field * (-apart / length).exp())
+        variances = torch.where(exists > 0, noise, 1.0)
+        factor = torch.linalg.cholesky(covariances + variances.diag_embed())  # (r, k, k)
+        white = torch.linalg.solve_triangular(factor, padded, upper=False)  # (r, k, 1)
+        spread = factor.diagonal(dim1=1, dim2=2).log().sum()  # of the filled ones 0
+        return ((white.square().sum() / 2 + spread) / exists.sum()).item()
 
     # Variances from 1e-4 to 20 mean squares, lengths from 0.1 % to 3 sizes of the site.
     bounds = [(-9.0, 3.0)] * 3 + [(-7.0, 1.0)]

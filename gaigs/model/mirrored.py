@@ -124,8 +124,14 @@ class MirroredSplatting(GaussianSplatting):
         is_shared = wants_boxes and not self.scene.one_radio
         if is_known and is_shared and not self.is_wide and isinstance(self.pooling, PathRssi):
             self._prepare_boxes(links)
+        if self.boxes and self.shadowed is not None:
             # Gains of single paths learn the shadows at the known receivers in place of boxes.
-            self.placement.path_gains.requires_grad_(not self.boxes)
+            self.placement.path_gains.requires_grad_(False)
+        elif self.boxes and isinstance(self.pooling, PathRssi):
+            log.warning(
+                "boxes=true searches none: it takes validation links, a known carrier, three "
+                "receivers or more, and a room rather than a site"
+            )
         # Without phases powers add to the end, and no later revision locates a plane.
         has_phases = is_known and not self.is_wide and not self.scene.one_radio
         self.settles = isinstance(self.pooling, PathRssi) and not has_phases

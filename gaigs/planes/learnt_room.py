@@ -75,7 +75,7 @@ def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
     """The learnt room, from paths of links.
 
     Paths of some training links outline the planes; without links, paths of ``spread_links`` do.
-    The drawn paths are of the first test transmitter; without links there are none.
+    With links, the paths of the first test transmitter are drawn.
     """
     if links is None:
         query = spread_links(placement.scene)

@@ -243,10 +243,10 @@ def drawn_errors(count, generator):
 
 def test_the_law_of_errors_is_found_again():
     generator = torch.Generator().manual_seed(0)
-    level, noise, field, length = fit_law(*drawn_errors(40, generator)).tolist()
-    assert level == pytest.approx(9, rel=0.5)
-    assert noise + field == pytest.approx(20, rel=0.2)
-    assert length == pytest.approx(2, rel=0.5)
+    errors, places = drawn_errors(40, generator)
+    errors[0], places[0] = errors[0][:30], places[0][:30]
+    law = fit_law(errors, places)
+    torch.testing.assert_close(law, torch.tensor([9.0, 4.0, 16.0, 2.0]).double(), rtol=0.3, atol=0)
     nothing = fit_law([torch.zeros(4)] * 3, [torch.zeros(4, 3)] * 3)
     assert nothing.isfinite().all()
 

@@ -36,7 +36,8 @@ class Placement(nn.Module, ABC):
         """The Gaussians of each query.
 
         Args:
-            gaussians: The free Gaussians; None if there are none, which requires ``has_own``.
+            gaussians: The free Gaussians. None for a placement with ``has_own``, which needs
+                none.
             query: The links.
         """
 
