@@ -194,8 +194,8 @@ class MirroredSplatting(GaussianSplatting):
     def _fit_channels(self, links: Links, task: Task, pooling: ChannelPooling) -> None:
         """Starts the training from free space, and plans planes for its first revision.
 
-        ``ChannelSearch`` finds the planes; for channels of few numbers ``FieldSearch``, which needs
-        a common phase. Without one, the faces of the box stay.
+        ``ChannelSearch`` finds the planes. For channels with few values ``FieldSearch`` does, which
+        needs a common phase. Without one, the faces of the box stay.
         """
         placement = self.placement
         received = links.labels

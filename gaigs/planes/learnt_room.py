@@ -38,7 +38,7 @@ class PlaneTable(NamedTuple):
 
 
 class LearntPlane(NamedTuple):
-    """The drawn part of a learnt plane."""
+    """A learnt plane as a polygon for figures."""
 
     number: int  # as in ``metrics.json``
     # A convex polygon, counterclockwise as seen from outside the room [m].

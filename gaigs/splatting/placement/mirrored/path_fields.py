@@ -147,7 +147,7 @@ class PathFields(MovablePlanes):
     def _load_from_state_dict(self, state_dict, prefix, *args):
         # Receivers without training links had gains of their own before.
         state_dict.setdefault(prefix + "is_heard", torch.ones_like(self.is_heard))
-        if self.path_phases is not None:  # channels of few numbers had none before
+        if self.path_phases is not None:  # channels with few values had none before
             state_dict.setdefault(prefix + "path_phases", torch.zeros_like(self.path_phases))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
