@@ -1,4 +1,4 @@
-"""Common part of the losses that average a function of the error."""
+"""Base class of the losses that average a function of the error."""
 
 from abc import ABC, abstractmethod
 

@@ -1,4 +1,4 @@
-"""Fourier features of positions: metric structure, no scene token."""
+"""A tokenizer of Fourier features of positions, without a scene token."""
 
 import math
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ class EuclideanTokenizer(nn.Module):
             and of the transmitters' box.
         gaussian_octaves: Lowest and highest octave k of the Gaussians' features, 2^k cycles a
             metre.
-        transmitter_octaves: The same for the transmitter; None: ``learnable_octaves``.
+        transmitter_octaves: Octaves of the transmitter's features; None: ``learnable_octaves``.
         hidden: Width of the transmitter network's hidden layer.
         width: Width of E(P_TX). If ``hidden`` and ``width`` are None, there is no network, and
             E(P_TX) are the features themselves.
