@@ -1,4 +1,4 @@
-"""The budget of a training, in steps, wall time, or both, and its spent part."""
+"""The budget of a training in steps, wall time or both, and the fraction that is spent."""
 
 import contextlib
 import math

@@ -372,7 +372,7 @@ class _Render:
         return cl.Buffer(self.queue.context, flags, hostbuf=np.ascontiguousarray(values))
 
     def _empty(self, size):
-        """A device buffer of ``size`` four-byte values, at least one: OpenCL allows no empty one."""
+        """A device buffer of ``size`` four-byte values, at least one, since none may be empty."""
         return _pool(self.queue).allocate(4 * max(1, int(size)))
 
     def _finish(self, *buffers):

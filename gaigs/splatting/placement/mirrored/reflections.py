@@ -62,7 +62,7 @@ def seen_from(planes: Float[Tensor, "*w 4"], origin: Float[Tensor, "3"]) -> Floa
 
 
 def largest_order(planes: int, most: int) -> int:
-    """Largest order with at most ``most`` sequences of ``planes``, of which there are two or more."""
+    """Largest order with at most ``most`` sequences of ``planes``, a number of two or more."""
     order = 0
     count = 1
     longest = planes  # sequences of the next order
