@@ -169,7 +169,7 @@ class MirroredSplatting(GaussianSplatting):
             self.second_start = {"search": False}
 
     def _prepare_levels(self, links: Links) -> None:
-        """Prepares ``LevelSearch``, which ``revise`` runs after obstacles are learnt from powers."""
+        """Prepares ``LevelSearch``, for ``revise`` once obstacles are learnt from powers."""
         trend = 0 * links.labels
         if self.trend is not None:
             trend = self.trend(Batch(links.query).to(self.device)).value.cpu()
@@ -183,7 +183,7 @@ class MirroredSplatting(GaussianSplatting):
         )
 
     def _prepare_boxes(self, links: Links) -> None:
-        """Draws links for the search of boxes in ``revise``, and other links that test the boxes."""
+        """Draws links for the search of boxes in ``revise``, and links that test its boxes."""
         # With so many a search takes a minute; with 600 it finds a third of the furniture.
         rows, held = drawn(links.split.train, 1500), drawn(links.split.validation, 1500)
         # One receiver or two do not tell where along a path an obstacle stands.

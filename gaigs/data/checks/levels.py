@@ -37,7 +37,7 @@ def check_levels(links: Any) -> Iterator[Finding]:
 
 
 def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
-    """A finding about positive levels: powers, amplitudes, or decibels of another sign or unit."""
+    """A finding if levels are positive: powers, amplitudes, or decibels with a wrong sign."""
     low, high = np.quantile(levels.numpy(), (0.05, 0.95)).tolist()
     text = (
         f"{int((levels > 0).sum())} levels are above 0 dBm, {levels.min():.3g} to "
@@ -223,7 +223,7 @@ def check_places_of_levels(
 
 
 def _scale(errors: Float[Tensor, " n"], sample: Sample) -> Float[Tensor, " r"]:
-    """Robust standard deviation at each receiver; with under 10 links, of all receivers."""
+    """Robust standard deviation of errors at each receiver; all receivers' with under 10 links."""
     scales = (1.4826 * errors.abs().median()).expand(len(sample.positions)).clone()
     for number in range(len(scales)):
         at_receiver = errors[sample.receivers == number]

@@ -1,4 +1,4 @@
-"""Checks of receivers' places by the levels: units, axes, order, and wrong places."""
+"""Checks of receivers' places against levels: units, axes, order, and wrong places."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -84,7 +84,7 @@ def sample_of_given(
 
 
 def check_conventions(sample: Sample) -> Iterator[Finding]:
-    """A finding if levels follow the distance clearly better in another unit or with other axes."""
+    """A finding if levels follow the distance much better in another unit or other axes."""
     rows = [
         *of_frames(),
         *of_units([("tx",), ("rx",)]),
