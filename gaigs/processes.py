@@ -1,4 +1,4 @@
-"""Resources and signals of a run: threads, memory, Ctrl-C and SIGTERM, locked folders."""
+"""Resources of a run and the signals that stop it: threads, memory, Ctrl-C, locked folders."""
 
 import atexit
 import contextlib
@@ -50,9 +50,9 @@ class Stopped(KeyboardInterrupt):
 def keep_memory() -> None:
     """Makes this process faster, at the cost of memory.
 
-    Freed arrays stay with the process; otherwise glibc would map their pages again in each step.
-    Imports create half a million permanent objects, so garbage collection becomes rarer, and is
-    skipped at the end.
+    The process keeps the memory of freed arrays, which glibc would otherwise map again in each
+    step. Garbage collection becomes rarer, since imports create half a million permanent objects,
+    and is skipped at the end.
     """
     gc.set_threshold(50_000)
     atexit.register(gc.freeze)

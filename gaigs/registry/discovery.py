@@ -67,8 +67,7 @@ class Holder:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the sources: the component's source, and all files in ./plugins that it
-        imports.
+        """SHA-256 of the component's source and of all files in ./plugins that it imports.
 
         The component's source is its package or, outside packages, its file.
         """

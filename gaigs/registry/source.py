@@ -35,7 +35,7 @@ class Located(NamedTuple):
 
 
 class UnclearSource(Exception):
-    """The source does not show an option or its default; an import does."""
+    """An option or its default cannot be read from the source; an import is needed."""
 
 
 def registrations(file: Path) -> list[Registration]:
