@@ -273,8 +273,8 @@ def stopping(waits: bool = False) -> Iterator[None]:
     """Makes the signals ``STOPPING`` stop a run as Ctrl-C does, and finally restores the handlers.
 
     Args:
-        waits: True for a process that waits for another run afterwards. A signal during this wait
-            stops its next run. If the process ended, its launcher would hang.
+        waits: True for a launcher's process that waits for its next run. A signal during the wait
+            then stops that run, since the launcher would hang if the process ended.
     """
     # Other threads may not set handlers.
     if threading.current_thread() is not threading.main_thread():

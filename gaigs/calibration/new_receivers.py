@@ -127,7 +127,7 @@ def fit_law(
     units = torch.stack((mean, mean, mean, size))
 
     def cost(logarithms: np.ndarray) -> float:
-        """Mean negative log likelihood, but for a constant."""
+        """Mean negative log likelihood of the errors, without constant terms."""
         level, noise, field, length = torch.from_numpy(logarithms).exp() * units
         covariances = pairs * (level + field * (-apart / length).exp())
         variances = torch.where(exists > 0, noise, 1.0)

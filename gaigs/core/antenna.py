@@ -14,7 +14,7 @@ from gaigs.core.geometry import Pose
 
 
 def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"]]:
-    """The distinct vectors between places, to nine decimals, and the index of each pair's vector."""
+    """The distinct vectors between places, to nine decimals, and the number of each pair's."""
     apart = (places[:, None] - places).flatten(0, 1).round(decimals=9)  # (e x e, 3)
     return torch.unique(apart, dim=0, return_inverse=True)
 

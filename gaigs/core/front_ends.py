@@ -98,9 +98,7 @@ class FrontEndFit:
         return FrontEndFit(self.labels[index], self.waves[index], self.task, self.options)
 
     def start(self, shape: Shape) -> FrontEnd:
-        """The best of several fits, started at the mean over links or, if phases are unknown, at
-        single links.
-        """
+        """The best of several fits: from the mean over links, or single links of unknown phase."""
         strengths = self.waves.abs()
         relative = self.labels * self.waves.conj() / torch.where(strengths > 0, strengths, 1)
         starts = [relative.mean(0)]
@@ -135,10 +133,7 @@ class FrontEndFit:
         return FrontEnd(response, scatter, (1 - errors).mean().item())
 
     def likeness(self) -> float:
-        """Fraction of power that an unrestricted response and the direct wave explain.
-
-        It is computed at a few links.
-        """
+        """Fraction of a few links' power that an unrestricted response explains."""
         thinned = self.at(evenly(torch.arange(len(self.labels)), 64))
         return thinned.start(Shape(max(self.options.counts), True)).explained
 

@@ -61,7 +61,7 @@ SMOOTHNESSES = (0.5, 1.5)
 
 
 def matern(apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
-    """Matern correlation of places at distances ``apart`` [m], of smoothness 1/2 or 3/2.
+    """Matern correlation, of smoothness 1/2 or 3/2, at the distances ``apart`` [m].
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, equations 4.16
     and 4.17.

@@ -130,13 +130,19 @@ class LocalMixtures(NamedTuple):
         nearest: Nearest,
         sets: Int[Tensor, " m"],
     ) -> LocalMixture:
+        """Mixtures at m places from the readings y around each, sorted by their ``sets``.
+
+        A candidate has the matrix K = correlations + ratio I of readings and the correlations c
+        with the place. With the Cholesky factor K = L L', the mean is (L^-1 c)' (L^-1 y), and the
+        variance is 1 + ratio - |L^-1 c|², times a scale that y and the prior determine.
+        """
         options, scale = self.options, self.choice.scale
         points = scaled(self.readings.places, scale)[nearest.rows]  # (m, j, d)
         near = (points - scaled(places, scale)[:, None]).norm(dim=2)  # (m, j)
-        # What does not exist correlates with nothing, not even with itself.
+        # Missing readings correlate with nothing, not even with themselves.
         near = near.where(nearest.exists, 1e15)
-        # Places with the same readings around share matrices and factors, as the candidates are the
-        # same at all receivers.
+        # Places with the same readings around share the factors L; candidates are the same at all
+        # receivers.
         _, which = sets.unique_consecutive(return_inverse=True)
         first = torch.searchsorted(which, which.unique())
         pairs = nearest.exists[first, :, None] & nearest.exists[first, None]
@@ -160,12 +166,12 @@ class LocalMixtures(NamedTuple):
                 noise = ratio * torch.eye(values.shape[1]).to(values)
                 factor = torch.linalg.cholesky(correlations + noise)  # (u, j, j)
                 white = torch.linalg.solve_triangular(factor[which], both, upper=False)
-                towards, rotated = white.unbind(2)  # (m, j)
-                # The receiver's variance of readings divides into signal and noise.
+                towards, rotated = white.unbind(2)  # (m, j), L^-1 c and L^-1 y
+                # The receiver's variance of readings is the prior mean of signal plus noise.
                 prior_energy = options.degrees * total / (1 + ratio)
                 energy = prior_energy + rotated.square().sum(1)
                 determinant = 2 * factor.diagonal(dim1=1, dim2=2).log().sum(1)[which]
-                # Readings that do not exist have a factor of the noise alone.
+                # Missing readings add the noise alone to the determinant.
                 determinant = determinant - (values.shape[1] - counts) * logarithm
                 likelihood = options.degrees * prior_energy.log() - determinant
                 likelihood = likelihood - (options.degrees + counts) * energy.log()

@@ -34,6 +34,9 @@ class ScalarPosterior(Posterior):
         return without_gross_errors(links)
 
     def fit(self, links: Links, candidates: Mapping[float, Tensor]) -> float:
+        # 1. Kernel, noise and lengths are fitted to the residuals of the last candidate.
+        # 2. With these as the start, lengths and noise are fitted again for each candidate.
+        # 3. The mean of the candidates, weighted by their likelihoods, is fitted once more.
         index = links.split.known
         known = self._coordinates(links.query[index])
         folds = folds_of(links, index)
@@ -67,7 +70,7 @@ class ScalarPosterior(Posterior):
                 places = links.query[index[held]].place_keys.unique()
                 each = len(held) / len(places)
                 costs = torch.tensor([refit(values) for values in residuals], dtype=torch.float64)
-                # -inf if a trend explains all
+                # A cost is -inf if a trend explains all labels.
                 shares = torch.softmax(-costs.clamp_min(-1e300) / each, 0)
             refit(shares @ torch.stack(residuals))
         return (shares @ weights).item()

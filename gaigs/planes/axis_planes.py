@@ -154,10 +154,7 @@ def room_axes(planes: Float[Tensor, "w 4"]) -> Float[Tensor, "k 3"]:
 
 
 def is_square(planes: Float[Tensor, "w 4"]) -> bool:
-    """True if planes are horizontal or vertical, and pairwise parallel or perpendicular.
-
-    The tolerance is about a degree.
-    """
+    """True if planes are level or upright, and pairwise parallel or square, to about a degree."""
     normals = torch.cat((planes[:, :3], planes.new_tensor([[0.0, 0.0, 1.0]])))
     cosines = (normals @ normals.mT).abs()
     return bool(((cosines < 0.02) | (cosines > 0.9998)).all())

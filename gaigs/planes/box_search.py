@@ -144,10 +144,7 @@ class BoxSearch:
 
     @torch.no_grad()
     def run(self) -> list[Cuboid]:
-        """The boxes found; an empty list if no box lowers the error significantly.
-
-        When the time is up, the search ends with the boxes found so far.
-        """
+        """The boxes found until the time is up; empty if no box helps significantly."""
         with contextlib.suppress(TimeoutError):
             for _ in range(self.most):
                 if len(self.boxes) >= self.most or not self._add():
@@ -177,10 +174,7 @@ class BoxSearch:
 
     @torch.no_grad()
     def gain(self, boxes: list[Cuboid]) -> float:
-        """Fall of the mean error by the given boxes alone; 0 if the time is up.
-
-        The boxes may come from another search.
-        """
+        """Fall of the mean error by ``boxes``, of any search; 0 if the time is up."""
         with contextlib.suppress(TimeoutError):
             return self._error(self.free, []) - self._error(self.free, boxes)
         return 0.0

@@ -22,8 +22,7 @@ class FieldScore(Score[FieldRoom]):
 
     With a separate gain at each place, any plane would explain a channel of one value. A common
     gain makes a few hundred places one large array, over which the phases of a wrong plane do not
-    fit.
-    Powers are summed over receivers and groups of places, whose relative phases are unknown.
+    fit. Powers are summed over receivers and groups of places, whose relative phases are unknown.
 
     Args:
         data: Training channels with a common phase.

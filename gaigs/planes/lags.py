@@ -216,7 +216,7 @@ class ReceiverLags:
         return sums.index_add(1, self.array.lags[1], flat) / self.counts
 
     def further_wave(self, paths: ArrayPaths, bandwidth: float) -> FurtherWave:
-        """Weights of a further path's wave by its interference with the known ``paths``."""
+        """How a further path, by interference with the known ``paths``, lowers the errors."""
         slopes = self.slopes(self.covariances(paths, bandwidth))
         weights = (slopes @ paths.steering.mT).mT * paths.fields[..., None]  # (b, n, e)
         if bandwidth:

@@ -226,11 +226,12 @@ def attenuate_paths(
     fields = fields.double()
     powers = fields.square()
     fields[powers < options.faint * powers.sum(1, keepdim=True)] = 0
-    # Legs of the paths that count, of all links in a row (s,).
+    # Legs of the paths whose field is not 0, over all links (s,).
     link, leg = (fields > 0)[:, folded.path].nonzero().T
     paths = link * len(sequences) + folded.path[leg]
     start = folded.start[link, leg].double()
     along = folded.end[link, leg].double() - start
+    # Boxes become sheets of their own, so only the Gaussians attenuate here.
     no_boxes = torch.zeros(len(start), int(obstacles.used.sum()), dtype=torch.bool)
     depths = obstacles(start.float(), (start + along).float(), no_boxes).real.double()
     depths = fields.new_zeros(fields.numel()).index_add(0, paths, depths)  # (b n,), of each path

@@ -131,11 +131,7 @@ class PlanePeriodogram:
         return distinct
 
     def _is_apart(self, peak: TilePeak, other: TilePeak) -> bool:
-        """True if two planes are in different lobes.
-
-        Then their normals differ by more than a quarter of ``tile``, or their positions at the
-        pivot by more than a quarter of the wavelength.
-        """
+        """True if normals differ by a quarter of ``tile``, or pivots by a quarter wavelength."""
         gap = peak.plane - other.plane
         move = (gap[3] - gap[:3] @ peak.pivot).abs()
         return bool(gap[:3].norm() > self.tile / 4 or move > self.wavelength / 4)

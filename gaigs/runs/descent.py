@@ -106,7 +106,7 @@ def _identity(links: Links, config: dict) -> dict:
 
 
 def _callbacks(module: Any, links: Links, config: dict) -> list[Callback]:
-    """Callbacks between the steps: checkpoints, revisions and density control if configured."""
+    """Callbacks between the steps: density control, revisions, progress line; if configured."""
     callbacks: list[Callback] = []
     if module.density is not None:
         callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))

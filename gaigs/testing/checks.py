@@ -26,7 +26,7 @@ def require_empty(got: Sequence[int], shapes: Collection[Sequence[int]], rule: s
 
 
 def require_refusal(call: Callable[[], object], rule: str) -> None:
-    """Requires that a call raises a ``ValueError``, or a ``TypeError`` like type checkers."""
+    """Requires that a call raises a ``ValueError``, or a ``TypeError`` as type checkers do."""
     try:
         call()
     except (ValueError, TypeError):

@@ -27,7 +27,7 @@ class MeanScores:
             self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
 
     def over_processes(self, strategy) -> dict[str, float]:
-        """Means of all scores over all processes, by name; every process must call it."""
+        """Means over all processes' links, as ``Task.logged``; every process must call it."""
         numbers = [self.count, *self.sums.values()]
         totals = torch.tensor(numbers, dtype=torch.float64, device=strategy.root_device)
         count, *sums = strategy.reduce(totals, reduce_op="sum").tolist()

@@ -136,7 +136,7 @@ def smoothed(
     spacing = distances(first, first).fill_diagonal_(math.inf).amin(1).median()
     moves = Moves(places, math.hypot(step, spacing.item()), jump)
 
-    # forward: given the values until each one; backward: given those after it.
+    # forward: log posterior given the transmissions up to each one; backward: given later ones.
     forward = [single[0]]  # n of (k,)
     for value, pair in zip(single[1:], itertools.pairwise(indices), strict=True):
         forward.append(value + moves.take(forward[-1], *pair))

@@ -162,5 +162,5 @@ class Spectrum(Task):
     def stored(
         self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]
     ) -> dict[str, np.ndarray]:
-        """``ssim``."""
+        """The array ``ssim``, the similarity of each prediction."""
         return {"ssim": scores["ssim"].numpy()}

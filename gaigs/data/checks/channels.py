@@ -131,7 +131,7 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
 
 
 def _without_sign(few: Sample, is_enough: bool) -> Iterator[Finding]:
-    """A finding about channels whose phases follow the distance with neither sign."""
+    """A finding if phases of channels follow the distance neither with one sign nor the other."""
     explained = "distance explains {} of the levels' spread"
     by_level = Measure(level_share, 0.22, 0.3, explained, "of the spread of levels")
     finding = best_convention(few, by_level)

@@ -215,7 +215,10 @@ def changing(name: str, parts: Sequence[str], move: Move, mend: str) -> Hypothes
 
 
 def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hypothesis:
-    """A convention that multiplies points of ``ends`` by a matrix, as ``mend`` does in numpy."""
+    """The convention that points of ``ends`` need multiplication by a matrix.
+
+    ``mend`` is this multiplication as text in numpy, which the advice appends to array names.
+    """
     parts = {"tx": "transmitters", "rx": "positions", "elements": "elements"}
     lines = "; ".join(f"{end} = {end}{mend}" for end in ends)
     return changing(

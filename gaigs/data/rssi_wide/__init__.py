@@ -171,7 +171,7 @@ def _to_links(
 
 
 def _read_table(file: str | Path) -> tables.Table:
-    """The table of readings; a ``ValueError`` for a table with a reading a line."""
+    """The wide table of a file; a ``ValueError`` for one with a reading in each line."""
     path = tables.find_file(file, "a table of readings")
     table = tables.read_table(path, "a heading x,y,ap1,ap2,... and one place a line")
     if {"tx_x", "rx_x"} <= {name.lower() for name in table.names}:
@@ -205,7 +205,7 @@ def _remarks_on_readings(
 
 
 def _remarks_on_heights(axes: Axes, placed: Mapping, height: float, storey: float) -> list[str]:
-    """Remarks on heights that options gave."""
+    """Remarks on heights that come from options, as the table or the gateways have none."""
     if axes.z < 0:
         return [f"all places are {height:g} m high (data.height)"]
     if axes.is_floor:

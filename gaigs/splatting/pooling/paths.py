@@ -91,7 +91,7 @@ class LagPooling(PathPooling):
         self.take_receivers(scene)
 
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
-        """Replaces the scene, possibly by one with other receivers."""
+        """Sets ``is_same_for_all`` for a scene's receivers, whose arrays must be planar."""
         self.is_same_for_all = all(receiver.array.is_point for receiver in scene.receivers)
         for receiver in scene.receivers:
             height = receiver.array.elements[:, 2].abs().max()
