@@ -63,8 +63,7 @@ class FrontEndOptions:
 
 
 class FrontEndFit:
-    """Fit of a front end's response to the links of one receiver, judged by its gain over free
-    space.
+    """Fit of a front end's response to the links of one receiver.
 
     A link is h = g R w exp(j (phi + 2 pi f tau)) + error. R is the response, w the direct wave, and
     g a positive gain. The phase phi and the delay tau are 0 if the task's phase is known.

@@ -95,10 +95,10 @@ class PathTerms(nn.Module):
         return (columns * self.coefficients[radios]).sum(1).to(transmitters)
 
     def fit(self, links: Links, errors: Float[Tensor, " k"], chooses: bool) -> None:
-        """Fits the coefficients to ``errors`` of a law at the known links.
+        """Fits the coefficients to ``errors``, the residuals of a path-loss law at known links.
 
-        With ``chooses`` the terms are chosen first. A receiver without links gets the others'
-        means.
+        With ``chooses`` the terms are chosen first. A receiver without links gets the means of the
+        other receivers' coefficients.
         """
         if links.uncertainties is not None:
             self.regions.copy_(links.uncertainties)

@@ -311,7 +311,7 @@ class MirroredSplatting(GaussianSplatting):
     def _revise_planes(
         self, number: int, train: Batch, validation: Batch | None, loss: Loss
     ) -> str:
-        """``revise`` without the search of boxes in levels."""
+        """The changes of ``revise`` to planes and paths, without the search of boxes in levels."""
         placement = self.placement
         # Channels are sums of waves: powers alone say nothing, and phases count from the start.
         adds_waves = not isinstance(self.pooling, LagPooling)

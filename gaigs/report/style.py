@@ -265,7 +265,7 @@ def _titles() -> dict[str, str]:
 
 @cache
 def _places() -> dict[str, int]:
-    """Index of each known model in ``LINES``, so that gaigs's two predictors have solid lines."""
+    """Index into ``LINES`` of each known model; the two predictors of gaigs get solid lines."""
     places = {
         "gaigs": 0,
         "mirrored": 26,

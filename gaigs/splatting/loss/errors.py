@@ -28,4 +28,4 @@ class MeanError(ABC):
 
     @abstractmethod
     def mean(self, values: Tensor, labels: Tensor) -> Tensor:
-        """Only the loss."""
+        """The loss, without terms for the log."""

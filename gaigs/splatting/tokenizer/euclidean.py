@@ -107,8 +107,8 @@ def learnable_octaves(scene: Scene) -> tuple[int, int]:
 
     Periods range from twice the box's longest edge to 16 distances between neighbouring
     transmitters. The output of the network has multiples of its input frequencies, so input
-    frequencies must be well below the sampling limit. Periods for noisy labels are at least 16 m:
-    neighbouring RSSI labels differ by decibels, and longer periods still allow a sharp shadow.
+    frequencies must be well below the sampling limit. Periods for noisy labels are at least 16 m,
+    since shorter ones would fit noise; the network's multiples can still form a sharp shadow.
     """
     neighbours = 16  # chosen on validation parts of rfid-s23-200 and the built-in room
     highest = min(round(-math.log2(neighbours * scene.spacing)), MAX_OCTAVE)
