@@ -251,6 +251,13 @@ def test_the_law_of_errors_is_found_again():
     assert nothing.isfinite().all()
 
 
+def test_sparse_places_do_not_take_noise_for_a_field():
+    """By their likelihood alone readings so far apart have no noise."""
+    links = gaigs.links("synthetic_rssi", transmitters=80, receivers=9, split="receivers")
+    scatter = gaigs.train("path_loss", links, progress=False).calibration.elsewhere.scatter
+    assert 1 < scatter[1] < 9, "the noise of the simulated levels is 4 dB squared"
+
+
 @pytest.fixture(scope="module")
 def law():
     """A model that is asked for receivers without links, and these links."""
