@@ -229,6 +229,16 @@ def test_readings_at_a_new_receiver_correct_its_level():
         gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0)).adapt(far)
 
 
+@pytest.mark.parametrize("levels", [[-50.0], [-50.0, -52.0], [-50.0, float("nan"), -52.0]])
+def test_readings_too_few_for_a_split_are_taken(law, levels):
+    door = Receiver("door", Pose.at([3.0, 0.2, 2.0]))
+    spots = [[1.0, 2.0, 1.5], [2.0, 1.0, 1.5], [4.0, 2.5, 1.0]][: len(levels)]
+    few = gaigs.links(task="rssi", transmitters=spots, receivers=[door], labels=levels)
+    assert "degrees" not in few.remarks
+    assert law[0].adapt(few).predict(spots).isfinite().all()
+    assert len(few.split.train)
+
+
 def drawn_errors(count, generator):
     """Errors of receivers with a level of 3 dB, a field of 4 dB and 2 m, and noise of 2 dB."""
     errors, places = [], []
