@@ -176,6 +176,8 @@ def test_deviations_take_the_mixtures_of_the_means_until_hyperparameters_change(
     process(places, which)
     before = process.deviations(places, which)
     assert len(asked_for) == 1
+    process(places, which)
+    assert len(asked_for) == 2, "a second prediction takes the time of the first"
     other = ScalarProcess(links.scene)
     other.logarithms, other.choice = process.logarithms + 1, process.choice
     process.take(other)
