@@ -166,16 +166,18 @@ def _installed_holders(kind: str) -> list[Holder]:
         if os.path.isdir(folder or ".")
     )
     holders = []
-    for point in _entry_points(path).select(group=f"gaigs.{kind}"):
+    for point in _entry_points(path).get(f"gaigs.{kind}", ()):
         where = f"distribution {point.dist.name} {point.dist.version}"
         holders.append(Holder(kind, point.name, where, point.value))
     return holders
 
 
 @functools.lru_cache
-def _entry_points(_: tuple) -> Any:
-    """All entry points, from a file of each package on ``sys.path``: reading is slow."""
-    return metadata.entry_points()
+def _entry_points(_: tuple) -> dict[str, metadata.EntryPoints]:
+    """Entry points of gaigs by group, from a file of each package on ``sys.path``: reading is slow."""
+    points = metadata.entry_points()
+    groups = [group for group in points.groups if group.startswith("gaigs.")]
+    return {group: points.select(group=group) for group in groups}
 
 
 def _dropped_holders(kind: str | None = None) -> tuple[list[Holder], list[str]]:
