@@ -239,6 +239,7 @@ def _with_imports(place: Path) -> set[Path]:
     """The source files of a module or package, and of those in ./plugins that they import."""
     plugins = Path.cwd() / "plugins"
     roots = [plugins, *sources(plugins)]
+    entries = [path for root in roots if root.is_dir() for path in root.iterdir()]
     known: set[Path] = set()
     places = [place]
     while places:
@@ -250,8 +251,6 @@ def _with_imports(place: Path) -> set[Path]:
             words: set[str] = set()
             for line in re.findall(r"^\s*(?:from|import)\s(.*)", text, re.M):
                 words |= {*re.findall(r"(?:plugins\.)?(\w+)", line)}
-            for root in roots:
-                names = [*words, *(f"{word}.py" for word in words)]
-                places += [root / name for name in names if (root / name).exists()]
+            places += [path for path in entries if path.name.removesuffix(".py") in words]
         known |= files
     return known
