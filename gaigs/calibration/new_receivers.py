@@ -143,5 +143,5 @@ def fit_law(
     # Variances from 1e-4 to 20 mean squares, lengths from 0.1 % to 3 sizes of the site.
     bounds = [(-9.0, 3.0)] * 3 + [(-7.0, 1.0)]
     start = np.log([0.25, 0.3, 0.3, 0.05])
-    found = minimize(cost, start, method="L-BFGS-B", bounds=bounds)
-    return torch.from_numpy(np.exp(found.x)) * units
+    result = minimize(cost, start, method="L-BFGS-B", bounds=bounds)
+    return torch.from_numpy(np.exp(result.x)) * units
