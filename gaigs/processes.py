@@ -238,7 +238,7 @@ class _Repeater:
         self.hook = sys.unraisablehook
 
     def stop(self, number: int, _) -> None:
-        """Raises ``Stopped``; a second signal is not sent while the run stops."""
+        """Raises ``Stopped``; signals that were still to be sent again are cancelled."""
         self.cancel()
         hang_up(number)
         raise Stopped("stopped", number)

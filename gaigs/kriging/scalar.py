@@ -43,7 +43,7 @@ class ScalarProcess(nn.Module):
     held-out readings are significantly likelier; then ``weights`` are not used.
 
     Attributes:
-        options: Numbers of the fit and of predictions.
+        options: Options of the fit and of predictions.
         logarithms: Logarithms of length, deviation of the signal and of the noise at each receiver
             (r, 3).
         choice: The fields of ``Choice`` as numbers (4,).

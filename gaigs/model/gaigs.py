@@ -341,7 +341,7 @@ class GaussianSplatting(Model):
         return {} if self.rasterizer is None else {"rasterizer": self.rasterizer.used}
 
     def rendering(self, batch: Batch) -> Callable[[], object]:
-        """The rasterizer, or the sum over paths, for links to the first link's receiver."""
+        """A function that only draws the map, or sums the paths, at the first link's receiver."""
         receiver = int(batch.query.receivers[0])
         query = batch.query[(batch.query.receivers == receiver).nonzero()[:, 0]]
         with torch.no_grad():

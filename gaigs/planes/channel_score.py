@@ -117,7 +117,7 @@ class ChannelScore(Score[SlabRoom]):
         return self._best_moves(room, number)[0]
 
     def move_and_polish(self, room: SlabRoom, number: int) -> SlabRoom:
-        """The best result of the three best moves of a plane, each also after a gradient descent.
+        """The best of six rooms: the three best moves of a plane, with and without a descent.
 
         The descent also fits the slab, since a wrong slab may hide the best offset.
         """

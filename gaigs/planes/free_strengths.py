@@ -129,8 +129,8 @@ class FreeScore(Score[FreeRoom]):
         """Delay profiles of a residual at e elements and t delays, over the norm of the channel.
 
         With a profile the rating of a plane needs one look-up for each element, in place of a sum
-        over subcarriers. The carrier's phase is not in it. The last dimension has the real and the
-        imaginary part.
+        over subcarriers. Profiles are without the phase of the carrier. The last dimension has the
+        real and the imaginary part.
         """
         residual = residual / (
             receiver.flat.norm(dim=1, keepdim=True) * math.sqrt(residual.shape[1])

@@ -48,7 +48,7 @@ class LearntPlane(NamedTuple):
 
 
 class Matter(NamedTuple):
-    """Obstacles: Gaussians, and boxes with sharp edges."""
+    """Learnt obstacles of a room: k Gaussians of matter, and m boxes with sharp edges."""
 
     centres: Float[ndarray, "k 3"]  # [m]
     widths: Float[ndarray, "k 3"]  # standard deviations along the world's axes [m]

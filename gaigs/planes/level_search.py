@@ -130,7 +130,7 @@ class LevelScore(Score[LevelRoom]):
         before: list[Complex[Tensor, "b 1"]],
         sequences: Int[Tensor, "n order"],
     ) -> float:
-        """Mean fall of the errors from powers ``before`` to the room's, in standard errors."""
+        """Mean fall of the errors [standard errors] if the room's powers replace ``before``."""
         phased = is_phased(sequences, room.located)
         gains = []
         for (receiver, passing), old in zip(self.paths.split(room.passing), before, strict=True):

@@ -218,7 +218,9 @@ def _pitch_of_row(grid: Grid) -> float:
 def factor(
     across: Float[Tensor, "*batch k"], along: Float[Tensor, "*batch k"], variance: float
 ) -> Float[Tensor, "*batch 3"]:
-    """p, q and r of the lower triangular factor of [across; along] [across; along]' + variance I.
+    """p, q and r of the factor [[p, 0], [q, r]] of the covariance M M' + variance I.
+
+    ``across`` and ``along`` are the two rows of M.
 
     With e = across / p: q = e . along and r² = variance + |e x along|² + variance |along|² / p².
     All roots are of sums of squares, so no difference cancels, even for a long, thin ellipse.
