@@ -1,4 +1,4 @@
-"""Resources and signals of a run: threads, memory, Ctrl-C and SIGTERM, locked folders."""
+"""Resources of a run and the signals that stop it: threads, memory, Ctrl-C, locked folders."""
 
 import atexit
 import contextlib
@@ -50,9 +50,9 @@ class Stopped(KeyboardInterrupt):
 def keep_memory() -> None:
     """Makes this process faster, at the cost of memory.
 
-    Freed arrays stay with the process; otherwise glibc would map their pages again in each step.
-    Imports create half a million permanent objects, so garbage collection becomes rarer, and is
-    skipped at the end.
+    The process keeps the memory of freed arrays, which glibc would otherwise map again in each
+    step. Garbage collection becomes rarer, since imports create half a million permanent objects,
+    and is skipped at the end.
     """
     gc.set_threshold(50_000)
     atexit.register(gc.freeze)
@@ -238,7 +238,7 @@ class _Repeater:
         self.hook = sys.unraisablehook
 
     def stop(self, number: int, _) -> None:
-        """Raises ``Stopped``; a second signal is not sent while the run stops."""
+        """Raises ``Stopped``; signals that were still to be sent again are cancelled."""
         self.cancel()
         hang_up(number)
         raise Stopped("stopped", number)
@@ -273,8 +273,8 @@ def stopping(waits: bool = False) -> Iterator[None]:
     """Makes the signals ``STOPPING`` stop a run as Ctrl-C does, and finally restores the handlers.
 
     Args:
-        waits: True for a process that waits for another run afterwards. A signal during this wait
-            stops its next run. If the process ended, its launcher would hang.
+        waits: True for a launcher's process that waits for its next run. A signal during the wait
+            then stops that run, since the launcher would hang if the process ended.
     """
     # Other threads may not set handlers.
     if threading.current_thread() is not threading.main_thread():

@@ -110,7 +110,7 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return (levels, self._arranged(estimate[1])) if return_std else levels
 
     def _arranged(self, values: Any) -> np.ndarray:
-        """Values of the model's receivers in the shape of the training's levels; NaN for others."""
+        """Values in the shape of the training levels; NaN for receivers that the model lacks."""
         levels = np.full((len(values), *(self.shape_ or (1,))), np.nan)
         levels[:, self.columns_] = values.double().numpy()
         return levels if self.shape_ else levels[:, 0]

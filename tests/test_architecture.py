@@ -23,7 +23,7 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-    "lines of gaigs/": 50_019,
+    "lines of gaigs/": 50_164,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
     "module constants": 100,
@@ -33,11 +33,11 @@ LIMITS = {
 """Raised only with a reason beside the number.
 
 Lines of 100 characters in place of 120, and dense steps opened up, made 31,400 lines 41,000. Data
-frames, plots, the choice of a model and channels of few numbers made them 44,600; receivers
+frames, plots, the choice of a model and channels with few values made them 44,600; receivers
 without measurements, placement, front ends, large surveys and buildings 47,500. Shorter docstrings
 of internal parts left 46,100. Reasons, shapes and docstrings added 1,020; boxes in shadows,
 averages of models and large surveys 700. Terms and parameters that docstrings explain added 100,
-and terrain 240.
+and terrain 240. Docstrings that need no knowledge of the code added 145.
 """
 
 

@@ -21,22 +21,22 @@ from gaigs.kriging.links import nearest_places
 class Calibration:
     """Quantiles of a model's errors at links that it has not seen, in groups of links.
 
-    An error is absolute, over the model's own deviation. A group of n links has an interval of
-    level p by the quantile p (n + 1) / n of its errors: it then holds a new link's label with
-    probability p, if links are exchangeable. For labels of several numbers n is
-    ``effective_count``, so the probability is about p.
+    Here an error is an absolute error over the standard deviation that the model states. The
+    interval of level p in a group of n links is the quantile p (n + 1) / n of its errors. It then
+    holds a new link's label with probability p, if links are exchangeable. For labels of several
+    values n is ``effective_count``, so the probability is about p.
 
-    Each receiver is a group where all have at least 100 links. If a model states no deviation,
-    links are also grouped by the distance to their receiver's nearest known place, where errors
-    rise with this distance. Pixels of a spectrum are also grouped by their predicted amplitude, see
-    ``bin_numbers``.
+    Each receiver is a group if all receivers have at least 100 links. If a model states no
+    deviations, and errors rise with the distance to the receiver's nearest known place, links are
+    also grouped by this distance. Pixels of a spectrum are also grouped by their predicted
+    amplitude, see ``bin_numbers``.
 
     Source: Vovk, Gammerman and Shafer, Algorithmic Learning in a Random World, 2005.
     """
 
-    edges: Float[Tensor, "r e"]  # of the distances (r or 1, g - 1) [m]
+    edges: Float[Tensor, "r e"]  # distances between groups (r or 1, g - 1) [m]
     amplitudes: Float[Tensor, " a"]  # edges of the predicted amplitudes (bins - 1,)
-    counts: Int[Tensor, " g"]  # links of each group (groups,)
+    counts: Int[Tensor, " g"]  # number of links in each group (groups,)
     # Quantiles of the errors for intervals of levels 0 to 1 (groups, bins, steps + 1).
     quantiles: Float[Tensor, "g b q"]
     sizes: Float[Tensor, "g b"]  # root mean square of the errors (groups, bins)
@@ -47,10 +47,10 @@ class Calibration:
     # Relative width of intervals at each receiver without links, 0 at others; None: every receiver
     # has links.
     widths: Float[Tensor, " w"] | None = None
-    # Calibration of receivers without links, by errors at each receiver of models that have the
-    # mean of the others in its place; None if there are too few.
+    # Calibration for receivers without links. Its errors are those at each receiver when a model
+    # predicts it by the mean of the other receivers. None if receivers are too few.
     elsewhere: "Calibration | None" = None
-    # Law of the errors of levels, see ``gaigs.model.adapted``.
+    # Parameters of the covariance of level errors, see ``gaigs.model.adapted``.
     scatter: Float[Tensor, " n"] | None = None
 
     @classmethod
@@ -71,14 +71,14 @@ class Calibration:
         Args:
             task: Task of the labels.
             labels, values: Labels of the links and their predictions.
-            deviations: Deviations that the model states.
+            deviations: Standard deviations that the model states.
             query: The links.
             near: Distance of each link to the nearest place that its predicting model knows [m];
                 None if the model states deviations, which need no groups of distances.
             known: Links that the calibrated model knows.
-            new: Receivers of the links if they count as new, and so err as a whole.
-            steps: Number of levels whose quantiles are stored; a level between two takes the
-                higher one's.
+            new: Receivers of the links if they count as new: all errors at one are then dependent.
+            steps: Number of levels whose quantiles are stored. A level between two stored ones
+                uses the higher one.
         """
         labels, values, deviations = thinned(task, labels, values, deviations)
         scale = _shaped(deviations, values)  # (n, m)
@@ -92,8 +92,8 @@ class Calibration:
         sizes = errors.new_zeros(shape, dtype=torch.float64)
         for group in range(shape[0]):
             for number in range(shape[1]):
-                # A bin without pixels in a group, as of receivers in different surroundings, has
-                # the errors of all groups.
+                # A bin without pixels in a group uses the errors of all groups. This occurs with
+                # receivers in different surroundings.
                 in_bin = bins.numbers == number
                 inside = in_bin & (groups.numbers == group)[:, None] & exists
                 inside = inside if inside.any() else in_bin & exists
@@ -101,10 +101,10 @@ class Calibration:
                 ordered = errors[inside].double().sort().values
                 sizes[group, number] = ordered.square().mean().sqrt()
                 if new is None:
-                    found = link_quantiles(ordered, errors, inside, levels)
+                    bounds = link_quantiles(ordered, errors, inside, levels)
                 else:
-                    found = new.quantiles(errors, inside, levels)
-                quantiles[group, number] = found
+                    bounds = new.quantiles(errors, inside, levels)
+                quantiles[group, number] = bounds
         if not groups.edges.shape[1]:
             known = known[:0]
         lowest = torch.tensor(task.lowest, dtype=torch.float64)
@@ -120,7 +120,7 @@ class Calibration:
         )
 
     def at_receivers(self, count: int) -> "Calibration | None":
-        """The calibration for receivers without links; None if too few have calibrated it."""
+        """The calibration for ``count`` receivers without links; None if there is none."""
         new = self.elsewhere
         return None if new is None else replace(new, widths=torch.ones(count), elsewhere=new)
 
@@ -155,7 +155,8 @@ class Calibration:
                 "calibrate them"
             )
         shape = -1, *[1] * (value.ndim - 1)
-        # The model's own deviations are of receivers with links; NaN where an array lacks elements.
+        # Deviations that the model states hold for receivers with links only. Their NaN marks
+        # elements that an array lacks.
         usual = _shaped(usual_deviations(value) * widths, value)
         usual = usual.masked_fill(_shaped(deviations, value).isnan(), math.nan)
         new = self.elsewhere._estimates(value, usual, query, levels)
@@ -183,7 +184,7 @@ class Calibration:
     def _estimate(
         self, value: Tensor, deviations: Tensor, groups: Int[Tensor, " b"], level: float
     ) -> Estimate:
-        """The interval of predictions, by the number of each link's group."""
+        """The interval of predictions; ``groups`` has the number of each link's group."""
         self._check_counts(groups, level)
         # Numbers of the cells of group and amplitude bin, as in the flattened quantiles.
         cells = groups.reshape(-1, *[1] * (value.ndim - 1))
@@ -196,7 +197,7 @@ class Calibration:
         std = scale * self.sizes.flatten().to(scale).take(cells)
         if not value.is_complex():
             lower = (value - half).clamp_min(self.lowest.item())
-            # Some models predict less than the least label.
+            # A model may predict less than the least possible label.
             return Estimate(value, std, torch.minimum(lower, value), value + half)
         absent = std.isnan()  # elements that an array lacks
         power = value.masked_fill(absent, 0).abs().square().flatten(1).sum(1)  # (b,)
@@ -233,14 +234,14 @@ class Calibration:
 
     @property
     def mean_error(self) -> float:
-        """Mean absolute error over the model's own deviation, by the stored quantiles.
+        """Mean absolute error over the deviation that the model states, by the stored quantiles.
 
-        The mean is a little too large, since stored quantiles are those for a new link.
+        The mean is slightly too large, since quantiles p (n + 1) / n are stored.
         """
         return torch.trapezoid(self.quantiles, dx=1 / self.steps).mean().item()
 
     def gives(self, level: float) -> bool:
-        """True if every group has enough links for intervals of a level."""
+        """True if every group has enough links for intervals of this level."""
         is_new = self.widths is not None and bool((self.widths > 0).any())
         gives_new = not is_new or (self.elsewhere is not None and self.elsewhere.gives(level))
         return gives_new and fewest(level) <= int(self.counts.min())
@@ -264,10 +265,10 @@ class Calibration:
 class Groups(NamedTuple):
     """Links in groups by receiver and distance."""
 
-    # Distances between the groups of a receiver, or of all receivers (r or 1, g - 1) [m].
+    # Distances that separate the groups of a receiver, or of all receivers (r or 1, g - 1) [m].
     edges: Float[Tensor, "r e"]
     numbers: Int[Tensor, " n"]  # group of each link
-    counts: Int[Tensor, " g"]  # links of each group (groups,)
+    counts: Int[Tensor, " g"]  # number of links in each group (groups,)
 
 
 def group_links(
@@ -308,7 +309,7 @@ def group_links(
         squares = torch.stack(
             [errors[numbers == group].square().nanmean() for group in range(len(counts))]
         )
-        # Distance tells errors apart only if these rise with it.
+        # Distances are useful only if errors rise with them.
         rises = (squares.view(-1, groups).diff() > 0).all()
         if counts.min() >= enough // 2 and rises:
             return Groups(edges, numbers, counts)
@@ -316,17 +317,17 @@ def group_links(
 
 
 class Bins(NamedTuple):
-    """Values of labels, sorted into bins by their predicted amplitudes."""
+    """The bin of each label value, by its predicted amplitude."""
 
     amplitudes: Float[Tensor, " a"]  # edges of the bins (bins - 1,)
     numbers: Int[Tensor, "n m"]  # bin of each value of each link
 
 
 def bin_numbers(values: Inexact[Tensor, "n m"], most: int = 8) -> Bins:
-    """Bins of predictions by their amplitude, since errors are larger where this is high.
+    """Bins of predictions by their amplitude, since errors are larger at high amplitudes.
 
-    Labels of one number and channels have one bin. Spectra have ``most`` bins of as many pixels
-    each; the number is halved until ``fewest(0.9)`` links or more have pixels in each bin.
+    Scalar labels and channels have one bin. Spectra have ``most`` bins with equal numbers of
+    pixels. The number of bins is halved until at least ``fewest(0.9)`` links have pixels in each.
     """
     numbers = (values.abs() if values.is_complex() else values).double()
     sample = numbers.flatten()[evenly(torch.arange(numbers.numel()), 10**6)]
@@ -347,14 +348,14 @@ def link_quantiles(
     levels: Float[Tensor, " q"],
     level: float = 0.9,
 ) -> Float[Tensor, " q"]:
-    """Quantiles of a group's errors that are the bounds of a new link's errors.
+    """Quantiles of a group's errors, by which new links are within intervals of each level.
 
     Args:
-        ordered: Errors of the group's numbers, ascending.
-        errors: Errors of all numbers.
-        inside: True for the numbers of the group.
+        ordered: Errors of the group's label values, ascending.
+        errors: Errors of all label values.
+        inside: True for the label values of the group.
         levels: Levels of the intervals.
-        level: Level at which the scatter of the links' shares is measured, for all levels.
+        level: Level at which ``effective_count`` is taken, for all levels.
     """
     held = (errors <= quantile(ordered, levels.new_tensor(level))) & inside
     both = torch.stack((held.sum(1), inside.sum(1)))  # (2, n)
@@ -364,11 +365,14 @@ def link_quantiles(
 
 
 def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float:
-    """Number of independent numbers that would calibrate an interval as well as some links do.
+    """Number of independent label values that would calibrate an interval as well as n links do.
 
-    Numbers of one link err together, so they count as fewer than there are, but as no fewer than
-    the links. ``counts`` is the number of each link's numbers, ``held`` how many of these are
-    within the interval.
+    Errors of values in one link depend on each other. The result is therefore less than the number
+    of all values, and at least about the number of links.
+
+    Args:
+        held: Number of each link's values that are within the interval.
+        counts: Number of each link's values.
     """
     total = counts.sum().double()
     weights = counts / total
@@ -381,13 +385,13 @@ def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float
 
 
 def fewest(level: float) -> int:
-    """Fewest links n that give an interval of a level p: p (n + 1) / n is at most 1."""
+    """Smallest number of links n that calibrates an interval of level p: p (n + 1) / n <= 1."""
     # 0.9 / (1 - 0.9) is above 9 by rounding.
     return math.ceil(level / (1 - level) - 1e-9)
 
 
 def usual_deviations(value: Tensor) -> Float[Tensor, " b"]:
-    """Deviations for a model without any: 1, or each predicted channel's root mean square."""
+    """Deviations for a model that states none: 1, or the root mean square of each channel."""
     if value.is_complex():
         return value.abs().square().flatten(1).mean(1).sqrt()
     return torch.ones(len(value), device=value.device)
@@ -414,7 +418,7 @@ def _shaped(deviations: Tensor, values: Tensor) -> Tensor:
 
 
 class Thinned(NamedTuple):
-    """Labels, predictions and deviations of links by ``thin_labels``: m numbers of each."""
+    """Labels, predictions and deviations of links, thinned to m values by ``thin_labels``."""
 
     labels: Inexact[Tensor, "n m"]
     values: Inexact[Tensor, "n m"]

@@ -12,13 +12,13 @@ from gaigs.core.task import Axis
 
 
 class Asked(NamedTuple):
-    """Names and coordinates of the axes of a prediction."""
+    """The request of a prediction: names and coordinates of its axes."""
 
     positions: Float[Tensor, "*places 3"]  # positions of the transmitters (..., 3) [m]
-    # Names of the receivers: (k,) if these have an axis of their own, else one for each position
-    # (...).
+    # Names of the receivers, (k,) if the prediction has an axis of receivers, otherwise one for
+    # each position (...).
     receivers: ndarray
-    has_axis: bool  # True if receivers have an axis of their own
+    has_axis: bool  # True if the prediction has an axis of receivers
     axes: Mapping[str, Axis]  # axes of a label
     # Name and unit of a value.
     quantity: str
@@ -26,7 +26,7 @@ class Asked(NamedTuple):
 
     @property
     def dimensions(self) -> tuple[str, ...]:
-        """Names of the axes of a value; places of a grid are ``place_0``, ``place_1``."""
+        """Names of the axes of a value; axes of a grid of places are ``place_0``, ``place_1``."""
         count = self.positions.ndim - 1
         places = ["place"] if count == 1 else [f"place_{axis}" for axis in range(count)]
         return (*places, *["receiver"] * self.has_axis, *self.axes)
@@ -50,15 +50,15 @@ class Estimate(EstimateParts):
     Attributes:
         value: The prediction of ``predict`` without an interval.
         std: Standard deviation of the label about the value, in the label's unit; for a channel
-            that of the complex error. This and all that follow are NaN at elements that an array
-            lacks.
-        lower, upper: Ends of the interval, which holds the label with the asked probability; None
+            the standard deviation of the complex error. This and the following attributes are NaN
+            at elements that an array lacks.
+        lower, upper: Ends of the interval that holds the label with the requested probability; None
             for channels.
-        radius: Radius of a disc about the value which holds the channel with this probability, in
+        radius: Radius of a disc about the value that holds the channel with this probability, in
             the label's unit; None for other labels.
         snr_db: Expected signal-to-noise ratio of each link's channel [dB], without the axes of
             elements and subcarriers; None for other labels.
-        asked: Names and coordinates of the axes, no part of the tuple; None if unknown.
+        asked: Names and coordinates of the axes, which the tuple lacks; None if unknown.
 
     Example:
         >>> model = gaigs.train("knn", gaigs.links("synthetic_rssi", transmitters=100))
@@ -70,7 +70,7 @@ class Estimate(EstimateParts):
     asked: Asked | None = None
 
     def about(self, asked: Asked) -> "Estimate":
-        """The estimate, with the names of its axes."""
+        """The estimate itself, after its axes are set."""
         self.asked = asked
         return self
 

@@ -1,4 +1,4 @@
-"""Links that calibrate a model, since neither the model nor its like has seen them."""
+"""Links that calibrate a model: each is predicted by a model that has not seen it."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -16,11 +16,11 @@ from gaigs.data import Links, with_places
 from gaigs.kriging.links import folds_of, single_readings
 
 LOOK_UP_FOLDS = 5
-"""Folds of the known links that calibrate a look-up."""
+"""Number of folds of the known links that calibrate a look-up."""
 
 
 class Unseen(NamedTuple):
-    """A model, and links that it has not seen."""
+    """A model, with links that it has not seen and links that it knows."""
 
     model: Any
     asked: Int[Tensor, " k"]  # indices of links that it has not seen
@@ -28,10 +28,10 @@ class Unseen(NamedTuple):
 
 
 class Fold(NamedTuple):
-    """A fold of the known links, held out."""
+    """A held-out fold of the known links."""
 
-    rest: Links  # links whose split has no link of the fold
-    asked: Int[Tensor, " k"]  # indices of links of the fold, to be predicted
+    rest: Links  # the data set with a split that lacks the fold's links
+    asked: Int[Tensor, " k"]  # indices of the fold's links to predict
 
 
 class Answers(NamedTuple):
@@ -39,14 +39,14 @@ class Answers(NamedTuple):
 
     values: Inexact[Tensor, " k *shape"]  # predictions
     deviations: Float[Tensor, " k ..."]  # standard deviations of the labels (k,) or (k, *shape)
-    are_stated: bool  # True if the model knows its deviations; False if they are a default
+    are_stated: bool  # True if the model states its deviations; False if they are a default
 
 
 def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -> Iterator[Fold]:
-    """Holds out one fold of the known links after the other, until the time is up.
+    """Yields one held-out fold of the known links after the other, until the time is up.
 
-    A fold's links are to be predicted by a model of all others. Of all ``count`` folds together
-    about ``most`` links are yielded, evenly chosen.
+    Links of a fold are to be predicted by a model of the other folds. All ``count`` folds together
+    have about ``most`` links, evenly chosen.
     """
     index, receivers = links.split.known, links.scene.radio_of(links.query.receivers)
     folds = folds_of(links, index) % count
@@ -55,13 +55,13 @@ def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -
         if stages.is_up():
             return
         is_known = folds != fold
-        # A receiver that has links in this fold alone keeps them.
+        # If all links of a receiver are in this fold, they are not held out.
         is_known |= torch.isin(receivers[index], receivers[index[is_known]], invert=True)
         part = index[~is_known & torch.isin(index, asked)]
         if not len(part):
             continue
         rest = replace(links, split=links.split.only(index[is_known]))
-        # Estimated places of receivers are estimated anew, without the fold.
+        # Estimated places of receivers are estimated again, without the fold.
         if links.uncertainties is not None and links.uncertainties.any():
             is_estimated = links.uncertainties > 0
             unknown = torch.where(is_estimated, math.inf, 0.0)
@@ -70,9 +70,9 @@ def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -
 
 
 def validation_halves(links: Links) -> list[tuple[Int[Tensor, " k"], Int[Tensor, " j"]]]:
-    """Pairs of the halves of the validation links, in both orders.
+    """The two halves of the validation links, as a pair in both orders.
 
-    Links of one group, which cannot be halved, are paired with themselves.
+    If all links are in one group, which cannot be halved, they are paired with themselves.
     """
     validation = links.split.validation
     halves = folds_of(links, validation) % 2
@@ -94,8 +94,8 @@ def calibrate(
     Args:
         links: Links with the split of the model.
         name: Name of the model, for messages.
-        count: Number of models that ``unseen`` gives when time suffices.
-        unseen: The model fitted without some links, and these links.
+        count: Number of models that ``unseen`` yields if time suffices.
+        unseen: Models fitted without a part of the links, and that part.
         answer: Function from a model and indices of links to its predictions.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Bounds of errors at receivers without links, each of which errs as a whole."""
+"""Bounds of errors at receivers without links, where all errors of one receiver are dependent."""
 
 import math
 from collections.abc import Sequence
@@ -17,13 +17,13 @@ from gaigs.core.query import evenly
 
 
 class NewReceivers(NamedTuple):
-    """Receivers of links that models predicted as if their receivers were new.
+    """Receivers of n links, each predicted as if its receiver were new.
 
     Source: Hahn and Meeker, Statistical Intervals, 1991, for the prediction of a normal number.
     """
 
     receivers: Int[Tensor, " n"]
-    are_taught: Bool[Tensor, " n"]  # True for links of receivers from which the room has learnt
+    are_taught: Bool[Tensor, " n"]  # True for links of receivers from which the room was learnt
 
     def quantiles(
         self,
@@ -33,39 +33,41 @@ class NewReceivers(NamedTuple):
         parts: int = 200,
         draws: int = 50,
     ) -> Float[Tensor, " q"]:
-        """Quantiles of the links' errors that are the bounds of errors at one more receiver.
+        """Bounds of the errors at one more receiver, for each level p.
 
-        Receivers differ in their quantile of a level p, whose logarithm is taken as normal. Of k
-        receivers these logarithms have the mean c and the deviation s. That of one more is
+        Each receiver has a quantile of its errors at level p. Its logarithm is taken as normal over
+        receivers. With k receivers it has the mean c and the standard deviation s. The logarithm at
+        one more receiver is
 
             c + s (1 + 1/k)^½ t
 
-        with Student's t of k - 1 degrees of freedom. The bound b holds errors with the chance p
+        with Student's t of k - 1 degrees of freedom. The bound b holds errors with probability p:
 
             p = mean over t of F(log b - c - s (1 + 1/k)^½ t)
 
-        with F the distribution of log errors about their receiver's quantile. Receivers from which
-        the room has learnt err less. If others err more, c is the others' mean, and k their number;
-        s is about a mean for each kind.
+        F is the distribution of log errors relative to their receiver's quantile. Errors are
+        smaller at receivers from which the room was learnt. If they are larger at the others, c and
+        k are those of the others alone. s is relative to the mean of each of these two kinds.
 
         Args:
-            errors: Errors of all numbers.
-            inside: True for numbers that count.
+            errors: Errors of all label values.
+            inside: True for the label values that are used.
             levels: Levels p of the intervals.
-            parts, draws: Points at which F and the distribution of t are taken.
+            parts, draws: Numbers of points at which F and the distribution of t are taken.
         """
         middles = (torch.arange(parts, dtype=torch.float64) + 0.5) / parts
-        rows, own_bounds, kinds = [], [], []
+        # Log errors of each receiver: points of their distribution, and quantiles of the levels.
+        points, receiver_bounds, kinds = [], [], []
         for receiver in self.receivers.unique():
-            own = self.receivers == receiver
-            numbers = errors[own][inside[own]].double().clamp_min(FAINTEST).log().sort().values
-            if len(numbers):
-                rows.append(quantile(numbers, middles))
-                own_bounds.append(quantile(numbers, levels))
-                kinds.append(self.are_taught[own][0])
-        offsets, taught = torch.stack(own_bounds), torch.stack(kinds)  # (k, q), (k,)
-        apart = torch.stack(rows)[:, None] - offsets[..., None]  # (k, q, parts)
-        within = apart.movedim(0, 1).flatten(1).sort().values  # (q, k parts)
+            rows = self.receivers == receiver
+            logs = errors[rows][inside[rows]].double().clamp_min(FAINTEST).log().sort().values
+            if len(logs):
+                points.append(quantile(logs, middles))
+                receiver_bounds.append(quantile(logs, levels))
+                kinds.append(self.are_taught[rows][0])
+        offsets, taught = torch.stack(receiver_bounds), torch.stack(kinds)  # (k, q), (k,)
+        relative = torch.stack(points)[:, None] - offsets[..., None]  # (k, q, parts)
+        within = relative.movedim(0, 1).flatten(1).sort().values  # (q, k parts), F of each level
         chances = (torch.arange(draws, dtype=torch.float64) + 0.5) / draws
         freedom = max(len(taught) - len(taught.unique()), 1)
         t = torch.from_numpy(stdtrit(freedom, chances.numpy()))  # (draws,)
@@ -74,21 +76,25 @@ class NewReceivers(NamedTuple):
             centre, scale = _predictive(offset, taught, freedom)
             sums = (centre + scale * t)[:, None] + quantile(logs, middles)  # (draws, parts)
             bounds.append(quantile(sums.flatten().sort().values, level))
-        # Where receivers differ less at a higher level, its bound may be less.
+        # A higher level may have a lower bound if receivers differ less there; bounds must rise.
         logarithms = torch.stack(bounds).cummax(0).values
         return logarithms.clamp_max(-math.log(FAINTEST)).exp()
 
 
 def _predictive(
-    numbers: Float[Tensor, " k"], are_taught: Bool[Tensor, " k"], freedom: int
+    values: Float[Tensor, " k"], are_taught: Bool[Tensor, " k"], freedom: int
 ) -> tuple[Tensor, Tensor]:
-    """Centre and scale of Student's t distribution of one more receiver's number."""
-    kinds = [numbers[are_taught == kind] for kind in are_taught.unique()]
-    squares = torch.stack([(own - own.mean()).square().sum() for own in kinds])
-    # The room fits receivers from which it has learnt: that others err less is chance.
-    others = numbers[~are_taught]
-    shown = others if len(others) and others.mean() > numbers.mean() else numbers
-    return shown.mean(), (squares.sum() / freedom * (1 + 1 / len(shown))).sqrt()
+    """Centre and scale of Student's t distribution of a quantity at one more receiver.
+
+    ``values`` has the quantity at k receivers.
+    """
+    kinds = [values[are_taught == kind] for kind in are_taught.unique()]
+    squares = torch.stack([(kind - kind.mean()).square().sum() for kind in kinds])
+    # A room fits best the receivers from which it was learnt. If the others have smaller errors,
+    # that is by chance, and all receivers count.
+    others = values[~are_taught]
+    used = others if len(others) and others.mean() > values.mean() else values
+    return used.mean(), (squares.sum() / freedom * (1 + 1 / len(used))).sqrt()
 
 
 def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float[Tensor, "*q"]:
@@ -100,21 +106,21 @@ def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float
 def fit_law(
     errors: Sequence[Float[Tensor, " _"]], places: Sequence[Float[Tensor, "_ 3"]], most: int = 100
 ) -> Float[Tensor, "4"]:
-    """The most likely law of ``gaigs.model.adapted`` for receivers, each predicted as a new one.
+    """Maximum-likelihood parameters of the error covariance of ``gaigs.model.adapted`` (4,).
 
-    Links farther apart than the field's length tell little of the noise. So its logarithm has a
-    prior: a normal distribution with a deviation of 1 about 0.3 mean squares.
+    Links farther apart than the field's length hardly determine the noise. So the logarithm of the
+    noise has a normal prior about 0.3 mean squares, with a standard deviation of 1.
 
     Args:
-        errors: Errors of each receiver's links, (k,) of k links.
-        places: Their transmitters (k, 3) [m].
-        most: Largest number of links of a receiver.
+        errors: Errors of the links of each receiver (k,), predicted as if it were new.
+        places: Transmitters of these links (k, 3) [m].
+        most: Largest number of links that are used at a receiver.
     """
     rows = [evenly(torch.arange(len(part)), most) for part in errors]
     parts = [part[row].double() for part, row in zip(errors, rows, strict=True)]
     spots = [part[row].double() for part, row in zip(places, rows, strict=True)]
     mean = torch.cat(parts).square().mean().clamp_min(1e-9)
-    # Receivers with fewer links are filled up with errors of 0 that correlate with nothing.
+    # Receivers with fewer links are padded with errors of 0 that correlate with nothing.
     exists = pad_sequence([torch.ones(len(part)) for part in parts], batch_first=True)  # (r, k)
     padded = pad_sequence(parts, batch_first=True)[..., None]  # (r, k, 1)
     there = pad_sequence(spots, batch_first=True)  # (r, k, 3)
@@ -124,18 +130,18 @@ def fit_law(
     units = torch.stack((mean, mean, mean, size))
 
     def cost(logarithms: np.ndarray) -> float:
-        """Mean negative log likelihood with the prior, but for a constant."""
+        """Mean negative log posterior, without constant terms."""
         prior = (logarithms[1] - start[1]) ** 2 / 2
         level, noise, field, length = torch.from_numpy(logarithms).exp() * units
         covariances = pairs * (level + field * (-apart / length).exp())
         variances = torch.where(exists > 0, noise, 1.0)
         factor = torch.linalg.cholesky(covariances + variances.diag_embed())  # (r, k, k)
         white = torch.linalg.solve_triangular(factor, padded, upper=False)  # (r, k, 1)
-        spread = factor.diagonal(dim1=1, dim2=2).log().sum()  # of the filled ones 0
+        spread = factor.diagonal(dim1=1, dim2=2).log().sum()  # padding adds 0
         return ((white.square().sum() / 2 + spread + prior) / exists.sum()).item()
 
     # Variances from 1e-4 to 20 mean squares, lengths from 0.1 % to 3 sizes of the site.
     bounds = [(-9.0, 3.0)] * 3 + [(-7.0, 1.0)]
     start = np.log([0.25, 0.3, 0.3, 0.05])
-    found = minimize(cost, start, method="L-BFGS-B", bounds=bounds)
-    return torch.from_numpy(np.exp(found.x)) * units
+    result = minimize(cost, start, method="L-BFGS-B", bounds=bounds)
+    return torch.from_numpy(np.exp(result.x)) * units

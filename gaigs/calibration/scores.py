@@ -1,4 +1,4 @@
-"""Scores of intervals: how often they hold, and how wide they are."""
+"""Scores of intervals: how often they hold the label, and how wide they are."""
 
 import math
 
@@ -12,7 +12,7 @@ from gaigs.core.query import Query, evenly
 
 
 def holds(estimate: Estimate, labels: Inexact[Tensor, " k *shape"]) -> Bool[Tensor, " k *shape"]:
-    """True for each number of aligned labels that is within its interval."""
+    """True for each value of aligned labels that is within its interval."""
     if estimate.radius is not None:
         return (labels - estimate.value).abs() <= estimate.radius
     return (estimate.lower <= labels) & (labels <= estimate.upper)  # type: ignore[operator]
@@ -21,11 +21,12 @@ def holds(estimate: Estimate, labels: Inexact[Tensor, " k *shape"]) -> Bool[Tens
 def interval_scores(
     labels: Inexact[Tensor, " k *shape"], half: Estimate, most: Estimate
 ) -> dict[str, Float[Tensor, " k"]]:
-    """Scores of each of k links' intervals, by name.
+    """Scores of the intervals of k links, by name.
 
-    ``coverage_50`` and ``coverage_90`` are the shares of a label's numbers within its intervals,
-    and ``width_90`` is the width of the intervals of 90 %. ``crps`` [label's unit] and ``nll``,
-    -log p, are of a normal distribution with the estimate's ``std``, for channels of both parts.
+    ``coverage_50`` and ``coverage_90`` are the shares of a label's values within its intervals of
+    50 and 90 %, and ``width_90`` is the width of the latter. ``crps`` [label's unit] and ``nll``,
+    -log p, assume a normal distribution with the estimate's ``std``. For channels they are means
+    over real and imaginary part.
 
     Args:
         labels: Labels, aligned to the predictions.
@@ -67,10 +68,11 @@ def interval_scores(
 def scores_of_links(
     calibration: Calibration, links: Thinned, query: Query, size: int = 64
 ) -> dict[str, Float[Tensor, " k"]]:
-    """``interval_scores`` of predictions, with the columns that ``summarise_intervals`` needs.
+    """``interval_scores`` of predictions, with two more columns for ``summarise_intervals``.
 
-    ``calibration_links`` is the number of links that calibrate, ``places`` the number of each
-    link's place. ``size`` links are scored at a time: estimates take ten times the labels' memory.
+    ``calibration_links`` is the number of calibrating links. ``places`` identifies the place of
+    each link. ``size`` links are scored at a time, since estimates take ten times the labels'
+    memory.
     """
     parts = []
     for rows in torch.arange(len(query)).split(size):
@@ -88,9 +90,9 @@ def scores_of_links(
 def shares_within(
     calibration: Calibration, links: Thinned, query: Query, most: int = 300
 ) -> np.ndarray:
-    """Shares of numbers within intervals of levels 0.05, 0.1, ..., 0.95 (19,), at ``most`` links.
+    """Shares of label values within intervals of levels 0.05, 0.1, ..., 0.95 (19,).
 
-    A share is NaN where too few links calibrate its level.
+    At most ``most`` links are used. A share is NaN if too few links calibrate its level.
     """
     rows = evenly(torch.arange(len(query)), most)
     arguments = links.values[rows], links.deviations[rows], query[rows]
@@ -107,7 +109,7 @@ def shares_within(
 def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
     """Means of ``scores_of_links`` over links, and standard errors of the coverages.
 
-    These errors are named ``coverage_50_error`` and ``coverage_90_error``.
+    The standard errors are named ``coverage_50_error`` and ``coverage_90_error``.
     """
     numbers = {}
     for name, score in scores.items():
@@ -127,8 +129,8 @@ def coverage_error(
 ) -> float:
     """Standard error of the mean share of links within intervals; NaN with one place.
 
-    Links at one place depend on each other; different places count as independent. The links that
-    calibrate are a sample, too, and add to the error by their number. If all links have the same
+    Links at one place depend on each other; different places count as independent. The calibrating
+    links are a sample, too, so a small number of them adds to the error. If all links have the same
     share, the variance is taken as level (1 - level).
 
     Source: Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015.
@@ -138,7 +140,7 @@ def coverage_error(
     if len(sums) <= 1:
         return math.nan
     links = 1 / count + 1 / calibration_links
-    # Variance of a link's share that places of independent errors have.
+    # Variance of a link's share, from independent errors of the places.
     spread = sums.square().sum().item() / count * len(sums) / max(len(sums) - 1, 1)
     if score.min() == score.max():
         spread = level * (1 - level) * count / len(sums)

@@ -77,7 +77,7 @@ def describe_job(settings: DictConfig, command: str | None) -> Job:
 
 
 def end_stopped(job: Job, stop: KeyboardInterrupt) -> NoReturn:
-    """Ends a job after a signal: the process, or within a launcher's process only this job."""
+    """Ends a job after a signal: its process, or only the job in a launcher's process."""
     message = f"gaigs: {str(stop) or 'stopped'}; {job.goes_on}"
     number = getattr(stop, "number", signal.SIGINT)
     if job.is_sweep and job.launcher != "BasicLauncher":
@@ -92,7 +92,7 @@ def end_stopped(job: Job, stop: KeyboardInterrupt) -> NoReturn:
 
 
 def end_failed(job: Job, error: Exception, is_verbose: bool) -> NoReturn:
-    """Ends a job after an error, with one message or else the traceback.
+    """Ends a job after an error, with one message if a user can correct it, or the traceback.
 
     A single run ends the process. A job of a sweep raises, so that Hydra continues with other jobs.
     """
@@ -113,7 +113,7 @@ def end_failed(job: Job, error: Exception, is_verbose: bool) -> NoReturn:
 
 
 def note_task(words: list[str], config: dict) -> None:
-    """Logs a warning if the experiment's name is of another task than the labels."""
+    """Logs a warning if the experiment is meant for another task than the labels'."""
     parts = [config.get(key) for key in ("task", "data")]
     if not all(isinstance(part, dict) and "name" in part for part in parts):
         return  # the check of the configuration says what is wrong

@@ -58,7 +58,7 @@ def describe(links: Links) -> Description:
     """A first look at links of any task: extent, levels, receivers, and suspected faults.
 
     Args:
-        links: With or without a split.
+        links: Links, with or without a split.
 
     Example:
         >>> gaigs.describe(gaigs.links("synthetic", transmitters=40, order=0)).suspicious
@@ -101,7 +101,7 @@ class Levels:
 
 
 def mean_levels(links: Links, index: Int[Tensor, " k"]) -> Float[Tensor, " k"]:
-    """The means of some labels; for channels the mean power [dB]."""
+    """The mean over each label of ``index``; for channels the mean power [dB]."""
     labels = links.labels[index].reshape(len(index), -1)
     if not labels.is_complex():
         return labels.double().mean(1)

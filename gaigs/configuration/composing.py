@@ -54,7 +54,7 @@ def compose(*overrides: str, **options) -> dict:
 
 
 def composed(overrides: Sequence[str], options: Mapping, sections: Sequence[str] = ()) -> dict:
-    """Like ``compose``; with ``sections`` options are searched only in these sections."""
+    """``compose`` for which a name in ``options`` is searched only in the given ``sections``."""
     choices, values = _choices(options)
     with _composing:
         running = GlobalHydra.instance()

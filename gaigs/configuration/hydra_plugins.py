@@ -105,7 +105,7 @@ def run_folder(overrides: str) -> str:
 
 
 def installed(*names: str) -> str:
-    """The installed models of a list, joined by commas for a sweep; the log names the others."""
+    """Names of installed models, joined by commas for a sweep; the log lists the other names."""
     models = registry("model").names()
     missing = [name for name in names if name not in models]
     if missing:
@@ -114,7 +114,7 @@ def installed(*names: str) -> str:
 
 
 def known(kind: str, name: str, otherwise: str) -> str:
-    """``name`` if the kind has a configuration file or component of it, else ``otherwise``."""
+    """``name`` if the kind has a file or component with this name, else ``otherwise``."""
     return name if files_of(kind, name) or name in registry(kind).names() else otherwise
 
 

@@ -1,1 +1,1 @@
-"""Geometry, antennas, queries, tasks and laws of propagation, used by all other parts."""
+"""Geometry, antennas, queries, tasks and propagation, used by all other parts."""

@@ -14,7 +14,7 @@ from gaigs.core.geometry import Pose
 
 
 def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"]]:
-    """The distinct vectors between places, to nine decimals, and each pair's index among them."""
+    """The distinct vectors between places, to nine decimals, and the number of each pair's."""
     apart = (places[:, None] - places).flatten(0, 1).round(decimals=9)  # (e x e, 3)
     return torch.unique(apart, dim=0, return_inverse=True)
 
@@ -82,11 +82,10 @@ class Array:
 
     @functools.cached_property
     def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"], Float[Tensor, " l"]]:
-        """Distinct vectors between elements [m], the number of each pair's vector, and pairs per
-        vector.
+        """Lags, the distinct vectors between two elements [m]; each pair's lag; pairs at each lag.
 
-        The covariance of a field depends on these vectors alone. A 4 x 4 array has 49 of them.
-        Tensors are float64.
+        The covariance of a field depends on lags alone. A 4 x 4 array has 49 lags. The second
+        tensor has the number of each pair's lag. Tensors are float64.
         """
         # Cached tensors of inference mode could not be saved for a later backward pass.
         with torch.inference_mode(False):
@@ -146,7 +145,7 @@ class Receiver:
             )
 
     def hears(self, frequencies: Float[Tensor, " s"]) -> Bool[Tensor, " s"]:
-        """True for frequencies within its band [Hz]."""
+        """True for frequencies [Hz] that are within the receiver's band."""
         return (frequencies >= self.band[0]) & (frequencies < self.band[1])
 
 

@@ -1,4 +1,4 @@
-"""Responses of front ends: factors of elements and subcarriers, common to a receiver's links."""
+"""Front ends: a receiver's factor for each element and subcarrier, the same in all its links."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from gaigs.core.query import evenly
 
 
 class Shape(NamedTuple):
-    """Freedom of a response over elements and subcarriers."""
+    """Number of degrees of freedom of a response over elements and over subcarriers."""
 
     count: int  # free numbers over the band
     # True if elements share these numbers, up to a complex gain of each; False if each has its own.
@@ -37,7 +37,7 @@ class FrontEnd(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """A front end with its shape, and mean scores of free space at places outside the fit."""
+    """A front end with its shape, and mean scores of free space at places left out of the fit."""
 
     front_end: FrontEnd
     shape: Shape
@@ -63,8 +63,7 @@ class FrontEndOptions:
 
 
 class FrontEndFit:
-    """Fit of a front end's response to the links of one receiver, judged by its gain over free
-    space.
+    """Fit of a front end's response to the links of one receiver.
 
     A link is h = g R w exp(j (phi + 2 pi f tau)) + error. R is the response, w the direct wave, and
     g a positive gain. The phase phi and the delay tau are 0 if the task's phase is known.
@@ -98,7 +97,7 @@ class FrontEndFit:
         return FrontEndFit(self.labels[index], self.waves[index], self.task, self.options)
 
     def start(self, shape: Shape) -> FrontEnd:
-        """The best fit of several starts: the mean over links, or single links of unknown phase."""
+        """The best of several fits: from the mean over links, or single links of unknown phase."""
         strengths = self.waves.abs()
         relative = self.labels * self.waves.conj() / torch.where(strengths > 0, strengths, 1)
         starts = [relative.mean(0)]
@@ -133,7 +132,7 @@ class FrontEndFit:
         return FrontEnd(response, scatter, (1 - errors).mean().item())
 
     def likeness(self) -> float:
-        """Fraction of a few links' power that a free response and the direct wave explain."""
+        """Fraction of a few links' power that an unrestricted response explains."""
         thinned = self.at(evenly(torch.arange(len(self.labels)), 64))
         return thinned.start(Shape(max(self.options.counts), True)).explained
 
@@ -205,7 +204,7 @@ class FrontEndFit:
         return max(64, numbers // self.labels[0].numel())
 
     def _smooth(self, response: Complex[Tensor, "e s"], shape: Shape) -> Complex[Tensor, "e s"]:
-        """The nearest response of a shape."""
+        """The response of this shape that is nearest to ``response``."""
         basis = self._basis(response, shape.count)
         smooth = response @ basis.conj() @ basis.mT
         if shape.is_separable and len(response) > 1:
@@ -223,7 +222,7 @@ class FrontEndFit:
         return basis
 
     def _normal(self, response: Complex[Tensor, "e s"]) -> Complex[Tensor, "e s"]:
-        """The response scaled to a mean power of 1; without its delay if links' are unknown."""
+        """The response scaled to a mean power of 1; without its delay if delays are unknown."""
         if self.task.phase == "per_link_and_delay":
             ones = torch.ones_like(response)
             response = response * alignment(response, ones, self.task.frequencies)

@@ -22,7 +22,7 @@ class ExtrapolationWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Frame:
-    """Place of the world frame on a map: its origin (x, y) [m] in a projected system (EPSG code).
+    """Place of the world frame on a map: an EPSG code, and the origin's x and y [m] there.
 
     Raises:
         ValueError: The system does not exist, its unit is not the metre, or the origin is outside
@@ -128,7 +128,7 @@ class Pose:
 
     @classmethod
     def at(cls, position) -> "Pose":
-        """A pose at 3 coordinates [m] whose axes are the world's."""
+        """A pose at 3 coordinates [m] with the world's axes."""
         return cls.from_xyzw(position, (0.0, 0.0, 0.0, 1.0))
 
     def to(self, like: Tensor) -> "Pose":
@@ -165,7 +165,7 @@ def unit_quaternions(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 
 
 
 def _of_moderate_length(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
-    """Quaternions over their largest component, so that squares neither overflow nor vanish."""
+    """Quaternions divided by their largest component, so that squares stay in range."""
     largest = quats.detach().abs().amax(-1, keepdim=True)
     return quats / torch.where(largest == 0, 1, largest)
 

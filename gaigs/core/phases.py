@@ -1,4 +1,4 @@
-"""Phases of measured channels: their sign, alignment to waves, and parts common to links."""
+"""Phases of measured channels: sign convention, alignment to waves, and fixed offsets."""
 
 import math
 from typing import NamedTuple
@@ -15,7 +15,7 @@ MANY = 30
 
 
 class StrangeParts(NamedTuple):
-    """Parts of a receiver with fixed phases or gains beyond the geometry."""
+    """Elements and subcarriers of a receiver whose phases or gains differ from geometry."""
 
     elements: bool
     subcarriers: bool
@@ -81,7 +81,7 @@ def strange_parts(
     common_share: float = 0.7,
     least_share: float = 0.01,
 ) -> dict[int, StrangeParts]:
-    """Receivers whose elements or subcarriers have fixed phases or gains beyond the geometry.
+    """Receivers whose elements or subcarriers have fixed phases or gains unlike geometry's.
 
     Receivers with fewer than ``MANY`` links, or without a direct wave, are left out. Elements count
     only if the directions of the direct waves differ from link to link: with one direction,
@@ -204,7 +204,7 @@ def unknown_phase(
     frequencies: Float[Tensor, " s"],
     declared: str = "known",
 ) -> str | None:
-    """The ``data.phase`` that channels show if the phases of their links are random, else None.
+    """The value of ``data.phase`` that fits channels with random phases; otherwise None.
 
     The likeness of a link is the fraction of its power that the direct wave explains after the best
     phase. Random channels have a likeness of one over elements times subcarriers. The result is

@@ -18,12 +18,12 @@ NEAREST = 1e-2
 def free_space(
     distances: Float[Tensor, "*#batch"], frequencies: Float[Tensor, "*#batch"], sign: int = -1
 ) -> Complex[Tensor, "*batch"]:
-    """Free space, lambda / (4 pi d) exp(sign j 2 pi f d / c), in float64.
+    """Field of a wave in free space, lambda / (4 pi d) exp(sign j 2 pi f d / c), in float64.
 
     Args:
         distances, frequencies: [m] and [Hz], broadcast against each other.
         sign: -1 for the time dependence exp(+j omega t), +1 for exp(-j omega t), 0 for the
-            amplitude alone.
+            amplitude without a phase.
 
     Source: Friis, A note on a simple transmission formula, 1946.
     """
@@ -172,9 +172,9 @@ def strength(
     waves: Complex[Tensor, "k e s"],
     receivers: Int[Tensor, " k"],
 ) -> float:
-    """Amplitude of channels over waves: geometric mean over receivers of the medians over links.
+    """Ratio of amplitudes, channels to waves: a median over links, a geometric mean over receivers.
 
-    It is 1 where all channels are 0.
+    It is 1 if all channels are 0.
     """
     logs = []
     for receiver in receivers.unique():

@@ -1,4 +1,4 @@
-"""Queries, links of transmitters and receivers; batches, queries with directions and labels."""
+"""Queries, which list links; and batches, queries with directions and labels."""
 
 import math
 import reprlib
@@ -40,7 +40,7 @@ def check_carrier(name: str, frequencies: float | Tensor) -> None:
 
 
 def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
-    """At most ``most`` of some indices, evenly spread over their order."""
+    """At most ``most`` indices of ``index``, at even steps."""
     if len(index) <= most:
         return index
     return index[torch.linspace(0, len(index) - 1, most).round().long()]
@@ -59,7 +59,7 @@ def drawn(index: Int[Tensor, " k"], most: int = 10_000) -> Int[Tensor, " j"]:
 
 
 def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped[Tensor, "k m"]:
-    """At most ``most`` numbers of each label, evenly spread over its rows and columns."""
+    """At most ``most`` values of each label, evenly spread over its rows and columns."""
     numbers = labels[..., None].flatten(1)  # (k, rows x columns)
     columns = labels.shape[-1] if labels.ndim > 1 else 1
     index = evenly(torch.arange(numbers.shape[1]), most)
@@ -71,7 +71,7 @@ def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped
 
 
 def as_tensor(name: str, values: object, expected: str) -> Tensor:
-    """Numbers of any type as a tensor of their own dtype; a ``ValueError`` for anything else."""
+    """An array-like as a tensor of the same dtype; a ``ValueError`` for anything else."""
     if isinstance(values, Tensor):
         if values.is_meta or values.layout is not torch.strided:
             kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
@@ -101,7 +101,7 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
 
 
 def as_numbers(name: str, values: object, expected: str) -> Tensor:
-    """Real numbers of any type as a float32 tensor; a ``ValueError`` for anything else."""
+    """A real array-like as a float32 tensor; a ``ValueError`` for anything else."""
     expected = f"{expected} in real numbers"
     tensor = as_tensor(name, values, expected)
     if tensor.is_complex() or tensor.dtype == torch.bool:
@@ -159,7 +159,7 @@ def _is_text(values: object) -> bool:
 
 
 def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, "*points"] | None:
-    """Carriers of a request, checked [Hz]; for None the only known one, if there is one."""
+    """Checked carriers of a request [Hz]; for None the only known carrier, if there is one."""
     if values is None:
         if len(known) > 1:
             span = f"{known[0]:.7g} to {known[-1]:.7g} Hz"
@@ -230,7 +230,7 @@ def as_directions(directions: Directions | None, own: Grid | None, task: str) ->
 
 @dataclass
 class Query:
-    """Links from one transmitter to one receiver each. Two are equal only if all their fields are.
+    """A list of links, each from one transmitter to one receiver.
 
     Attributes:
         transmitters: Positions, world frame (b, 3) [m].
@@ -334,10 +334,10 @@ class Query:
         return which.bincount().double().reciprocal()[which]
 
     def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, " b"]]:
-        """The distinct links, sorted by position, frequency and receiver, and each link's number
-        among them.
+        """The distinct links, and the number of each link among them.
 
-        Without ``with_receivers`` links that differ only in the receiver are equal.
+        Distinct links are sorted by position, frequency and receiver. Without ``with_receivers``
+        links that differ only in the receiver are equal.
         """
         others = [self.frequencies] if self.frequencies is not None else []
         others += [self.receivers] if with_receivers else []

@@ -1,4 +1,4 @@
-"""Radio maps: predictions of one real number, e.g. RSSI, for transmitters anywhere on a floor."""
+"""Radio maps: predictions of a scalar, such as RSSI, for transmitters all over a floor."""
 
 import logging
 import math
@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, repr=False)
 class RadioMap:
-    """Predictions of one real number a link, e.g. RSSI, for transmitters on a horizontal plane.
+    """Predictions of a scalar, such as RSSI, for transmitters on a horizontal plane.
 
     Attributes:
         values: A map for each receiver (receivers, rows, columns) [unit]; rows along y, columns
@@ -65,7 +65,7 @@ class RadioMap:
         return f"<radio map of {name}: {names}; {grid}>"
 
     def only(self, index: Int[ndarray, " k"]) -> "RadioMap":
-        """The maps of some receivers."""
+        """The maps of the receivers with these numbers."""
         deviations = None if self.deviations is None else self.deviations[index]
         names = tuple(self.receivers[number] for number in index)
         return replace(self, values=self.values[index], receivers=names, deviations=deviations)
@@ -144,21 +144,21 @@ def radio_map(
     """Predictions on a plane over the widened box of training transmitters and all receivers.
 
     Args:
-        model: A fitted or loaded model of a task whose label is one real number, e.g. RSSI.
-        pitch: Distance between neighbouring points [m]. The points are its multiples, so maps of
-            one pitch share them. None: 0.1, more in a room with a side above 12.8 m; doubled until
-            the map of a slow model takes 20 s.
-        height: Height of the transmitters [m]; None: half-way between the lowest and the highest of
-            training, or the floor with most training places.
+        model: A fitted or loaded model of a task with scalar labels, such as RSSI.
+        pitch: Distance between neighbouring points [m]. Coordinates are multiples of it, so maps of
+            one pitch share points. None: 0.1, or more for a side above 12.8 m; for a slow model it
+            is doubled until the map takes 20 s.
+        height: Height of the transmitters [m]; None: half-way between lowest and highest training
+            transmitter, or the floor with most training places.
         margin: Widening of the box on each side [m].
         receivers: Names or indices, or one of them; None: all receivers.
         frequency: Carrier [Hz]; None: the training links' carrier, or the middle one of several.
-        progress: False for no bars.
+        progress: False hides progress bars.
 
     Warns:
-        ExtrapolationWarning: The frequency is outside the training links' band, or height or margin
-            go farther from the training transmitters' box than the diagonal of this box and the
-            receivers.
+        ExtrapolationWarning: The frequency is outside the training links' band; or a place is
+            outside the training transmitters' box by more than the diagonal of the box of
+            transmitters and receivers.
 
     Raises:
         TypeError: The model is not a ``gaigs.Model``.
@@ -207,7 +207,7 @@ def radio_map(
 
 
 def scalar_scene(model, owner: str) -> Scene:
-    """The scene of a model of one real number a link; ``owner`` names its use in errors."""
+    """The scene of a model with scalar labels; ``owner`` names its use in errors."""
     if not hasattr(model, "scene"):
         raise TypeError(
             f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint "
@@ -249,7 +249,7 @@ def _rectangle(scene: Scene, height: float, margin: float) -> tuple[ndarray, nda
 
 
 def _doubts(scene: Scene, height: float, margin: float) -> list[str]:
-    """Sentences on options that put transmitters far outside the training box."""
+    """Warnings for options that put transmitters far outside the training box."""
     beyond = max(scene.lower[2].item() - height, height - scene.upper[2].item())
     messages = []
     for name, distance, most in (

@@ -73,8 +73,8 @@ def rasterize_roofs(
     """The roofs on a grid.
 
     Args:
-        ground: Height of the ground in each cell [m]. A building without a height of its ground
-            stands on the mean below its footprint. Without ``ground`` it stands at 0.
+        ground: Height of the ground in each cell [m]. A building whose ground is unknown stands on
+            the mean below its footprint, or at 0 without ``ground``.
     """
     heights = np.full((grid.rows, grid.columns), nothing, dtype=np.float32)
     for building in buildings:
@@ -110,10 +110,10 @@ def obstruct(
 ) -> Float[Tensor, "b 4"]:
     """Obstruction of the direct paths from ``starts`` to ``ends`` [m] by roofs and ground.
 
-    Paths are sampled about once a cell. Samples within 1.5 cells of an end do not count, since the
-    cell of an antenna at a wall may belong to the building. The knife-edge loss depends on the
-    ``wavelength`` [m]. An effective radius of the earth of 8,500 km raises what is far from the
-    ends.
+    Paths are sampled about once in each cell. Samples within 1.5 cells of an end do not count,
+    since the cell of an antenna at a wall may belong to the building. The knife-edge loss depends
+    on the ``wavelength`` [m]. The curvature of the earth, with an effective radius of 8,500 km,
+    raises obstacles between the ends.
 
     Returns:
         Four numbers for each path: 1 if a roof is above it, else 0; its length inside buildings
@@ -157,7 +157,7 @@ def _bullington(
     plan: Float[Tensor, "b 1"],
     wavelength: float,
 ) -> Float[Tensor, " b"]:
-    """Parameter v of ``knife_edge`` for each path, with all that stands in it as one edge.
+    """Parameter v of ``knife_edge`` for each path, if one edge replaces all its obstacles.
 
     If the surface blocks the path, the edge is where the steepest lines from both ends meet.
     Otherwise it is the sample with the largest v.

@@ -1,4 +1,4 @@
-"""The scene of a model: receivers and arrays, box of the training transmitters, task."""
+"""The scene of a model: receivers, the box of training transmitters, and the task."""
 
 import functools
 import logging
@@ -24,8 +24,8 @@ log = logging.getLogger(__name__)
 class FlatAxis(NamedTuple):
     """A world axis on which all transmitters share a coordinate, and all receivers share one.
 
-    A plane across it at the coordinate h reflects paths of the same lengths as one at transmitters
-    + receivers - h, so labels do not show which of the two there is.
+    A plane across it at the coordinate h reflects paths of the same lengths as a plane at
+    transmitters + receivers - h, so labels cannot distinguish the two.
     """
 
     axis: int  # 0 to 2
@@ -53,17 +53,18 @@ class Scene:
         lower, upper: Corners of the box of the training transmitters, world frame (3,) [m].
         spacing: Median distance of a training transmitter to the nearest other one [m].
         frequencies: Distinct carriers of the training links, ascending (f,) [Hz]; empty if unknown.
-        bandwidth: Band around each carrier over which a label's power is averaged, 0 for a carrier
-            alone [Hz]; None if unknown.
+        bandwidth: Band around each carrier over which a label's power is averaged [Hz]. 0: a single
+            carrier; None: unknown.
         frame: Place of the world frame on a map; None if unknown.
         places: Number of training places; 0 if unknown.
-        floors: Heights of separate floors of training transmitters, that with most places first
-            (k,) [m]; empty for one floor.
-        responses: Factors of channels by each receiver's front end; None where none is learnt.
+        floors: Heights of separate floors of training transmitters, the floor with most places
+            first (k,) [m]; empty for one floor.
+        responses: Response of each receiver's front end, which multiplies channels; None for a
+            receiver without a learnt one.
         room: Corners of the box of training transmitters and training receivers (2, 3) [m]; None
             if ``receivers`` are those of the training.
-        one_radio: True if the receivers are places of one radio that moves, or of equal radios.
-            They share one gain, and a model learns from all their links together.
+        one_radio: True if the receivers are places of one moving radio, or identical radios. All
+            have the same gain, and a model learns from all their links together.
 
     Example:
         >>> scene = gaigs.links("synthetic_rssi", transmitters=50).scene
@@ -103,7 +104,7 @@ class Scene:
         return 1 if self.one_radio else len(self.receivers)
 
     def radio_of(self, receivers: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
-        """Number of each receiver's radio: what a model learns of a receiver is of its radio."""
+        """Number of each receiver's radio, by which models store what they learn of receivers."""
         return torch.zeros_like(receivers) if self.one_radio else receivers
 
     def by_radio(self, query: Query) -> Query:
@@ -126,7 +127,7 @@ class Scene:
 
     @functools.cached_property
     def flat_axes(self) -> list[FlatAxis]:
-        """World axes on which training transmitters, and elements, stand within a centimetre."""
+        """World axes along which training transmitters and elements vary by under 1 cm each."""
         elements = []
         for receiver in self.receivers:
             pose = receiver.pose.to(self.lower)
@@ -145,14 +146,14 @@ class Scene:
 
     @property
     def height(self) -> float:
-        """Height of the floor with most training places, or half-way up a single floor [m]."""
+        """Height of the floor with most training places; of a single floor the middle [m]."""
         if len(self.floors):
             return float(self.floors[0])
         return float((self.lower[2].double() + self.upper[2].double()) / 2)
 
     @property
     def middle_frequency(self) -> float | None:
-        """The middle one of the training links' carriers [Hz]; None if they have none."""
+        """The middle carrier of the training links [Hz]; None if carriers are unknown."""
         if not len(self.frequencies):
             return None
         return float(self.frequencies[len(self.frequencies) // 2])
@@ -170,7 +171,7 @@ class Scene:
         return len(self.frequencies) > 1
 
     def band_positions(self, query: Query) -> Float[Tensor, " b"]:
-        """Log-positions of carriers in the training links' band, from -1 to 1."""
+        """Logarithms of carriers, scaled from -1 to 1 over the training links' band."""
         if query.frequencies is None:
             raise ValueError(
                 f"a frequency must be given, as the data have {len(self.frequencies)} carriers"
@@ -195,7 +196,7 @@ class Scene:
     def received(
         self, query: Query, channels: Complex[Tensor, "b e s"]
     ) -> Complex[Tensor, "b e s"]:
-        """Channels behind the receivers' front ends."""
+        """Channels after the receivers' front ends: multiplied by their responses."""
         if self.responses is None:
             return channels
         return channels * self.responses.to(channels)[query.receivers]
@@ -306,7 +307,9 @@ def direct_waves(
     sign: int = -1,
     at_elements: bool = True,
 ) -> Complex[Tensor, "b e s"]:
-    """Free space to the receiver's elements or, without ``at_elements``, to its middle (e = 1).
+    """Fields in free space at the receiver's elements, or at its middle (e = 1).
+
+    The middle is used without ``at_elements``.
 
     It is 0 at elements that the receiver's array lacks, and outside the receiver's band.
     ``sign`` is as for ``free_space``.

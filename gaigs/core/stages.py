@@ -27,8 +27,8 @@ class Timekeeper:
         shown: True if its stages have progress bars.
 
     Attributes:
-        seconds: Time of each ``timed`` part [s], without the parts inside it.
-        ends: Function that is true when the current part, such as a training, has to end; or None.
+        seconds: Time of each ``timed`` part [s], without nested parts.
+        ends: Function that is True when the current part, such as a training, must end; or None.
     """
 
     def __init__(self, limit: float = math.inf, shown: bool = True):
@@ -48,7 +48,7 @@ class Timekeeper:
 
 
 class Stage:
-    """A part of a run; arguments as for ``stage``."""
+    """A part of a run, with a number of steps; arguments as for ``stage``."""
 
     def __init__(self, keeper: Timekeeper, name: str, total: int, until: float, is_fixed: bool):
         self.keeper = keeper
@@ -102,7 +102,7 @@ _keeper: ContextVar[Timekeeper | None] = ContextVar("keeper", default=None)
 
 
 def current() -> Timekeeper:
-    """The present run; outside of runs one without a limit."""
+    """The timekeeper of the present run; outside of runs one without a limit."""
     keeper = _keeper.get()
     if keeper is None:
         keeper = Timekeeper()
@@ -158,7 +158,7 @@ def portion(share: float) -> contextlib.AbstractContextManager[Stage]:
 
 @contextlib.contextmanager
 def timed(name: str) -> Iterator[None]:
-    """A part of the current run whose time is recorded under a name, without inner parts."""
+    """A part of the current run whose time is recorded under a name, without nested parts."""
     seconds = current().seconds
     inside = sum(seconds.values())
     began = time.monotonic()
@@ -212,7 +212,7 @@ def leave_out(what: str) -> None:
 
 
 def with_progress(function: Callable) -> Callable:
-    """A decorator: calls with ``progress=False``, a keyword of the function, hide their bars."""
+    """A decorator that hides the progress bars of calls with ``progress=False``."""
 
     @functools.wraps(function)
     def shown(*arguments, **options):

@@ -34,11 +34,11 @@ Parts = tuple[Int[Tensor, " train"], Int[Tensor, " test"]]
 
 @dataclass(frozen=True)
 class Split:
-    """Links for training, validation and test. ``name`` states the protocol with its numbers.
+    """Indices of the links for training, validation and test.
 
-    ``groups`` has the group of each of the n links, such as its row, run or cube. A group is never
-    divided, even in cross-validation. None: a group is a place. ``by_receivers`` is true if whole
-    receivers are held out. Models then predict for receivers without training links.
+    ``name`` states the kind of split with its parameters. ``groups`` has the group of each of the n
+    links, such as its row, run or cube. A group is never divided, even in cross-validation. None: a
+    group is a place. ``by_receivers`` is true if whole receivers are held out.
     """
 
     name: str
@@ -81,15 +81,14 @@ class Links:
             *task.shape).
         task: Task of the labels.
         rows: Row of each link in the order of measurement, from 0 (n,). Links of one transmission
-            to several receivers, or at several frequencies, share a row. None: each link has its
-            own.
+            to several receivers, or at several frequencies, share a row. None: each link is a row.
         official: Function that reads the training and test links that came with the data, for the
             official split; or None.
         split: Train, validation and test links; None until a split is chosen, see ``load``.
         bandwidth: Band around each carrier over which a label's power is averaged [Hz]. 0: a single
             carrier; None: unknown.
-        held_out: The same links at held-out subcarriers, with the labels of the test; None if
-            all subcarriers are trained.
+        held_out: The same links at held-out subcarriers, whose labels are the test; None if no
+            subcarriers are held out.
         frame: Place of the world frame on a map; None if unknown.
         uncertainties: Standard deviation of each receiver's place (r,) [m]: 0 for a given place,
             infinite until ``divide`` estimates the place from the training links. None: all places
@@ -98,8 +97,8 @@ class Links:
             readings. The deviation of a mean of several readings is lower. None without
             repetitions.
         edges: Line segments of the room to draw in figures (k, 2, 3) [m]; empty if unknown.
-        one_radio: True if the receivers are places of one moving radio, or identical radios, with
-            one gain. Otherwise each receiver has its own gain.
+        one_radio: True if the receivers are places of one moving radio, or identical radios, so
+            that all have the same gain. Otherwise each receiver has a separate gain.
         front_ends: Responses of the receivers' front ends; None if none is learnt.
         remarks: Counts of links that were read and excluded, with the reason.
         origin: Configurations of ``data`` and ``split``; empty for arrays in memory.
@@ -244,7 +243,7 @@ def load(data: Mapping, split: Mapping, task: str | None = None, is_checked: boo
 
 
 def divide(links: Links, split: Mapping, is_checked: bool = True) -> Links:
-    """Links with the split of a configuration, learnt front ends and estimated places.
+    """Links after all preparations that follow from a split: front ends, places, constant parts.
 
     Constant subcarriers of channels are removed. In links with ``uncertainties`` receivers without
     a training link are removed, and unknown places of receivers are estimated from the training

@@ -51,30 +51,30 @@ def from_arrays(
             ``Spectrum(elevations, azimuths)`` or ``Csi(elements, frequencies)`` of
             ``gaigs.core.task``.
         transmitters: Positions, world frame (n, 3) [m], or (n, 2) of one ``height``.
-        labels: One a link (n, *task.shape), or one for each transmitter and receiver (n, k,
-            *task.shape). Numbers (n, k) may be a data frame, whose columns name the receivers.
-            Readings of NaN or None and channels of zeros were not received: they are left out, and
+        labels: A label for each link (n, *task.shape), or for each transmitter and receiver (n, k,
+            *task.shape). Scalars (n, k) may be a data frame, whose columns name the receivers.
+            Labels of NaN or None and channels of zeros were not received. They are left out, and
             so are receivers without training links.
-        receivers: ``Receiver`` or several; or positions (3,) or (k, 3) [m], or a mapping of names
-            to positions. Such receivers are not turned, and all elements of a channel stand at the
-            position. For levels [dBm] a position, or all of them, may be None or NaN, and is then
-            estimated from the training links.
-        index: Receiver of each link (n,), or of all, from 0; not needed with one receiver, n
-            positions, or labels (n, k, ...).
-        frequency: Carrier, one or one a link [Hz]; None if unknown, for channels the middle of the
-            subcarriers.
-        bandwidth: Band around each carrier that powers are averaged over, 0 for a carrier alone
-            [Hz]; None if unknown.
-        split: Name of a registered split, ``options`` are its own; by default ``official`` with
-            ``test_rows``, else ``random``.
+        receivers: One or several ``Receiver``; or positions (3,) or (k, 3) [m]; or a mapping of
+            names to positions. Receivers at positions have the world's axes, with all elements at
+            the position. For levels [dBm] positions may be None or NaN; they are then estimated
+            from the training links.
+        index: Number of each link's receiver (n,), or one number for all links, from 0. It is not
+            needed with one receiver, n positions, or labels (n, k, ...).
+        frequency: Carrier of all links, or of each link (n,) [Hz]. None: unknown, or for channels
+            the middle of the subcarriers.
+        bandwidth: Band around each carrier over which powers are averaged [Hz]; 0: a single
+            carrier; None: unknown.
+        split: Name of a registered split, whose options are in ``options``. None: ``official`` if
+            ``test_rows`` are given, otherwise ``random``.
         test_rows: Rows of ``transmitters`` to test on, as numbers or a mask (n,).
-        train_rows: Rows to train and validate on; by default all others.
+        train_rows: Rows to train and validate on. None: all other rows.
         frame: Place of the positions' origin on a map, such as ``gaigs.Frame(32632, 450000.0,
             5400000.0)`` for UTM less that easting and northing; None if unknown.
         height: Height of positions (n, 2) or (k, 2) [m].
-        one_radio: True if the receivers are places of one radio that moves, or of radios alike,
-            with one gain. None: True for receivers at one position a link, see
-            ``gaigs.data.readings.are_one_radio``.
+        one_radio: True if the receivers are places of one moving radio, or identical radios, so
+            that all have the same gain. None: ``gaigs.data.readings.are_one_radio`` decides, if
+            each link has its own receiver position.
 
     Raises:
         TypeError: An option has a wrong type.
@@ -192,7 +192,7 @@ def split_configuration(
 
 
 class _Ends(NamedTuple):
-    """Receivers, and how the links belong to them."""
+    """Receivers, and the receiver of each link."""
 
     receivers: tuple[Receiver, ...]
     index: Any  # receiver of each link; None if the labels' shape tells
@@ -226,7 +226,7 @@ def _find_ends(
     height: float,
     remarks: list[str],
 ) -> _Ends:
-    """The receivers that are given, or made from positions or from the shape of labels."""
+    """The given receivers, or receivers made from positions or the shape of labels."""
     receivers = (receivers,) if isinstance(receivers, Receiver) else receivers
     is_list = isinstance(receivers, Sequence)
     if is_list and all(isinstance(receiver, Receiver) for receiver in receivers):
@@ -438,7 +438,7 @@ def _doubt_levels(labels: Tensor, received: Tensor, remarks: list[str]) -> None:
 def _carriers(
     frequency: Any, task: Task, row: Int[Tensor, " m"], places: Float[Tensor, "n 3"]
 ) -> Float[Tensor, " m"] | None:
-    """Carrier of each link [Hz]; of channels by default the middle of the subcarriers."""
+    """Carrier of each link [Hz]; for channels by default the middle of the subcarriers."""
     if frequency is None and task.frequencies is not None:
         frequency = (task.frequencies.min() + task.frequencies.max()).item() / 2
     if frequency is None:
@@ -475,7 +475,7 @@ def _parts(
 
 
 def _rows(name: str, values: Any, count: int) -> Int[Tensor, " k"]:
-    """Ascending numbers of rows, given as such or as a mask of all ``count`` rows."""
+    """Ascending numbers of rows, from numbers or from a mask of all ``count`` rows."""
     rows = as_tensor(name, values, "numbers of rows")
     if rows.dtype == torch.bool and rows.shape == (count,):
         rows = rows.nonzero()[:, 0]

@@ -174,12 +174,12 @@ def _within(task: Csi, option: str, band: Sequence[float]) -> Bool[Tensor, " s"]
 
 
 def _has_signal(links: Links, subcarriers: Bool[Tensor, " s"]) -> Bool[Tensor, " n"]:
-    """True for each link that is not 0 at all of some subcarriers."""
+    """True for links whose label differs from 0 at one of the ``subcarriers`` or more."""
     return links.labels[..., subcarriers].abs().amax((1, 2)) > 0
 
 
 def _at(links: Links, subcarriers: Bool[Tensor, " s"]) -> Links:
-    """Links with labels at some subcarriers."""
+    """Links with labels at these ``subcarriers`` only."""
     task: Csi = links.task
     part = Csi(task.elements, task.frequencies[subcarriers], task.phase)
     return replace(links, labels=links.labels[..., subcarriers], task=part)

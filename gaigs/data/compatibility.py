@@ -1,4 +1,4 @@
-"""Checks that links fit the scene of a model: the same labels and receivers."""
+"""Checks that links have the labels and receivers of a model's scene."""
 
 from typing import Any
 

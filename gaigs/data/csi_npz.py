@@ -80,22 +80,22 @@ def read(
     links are left out; the remarks count them. The middle of the subcarriers' band counts as the
     carrier. There is no official split.
 
-    Frequencies more than a fifth apart, unless four or more are evenly spaced, are of different
-    bands: a receiver is then one radio for each, such as ``rx0 2.412 GHz``, whose links are 0 in
-    other bands; see ``gaigs.data.bands.in_bands``.
+    A step of more than ``band_gap`` in frequency separates two bands, see
+    ``gaigs.data.bands.in_bands``. A receiver then counts as one radio for each band, named for
+    example ``rx0 2.412 GHz``. Its links are 0 in other bands.
 
     Args:
-        file: One file, or a list of files of one site, such as of a band each. Arrays ``tx``
-            (n, 3), positions of the transmitters [m]; ``rx`` (k, 3), positions of the receivers
-            [m]; ``rx_index`` (n,), receiver of each link, from 0, not needed with one
-            receiver; ``frequencies`` (s,), subcarriers [Hz]; ``h`` (n, e, s), complex channels,
-            linear amplitude; optionally ``elements`` (e, 3), offsets of an array's elements from
-            its receiver's position along the world's axes [m], by default 0. With (k, e, 3) each
-            receiver has its own, and a missing element is NaN, and 0 in ``h``. The remarks name
-            other arrays. In place of ``h`` and ``rx_index`` the file may have impulse
-            responses, see ``gaigs.data.impulse_responses.from_sionna``.
-        arrays: Names of these arrays in the file where they differ, such as ``{"h": "CSI"}``; two
-            names are for real and imaginary part.
+        file: One file, or a list of files of one site, for example one for each band. Arrays:
+            ``tx`` (n, 3), positions of the transmitters [m]; ``rx`` (k, 3), positions of the
+            receivers [m]; ``rx_index`` (n,), receiver of each link, from 0, optional with one
+            receiver; ``frequencies`` (s,), subcarriers [Hz]; ``h`` (n, e, s), complex channels;
+            optionally ``elements`` (e, 3), offsets of the elements from the receiver's position
+            along the world's axes [m], by default 0. Elements (k, e, 3) are separate for each
+            receiver; a missing one is NaN, and 0 in ``h``. The remarks name other arrays. In place
+            of ``h`` and ``rx_index`` the file may have impulse responses, see
+            ``gaigs.data.impulse_responses.from_sionna``.
+        arrays: The file's names for these arrays if different, such as ``{"h": "CSI"}``. Two names
+            are for real and imaginary part.
         phase: See ``gaigs.core.task.csi.Csi``.
         band_train, band_test: Subcarriers to train and to test on, as for
             ``gaigs.data.bands.hold_out_band`` [Hz].
@@ -393,7 +393,7 @@ def _check_values(file: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _rule(name: str, array: np.ndarray, receivers: int) -> tuple[str, np.ndarray]:
-    """What an array may hold, in words for errors, and True for each number that is allowed."""
+    """A text for errors that says what an array may hold, and True for each allowed number."""
     if name == "h":
         low, high = 1e-18, 1e18  # float32 can hold their squares
         sizes = np.abs(array)

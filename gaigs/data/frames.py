@@ -36,31 +36,31 @@ def from_frame(
 ) -> Links:
     """Links of a data frame of levels [dBm], with their split.
 
-    The frame is of pandas, polars, pyarrow, or of another library with the PyCapsule or the
-    interchange protocol; or a mapping of columns. It has a place a row and a receiver a column; or,
-    with ``receiver`` and ``level``, a reading a row. Where both ends move, each row has both
-    places: ``receiver`` lists the columns of the receiver's, or columns have the names of
-    ``rssi_csv``. Other columns and cells are understood, checked and remarked on as by
+    The frame is from pandas, polars, pyarrow, or another library with the PyCapsule or the
+    interchange protocol; or it is a mapping of columns. A wide frame has a row for each place and a
+    column for each receiver. A long frame has a row for each reading, and needs ``receiver`` and
+    ``level``. If both ends move, each row also has the receiver's place: in the columns of
+    ``receiver``, or in columns named as in ``rssi_csv``. Other columns and cells are read as by
     ``gaigs.data.rssi_wide.read``. NaN and None were not received.
 
     Args:
         frame: The data frame.
-        x, y: Columns of the coordinates, in metres unless their names say another unit; longitude
-            and latitude come in this order. None: found by their names.
-        z: Column of the height, or of the floor if its name says so. None: found by its name, else
-            all are ``height``.
+        x, y: Columns of the coordinates, or of longitude and latitude. The unit is the metre unless
+            their names state another. None: columns with usual names.
+        z: Column of the height, or of the floor if it is named so. None: the column with a usual
+            name; without one, heights are ``height``.
         receivers: Positions by name, as a mapping to [x, y, z] or [x, y], or a data frame with
-            columns ``name``, ``x``, ``y`` and optionally ``z``. A position of None and all others
-            are estimated from the training links. A list of names has the columns of receivers.
-            None: all columns that mostly hold low levels.
-        receiver: Column of the receivers' names, in a frame with a reading a row; or the two or
-            three columns of the receiver's place [m].
-        level: Column of the readings of such a frame [dBm].
+            columns ``name``, ``x``, ``y`` and optionally ``z``; missing positions are estimated
+            from the training links. Or a list of the columns that are receivers. None: all columns
+            that mostly hold low levels.
+        receiver: Column of the receivers' names in a long frame; or the two or three columns of the
+            receiver's place [m].
+        level: Column of the readings in a long frame [dBm].
         ignore, not_heard, height, storey, epsg, frequency: As for ``gaigs.data.rssi_wide.read``.
-        split: Name of a registered split, ``options`` are its own; None: ``random``.
+        split: Name of a registered split, whose options are in ``options``; None: ``random``.
 
     Raises:
-        ImportError: A package that the frame or its coordinates take is not installed.
+        ImportError: A package that the frame or its coordinates need is not installed.
         ValueError: A column is missing, or a cell is wrong; the message names row, column and
             value.
 
@@ -109,7 +109,7 @@ def from_frame(
 
 
 def _places_of(table: Table, names: Sequence) -> Float[np.ndarray, "n d"]:
-    """Positions of one end, a column a coordinate."""
+    """Positions of one end of the links, from a column for each coordinate."""
     columns = [table.column(str(name)) for name in names]
     return table.numbers[:, columns]
 

@@ -1,4 +1,4 @@
-"""Places of gateways without a given place, estimated from the levels that they receive."""
+"""Estimation of unknown gateway places from the levels that the gateways receive."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -36,7 +36,10 @@ class Prior:
 
 
 class Laws(NamedTuple):
-    """Laws constant + slope log10(distance) for c correlations and g candidate places."""
+    """Path-loss laws, level = constant + slope log10(distance).
+
+    There is one for each of c correlations of shadowing and g candidate places of the gateway.
+    """
 
     evidence: Float[Tensor, "c g"]  # log likelihood, up to a constant
     slopes: Float[Tensor, "c g"]  # [dB per decade]

@@ -153,7 +153,10 @@ def marks_of(levels: Float[ndarray, "n k"]) -> list[float]:
 
 
 def _usual_marks(levels: Float[ndarray, "n k"], lowest: float) -> list[float]:
-    """Marks among usual values and the ``lowest`` one: isolated, or much more frequent."""
+    """Values that mean "not heard", as in ``marks_of``: usual marks, or the ``lowest`` value.
+
+    Such a value is apart from all others, or much more frequent than its neighbours.
+    """
     usual = (-100.0, -105.0, -110.0, -120.0, -127.0, -128.0)  # marks of "not heard" [dBm]
     values, counts = np.unique(levels[~np.isnan(levels)], return_counts=True)
     marks = []

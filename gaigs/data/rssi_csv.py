@@ -39,14 +39,13 @@ def read(
     frequency: float | None = None,
     one_radio: bool | None = None,
 ) -> Links:
-    """A data set from a table with a heading and a reading a line: one link for each received
-    reading.
+    """A data set from a table with one reading in each line: a link for each received reading.
 
     Places of the fixed end become the receivers, ``rx1`` ... or ``tx1`` ... in the order of their
-    first appearance. They look along the world's axes. Places of the moving end become the
-    transmitters; by reciprocity the attenuation is equal in both directions. The readings of a
-    transmitter place share a row. Readings of ``not_heard``, and fixed places with no other
-    readings, are left out; the remarks count them. There is no official split.
+    first appearance, with the world's axes. Places of the moving end become the transmitters, since
+    attenuation is equal in both directions. The readings of a transmitter place share a row.
+    Readings of ``not_heard``, and fixed places with no other readings, are left out; the remarks
+    count them. There is no official split.
 
     Args:
         file: Table with the columns ``tx_x``, ``tx_y``, ``tx_z``, ``rx_x``, ``rx_y``, ``rx_z`` [m]

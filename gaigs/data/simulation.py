@@ -1,4 +1,4 @@
-"""Data sets of simulated rooms: the same labels, whatever simulates the room."""
+"""Data sets of simulated rooms, from the responses of any simulator."""
 
 import itertools
 import math
@@ -143,9 +143,9 @@ def _distort(
     bandwidth: float | None,
     seed: int,
 ) -> Complex[Tensor, "n elements f"]:
-    """Channels with a random phase a link.
+    """Channels with a random phase for each link.
 
-    With a bandwidth [Hz] each link also has a delay of at most two over the bandwidth, and a gain
+    With a bandwidth [Hz] each link also gets a delay of at most two over the bandwidth, and a gain
     of -6 to 6 dB.
     """
     sequence = np.random.SeedSequence((seed % 2**64, 2))  # the places use ``seed`` itself
@@ -161,7 +161,7 @@ def _distort(
 
 
 def without_silent(links: Links, transmitters: int, has_path: Bool[Tensor, " n"]) -> Links:
-    """Links from places that a path leads to; the remarks count the others."""
+    """Links for which a path exists; the remarks count the others."""
     if has_path.all():
         return links
     if len(links.rows[has_path].unique()) < 2:
@@ -251,8 +251,8 @@ def wall_poses(
 ) -> tuple[Pose, ...]:
     """Poses along the walls, 0.1 m off them and outside furniture, that face the room's middle.
 
-    They divide the walls evenly. Their heights fill 1.2 to 2.6 m evenly, in steps of the golden
-    ratio modulo 1, so that neighbours differ.
+    They are evenly spaced along the walls. Heights are spread evenly over 1.2 to 2.6 m, in steps of
+    the golden ratio modulo 1, so that neighbours differ.
 
     Args:
         outline: From a height, the corners of the walls there, counterclockwise (float64) [m].
@@ -354,5 +354,5 @@ def to_spectra(
 
 
 def rss_dbm(responses: Complex[Tensor, "b elements f"]) -> Float[Tensor, " b"]:
-    """Received signal strength of 0 dBm sent, the mean over elements and frequencies [dBm]."""
+    """Received level for a transmitter of 0 dBm, a mean over elements and frequencies [dBm]."""
     return 10 * torch.log10(responses.abs().square().mean((1, 2)))

@@ -37,25 +37,25 @@ def from_sionna_rt(
 ) -> Links:
     """Links of ``sionna.rt.Paths`` or ``sionna.rt.RadioMap``, with their split.
 
-    A channel is the same both ways: the end with fewer places becomes the receivers. Paths give
-    channels at ``frequencies``, and without them levels, the sum of the paths' powers for a
-    transmitter of 0 dBm. A radio map gives the levels of its cells [dBm], and cells that no path
-    reaches are left out.
+    The end with fewer places becomes the receivers, since channels are equal in both directions.
+    ``Paths`` become channels at ``frequencies``. Without these they become levels, sums of the
+    paths' powers for a transmitter of 0 dBm. A ``RadioMap`` becomes levels of its cells [dBm],
+    without cells that no path reaches.
 
     Args:
         source: The object.
         frequencies: Subcarriers, absolute or relative to the carrier (s,) [Hz]. None: levels.
-        frequency: Carrier [Hz]; None: the scene's, as far as the object keeps it.
-        receivers: Positions of a radio map's transmitters (k, 3) [m], or by name. None: those that
-            the object keeps.
+        frequency: Carrier [Hz]; None: the carrier that the object stores, if any.
+        receivers: Positions of a radio map's transmitters (k, 3) [m], or by name. None: the
+            positions that the object stores.
         elements: Offsets of the receiver array's elements along the world's axes (e, 3) [m]. None:
-            the object's; paths with ``synthetic_array`` count as of a device that is not turned.
-            They are unknown if several antennas share an element.
+            offsets from the object; with ``synthetic_array`` devices count as not rotated. Offsets
+            are unknown if several antennas share an element.
         phase: See ``gaigs.core.task.csi.Csi``.
-        split: Name of a registered split, ``options`` are its own; None: ``random``.
+        split: Name of a registered split, whose options are in ``options``; None: ``random``.
 
     Raises:
-        ValueError: A path has no carrier or no delay, or an option is of the other kind of object.
+        ValueError: A path has no carrier or no delay, or an option does not apply to the object.
     """
     config = split_configuration("objects of Sionna RT", from_sionna_rt, split, options)
     if frequency is None:
@@ -110,7 +110,7 @@ def _elements(
     """Offsets of the antennas from their device [m], at the end of the links with fewer devices.
 
     Without a synthetic array, paths are traced to each antenna, and ``rx`` and ``tx`` are the
-    traced places. Else all devices have the antennas of the scene's array.
+    antennas' places. Otherwise all devices have the antennas of the scene's array.
     """
     fixed, array = (rx, source.rx_array) if len(rx) <= len(tx) else (tx, source.tx_array)
     if not source.synthetic_array:

@@ -15,7 +15,7 @@ from gaigs.io.tables import find_file
 
 
 class Extent(NamedTuple):
-    """What a file covers in the world frame."""
+    """The area that a file covers in the world frame."""
 
     lower: Float[ndarray, "2"]  # corners, x and y [m]
     upper: Float[ndarray, "2"]

@@ -261,7 +261,7 @@ def inert(text: str) -> str:
 
 
 def original(text: str) -> str:
-    """The text from which ``inert`` made this one."""
+    """The inverse of ``inert``: the text before an apostrophe was added."""
     return text[1:] if text.startswith("'") and inert(text[1:]) == text else text
 
 

@@ -1,4 +1,4 @@
-"""YAML files of data sets; numbers mean what people write.
+"""YAML files of data sets, with numbers as people mean them.
 
 PyYAML would read 010 as 8, 1:30 as 90 and 1e-3 as a word.
 """

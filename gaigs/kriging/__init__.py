@@ -1,1 +1,1 @@
-"""Kriging: Gaussian processes over links, below the models that use them."""
+"""Kriging: Gaussian processes over the places of links, for the models that use them."""

@@ -13,9 +13,9 @@ from gaigs.data import Links
 def validation_scores(
     links: Links, values: Tensor, index: Int[Tensor, " k"] | None = None
 ) -> Float[Tensor, " k"]:
-    """The task's monitored score of predictions ``values``, with its sign so that higher is better.
+    """The task's monitored score of each prediction in ``values``, negated if lower is better.
 
-    The predictions are of the validation links, or of the links ``index``.
+    The predictions are for the validation links, or for the links ``index``.
     """
     task = links.task
     labels = links.labels[links.split.validation if index is None else index]
@@ -24,10 +24,10 @@ def validation_scores(
 
 
 def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -> Tensor:
-    """weight one + (1 - weight) other, as a new tensor.
+    """The weighted mean of two predictions, weight ``one`` + (1 - weight) ``other``, a new tensor.
 
     For channels of unknown phase ``one`` is first aligned to ``other``. A prediction with a weight
-    of 0 is not read and may be None, since its NaN would spoil the sum.
+    of 0 is not read, so it may be None or NaN.
     """
     if weight in (0, 1):
         return (one if weight else other).clone()
@@ -37,10 +37,10 @@ def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -
 def is_surely_better(
     one: Float[Tensor, " k"], other: Float[Tensor, " k"], *, errors: float = 2.0
 ) -> bool:
-    """True if the mean of ``one`` is higher than the mean of ``other`` by ``errors`` standard
-    errors.
+    """True if the mean score ``one`` exceeds the mean ``other`` by ``errors`` standard errors.
 
-    The standard error is of paired differences, link by link. False for fewer than two scores.
+    Both have the scores of the same k links, and the standard error is that of the links'
+    differences. The result is False for fewer than two links.
     """
     gain = one - other
     return len(gain) > 1 and bool(gain.mean() > errors * gain.std() / math.sqrt(len(gain)))

@@ -1,4 +1,4 @@
-"""Kriged residuals of labels of many numbers: places, weights, and principal components."""
+"""Kriged residuals of labels with many values: places, weights, and principal components."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -20,13 +20,13 @@ from gaigs.kriging.posterior import Posterior
 
 
 class Field(nn.Module):
-    """The kriged residual at one receiver: places and weights of k known links.
+    """Kriging of one receiver's residuals from k known links.
 
-    Labels have many numbers, so residuals are stored as scores of q principal components.
+    Labels have many values, so residuals are stored as scores of q principal components.
     """
 
     places: Tensor  # places of the links (k, d) [m], see ``coordinates``
-    weights: Tensor  # scores of the components over the covariances of the links (k, q)
+    weights: Tensor  # inverse covariance matrix of the links times their scores (k, q)
     # Components in half precision (q, *shape), complex ones as real and imaginary part in the last
     # dimension.
     components: Tensor
@@ -63,8 +63,8 @@ class Field(nn.Module):
         shape = (len(components), *self.components.shape[1:])
         self.components = _like_loaded(self.components, components.reshape(shape))
         self._widen()
-        # Scores of the rounded components, so that each component corrects the rounding of the
-        # others: least squares, residuals = scores @ rounded.
+        # Scores are fitted to the components as rounded to half precision, by least squares of
+        # residuals = scores @ rounded. So each component corrects the rounding of the others.
         rounded = self.widened.cpu().flatten(1)  # (q, m)
         wide = torch.promote_types(rounded.dtype, torch.float64)
         gram = (rounded @ rounded.mH).to(wide)
@@ -76,7 +76,7 @@ class Field(nn.Module):
         self.signal = None
 
     def forward(self, places: Float[Tensor, "b d"], length: float, batch: Batch) -> Tensor:
-        """Kriged residuals (b, *shape) at some places, in the directions of a batch."""
+        """Kriged residuals (b, *shape) at b places, in the directions of a batch."""
         covariances = kernel(places, self.places, length)
         components = at_directions(self.widened, batch, self.scene)
         return torch.tensordot(covariances.to(self.weights) @ self.weights, components, 1)
@@ -84,13 +84,13 @@ class Field(nn.Module):
     def deviations(
         self, places: Float[Tensor, "b d"], process: Hyperparameters
     ) -> Float[Tensor, " b"]:
-        """Standard deviations of noisy labels at some places, means over a label's numbers."""
+        """Standard deviations of noisy labels at b places, averaged over the values of a label."""
         return self.size(process) * local_deviations(places, self.places, process)
 
     def size(self, process: Hyperparameters) -> Tensor:
-        """Maximum-likelihood deviation of the process, a mean over a label's numbers."""
+        """Maximum-likelihood standard deviation of the process, averaged over a label's values."""
         if self.signal is None:
-            # The mean of r' K^-1 r over numbers and links, with r the residuals of a number.
+            # The mean of r' K^-1 r over label values and links, with r the residuals of one value.
             covariances = covariance(self.places, process.length, process.nugget)
             components = self.widened.flatten(1)  # (q, m)
             products = self.weights.mH @ covariances.to(self.weights) @ self.weights  # (q, q)
@@ -114,10 +114,10 @@ class Field(nn.Module):
 
 
 class FieldPosterior(Posterior):
-    """Kriged residuals of labels of many numbers, a ``Field`` for each receiver.
+    """Kriged residuals of labels with many values, a ``Field`` for each receiver.
 
-    All receivers and numbers share hyperparameters. The trend's weight is the candidate with the
-    largest likelihood. Residuals of channels are limited, see ``damping``.
+    All receivers and label values share hyperparameters. The trend's weight is the candidate with
+    the largest likelihood. Residuals of channels are limited, see ``damping``.
 
     Spectra have ``features``, the trend's spectra on a coarse grid (``coarse``). The correlation of
     places falls with the difference of features, as at the edge of a shadow. Source: Wilson et al.,
@@ -237,8 +237,8 @@ class FieldPosterior(Posterior):
         # Over places and carriers alone: callers have no predicted spectra.
         known = field.places if not self.has_features else field.places[:, :3]
         places = scaled(known, 1 / process.scale)  # of scale 1
-        found = process.at(places, field.size(process).item() ** 2)
-        return replace(found, is_part=len(places) >= LIMIT)
+        of_labels = process.at(places, field.size(process).item() ** 2)
+        return replace(of_labels, is_part=len(places) >= LIMIT)
 
     def facts(self) -> Mapping[str, float]:
         places = [len(field.places) for field in self.fields]  # type: ignore[arg-type]
@@ -254,14 +254,14 @@ class FieldPosterior(Posterior):
 
 
 def _like_loaded(buffer: Tensor, values: Tensor) -> Tensor:
-    """Values with the memory layout of a loaded buffer: strides affect the rounding of products."""
+    """A copy of ``values`` with the strides of a loaded buffer, which affect rounding."""
     return buffer.new_empty(values.shape).copy_(values)
 
 
 def principal_components(
     residuals: Inexact[Tensor, "k m"], share: float = 2e-4, most: int = 512, exact: int = 512
 ) -> Inexact[Tensor, "q m"]:
-    """The smallest number of principal components that omit at most a fraction of the energy.
+    """Principal components, as many as needed for all but the fraction ``share`` of the energy.
 
     Each is scaled to a largest magnitude of 1. Residuals of 0 have no components.
 
@@ -269,12 +269,12 @@ def principal_components(
         residuals: Residuals of links.
         share: Largest fraction of the energy that the components omit.
         most: Largest number of components.
-        exact: Number of links, or of numbers in a label, up to which components are exact; beyond
+        exact: Number of links, or of values in a label, up to which components are exact; beyond
             it random projections are faster.
     """
     if min(residuals.shape) <= exact:
-        # By the smaller matrix of products: a decomposition of the residuals themselves takes ten
-        # times as long.
+        # Eigenvectors of the smaller Gram matrix: a singular value decomposition of the residuals
+        # takes ten times as long.
         is_flat = len(residuals) <= residuals.shape[1]
         gram = residuals @ residuals.mH if is_flat else residuals.mH @ residuals
         wide = torch.promote_types(gram.dtype, torch.float64)

@@ -40,7 +40,7 @@ class Hyperparameters(NamedTuple):
         return facts if math.isnan(self.scale) else {**facts, "frequency_scale_m": self.scale}
 
     def at(self, places: Float[Tensor, "k d"], signal: float) -> Process:
-        """The process of labels at ``places``, ``coordinates`` of scale 1; variance ``signal``."""
+        """The process with the variance ``signal`` and known ``places`` of ``scale`` 1."""
         noise = self.nugget * signal
 
         def covariances(a: Float[Tensor, "m d"], b: Float[Tensor, "n d"]) -> Float[Tensor, "m n"]:
@@ -50,8 +50,8 @@ class Hyperparameters(NamedTuple):
 
 
 FEWEST = 10
-"""Fewest validation links that choose hyperparameters, or whether paths are kriged, repeated
-readings as one: fewer ones overfit."""
+"""Fewest validation links that choose hyperparameters, or whether paths are kriged. Fewer links
+overfit. Repeated readings count as one."""
 
 
 class HeldOut(NamedTuple):
@@ -72,9 +72,9 @@ def damping(
 ) -> Float[Tensor, " k"]:
     """Factors, at most 1, by which the residuals of k channels are multiplied before kriging.
 
-    They limit the norm of a residual to ``most`` times the median norm of the known channels of its
-    receiver. Places within decimetres of a receiver exceed the limit, and so do gross errors. A
-    single one would spoil all predictions of the room.
+    They limit the norm of a residual to ``most`` times the median norm of the receiver's known
+    channels. Residuals within decimetres of a receiver exceed the limit, and so do gross errors.
+    Without the limit, one of them would spoil the predictions of the whole room.
     """
     sizes, levels = norms(residuals), norms(labels)
     factors = torch.ones_like(sizes)
@@ -101,9 +101,10 @@ def fit_hyperparameters(
     features: Callable[[Int[Tensor, " j"]], Float[Tensor, "j c"]] | None = None,
     length: float | None = None,
 ) -> tuple[Hyperparameters, float]:
-    """Hyperparameters with the largest likelihood, and their ``negative_log_likelihood``.
+    """Hyperparameters with the largest likelihood, and the ``negative_log_likelihood``.
 
-    The latter is summed over receivers, and is -inf if all residuals are 0.
+    The likelihood is that of held-out links of all receivers; -inf is returned if all residuals are
+    0.
 
     Args:
         scene: Receivers and task.
@@ -116,8 +117,8 @@ def fit_hyperparameters(
             is nearly linear within the box, and the length has no effect.
         features: Function from indices of links to their features, see ``coordinates``.
         length: A known correlation length. The other hyperparameters then minimise the squared
-            error of the held-out labels instead of maximising the likelihood: a trend was trained
-            on the training links, so the variance of their residuals is misleading.
+            error of the held-out labels. The likelihood would mislead, since the trend was trained
+            on the training links and their residuals vary too little.
     """
     longest = (scene.upper - scene.lower).max().item()
     lengths = (scene.spacing, edges * longest) if length is None else (length, length)
@@ -141,10 +142,10 @@ def fit_hyperparameters(
         return Hyperparameters(*np.exp(middle).tolist()), -math.inf
 
     def value(logarithms: Tensor) -> Tensor:
-        of_kernel = logarithms.exp()
+        hyperparameters = logarithms.exp()
         by_errors = length is not None
         parts = (
-            negative_log_likelihood(scene, held, *of_kernel, by_errors=by_errors)
+            negative_log_likelihood(scene, held, *hyperparameters, by_errors=by_errors)
             for held in held_out
         )
         return sum(parts, torch.zeros(()))
@@ -184,10 +185,10 @@ def hold_out(
 ) -> HeldOut | None:
     """At most ``most`` held-out links of one receiver, and the known links that predict them.
 
-    Validation links are held out, and training links predict them. With fewer than ``FEWEST``
-    validation links, training links are held out one by one, each with all links at its place. The
-    ``neighbours`` nearest links predict a held-out one. ``scale`` is as for ``coordinates`` [m].
-    None if all residuals are 0, or if no other place is known.
+    Each held-out link is a validation link, predicted by its ``neighbours`` nearest training links.
+    With fewer than ``FEWEST`` validation links, training links are held out one by one, each with
+    all links at its place. ``scale`` is as for ``coordinates`` [m]. The result is None if all
+    residuals are 0, or if no other place is known.
     """
     split, query = links.split, links.query
     radios = scene.radio_of(query.receivers)
@@ -210,13 +211,13 @@ def hold_out(
     around = train[apart.topk(count, largest=False).indices]  # (b, j)
     groups = torch.cat((asked[:, None], around), 1)  # (b, j + 1)
     used, place = groups.unique(return_inverse=True)
-    numbers = residuals(used)
-    numbers = numbers.to(torch.promote_types(numbers.dtype, torch.float64))
+    values = residuals(used)  # (u, m)
+    values = values.to(torch.promote_types(values.dtype, torch.float64))
     products = []
     for rows in place:
-        group = numbers[rows]  # (j + 1, m)
+        group = values[rows]  # (j + 1, m)
         products.append((group @ group.mH).real)
-    means = torch.stack(products) / numbers.shape[1]
+    means = torch.stack(products) / values.shape[1]  # (b, j + 1, j + 1)
     if not means.any():
         return None
     of_groups = None if features is None else features(used)[place]
@@ -232,11 +233,10 @@ def negative_log_likelihood(
     *,
     by_errors: bool = False,
 ) -> Float[Tensor, ""]:
-    """-2 log p(held-out labels | labels around them) without constants, averaged over a label's
-    numbers.
+    """-2 log p(held-out labels | labels around them), without constants.
 
-    The signal's variance is the maximum-likelihood value at the receiver. With ``by_errors`` all
-    held-out labels have one variance.
+    It is an average over the values of a label. The signal's variance is the maximum-likelihood
+    value at the receiver. With ``by_errors`` all held-out labels have one variance.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """
@@ -265,7 +265,7 @@ def local_deviations(
     process: Hyperparameters,
     neighbours: int = 64,
 ) -> Float[Tensor, " b"]:
-    """Standard deviations of noisy labels at ``asked`` places, over the signal's.
+    """Standard deviations of noisy labels at ``asked`` places, relative to that of the signal.
 
     They are conditional on the ``neighbours`` nearest known places. All places are ``coordinates``.
     """

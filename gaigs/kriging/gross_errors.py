@@ -1,4 +1,4 @@
-"""Received levels with gross errors, which contradict the levels around them."""
+"""Detection of received levels with gross errors, which contradict the levels around them."""
 
 import math
 from dataclasses import replace
@@ -13,16 +13,15 @@ from gaigs.kriging.links import coordinates, distances
 
 
 def without_gross_errors(links: Links, size: float = 6.0) -> Links:
-    """The links without known levels that have a gross error, since one such error spoils a whole
-    fit.
+    """A copy of the links in which known levels with gross errors are removed from the split.
 
-    Labels are scalars. Levels follow a law: a line over the logarithm of the distance to the
-    receiver, fitted with Cauchy's weights, so that a few wrong levels do not move it. A level is
-    removed if its error about the law exceeds ``size`` standard deviations, and also differs by
-    this much from the errors of the five nearest levels at its receiver. Errors that neighbours
-    share, or that more than one level in twenty has, are effects of the room and stay. The standard
+    Labels are scalars. One gross error may spoil a whole fit. The expected level is a line over the
+    logarithm of the distance to the receiver, fitted robustly (``errors_of_law``). A level is
+    removed if its error exceeds ``size`` standard deviations, and also differs by this much from
+    the errors of the five nearest levels at its receiver. Errors that neighbours share, or that
+    more than one level in twenty has, are effects of the room; such levels stay. The standard
     deviation is 1.48 times the median error of the receiver or of all receivers, whichever is
-    larger, and at least 1 dB. With fewer than 20 known links all stay.
+    larger, and at least 1 dB. With fewer than 20 known links nothing is removed.
 
     Source: Maronna, Martin and Yohai, Robust Statistics, 2006, sections 4.4 and 5.2.
     """
@@ -59,10 +58,10 @@ def are_alone(
     threshold: Float[Tensor, ""],
     neighbours: int = 5,
 ) -> Bool[Tensor, " k"]:
-    """True for errors above ``threshold`` that also differ by more than it from all errors nearby.
+    """True for errors above ``threshold`` that also differ by more than it from their neighbours'.
 
-    Nearby are the nearest ``neighbours`` places. If more than one error in twenty would be True,
-    all are False: such a number is an effect of the room.
+    Neighbours are the ``neighbours`` nearest places. If more than one error in twenty would be
+    True, all are False, since so many are an effect of the room.
     """
     is_alone = torch.zeros_like(errors, dtype=torch.bool)
     large = (errors.abs() > threshold).nonzero()[:, 0]
@@ -80,9 +79,9 @@ def are_alone(
 
 
 def errors_of_law(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-    """Levels minus a line over ``decades``, log10 of distances, fitted with Cauchy's weights.
+    """Levels minus a line over ``decades``, the log10 of distances.
 
-    Few levels with gross errors hardly move the line.
+    The line is fitted with Cauchy's weights, so a few gross errors hardly move it.
     """
     weights = torch.ones_like(levels)
     for _ in range(20):
@@ -97,5 +96,5 @@ def errors_of_law(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> 
 
 
 def robust_deviation(errors: Float[Tensor, " k"]) -> Float[Tensor, ""]:
-    """Standard deviation of normal errors, from their median magnitude; at least 1."""
+    """Standard deviation estimated as 1.48 times the median magnitude of errors; at least 1."""
     return (1.4826 * errors.abs().median()).clamp_min(1.0)

@@ -1,6 +1,6 @@
 """Kernels of Gaussian processes, and kriging weights with their variance.
 
-Labels of many numbers and paths use ``kernel``, scalar labels ``matern``.
+Labels with many values and paths use ``kernel``, scalar labels ``matern``.
 """
 
 import math
@@ -29,10 +29,10 @@ class Process:
     def whitened(
         self, asked: Float[Tensor, "g d"], rows: Int[Tensor, " j"] | slice = slice(None)
     ) -> tuple[Float[Tensor, "j g"], Float[Tensor, "j j"]]:
-        """Whitened covariances L^-1 C, and L.
+        """Whitened covariances L^-1 C, and the Cholesky factor L.
 
-        C are covariances of readings with places, L L' covariances among readings. The known
-        readings lower the variance at a place by the sum of squares of its column in L^-1 C.
+        C has the covariances of readings with places; L L' is the covariance matrix of the noisy
+        readings. They lower the variance at a place by the sum of squares of its column in L^-1 C.
 
         Args:
             asked: Places, ``coordinates`` of scale 1 [m].
@@ -54,14 +54,14 @@ def resize(module: nn.Module, state: Mapping[str, Tensor], prefix: str, *names: 
 
 
 LIMIT = 6000
-"""Most known links of a receiver that enter one covariance matrix, for memory's sake."""
+"""Largest number of a receiver's known links in one covariance matrix, to limit memory."""
 
 SMOOTHNESSES = (0.5, 1.5)
-"""Kernels of ``matern`` that the process of one number chooses from."""
+"""Values of ``smoothness`` in ``matern`` that are tried for scalar labels."""
 
 
 def matern(apart: Tensor, length: Tensor, smoothness: float) -> Tensor:
-    """Matern correlation of places at distances ``apart`` [m], of smoothness 1/2 or 3/2.
+    """Matern correlation, of smoothness 1/2 or 3/2, at the distances ``apart`` [m].
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, equations 4.16
     and 4.17.
@@ -83,12 +83,12 @@ def matern_slope(correlation: Tensor, apart: Tensor, length: Tensor, smoothness:
 def kernel(
     a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"], length: float | Tensor
 ) -> Float[Tensor, "*c m n"]:
-    """Covariances exp(-d / length) of places ``a`` and ``b`` [m], over the signal's variance."""
+    """Correlations exp(-d / length) of places ``a`` and ``b`` at the distance d [m]."""
     return (distances(a, b) / -length).exp_()
 
 
 def covariance(places: Float[Tensor, "k d"], length: float, nugget: float) -> Float[Tensor, "k k"]:
-    """Covariances of noisy labels over the signal's variance; arguments of ``kriging_weights``."""
+    """Covariances of noisy labels over the signal's variance; arguments as ``kriging_weights``."""
     covariances = kernel(places, places, length)
     covariances.diagonal().add_(nugget)
     return covariances

@@ -12,34 +12,30 @@ from gaigs.kriging.neighbours import Around
 
 
 class Choice(NamedTuple):
-    """Kernel and noise of a process.
+    """Kernel and noise of a process."""
 
-    The fields are smoothness of the kernel, degrees of freedom of the noise (inf: normal), scale of
-    carriers [m] or NaN, and True if length and noise differ from place to place.
-    """
-
-    smoothness: float = 0.5
-    degrees: float = math.inf
-    scale: float | Tensor = math.nan
-    is_local: bool = False
+    smoothness: float = 0.5  # of the kernel, see ``matern``
+    degrees: float = math.inf  # degrees of freedom of the noise; inf is normal noise
+    scale: float | Tensor = math.nan  # of carriers, see ``coordinates`` [m]; NaN for one carrier
+    is_local: bool = False  # True if length and noise differ from place to place
 
 
 class Conditional(NamedTuple):
-    """Means and variances of the process at places (m,), given the readings around."""
+    """Prediction of the process at m places, given j readings around each."""
 
     means: Float[Tensor, " m"]
     variances: Float[Tensor, " m"]
-    errors: Float[Tensor, "m i"]  # weights of the readings, and -1 of the place (m, j + 1)
-    solved: Float[Tensor, "m i"]  # readings over their covariances, and 0 of the place (m, j + 1)
+    errors: Float[Tensor, "m i"]  # kriging weights of the readings, then -1 (m, j + 1)
+    solved: Float[Tensor, "m i"]  # inverse covariance matrix times readings, then 0 (m, j + 1)
 
 
 def covariances(
     around: Around, hyperparameters: Float[Tensor, "r 3"], choice: Choice
 ) -> Float[Tensor, "m i i"]:
-    """Covariances of the process z at the readings around each place, and at the place itself.
+    """Covariances of the process z among the readings around each place and the place itself.
 
-    ``hyperparameters`` are length, deviation of the signal and deviation of the noise, at each
-    receiver.
+    ``hyperparameters`` are correlation length, standard deviation of the signal, and standard
+    deviation of the noise, at each receiver.
     """
     of_places = hyperparameters[around.receivers][..., None, None]  # (m, 3, 1, 1)
     length, signal, _ = of_places.unbind(1)
@@ -47,7 +43,7 @@ def covariances(
 
 
 def separations(around: Around, choice: Choice) -> Float[Tensor, "m i i"]:
-    """Distances in place and carrier, from ``coordinates``."""
+    """Distances that include the difference of carriers, as between ``coordinates``."""
     if around.bands is None:
         return around.apart
     return (around.apart.square() + choice.scale**2 * around.bands).sqrt()
@@ -56,11 +52,11 @@ def separations(around: Around, choice: Choice) -> Float[Tensor, "m i i"]:
 def conditional(
     between: Float[Tensor, "m i i"], values: Float[Tensor, "m j"], variances: Float[Tensor, "m j"]
 ) -> Conditional:
-    """Means and variances of z at places, given the readings around and their noise variances.
+    """Means and variances of z at places, given the readings y around each place.
 
-    ``between`` are ``covariances``. The mean is w'y, and the variance k - 2 w'c + w'(C + N) w. y
-    are the readings, N the variances of their noise, and C, c and k the covariances among readings,
-    with the place and at the place. The weights w = (C + N)^-1 c minimise the variance.
+    The mean is w'y, and the variance k - 2 w'c + w'(C + N) w. C, c and k are the covariances of z
+    among the readings, between readings and place, and at the place, all from ``between``. N has
+    the noise ``variances`` of the readings. The weights w = (C + N)^-1 c minimise the variance.
     """
     noisy = between[:, :-1, :-1] + torch.diag_embed(variances)
     towards = between[:, :-1, -1]  # c (m, j)
@@ -83,10 +79,10 @@ def slopes(
     of_mean: Float[Tensor, " m"],
     of_variance: Float[Tensor, " m"],
 ) -> Float[Tensor, "m 4"]:
-    """Derivatives of a cost by logarithms of length, signal, readings' noise and carriers' scale.
+    """Derivatives of a cost by the logarithms of length, signal, noise and scale of carriers.
 
-    The weights minimise the variance. So a change dC of all covariances changes the variance by e'
-    dC e and the mean by -e' dC s, with ``errors`` e and ``solved`` s of ``solution``.
+    A change dC of all covariances changes the variance by e' dC e and the mean by -e' dC s, with
+    ``errors`` e and ``solved`` s of ``solution``, since the weights minimise the variance.
 
     Args:
         around, hyperparameters, choice, between, variances: As for ``covariances`` and
@@ -118,7 +114,7 @@ def expected_factors(
     degrees: float,
     rounds: int = 3,
 ) -> Float[Tensor, "m j"]:
-    """Expected variance of each reading's noise over ``noises``, by Student's t.
+    """Expected variance of each reading's noise over ``noises``, if noise has Student's t.
 
     Only the readings around a place are used; the held-out reading there must have no influence.
 
@@ -137,7 +133,7 @@ def expected_factors(
         variances = noises * factors
         inverse = torch.linalg.inv(between + torch.diag_embed(variances))
         solved = (inverse @ values[..., None])[..., 0]  # (m, j)
-        # Expected square of the noise: of its mean, and its variance given the readings.
+        # Expected square of the noise given the readings: square of its mean, plus its variance.
         diagonal = inverse.diagonal(dim1=1, dim2=2)
         squares = (variances * solved).square() + variances - variances.square() * diagonal
         factors = (degrees + squares / noises) / (degrees + 1)
@@ -150,12 +146,13 @@ def log_density(
     noises: Float[Tensor, " m"],
     degrees: float,
 ) -> Float[Tensor, " m"]:
-    """log p of errors, each the sum of a normal variable and of noise.
+    """log p of errors that are the sum of a normal variable and of noise.
 
     The normal variable has the ``variances``. The noise has Student's t with ``degrees`` of freedom
-    and the squared scale ``noises``; infinite ``degrees`` make it normal. Student's t is a mixture
-    of normal distributions, whose precision times ``noises`` is a gamma variable. The trapezoidal
-    rule over its logarithm is exact to 1e-3 up to a hundred standard deviations.
+    and the squared scale ``noises``; with infinite ``degrees`` it is normal. Student's t is a
+    mixture of normal distributions whose precision, times ``noises``, is a gamma variable. The
+    mixture is integrated by the trapezoidal rule over the logarithm of the precision. The result is
+    exact to 1e-3 up to a hundred standard deviations.
     """
     if math.isinf(degrees):
         return _log_normal(errors, variances + noises)

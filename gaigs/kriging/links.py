@@ -16,7 +16,7 @@ from gaigs.core.scene import Scene
 from gaigs.data import Links
 
 PART = 256
-"""Labels held in memory at a time: a spectrum takes 130 KB."""
+"""Number of labels held in memory at a time; a spectrum takes 130 KB."""
 
 
 def known_links(links: Links, any_receiver: bool = False) -> list[Int[Tensor, " k"]]:
@@ -59,7 +59,7 @@ def limit_known(links: Links, most: int) -> Links:
 
 
 def folds_of(links: Links, index: Int[Tensor, " k"], count: int = 10) -> Int[Tensor, " k"]:
-    """Random fold, from 0, of some links; a group of the split, or a place, is never divided."""
+    """Random fold, from 0, of each link ``index``; links of a group or place share a fold."""
     groups = links.split.groups
     if groups is None:
         groups = place_numbers(links.query.transmitters[index])
@@ -77,7 +77,7 @@ def place_numbers(places: Float[Tensor, "k 3"]) -> Int[Tensor, " k"]:
 
 
 def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]:
-    """One random link of each place, receiver and carrier: errors of repetitions are similar."""
+    """One random link for each place, receiver and carrier, since repeated readings err alike."""
     if not len(index):
         return index
     _, which = links.query[index].unique(with_receivers=True)
@@ -89,12 +89,12 @@ def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]
 def coordinates(
     scene: Scene, query: Query, scale: float | Tensor, features: Float[Tensor, "b c"] | None = None
 ) -> Float[Tensor, "b d"]:
-    """Points (float64) whose Euclidean distance d is the distance of links.
+    """Coordinates of links (float64): the distance of two links is the Euclidean distance D.
 
-    d² = |dx|² + (scale d ln f)² for a difference dx of transmitters [m] and the carrier f. With
-    ``one_radio`` |dx|² includes both ends. ``scale`` [m] is used only if the training links have
-    several carriers, or if links have ``features``. With features d² = |dx|² + (scale |d
-    features|)².
+    With a difference dx of the transmitters [m] and df of ln(carrier), D² = |dx|² + (scale df)².
+    With ``one_radio`` |dx|² includes both ends. With ``features`` df is their difference instead.
+    ``scale`` [m] is used only if the training links have several carriers, or if there are
+    features.
     """
     positions = query.transmitters.double()
     if scene.one_radio:
@@ -109,12 +109,12 @@ def coordinates(
 
 
 def coarse(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b c"]:
-    """Means of spectra over 3 x 8 parts, in double precision: an array resolves little more."""
+    """Means of spectra over 3 x 8 parts, float64; an array hardly resolves more parts."""
     return functional.adaptive_avg_pool2d(spectra[:, None], (3, 8)).flatten(1).double()
 
 
 def scaled(places: Float[Tensor, "k d"], scale: float) -> Float[Tensor, "k d"]:
-    """``coordinates`` of a scale, from coordinates of scale 1."""
+    """``coordinates`` with another ``scale``, from coordinates with scale 1."""
     ends = edges_of(places)
     return torch.cat((places[:, :ends], scale * places[:, ends:]), 1)
 
@@ -125,21 +125,21 @@ def edges_of(places: Float[Tensor, "*k d"]) -> int:
 
 
 def distances(a: Float[Tensor, "*c m d"], b: Float[Tensor, "*c n d"]) -> Float[Tensor, "*c m n"]:
-    """Distances of all pairs [m], by differences: products would separate equal places."""
+    """Distances of all pairs [m]; by differences, so that they are 0 for equal places."""
     return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
 
 
 class Near(NamedTuple):
-    """The known places nearest to some places, nearest first."""
+    """The j known places nearest to each of m places, nearest first."""
 
     apart: Float[Tensor, "m j"]  # [m]
-    rows: Int[Tensor, "m j"]  # of known places
+    rows: Int[Tensor, "m j"]  # numbers of the known places
 
 
 def nearest_places(asked: Float[Tensor, "m d"], known: Float[Tensor, "k d"], count: int) -> Near:
-    """The ``count`` nearest known places, or all if there are fewer; by a k-d tree."""
+    """The ``count`` nearest known places of each asked place, or all if there are fewer."""
     count = min(count, len(known))
-    # Splits in the middle of a box stay fast where a place is measured often.
+    # A k-d tree split at the middles of boxes stays fast if a place is measured often.
     tree = cKDTree(known.double().cpu().numpy(), balanced_tree=False)
     apart, rows = tree.query(
         asked.double().cpu().numpy().reshape(-1, known.shape[1]), k=[*range(1, count + 1)]

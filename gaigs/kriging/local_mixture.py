@@ -19,16 +19,16 @@ class MixtureOptions:
     """Candidates of ``LocalMixture``, and their prior.
 
     Attributes:
-        neighbours: Readings around a place that weight its candidates. Fewer say little on a
-            length, more are no longer near.
+        neighbours: Number of readings around a place that weight its candidates. Fewer hardly
+            determine a length, and more are no longer near.
         lengths: Logarithms of the candidates' lengths over the mean length of the receivers.
         ratios: Logarithms of their ratios of noise to signal over the mean ratio of the receivers.
             The prior deviation about the receiver's ratio is 1.
         scatter: Prior deviation of the logarithm of the length about the receiver's length.
-        degrees: Readings that the receiver's own variance counts as, beside those around.
+        degrees: Weight of the receiver's variance in the prior [readings].
         errors: Least gain of the held-out log likelihood over one process everywhere
             [standard errors].
-        size: Places whose matrices are held in memory at a time.
+        size: Number of places whose matrices are held in memory at a time.
     """
 
     neighbours: int = 48
@@ -41,18 +41,18 @@ class MixtureOptions:
 
 
 class LocalMixture(NamedTuple):
-    """Readings at m places as a mixture of g Student's t, one for each length and noise.
+    """Distribution of a reading at each of m places: a mixture of g Student's t distributions.
 
-    Beside a mast, in a street and in a field shadows differ in length and size, and readings in
-    their noise. So z and noise around a place have a length, a ratio of noise to signal and a
-    variance of their own. The variance has an inverse gamma prior and is integrated out; length
-    and ratio are averaged over candidates, weighted by the likelihood of the readings around.
+    Shadows beside a mast, in a street and in a field differ in length and depth, and readings
+    differ in noise. So the length, the ratio of noise to signal, and the variance change from place
+    to place. The variance has an inverse gamma prior and is integrated out. Lengths and ratios are
+    g candidates, weighted by the likelihood of the readings around the place.
 
     Source: Hoeting et al., Bayesian model averaging: a tutorial, 1999; Shah, Wilson and
     Ghahramani, Student-t processes as alternatives to Gaussian processes, 2014.
     """
 
-    logarithms: Float[Tensor, "m g"]  # of the weights, whose sum is 1
+    logarithms: Float[Tensor, "m g"]  # logarithms of the candidates' weights, whose sum is 1
     means: Float[Tensor, "m g"]
     squares: Float[Tensor, "m g"]  # squared scales
     degrees: Float[Tensor, "m 1"]  # degrees of freedom
@@ -66,7 +66,7 @@ class LocalMixture(NamedTuple):
     def variance(self) -> Float[Tensor, " m"]:
         """Variances of the readings."""
         spread = (self.means - self.mean[:, None]).square()
-        # More than two degrees of freedom have a variance.
+        # A variance exists only with more than two degrees of freedom.
         within = self.squares * self.degrees / (self.degrees - 2).clamp_min(0.5)
         return (self.logarithms.exp() * (within + spread)).sum(1)
 
@@ -80,7 +80,7 @@ class LocalMixture(NamedTuple):
 
 
 class LocalMixtures(NamedTuple):
-    """What mixtures at places are made from."""
+    """Known readings and hyperparameters, from which mixtures at places are computed."""
 
     readings: Readings
     values: Float[Tensor, " k"]  # known readings, residuals of a trend
@@ -95,7 +95,7 @@ class LocalMixtures(NamedTuple):
         own: Int[Tensor, " m"] | None = None,
         folds: Int[Tensor, " k"] | None = None,
     ) -> LocalMixture:
-        """Mixtures at places, without the readings of their ``own`` fold."""
+        """Mixtures at places; readings in a place's ``own`` fold are not used for it."""
         readings = self.readings._replace(count=self.options.neighbours)
         nearest, sets = self._in_order(readings.nearest(places, receivers, own, folds))
         order = sets.argsort()
@@ -107,8 +107,10 @@ class LocalMixtures(NamedTuple):
         return LocalMixture(*(torch.cat(field)[back] for field in zip(*parts, strict=True)))
 
     def _in_order(self, nearest: Nearest) -> tuple[Nearest, Int[Tensor, " m"]]:
-        """The readings around each place in an order that does not depend on the place, and a
-        number of their set of places: receivers that hear the same places have the same sets.
+        """Readings around each place in an order of their own, and a hash of their places.
+
+        Sets of readings at the same places have the same order and hash, for any receiver, and so
+        can share matrices.
         """
         bits = self.readings.places.contiguous().view(torch.int64)  # (k, d)
         # A hash of each reading's place; past 64 bits it wraps. That of the origin is not 0 either.
@@ -128,13 +130,19 @@ class LocalMixtures(NamedTuple):
         nearest: Nearest,
         sets: Int[Tensor, " m"],
     ) -> LocalMixture:
+        """Mixtures at m places from the readings y around each, sorted by their ``sets``.
+
+        A candidate has the matrix K = correlations + ratio I of readings and the correlations c
+        with the place. With the Cholesky factor K = L L', the mean is (L^-1 c)' (L^-1 y), and the
+        variance is 1 + ratio - |L^-1 c|², times a scale that y and the prior determine.
+        """
         options, scale = self.options, self.choice.scale
         points = scaled(self.readings.places, scale)[nearest.rows]  # (m, j, d)
         near = (points - scaled(places, scale)[:, None]).norm(dim=2)  # (m, j)
-        # What does not exist correlates with nothing, not even with itself.
+        # Missing readings correlate with nothing, not even with themselves.
         near = near.where(nearest.exists, 1e15)
-        # Places with the same readings around share matrices and factors, as the candidates are the
-        # same at all receivers.
+        # Places with the same readings around share the factors L; candidates are the same at all
+        # receivers.
         _, which = sets.unique_consecutive(return_inverse=True)
         first = torch.searchsorted(which, which.unique())
         pairs = nearest.exists[first, :, None] & nearest.exists[first, None]
@@ -144,7 +152,7 @@ class LocalMixtures(NamedTuple):
         lengths, signals, noises = self.logarithms[receivers].unbind(1)
         total = (2 * signals).exp() + (2 * noises).exp()
         middle = self.logarithms[:, 0].mean()
-        own_ratios = 2 * (noises - signals)  # logarithms
+        receiver_ratios = 2 * (noises - signals)  # (m,) logarithms
         middle_ratio = 2 * (self.logarithms[:, 2] - self.logarithms[:, 1]).mean()
         logarithms, means, squares = [], [], []
         for step in options.lengths:
@@ -158,20 +166,20 @@ class LocalMixtures(NamedTuple):
                 noise = ratio * torch.eye(values.shape[1]).to(values)
                 factor = torch.linalg.cholesky(correlations + noise)  # (u, j, j)
                 white = torch.linalg.solve_triangular(factor[which], both, upper=False)
-                towards, rotated = white.unbind(2)  # (m, j)
-                # The receiver's variance of readings divides into signal and noise.
-                own = options.degrees * total / (1 + ratio)
-                energy = own + rotated.square().sum(1)
+                towards, rotated = white.unbind(2)  # (m, j), L^-1 c and L^-1 y
+                # The receiver's variance of readings is the prior mean of signal plus noise.
+                prior_energy = options.degrees * total / (1 + ratio)
+                energy = prior_energy + rotated.square().sum(1)
                 determinant = 2 * factor.diagonal(dim1=1, dim2=2).log().sum(1)[which]
-                # Readings that do not exist have a factor of the noise alone.
+                # Missing readings add the noise alone to the determinant.
                 determinant = determinant - (values.shape[1] - counts) * logarithm
-                likelihood = options.degrees * own.log() - determinant
+                likelihood = options.degrees * prior_energy.log() - determinant
                 likelihood = likelihood - (options.degrees + counts) * energy.log()
-                off = (logarithm - own_ratios).square() / 2
-                logarithms.append(likelihood / 2 - prior - off)
+                ratio_prior = (logarithm - receiver_ratios).square() / 2
+                logarithms.append(likelihood / 2 - prior - ratio_prior)
                 means.append((towards * rotated).sum(1))
-                left = 1 + ratio - towards.square().sum(1)
-                squares.append(left * energy / (options.degrees + counts))
+                variance = 1 + ratio - towards.square().sum(1)  # over the signal's
+                squares.append(variance * energy / (options.degrees + counts))
         weights = torch.stack(logarithms, 1).log_softmax(1)
         degrees = (options.degrees + counts)[:, None]
         return LocalMixture(weights, torch.stack(means, 1), torch.stack(squares, 1), degrees)

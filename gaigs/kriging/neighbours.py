@@ -1,4 +1,4 @@
-"""Known readings around places. The nearest ones screen those behind them."""
+"""Known readings around places. The nearest readings make farther ones nearly irrelevant."""
 
 import math
 from typing import NamedTuple
@@ -14,15 +14,16 @@ from gaigs.kriging.links import Near, distances, edges_of, nearest_places, scale
 
 
 class Nearest(NamedTuple):
-    """Rows of known readings near each of m places."""
+    """Rows of the j known readings nearest to each of m places."""
 
     rows: Int[Tensor, "m j"]  # rows of the readings
     exists: Bool[Tensor, "m j"]  # False beyond a receiver's readings
 
 
 class Around(NamedTuple):
-    """The nearest readings of the same receiver around each of m asked places; the place itself
-    comes last.
+    """The j nearest readings of the same receiver around each of m asked places.
+
+    In ``apart`` and ``bands`` the asked place itself comes last.
     """
 
     rows: Int[Tensor, "m j"]  # rows of the readings
@@ -37,14 +38,14 @@ class Around(NamedTuple):
 
 
 class HeldOutReadings(NamedTuple):
-    """Rows of held-out readings (m,), and the readings of other folds around them."""
+    """Rows of held-out readings, and the readings of other folds around each."""
 
     rows: Int[Tensor, " m"]
     around: Around
 
 
 class Readings(NamedTuple):
-    """Known readings, and the number of them that count as around a place."""
+    """Known readings, with a search for the nearest readings of a place."""
 
     scene: Scene  # receivers and carriers
     places: Float[Tensor, "k d"]  # places, see ``coordinates`` of scale 1
@@ -67,17 +68,17 @@ class Readings(NamedTuple):
             places, receivers: Asked places, ``coordinates`` of scale 1, and their receivers.
             own: Fold of each asked place, whose readings are left out; None: no folds.
             folds: Folds of the known readings.
-            reach: True to choose half of the readings at growing distances: near ones alone say
-                little on correlation lengths. It acts with folds.
-            size: Places whose neighbours are held in memory at a time.
-            most: With folds, readings of a receiver that are searched, evenly chosen.
+            reach: True to choose half of the readings at growing distances, since near ones alone
+                hardly determine correlation lengths. Used only with folds.
+            size: Number of places whose neighbours are held in memory at a time.
+            most: With folds, number of a receiver's readings that are searched, evenly chosen.
 
         Source: Stein, Chi and Welty, Approximating likelihoods for large spatial data sets, 2004.
         """
         rows = receivers.new_zeros(len(places), self.count)
         exists = torch.zeros_like(rows, dtype=torch.bool)
-        # Among carriers the nearest readings are those of a middle scale, so that they stay the
-        # same during a fit.
+        # With several carriers a middle scale decides which readings are nearest, so that they stay
+        # the same during a fit of the scale.
         scale = math.nan
         if self.scene.has_band:
             scale = math.sqrt(math.prod(scale_bounds(self.scene)))
@@ -89,12 +90,12 @@ class Readings(NamedTuple):
             asked_rows = (receivers == receiver).nonzero()[:, 0]
             if own is None or folds is None:
                 ends = scaled(places[asked_rows], scale), scaled(self.places[known], scale)
-                # One search for all receivers that hear the same places.
+                # One search for all receivers with readings at the same places.
                 if last is None or not all(map(torch.equal, ends, last)):
                     last = (*ends, nearest_places(*ends, self.count))
-                found = last[2].rows.shape[1]
-                rows[asked_rows, :found] = known[last[2].rows]
-                exists[asked_rows, :found] = True
+                nearest_rows = last[2].rows  # (a, j)
+                rows[asked_rows, : nearest_rows.shape[1]] = known[nearest_rows]
+                exists[asked_rows, : nearest_rows.shape[1]] = True
                 continue
             known = evenly(known, most)
             known_places = scaled(self.places[known], scale)
@@ -115,7 +116,7 @@ class Readings(NamedTuple):
         return Nearest(rows, exists)
 
     def _far_ranks(self, farthest: int) -> Int[Tensor, " j"]:
-        """Ranks by distance: the nearest half, and a geometric series up to the farthest."""
+        """Ranks by distance of ``count`` readings: the nearest half, then a geometric series."""
         half = self.count // 2
         far = torch.from_numpy(np.geomspace(half, farthest - 1, half)).round().long()
         return torch.cat((torch.arange(half), far))
@@ -137,11 +138,10 @@ class Readings(NamedTuple):
     def held_out(
         self, rows: Int[Tensor, " h"], folds: Int[Tensor, " k"], most: int
     ) -> HeldOutReadings:
-        """Held-out readings, evenly chosen from ``rows``, and the readings of other folds around
-        each.
+        """Held-out readings, evenly chosen from ``rows``, with readings of other folds around each.
 
-        All receivers together have about ``most``. A receiver has at least 16, unless the sum would
-        then exceed four times ``most``.
+        About ``most`` are chosen for all receivers together. Each receiver has at least 16, unless
+        the sum would then exceed four times ``most``.
         """
         receivers = self.receivers[rows].unique()
         each = max(1, most // len(receivers), min(16, 4 * most // len(receivers)))

@@ -1,4 +1,4 @@
-"""Levels beyond the logarithm of the distance: a break point, an antenna's lobes, and heights."""
+"""Terms of path loss beside the logarithm of the distance: break point, antenna lobes, height."""
 
 import logging
 from collections.abc import Mapping
@@ -21,13 +21,13 @@ class TermOptions:
     """Options of ``PathTerms``."""
 
     names: tuple[str, ...] = ("break point", "lobes", "height")  # of the terms
-    # Largest harmonic of the azimuth: lobes of 60 degrees and wider, as of sectors.
+    # Largest harmonic of the azimuth: lobes of 60 degrees and wider, as sector antennas have.
     harmonics: int = 6
-    breaks: int = 15  # candidates of a break point, quantiles of a receiver's distances
+    breaks: int = 15  # number of break points tried, at quantiles of a receiver's distances
     # Prior deviation of the change of slope at a break point, over the deviation of the levels
     # about their law [1 / decade].
     slope: float = 5.0
-    alike: float = 10.0  # readings that count as one: neighbours share their shadows
+    alike: float = 10.0  # number of readings that count as one, since neighbours share shadows
     errors: float = 3.0  # least fall of the held-out error by a term [standard errors]
     least: float = 0.01  # least fall over the error itself: a smaller one is not worth a term
 
@@ -36,9 +36,9 @@ class Solution(NamedTuple):
     """Coefficients of n terms, fitted once for each fold from the readings outside of it.
 
     Attributes:
-        coefficients: Coefficients without each fold.
-        variances: Their squared standard errors over the variance of a reading.
-        numbers: Chosen break point without each fold, an index into the candidates.
+        coefficients: Coefficients from the readings outside of each fold.
+        variances: Squared standard errors of the coefficients over the variance of a reading.
+        numbers: Index of the break point chosen for each fold, among the candidates.
     """
 
     coefficients: Float[Tensor, "f n"]
@@ -64,13 +64,13 @@ class PathTerms(nn.Module):
 
     used: Tensor  # True for terms in use, in the order of ``options.names`` (3,)
     breaks: Tensor  # log10 of the distance d0 of each receiver (r,)
-    regions: Tensor  # deviation of each receiver's place (r,) [m], as of ``path_loss``
+    regions: Tensor  # standard deviation of each receiver's position (r,) [m], as in ``path_loss``
     # c0, c1, a_1, b_1, a_2 .. c5 of each receiver (r, n).
     coefficients: Tensor
     deviations: Tensor  # their standard errors (r, n)
-    # Errors of the links of ``fit``, without the terms that saw their fold (n,); None before.
+    # Errors of the links of ``fit``, with terms fitted without each link's fold (n,); None before.
     unseen: Tensor | None = None
-    added: str | None = None  # what ``fit`` added, with held-out errors; None: nothing
+    added: str | None = None  # terms that ``fit`` added, with held-out errors; None: no term
     options = TermOptions()
     of_receivers = ("breaks", "coefficients", "deviations")
 
@@ -95,10 +95,10 @@ class PathTerms(nn.Module):
         return (columns * self.coefficients[radios]).sum(1).to(transmitters)
 
     def fit(self, links: Links, errors: Float[Tensor, " k"], chooses: bool) -> None:
-        """Fits the coefficients to ``errors`` of a law at the known links.
+        """Fits the coefficients to ``errors``, the residuals of a path-loss law at known links.
 
-        With ``chooses`` the terms are chosen first. A receiver without links gets the others'
-        means.
+        With ``chooses`` the terms are chosen first. A receiver without links gets the means of the
+        other receivers' coefficients.
         """
         if links.uncertainties is not None:
             self.regions.copy_(links.uncertainties)
@@ -139,7 +139,7 @@ class PathTerms(nn.Module):
         errors: Float[Tensor, " k"],
         folds: Int[Tensor, " k"],
     ) -> None:
-        """Adds terms one by one, while the error of held-out places falls clearly."""
+        """Adds terms one by one, while the error of held-out places falls significantly."""
         self.used.zero_()
         self.added = None
         _, places, counts = transmitters.unique(dim=0, return_inverse=True, return_counts=True)
@@ -150,18 +150,18 @@ class PathTerms(nn.Module):
             for number in (~self.used).nonzero()[:, 0].tolist():
                 used = self.used.index_fill(0, torch.tensor(number), True)
                 trials.append((self._held_out(transmitters, receivers, errors, folds, used), used))
-            left, used = min(trials, key=lambda trial: trial[0].abs().mean().item())
-            falls = self.unseen.abs() - left.abs()
-            # Readings at one place err together: their mean counts.
+            held_out, used = min(trials, key=lambda trial: trial[0].abs().mean().item())
+            falls = self.unseen.abs() - held_out.abs()
+            # Errors of readings at one place are similar, so each place counts by its mean.
             of_places = falls.new_zeros(len(counts)).index_add(0, places, falls) / counts
             chance = of_places.std() / len(counts) ** 0.5
             is_clear = of_places.mean() > self.options.errors * chance
             if not is_clear or falls.mean() < self.options.least * self.unseen.abs().mean():
                 return
             self.used.copy_(used)
-            self.unseen = left
-            held_out = f"{errors.abs().mean():.2f} -> {left.abs().mean():.2f}"
-            self.added = f"{self.facts()['terms']}; held-out error {held_out}"
+            self.unseen = held_out
+            change = f"{errors.abs().mean():.2f} -> {held_out.abs().mean():.2f}"
+            self.added = f"{self.facts()['terms']}; held-out error {change}"
 
     def _held_out(
         self,
@@ -171,8 +171,8 @@ class PathTerms(nn.Module):
         folds: Int[Tensor, " k"],
         used: Bool[Tensor, " t"],
     ) -> Float[Tensor, " k"]:
-        """Errors after the ``used`` terms, which are fitted without the reading's fold."""
-        left = errors.clone()
+        """Errors of readings after correction by terms that were fitted without their fold."""
+        corrected = errors.clone()
         radios = self.scene.radio_of(receivers)
         for radio in radios.unique().tolist():
             rows = radios == radio
@@ -181,9 +181,9 @@ class PathTerms(nn.Module):
             if not fold.any():
                 continue  # no other fold
             solution = self._solve(columns, errors[rows], fold, used)
-            shown = self._shown(solution.numbers[fold])  # (k, n)
-            left[rows] -= (columns.gather(1, shown) * solution.coefficients[fold]).sum(1)
-        return left
+            chosen = self._columns_with_break(solution.numbers[fold])  # (k, n)
+            corrected[rows] -= (columns.gather(1, chosen) * solution.coefficients[fold]).sum(1)
+        return corrected
 
     def _solve(
         self,
@@ -192,11 +192,14 @@ class PathTerms(nn.Module):
         folds: Int[Tensor, " k"],
         used: Bool[Tensor, " t"],
     ) -> Solution:
-        """Likeliest coefficients without each fold, at the best break point; one fold is kept."""
+        """Coefficients fitted to the readings outside of each fold, at the best break point.
+
+        A single fold is fitted to its own readings.
+        """
         both = torch.cat((columns, levels[:, None]), 1)
         parts = [both[folds == fold] for fold in range(int(folds.max()) + 1)]
-        own = torch.stack([part.T @ part for part in parts])  # (f, m + 1, m + 1)
-        sums = own.sum(0) - own if len(own) > 1 else own
+        grams = torch.stack([part.T @ part for part in parts])  # (f, m + 1, m + 1), of each fold
+        sums = grams.sum(0) - grams if len(grams) > 1 else grams  # of all other folds
         options = self.options
         orders = torch.arange(1, options.harmonics + 1).double().repeat_interleave(2)
         # Precisions of the prior, in units of a reading's; level and slope are nearly free.
@@ -207,9 +210,9 @@ class PathTerms(nn.Module):
         kept = is_used.nonzero()[:, 0]
         trials = []
         for number in range(options.breaks if used[0] else 1):
-            shown = self._shown(torch.tensor([number]))[0, kept]
-            products = sums[:, shown, -1]  # (f, p)
-            gram = sums[:, shown][:, :, shown] + prior[kept].diag()  # (f, p, p)
+            chosen = self._columns_with_break(torch.tensor([number]))[0, kept]
+            products = sums[:, chosen, -1]  # (f, p)
+            gram = sums[:, chosen][:, :, chosen] + prior[kept].diag()  # (f, p, p)
             inverse = torch.linalg.inv(gram)
             solved = (inverse @ products[..., None])[..., 0]  # (f, p)
             trials.append(((solved * products).sum(1), solved, inverse.diagonal(dim1=1, dim2=2)))
@@ -221,15 +224,15 @@ class PathTerms(nn.Module):
         errors = zeros.index_copy(1, kept, options.alike * variances[numbers, folds])
         return Solution(coefficients, errors, numbers)
 
-    def _shown(self, numbers: Int[Tensor, " f"]) -> Int[Tensor, "f n"]:
-        """Columns of ``_candidates`` with one break point each."""
+    def _columns_with_break(self, numbers: Int[Tensor, " f"]) -> Int[Tensor, "f n"]:
+        """Indices of the columns of ``_candidates`` that remain with break point ``numbers``."""
         first = torch.arange(self.coefficients.shape[1] - 1).expand(len(numbers), -1)
         return torch.cat((first, first[:, -1:] + 1 + numbers[:, None]), 1)
 
     def _candidates(
         self, transmitters: Float[Tensor, "k 3"], receivers: Int[Tensor, " k"]
     ) -> tuple[Float[Tensor, "k m"], Float[Tensor, " j"]]:
-        """Columns with all candidates of the break point of one receiver, and these candidates."""
+        """``_columns`` with all break points tried at one receiver, and these break points."""
         none = self.breaks.new_zeros(len(receivers), 0)
         shares = torch.linspace(0.05, 0.95, self.options.breaks).double()
         candidates = self._columns(transmitters, receivers, none)[:, 1].quantile(shares)
@@ -252,7 +255,7 @@ class PathTerms(nn.Module):
         orders = torch.arange(1, self.options.harmonics + 1).to(steps)
         turns = torch.atan2(steps[:, 1], steps[:, 0])[:, None] * orders  # (b, harmonics)
         lobes = torch.stack((turns.cos(), turns.sin()), 2).flatten(1)
-        # Heights end with the box: a law of them is not known beyond.
+        # Heights are limited to the box of the links, where they were fitted.
         low, high = self.scene.lower[2].to(steps), self.scene.upper[2].to(steps)
         height = transmitters[:, 2].to(steps).clamp(low, high) - (low + high) / 2
         height = height / ((high - low) / 2).clamp_min(1e-3)
@@ -263,7 +266,7 @@ class PathTerms(nn.Module):
 
 
 def report_terms(trend: nn.Module) -> None:
-    """Logs what the ``PathTerms`` of a trend have added; folds, which fit it again, do not."""
+    """Logs the terms that the ``PathTerms`` of a trend have added, if any."""
     terms = getattr(trend, "terms", None)
     if isinstance(terms, PathTerms) and terms.added:
         log.info("trend beyond path loss: %s %s", terms.added, terms.scene.task.error_unit)

@@ -39,13 +39,13 @@ class PathProcess(NamedTuple):
 
 @dataclass(frozen=True)
 class Equations:
-    """Likelihood of the processes u of n paths, from k links.
+    """Coefficients of the likelihood of the strengths u of n paths, from k links.
 
     The channel of a link is predicted as h + sum_i u_i m_i, with m_i the prior standard deviation
     of path i's field. With the residual r and noise of variance ``nugget`` p, the log likelihood is
     -|r - sum_i u_i m_i|² / (nugget p), quadratic in u. The noise power p is the mean power of the
-    residual's numbers plus a ten-thousandth of the label's. Links with large residuals, as in
-    shadow, therefore have less weight.
+    residual's values plus a ten-thousandth of the label's. So links with large residuals, as in
+    shadow, have less weight.
     """
 
     places: Float[Tensor, "k 3"]  # [m]
@@ -61,7 +61,7 @@ class Equations:
         residuals: Complex[Tensor, "k e s"],
         least: float = 1e-4,
     ) -> "Equations":
-        """Equations of links, computed in parts, since all fields together may take gigabytes.
+        """Coefficients from links, in parts, since all fields together may take gigabytes.
 
         Args:
             places: Places of the links [m].
@@ -94,8 +94,8 @@ class PathField(nn.Module):
     """Kriged strengths of the n paths to one receiver, from k known links."""
 
     places: Tensor  # places of the known links (k, 3) [m]
-    # Weights of the links (k, n): the mean of the processes at a place are its covariances with the
-    # places times these.
+    # Weights of the links (k, n). The mean strengths at a place are the kernel between it and
+    # ``places``, times these weights.
     weights: Tensor
     precisions: Tensor  # precision of each path's strength from each link alone (k, n)
 
@@ -115,8 +115,8 @@ class PathField(nn.Module):
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(between))
         grams = equations.grams * (process.deviation**2 / process.nugget)  # (k, n, n)
         sides = equations.sides / process.nugget  # (k, n)
-        # With u the strengths over their deviation: (K^-1 + G) u = s. The blocks of a place
-        # precondition it.
+        # With u the strengths over their deviation: (K^-1 + G) u = s. The (n, n) blocks of single
+        # places are the preconditioner.
         of_places = torch.eye(grams.shape[1], dtype=torch.float64)
         blocks = grams + inverse.diagonal()[:, None, None] * of_places
         precondition = torch.linalg.inv(blocks)
@@ -125,8 +125,8 @@ class PathField(nn.Module):
         def times(strengths: Tensor) -> Tensor:
             return inverse @ strengths + (grams @ strengths[..., None])[..., 0]
 
-        def preconditioned(rest: Tensor) -> Tensor:
-            return (precondition @ rest[..., None])[..., 0]
+        def preconditioned(residual: Tensor) -> Tensor:
+            return (precondition @ residual[..., None])[..., 0]
 
         solution = conjugate_gradients(times, preconditioned, sides * process.deviation**2)
         self.places = equations.places.clone()
@@ -134,16 +134,16 @@ class PathField(nn.Module):
         self.precisions = equations.grams.diagonal(dim1=1, dim2=2).real / process.nugget
 
     def forward(self, places: Float[Tensor, "b d"], process: PathProcess) -> Complex[Tensor, "b n"]:
-        """Mean of each path's process at some places."""
+        """Mean strength of each path at b places."""
         return kernel(places, self.places, process.length).to(self.weights) @ self.weights
 
     def variances(
         self, places: Float[Tensor, "b d"], process: PathProcess, most: int = 64
     ) -> Float[Tensor, "b n"]:
-        """Variances of each path's process at some places, as if the elements resolved all paths.
+        """Variance of each path's strength at b places, as if the elements resolved all paths.
 
-        Only the ``most`` known links nearest to a place are used, since they screen links behind
-        them.
+        Only the ``most`` known links nearest to a place are used; farther ones are nearly
+        irrelevant.
         """
         apart = distances(places, self.places)
         near = apart.topk(min(most, len(self.places)), largest=False).indices  # (b, j)
@@ -194,7 +194,7 @@ class PathPosterior(Posterior):
         return PathProcess(*self.hyperparameters.tolist())
 
     def fit_process(self) -> None:
-        """Sets the process for the scene's spacing."""
+        """Sets the default hyperparameters for the scene's spacing of places."""
         process = PathProcess.usual(self.scene.spacing)
         self.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
 
@@ -218,7 +218,7 @@ class PathPosterior(Posterior):
         return equations
 
     def solve_equations(self, equations: Sequence[Equations]) -> None:
-        """Takes the known links of all receivers."""
+        """Solves for the path strengths at the known links of each receiver."""
         device = self.hyperparameters.device
         for field, known in zip(self.fields, equations, strict=True):
             if len(known.places):
@@ -271,7 +271,7 @@ def conjugate_gradients(
     right: Tensor,
     most: int = 300,
 ) -> Tensor:
-    """The solution x of times(x) = right, to a relative residual of 1e-6.
+    """The solution x of times(x) = right, to a relative residual of 1e-6 or after ``most`` steps.
 
     Source: Hestenes and Stiefel, Methods of Conjugate Gradients for Solving Linear Systems, 1952.
     """
@@ -280,18 +280,18 @@ def conjugate_gradients(
         return (a.conj() * b).sum().real
 
     x = torch.zeros_like(right)
-    rest = right.clone()
-    direction = precondition(rest)
-    slope = dot(rest, direction)
+    residual = right.clone()
+    direction = precondition(residual)
+    slope = dot(residual, direction)
     for _ in range(most):
-        if rest.norm() <= 1e-6 * right.norm():
+        if residual.norm() <= 1e-6 * right.norm():
             break
-        ahead = times(direction)
-        step = slope / dot(direction, ahead)
+        change = times(direction)
+        step = slope / dot(direction, change)
         x = x + step * direction
-        rest = rest - step * ahead
-        near = precondition(rest)
-        before, slope = slope, dot(rest, near)
+        residual = residual - step * change
+        conditioned = precondition(residual)
+        before, slope = slope, dot(residual, conditioned)
         # Directions are conjugate: times(one) is orthogonal to all others.
-        direction = near + slope / before * direction
+        direction = conditioned + slope / before * direction
     return x

@@ -1,4 +1,4 @@
-"""The contract of a posterior of residuals, used by kriging."""
+"""The base class of a posterior of residuals, used by kriging."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -22,8 +22,8 @@ class Posterior(nn.Module):
     Attributes:
         chooses_weight: True if validation links choose the weight of kriging; otherwise it is 1.
         by_paths: True if strengths of paths are kriged, not labels.
-        start: Result of an earlier fit to similar links, where the next fit starts; or None.
-        seen: Known links that the fit has held out to choose hyperparameters; None: all.
+        start: Result of an earlier fit to similar links, from which the next fit starts; or None.
+        seen: Known links that the fit held out to choose hyperparameters; None: all known links.
         has_features: True if predictions need the trend's spectra at the asked links.
         is_lazy: True if only few places will be predicted. With many known links only those near
             these places are then solved for.
@@ -37,7 +37,7 @@ class Posterior(nn.Module):
     has_features = False
 
     def cleaned(self, links: Links) -> Links:
-        """The links without gross errors that would move the whole fit; by default all links."""
+        """The links without gross errors, which would spoil the fit; by default all links."""
         return links
 
     def fit(self, links: Links, candidates: Mapping[float, Tensor]) -> float:
@@ -51,11 +51,11 @@ class Posterior(nn.Module):
         raise NotImplementedError
 
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
-        """Takes the known links; ``residuals`` maps j rows to their residuals (j, *shape)."""
+        """Computes weights of the known links; ``residuals`` maps j rows to values (j, *shape)."""
         raise NotImplementedError
 
     def start_from(self, other: Any) -> None:
-        """Starts the next fit at another posterior's hyperparameters, to save time.
+        """Saves time: the next fit starts at another posterior's hyperparameters.
 
         By default nothing happens.
         """
@@ -71,15 +71,15 @@ class Posterior(nn.Module):
 
     @abstractmethod
     def deviations(self, batch: Batch) -> Tensor:
-        """Standard deviations of the labels (b,), means over their numbers, or (b, *shape)."""
+        """Standard deviations of labels (b, *shape), or their means over a label's values (b,)."""
 
     @abstractmethod
     def facts(self) -> Mapping[str, float]:
         """Hyperparameters and sizes for ``metrics.json``."""
 
     def process_at(self, receiver: int) -> Process | None:
-        """The process of one receiver's labels; None if processes are not of labels."""
+        """The process of one receiver's labels; None if other quantities are kriged."""
         return None
 
     def take_hyperparameters(self, other: Any) -> None:
-        """Copies the parameters of ``deviations`` from another posterior; by default nothing."""
+        """Copies hyperparameters of ``deviations`` from another posterior; by default nothing."""

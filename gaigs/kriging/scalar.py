@@ -1,6 +1,4 @@
-"""Gaussian processes of labels of one real number: one for each receiver, with heavy tails where
-data have them.
-"""
+"""Gaussian processes of scalar labels, one for each receiver, with normal or Student's t noise."""
 
 import hashlib
 import math
@@ -29,34 +27,34 @@ from gaigs.kriging.tiles import Merged, Tiles, merged
 
 
 class ScalarProcess(nn.Module):
-    """y = z + noise: residuals of a trend, z a Gaussian process over places at each receiver.
+    """Residuals y = z + noise of a trend; z is a Gaussian process over places at each receiver.
 
-    Each receiver has a correlation length l [m], a standard deviation of z and one of the noise, in
-    the label's unit. Their logarithms scatter about the logarithms of all receivers as Student's t:
-    one receiver may be far noisier than the others. Kernel (Matern-1/2 or -3/2) and noise (normal,
-    or Student's t) are the same for all receivers. All hyperparameters maximise the likelihood of
-    held-out readings, each given the readings around it. ``options`` has the numbers.
+    Each receiver has three hyperparameters: a correlation length [m], and standard deviations of z
+    and of the noise in the label's unit. Their logarithms scatter about common means as Student's
+    t, since one receiver may be far noisier than the others. All receivers share the kernel
+    (Matern-1/2 or -3/2) and the kind of noise (normal, or Student's t). All hyperparameters
+    maximise the likelihood of held-out readings, each given the readings around it.
 
     Student's t is a normal distribution whose variance is random. Expectation and maximisation give
-    each reading its own variance of the noise. So a reading that disagrees with all around it
-    counts little.
+    each reading its own noise variance. So a reading that disagrees with those around it has little
+    weight.
 
-    If held-out readings are surely likelier that way, length and noise differ from place to place,
-    see ``LocalMixture``; then no readings are weighted beforehand.
+    Length and noise may also differ from place to place, see ``LocalMixture``. This is chosen if
+    held-out readings are significantly likelier; then ``weights`` are not used.
 
     Attributes:
-        options: Numbers of the fit and of predictions.
+        options: Options of the fit and of predictions.
         logarithms: Logarithms of length, deviation of the signal and of the noise at each receiver
             (r, 3).
-        choice: Smoothness, degrees of freedom, scale of carriers, and 1 for local mixtures (4,).
+        choice: The fields of ``Choice`` as numbers (4,).
         places: Places of the known readings (k, d), see ``coordinates`` of scale 1.
         receivers, values: Receivers and residuals of the known readings (k,).
         variances: Variance of the noise of each known reading (k,).
-        weights: Values over the covariances of their receiver's readings (k,); 0 at receivers with
-            ``tiles``, and, where readings of one place are merged, at all but the first.
+        weights: Inverse covariance matrix of a receiver's readings times their values (k,). They
+            are 0 at receivers with ``tiles``, and at all but the first of merged readings.
         tiles: Parts of the readings of receivers with more places than ``options.together``.
         asked: Rows of the readings that the last ``fit`` held out.
-        is_solved: False before the readings of a lazy ``solve`` are weighted.
+        is_solved: False after a lazy ``solve``, until ``weights`` are computed.
         kept: Means and variances of local mixtures, by a digest of their places and receivers.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, sections 2.2 and
@@ -92,7 +90,7 @@ class ScalarProcess(nn.Module):
     def forward(
         self, places: Float[Tensor, "b d"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
-        """Mean of z at some places."""
+        """Mean of z at b places."""
         if self._choice.is_local:
             return self._moments(places, receivers, is_asked=True)[0]
         if not self.is_solved:
@@ -118,7 +116,7 @@ class ScalarProcess(nn.Module):
                 )
             else:
                 ends = scaled(places[asked], scale), all_places[known]
-                # Receivers that hear the same places share distances.
+                # Receivers with readings at the same places share distances.
                 if last is None or not all(map(torch.equal, ends, last)):
                     last = (*ends, distances(*ends))
                 length, signal, _ = self.logarithms[receiver].exp()
@@ -135,8 +133,8 @@ class ScalarProcess(nn.Module):
     ) -> tuple[Float[Tensor, " b"], Float[Tensor, " b"]]:
         """Means and variances of local mixtures at places.
 
-        Those of the last ``most`` calls are kept, as deviations of a batch follow its means. Means
-        are always computed: callers time them.
+        The results of the last ``most`` calls are cached, since a batch needs them twice. Means are
+        always computed, since callers measure their time.
         """
         content = [part.cpu().numpy().tobytes() for part in (places, receivers)]
         key = hashlib.sha256(b"".join(content)).digest()
@@ -149,7 +147,7 @@ class ScalarProcess(nn.Module):
         return mean.to(places), variance.to(places)
 
     def _solved(self, readings: Merged, receiver: int) -> Float[Tensor, " j"]:
-        """Values over the covariances of some readings of a receiver."""
+        """Inverse covariance matrix of j readings of a receiver, times their values."""
         places = self.places[readings.rows]
         between = self._covariances(places, places, receiver)
         between.diagonal().add_(readings.variances)
@@ -173,7 +171,7 @@ class ScalarProcess(nn.Module):
                 whitened, _ = process.whitened(places[part])
                 signal = (2 * self.logarithms[receiver, 1]).exp()
                 variances[part] += (signal - whitened.square().sum(0)).clamp_min(0)
-        # All receivers together: those that hear the same places share a search.
+        # All receivers together: readings at the same places share a search for neighbours.
         for part in is_many[receivers].nonzero()[:, 0].split(4 * self.options.size):
             near = self._near(places[part], receivers[part], self.options.around)
             variances[part] += near.variances.clamp_min(0)
@@ -186,7 +184,10 @@ class ScalarProcess(nn.Module):
         count: int,
         folds: tuple[Tensor, Tensor] | tuple[()] = (),
     ) -> Conditional:
-        """z at places given the ``count`` nearest readings, of other ``folds`` than the places'."""
+        """Prediction of z from the ``count`` nearest readings of each place.
+
+        ``folds`` are the folds of the places and of the readings; a place uses other folds only.
+        """
         readings = self._readings._replace(count=count)
         around = readings.around(places, receivers, readings.nearest(places, receivers, *folds))
         hyperparameters, choice = self.logarithms.exp(), self._choice
@@ -201,7 +202,7 @@ class ScalarProcess(nn.Module):
         return conditional(between, values, variances)
 
     def at(self, receiver: int) -> Process:
-        """The process of one receiver."""
+        """The process of one receiver, with its known readings."""
         known = self.receivers == receiver
         degrees = self.choice[1].item()
         noise = math.exp(2 * self.logarithms[receiver, 2].item())
@@ -211,7 +212,7 @@ class ScalarProcess(nn.Module):
         return Process(of_receiver, self.places[known], self.variances[known], noise)
 
     def facts(self) -> dict[str, float]:
-        """Medians over receivers of length and nugget; smoothness; degrees of freedom or 0."""
+        """Entries of ``metrics.json``; length and nugget are medians over receivers."""
         length, signal, noise = self.logarithms.exp().unbind(1)
         smoothness, degrees, scale, is_local = self.choice.tolist()
         facts = {
@@ -233,18 +234,17 @@ class ScalarProcess(nn.Module):
         folds: Int[Tensor, " k"],
         most: int = 600,
     ) -> int:
-        """Chooses the residuals, the kernel and the noise with which held-out readings are most
-        likely.
+        """Chooses residuals, kernel and noise by the likelihood of held-out readings.
 
         Args:
             places, receivers: Places and receivers of the known readings.
-            candidates: Residuals of the known readings about one trend or another.
-            folds: Readings are held out with all of their fold.
-            most: Held-out readings to which the hyperparameters of single receivers are fitted;
-                half as many choose.
+            candidates: Residuals of the known readings, for each trend that is tried.
+            folds: Fold of each reading. A fold is held out as a whole.
+            most: Number of held-out readings to which the hyperparameters of single receivers are
+                fitted. Half as many choose residuals, kernel and noise.
 
         Returns:
-            Index of the chosen residuals; ``solve`` takes them.
+            Index of the chosen residuals.
         """
         self.places, self.receivers = places, receivers
         every = torch.arange(len(places))
@@ -264,7 +264,7 @@ class ScalarProcess(nn.Module):
         return index
 
     def _is_local(self, folds: Int[Tensor, " k"]) -> bool:
-        """True if the held-out readings are surely likelier by local mixtures."""
+        """True if held-out readings are significantly likelier with local mixtures."""
         rows, options = self.asked.unique(), self._mixtures.options
         values, receivers = self.values[rows], self.receivers[rows]
         asked = self.places[rows], receivers
@@ -283,7 +283,7 @@ class ScalarProcess(nn.Module):
         return choices
 
     def fit_count(self, candidates: int) -> int:
-        """Number of maximisations of a ``fit`` to this many candidates of residuals."""
+        """Number of maximisations in a ``fit`` with this number of candidate residuals."""
         return candidates + len(self._choices())
 
     def hold_out(
@@ -301,8 +301,8 @@ class ScalarProcess(nn.Module):
             folds: Fold of each reading. The first fit predicts a reading from the other folds.
             held: Rows of the readings that a second fit predicts from all others, such as the
                 validation links. None: no second fit.
-            most: About the number of readings that a fit predicts; up to four times as many where
-                each receiver would have fewer than 16.
+            most: Approximate number of readings that a fit predicts; up to four times as many if
+                receivers would have fewer than 16 each.
         """
         self.places, self.receivers = places, receivers
         every = torch.arange(len(places))
@@ -313,10 +313,10 @@ class ScalarProcess(nn.Module):
         return groups
 
     def refit(self, values: Float[Tensor, " k"], groups: Sequence[HeldOutReadings]) -> float:
-        """Fits lengths and deviations anew, from their present values; kernel and noise stay.
+        """Fits lengths and deviations again from their present values; kernel and noise stay.
 
-        Few readings alone would overfit, so the mean of the first fit over the receivers is the
-        second fit's prior.
+        The mean over receivers of the first fit is the prior of the second, which may have few
+        readings and would otherwise overfit.
 
         Args:
             values: Residuals of the known readings.
@@ -339,10 +339,10 @@ class ScalarProcess(nn.Module):
         values: Float[Tensor, " k"],
         is_lazy: bool = False,
     ) -> None:
-        """Takes residuals of known readings and weights them for predictions.
+        """Stores the residuals of known readings, and computes their weights for predictions.
 
-        ``fit`` has chosen the hyperparameters before. With ``is_lazy`` the weights are computed
-        only once many places are asked for; few places are predicted from the readings around them.
+        ``fit`` has chosen the hyperparameters before. With ``is_lazy`` the weights are computed at
+        the first prediction of many places; few places are predicted from the readings around them.
         """
         self.places, self.receivers, self.values = places, receivers, values.clone()
         self.variances = (2 * self.logarithms[receivers, 2]).exp()
@@ -354,12 +354,12 @@ class ScalarProcess(nn.Module):
             self._solve()
 
     def _save_to_state_dict(self, *args):
-        if not self.is_solved:  # what loads it takes it for solved
+        if not self.is_solved:  # a loaded process counts as solved
             self._solve()
         super()._save_to_state_dict(*args)
 
     def _solve(self) -> None:
-        """Weights the known readings."""
+        """Computes ``weights`` and ``tiles`` of the known readings."""
         places, receivers, values = self.places, self.receivers, self.values
         self.is_solved = True
         self.variances = self.variances * self._factors(values)
@@ -375,7 +375,7 @@ class ScalarProcess(nn.Module):
                 self.weights[readings.rows] = self._solved(readings, receiver)
 
     def take(self, other: "ScalarProcess") -> None:
-        """Takes another process's hyperparameters; for means call ``solve`` again."""
+        """Copies another process's hyperparameters; means need another ``solve``."""
         ratios = (2 * (other.logarithms - self.logarithms)[self.receivers, 2]).exp()
         is_alike = torch.equal(self.choice[:2], other.choice[:2]) or other._choice.is_local
         self.variances = self.variances * ratios
@@ -415,10 +415,11 @@ class ScalarProcess(nn.Module):
         return maximise(cost, start)
 
     def _factors(self, values: Float[Tensor, " k"]) -> Float[Tensor, " k"]:
-        """Ratios of each known reading's noise variance to its receiver's (k,); 1 for normal noise.
+        """Noise variance of each known reading over its receiver's (k,); 1 for normal noise.
 
-        With Student's t of nu degrees of freedom, a ratio is (nu + E e² / variance) / (nu + 1).
-        Here e is the reading's noise given the readings around it. The two are updated in turn.
+        With Student's t of nu degrees of freedom, this ratio is (nu + E e² / variance) / (nu + 1).
+        The expected square E e² of the reading's noise follows from the readings around it and
+        their ratios, so both are updated in turn.
         """
         choice = self._choice
         factors = torch.ones_like(values)
@@ -429,7 +430,7 @@ class ScalarProcess(nn.Module):
         readings = self._readings._replace(count=near + 1)
         rows = torch.arange(len(values), device=values.device)
         every = readings.nearest(self.places, self.receivers)
-        every.exists.logical_and_(every.rows != rows[:, None])  # not itself
+        every.exists.logical_and_(every.rows != rows[:, None])  # without the reading itself
         parts = []
         for part in rows.split(self.options.size):
             parts.append((part, Nearest(every.rows[part], every.exists[part])))
@@ -461,7 +462,7 @@ class ScalarProcess(nn.Module):
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
         choice = f"{prefix}choice"
-        if choice in state_dict:  # checkpoints of before know no local mixtures
+        if choice in state_dict:  # older checkpoints have no entry for local mixtures
             missing = len(self.choice) - len(state_dict[choice])
             state_dict[choice] = torch.nn.functional.pad(state_dict[choice], (0, missing))
         self.kept.clear()

@@ -1,4 +1,4 @@
-"""Hyperparameters of scalar processes, by the likelihood of held-out readings."""
+"""Fit of the hyperparameters of scalar processes to held-out readings, by their likelihood."""
 
 import math
 from dataclasses import dataclass
@@ -29,15 +29,15 @@ class ScalarOptions:
     """Options of a process of scalar labels.
 
     Attributes:
-        neighbours: Readings around a held-out one during a fit.
+        neighbours: Number of readings around a held-out one during a fit.
         around: Number of nearest readings for a variance, if a receiver has more than ``many``; and
             for the noise of a reading with Student's t, if more than ``large`` are known. Farther
             readings lower a deviation by only a hundredth.
-        local: Nearest readings for the mean at a place while a process is not solved.
+        local: Number of nearest readings for the mean at a place while a process is not solved.
         few: Number of known readings for each predicted place above which an unsolved process
             answers by ``local`` readings; otherwise it is solved first.
-        large: Number of known readings above which a fold keeps the hyperparameters of all
-            readings: ten times the number that a fit holds out.
+        large: Number of known readings above which models of single folds keep the hyperparameters
+            of all readings. It is ten times the number that a fit holds out.
         many: Largest number of a receiver's readings that all enter a variance. With more, only the
             nearest ``around`` enter, to save time.
         together: Largest number of a receiver's readings in one covariance matrix; ``Tiles`` divide
@@ -50,8 +50,8 @@ class ScalarOptions:
         tolerance: Relative change of the negative log likelihood that ends a maximisation, much
             smaller than differences between hyperparameters.
         size: Number of places whose covariances are in memory at a time.
-        edges: Longest correlation length, in longest edges of the box of places. With longer ones
-            the kernel is linear in the box.
+        edges: Longest correlation length [longest edges of the box of places]. With longer ones the
+            kernel is linear in the box.
         widest: Largest deviation of the signal over the residuals' root mean square. Readings
             millimetres apart determine only the ratio of the deviation to a power of the length,
             and an unbounded deviation would predict impossible levels.
@@ -79,7 +79,7 @@ class ScalarOptions:
 
 
 class ScalarFit(NamedTuple):
-    """Hyperparameters with the lowest cost.
+    """Result of a fit: the hyperparameters with the lowest cost.
 
     Attributes:
         cost: Negative log likelihood of the held-out readings, with the prior.
@@ -95,9 +95,9 @@ class ScalarFit(NamedTuple):
 class HeldOutCost:
     """Negative log posterior of hyperparameters, given held-out readings.
 
-    A point of the search is a row of numbers: the common logarithms of length, signal and noise;
-    the logarithm of the scale of carriers if there are several; and with ``has_deviations`` each
-    receiver's deviations from the first three, in units of their scatter.
+    A point of the search is a vector. It has the logarithms of length, signal and noise, common to
+    all receivers; the logarithm of the scale of carriers if there are several; and, with
+    ``has_deviations``, each receiver's differences from the first three, in units of their scatter.
 
     Args:
         scene: Receivers and carriers.
@@ -173,7 +173,7 @@ class HeldOutCost:
         return likelihood + prior.item(), gradient.numpy()
 
     def _likelihood(self, point: np.ndarray) -> tuple[float, Float[Tensor, "r 3"], float]:
-        """Negative log likelihood, its gradient by all logarithms, and its gradient by the scale.
+        """Negative log likelihood, and its gradients by all logarithms and by the scale.
 
         The gradient of the matrices is written out; autograd would take several times as long.
         """
@@ -181,20 +181,20 @@ class HeldOutCost:
         receivers, hyperparameters = self.around.receivers, logarithms.exp()
         noises = hyperparameters[receivers, 2].square()  # (m,)
         between = covariances(self.around, hyperparameters, choice)
-        of_readings = noises[:, None] * self.factors  # (m, j)
-        given = conditional(between, self.readings, of_readings)
+        noise_power = noises[:, None] * self.factors  # (m, j)
+        given = conditional(between, self.readings, noise_power)
         with torch.enable_grad():
             leaves = [given.means, given.variances, noises]
             leaves = [leaf.detach().requires_grad_() for leaf in leaves]
             means, variances, noise = leaves
             total = -log_density(self.asked - means, variances, noise, choice.degrees).sum()
             of_mean, of_variance, of_noise = torch.autograd.grad(total, leaves)
-        found = slopes(
-            self.around, hyperparameters, choice, between, of_readings, given, of_mean, of_variance
+        of_place = slopes(  # (m, 4)
+            self.around, hyperparameters, choice, between, noise_power, given, of_mean, of_variance
         )
-        found[:, 2] += 2 * of_noise * noises
-        gradient = torch.zeros_like(logarithms).index_add(0, receivers, found[:, :3])
-        return total.item(), gradient, found[:, 3].sum().item()
+        of_place[:, 2] += 2 * of_noise * noises
+        gradient = torch.zeros_like(logarithms).index_add(0, receivers, of_place[:, :3])
+        return total.item(), gradient, of_place[:, 3].sum().item()
 
     def start(self, logarithms: Float[Tensor, "r 3"] | None) -> np.ndarray:
         """The initial point: from earlier hyperparameters, or the best of a coarse grid."""
@@ -213,9 +213,9 @@ class HeldOutCost:
         return np.concatenate((point, np.zeros(len(self.bounds) - self.shared)))
 
     def expect(self, point: np.ndarray) -> None:
-        """Sets ``factors`` to the expected variances of single readings' noise, given a point.
+        """Sets ``factors`` of the noise variances to their expected values at a point.
 
-        A reading that disagrees with all around it then has little weight.
+        A reading that disagrees with those around it then has little weight.
         """
         logarithms, choice = self.unpacked(torch.from_numpy(point))
         between = covariances(self.around, logarithms.exp(), choice)[:, :-1, :-1]
@@ -225,7 +225,7 @@ class HeldOutCost:
         )
 
     def fit_at(self, cost: float, point: np.ndarray) -> ScalarFit:
-        """The hyperparameters of a point."""
+        """The hyperparameters of a point, with their cost."""
         logarithms, choice = self.unpacked(torch.from_numpy(point))
         return ScalarFit(cost, logarithms, choice._replace(scale=float(choice.scale)))
 

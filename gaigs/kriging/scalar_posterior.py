@@ -21,9 +21,8 @@ from gaigs.kriging.scalar import ScalarProcess
 class ScalarPosterior(Posterior):
     """Kriged residuals of scalar labels, with a ``ScalarProcess``.
 
-    The trend's weight is the mean of its candidates, weighted by the likelihood of the validation
-    links. Without validation links candidates have equal weights. All readings of a place count as
-    one.
+    The weight of the trend is a mean of the candidates. Each counts by its likelihood on the
+    validation links, or equally without such links. All readings of a place count as one.
     """
 
     def __init__(self, scene: Scene):
@@ -35,13 +34,16 @@ class ScalarPosterior(Posterior):
         return without_gross_errors(links)
 
     def fit(self, links: Links, candidates: Mapping[float, Tensor]) -> float:
+        # 1. Kernel, noise and lengths are fitted to the residuals of the last candidate.
+        # 2. With these as the start, lengths and noise are fitted again for each candidate.
+        # 3. The mean of the candidates, weighted by their likelihoods, is fitted once more.
         index = links.split.known
         known = self._coordinates(links.query[index])
         folds = folds_of(links, index)
         weights = torch.tensor([*candidates], dtype=torch.float64)
         residuals = [values.flatten().double() for values in candidates.values()]  # (k,) each
-        # Training links' own residuals are too small, as the trend was trained on them: validation
-        # links decide.
+        # Residuals of training links are too small, since the trend was trained on them, so
+        # validation links decide.
         count = len(links.split.train)
         held = torch.arange(count, len(index)) if len(links.split.validation) else None
         process = self.process.cpu()
@@ -64,11 +66,11 @@ class ScalarPosterior(Posterior):
 
             shares = torch.full((len(weights),), 1 / len(weights), dtype=torch.float64)
             if held is not None and len(weights) > 1:
-                # Readings at one place err together: they count as one.
+                # Errors of readings at one place are similar, so they count as one reading.
                 places = links.query[index[held]].place_keys.unique()
                 each = len(held) / len(places)
                 costs = torch.tensor([refit(values) for values in residuals], dtype=torch.float64)
-                # -inf if a trend explains all
+                # A cost is -inf if a trend explains all labels.
                 shares = torch.softmax(-costs.clamp_min(-1e300) / each, 0)
             refit(shares @ torch.stack(residuals))
         return (shares @ weights).item()

@@ -1,4 +1,4 @@
-"""Means of a process of very many readings: places in tiles, each solved by nearby readings."""
+"""Means of a process with very many readings, in tiles that are solved with nearby readings."""
 
 import math
 from collections.abc import Callable
@@ -13,38 +13,39 @@ from gaigs.kriging.links import nearest_places
 
 
 class Merged(NamedTuple):
-    """Readings of a receiver; repeated readings at one place and carrier may be merged."""
+    """Readings of a receiver, in which repeated readings at a place and carrier may be one."""
 
-    rows: Int[Tensor, " m"]  # of the first at each place
-    values: Float[Tensor, " m"]  # means, weighted by 1 / variance
-    variances: Float[Tensor, " m"]  # of their noise
+    rows: Int[Tensor, " m"]  # row of the first reading at each place
+    values: Float[Tensor, " m"]  # means of the readings, weighted by 1 / variance
+    variances: Float[Tensor, " m"]  # noise variances of these means
 
 
 class Tiles(nn.Module):
-    """Groups of the readings of a receiver with too many of them for one covariance matrix.
+    """Division of a receiver's readings, if they are too many for one covariance matrix.
 
-    A tile is solved with ``size`` readings, in this order: first its own readings, at most
-    ``core``; then neighbours of each of these, which screen readings farther away; then the
+    Each reading belongs to one tile, and at most ``core`` readings to a tile. A tile is solved with
+    ``size`` readings: those that belong to it, then the neighbours of each of these, then the
     readings nearest to the tile's centre. A place is predicted by the tile of its nearest reading.
     A tile is solved at the first prediction in it.
     """
 
     core = 64
-    """Most readings of a tile's own."""
+    """Largest number of readings that belong to a tile."""
     size = 256
-    """Readings of a tile; see docs/methods.md for the error that more would take away."""
+    """Number of readings with which a tile is solved; docs/methods.md has the error of fewer."""
     neighbours = 32
-    """Readings around each of a tile's own: as many as fill a tile where density is even."""
+    """Number of neighbours of each reading that belongs to a tile; at even density they fill it."""
 
     stored = "readings", "values", "variances", "owners", "rows"
 
-    readings: Tensor  # rows of the divided readings, one a place, among all known readings (n,)
-    # Their values, and variances of their noise, see ``Merged`` (n,).
+    readings: Tensor  # rows of the divided readings among all known ones, one for each place (n,)
+    # Values of the divided readings, and their noise variances, see ``Merged`` (n,).
     values: Tensor
     variances: Tensor
-    owners: Tensor  # tiles whose own they are (n,)
-    rows: Tensor  # rows of those with which each tile is solved among ``readings`` (t, j)
-    # Values over the covariances of a tile's readings (t, j); NaN until asked for, and not stored.
+    owners: Tensor  # tile to which each divided reading belongs (n,)
+    rows: Tensor  # rows of ``readings`` with which each tile is solved (t, j)
+    # Inverse covariance matrix of a tile's readings times their values (t, j); NaN until solved,
+    # and not stored.
     weights: Tensor
 
     def __init__(self) -> None:
@@ -75,7 +76,7 @@ class Tiles(nn.Module):
         tiles = []
         for part, nearest in zip(parts, near, strict=True):
             order = torch.cat((part, around[part].mT.flatten(), nearest))  # nearest ranks first
-            tiles.append([*dict.fromkeys(order.tolist())][: near.shape[1]])
+            tiles.append([*dict.fromkeys(order.tolist())][: near.shape[1]])  # without repetition
         owners = torch.empty_like(readings.rows)
         for number, part in enumerate(parts, len(self)):
             owners[part] = number
@@ -149,7 +150,10 @@ def merged(
 
 
 def halves(places: Float[Tensor, "k d"], most: int) -> list[Int[Tensor, " _"]]:
-    """Rows of places in boxes of at most ``most``; boxes are halved across their longest edge."""
+    """Rows of the places in each box; boxes are halved across their longest edge.
+
+    Halving ends when no box has more than ``most`` places.
+    """
     parts = [torch.arange(len(places), device=places.device)]
     done = []
     while parts:

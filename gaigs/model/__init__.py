@@ -1,4 +1,4 @@
-"""Models predict a task's value from transmitter, receiver, carrier and directions."""
+"""Models predict labels of a task from transmitter, receiver, carrier and directions."""
 
 from gaigs.model.base import Model, Prediction
 from gaigs.model.look_up import LookUp

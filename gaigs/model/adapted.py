@@ -4,8 +4,8 @@ Errors of a model at two places of a receiver without links have the covariance
 
     level + field exp(-distance / length) + [same place] noise
 
-Four numbers hold this law: level, noise, field [label's unit squared] and length [m], by
-``gaigs.calibration.new_receivers.fit_law``.
+``gaigs.calibration.new_receivers.fit_law`` fits its four parameters: level, noise and field
+[label's unit squared], and length [m].
 """
 
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ from gaigs.registry import register, registry
 
 @register("model", "adapted")
 class Adapted(Wrapper):
-    """y(x) + c(x)' (C + N)^-1 e: the best linear prediction of a receiver's errors from a few.
+    """A model whose errors at a receiver are predicted from a few readings there, and removed.
 
-    y is the model at receivers without links, and e are its errors at the readings. C are the
-    covariances among the readings of a receiver, c those with the place x, and N is the noise, of
-    which repeated readings of a place have one draw. ``Model.adapt`` makes it.
+    The prediction at x is y(x) + c(x)' (C + N)^-1 e, the best linear one. y is the model at
+    receivers without links, and e has its errors at the readings. C and c are error covariances
+    among readings and with x. N is the noise, which repeated readings of a place share.
 
     Args:
         base: The model at these receivers, or its configuration if a state is to be loaded.
@@ -55,7 +55,7 @@ class Adapted(Wrapper):
 
     @torch.no_grad()
     def take(self, links: Links, law: Float[Tensor, " n"], most: int = 2000) -> None:
-        """Takes readings, at most ``most``, and the law of errors."""
+        """Stores at most ``most`` readings, and the parameters ``law`` of the error covariance."""
         # Checkpoints of earlier versions have level and noise alone.
         self.law = functional.pad(law.double(), (0, 4 - len(law))).clamp_min(1e-9)
         rows = evenly(torch.arange(len(links)), most)
@@ -72,7 +72,7 @@ class Adapted(Wrapper):
         return Prediction(value + (towards.T @ white)[:, 0].to(value), {})
 
     def deviations(self, batch: Batch) -> Float[Tensor, " b"]:
-        """Deviations of the errors over those without readings."""
+        """Standard deviations of the errors, relative to those without readings."""
         towards, _ = self._process.whitened(_coordinates(batch.query))
         total = self.law[:3].sum()
         return (1 - towards.square().sum(0) / total).sqrt().float()
@@ -115,5 +115,5 @@ class Adapted(Wrapper):
 
 
 def _coordinates(query: Query) -> Float[Tensor, "b 4"]:
-    """Places of transmitters [m], with the number of the receiver behind."""
+    """Places of transmitters [m] in three columns, and the number of the receiver in a fourth."""
     return torch.cat((query.transmitters, query.receivers[:, None]), 1).double()

@@ -27,8 +27,8 @@ from gaigs.registry import name_of
 def batch_size(links: Links, model: Model | None = None) -> int:
     """Number of links to predict at a time.
 
-    Labels of one number have larger batches, since they take little memory. Look-ups have the
-    largest, since a batch costs them time for every receiver.
+    Scalar labels have larger batches, since they take little memory. Look-ups have the largest,
+    since each batch takes time for every receiver.
     """
     if not links.task.is_scalar:
         return 64
@@ -57,9 +57,9 @@ def weighed_residuals(
 
     Args:
         links: Links with a split.
-        fallback: Model of the other share.
+        fallback: Model whose weight is 1 minus the trend's.
         values: The trend's predictions of the known links.
-        weights: Shares of the trend.
+        weights: Weights of the trend.
     """
     index, task = links.split.known, links.task
     # Without an alignment each number stands alone, so labels may be thinned first.
@@ -77,22 +77,22 @@ def weighed_residuals(
 
 
 def share_at_new(links: Links, held: Int[Tensor, " k"], one: Tensor, other: Model) -> float:
-    """Share w of predictions of levels beside another model's, with the least mean square error at
-    receivers that neither knows.
+    """Weight w of one model's levels in a mean with another model's, for unknown receivers.
 
-    Few receivers tell little: a half counts as one more beside n of them. With the mean squares a
-    and b of the errors, the mean c of their products and m = (a + b) / 2, w minimises
+    The weight minimises the mean square error at n receivers that neither model knows. A weight of
+    a half is the prior, with the weight of one receiver. With the mean squares a and b of the
+    errors, the mean c of their products and m = (a + b) / 2, w minimises
 
         a w² + 2 c w (1 - w) + b (1 - w)² + 2 m (w - ½)² / n
 
     Args:
         links: Links with levels as labels.
-        held: Links of such receivers; each receiver has one vote.
+        held: Links of receivers that neither model knows; each receiver counts equally.
         one: Predictions of these links [dBm].
-        other: Model of the other share.
+        other: The other model.
 
-    Source: Stock and Watson, Combination forecasts of output growth, 2004, for shares drawn to
-    equal ones.
+    Source: Stock and Watson, Combination forecasts of output growth, 2004, for weights shrunk
+    towards equal ones.
     """
     receivers = links.query.receivers[held]
     _, numbers, counts = receivers.unique(return_inverse=True, return_counts=True)
@@ -118,9 +118,9 @@ def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor
 
 
 def calibrated(model: Model, links: Links) -> Calibration | None:
-    """The calibration of a model by its ``unseen`` links.
+    """The calibration of a model by the links of ``Model.unseen``.
 
-    None without such links, or if the links hold out carriers.
+    It is None without such links, or if the split holds out carriers.
     """
     if links.held_out is not None:
         return None
@@ -202,8 +202,7 @@ def at_new_receivers(
 
 
 def count_in_time(model: Model, links: Links, most: int) -> int:
-    """The number of known links of a receiver, at most ``most``, that the time left for kriging
-    allows.
+    """The number of a receiver's known links, at most ``most``, that can be kriged in time.
 
     The trained model predicts the links once, and once more for each half of the validation links.
     These three predictions may take a third of the time that is left.

@@ -1,4 +1,4 @@
-"""The contract of kind ``model``."""
+"""The base class of kind ``model``."""
 
 import copy
 import itertools
@@ -53,7 +53,7 @@ class Prediction(NamedTuple):
 
 
 class Model(Movable):
-    """The contract of kind ``model``: ``forward`` maps a ``Batch`` to a ``Prediction``.
+    """Base class of kind ``model``: ``forward`` maps a ``Batch`` to a ``Prediction``.
 
     The state dict has everything that ``predict`` needs. A model with parameters is trained. A
     model without parameters is a look-up, which learns only in ``fit``, see ``LookUp``.
@@ -69,14 +69,14 @@ class Model(Movable):
         chunk: Largest number of (link, direction) pairs evaluated at a time, except in a training;
             None: whole labels.
         revisions: Fractions of the training after which ``revise`` is called.
-        settles: True if no later revision will lower errors suddenly. A training may then stop if
-            extrapolated errors stay above the errors of a law of distance.
+        settles: True if no later revision will lower errors suddenly. A training may then stop
+            early if its extrapolated errors stay above those of a path-loss model.
         second_start: Options of a second training from another start; the validation score chooses
             between both. Empty for one training.
         predicts_untrained: True if predictions before the first step are scored, too.
         any_frequency, any_receiver: See ``Movable``.
         configuration: Options of a registered model; ``save`` stores them.
-        calibration: Data of intervals; None if validation links have not measured the errors.
+        calibration: Error quantiles for intervals; None if no validation links measured errors.
         known_places: Keys of the training and validation places, ``Query.place_keys``; None if
             unknown.
         links: Known links of a look-up.
@@ -299,7 +299,7 @@ class Model(Movable):
         )
 
     def _located(self, receiver: object, transmitters: object) -> tuple[Any, object]:
-        """This model and its ``receiver``; for a new receiver a copy of the model there, and 0."""
+        """This model and ``receiver``; for a new receiver a copy of the model for it, and 0."""
         new = as_new_receiver(receiver, self.scene, transmitters)
         if new is None:
             return self, receiver
@@ -446,7 +446,7 @@ class Model(Movable):
     def deviations(self, batch: Batch) -> Tensor | None:
         """Standard deviations (b, *shape) of the labels up to a common factor; None if unknown.
 
-        They may also be (b,), root mean squares over the numbers of a label.
+        They may also be (b,), root mean squares over the values of a label.
         """
         return None
 
@@ -476,7 +476,7 @@ class Model(Movable):
         return 1 if self.is_trained else LOOK_UP_FOLDS
 
     def unseen(self, links: Links) -> Iterator[Unseen]:
-        """Yields models like this one, each with links outside its training.
+        """Yields models like this one, each with links that it has not been trained on.
 
         A look-up is fitted again without each fold of the known links, and so are estimated places
         of receivers. A trained model comes with the validation links, although these have chosen

@@ -46,7 +46,7 @@ def write(content: dict, path: Path) -> None:
 
 
 def read(path: str | Path) -> dict:
-    """The content of a checkpoint, tensors and plain Python only; errors as of ``gaigs.load``."""
+    """The content of a checkpoint: tensors and plain Python values; errors as in ``gaigs.load``."""
     check_type("path", path, str | Path)
     path = Path(path)
     if not os.path.isfile(path):  # False for a name that is too long
@@ -108,7 +108,7 @@ def save(model: nn.Module, path: str | Path) -> None:
 
 
 def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Module:
-    """The model of a checkpoint in evaluation mode, on the CPU; errors as of ``gaigs.load``.
+    """The model of a checkpoint in evaluation mode, on the CPU; errors as in ``gaigs.load``.
 
     ``recorded`` gives digests of plug-ins for a checkpoint of an earlier version, which has none.
     """
@@ -161,7 +161,7 @@ def trained_weights(content: dict) -> dict:
 
 
 def described(model: nn.Module) -> dict:
-    """Entries of a checkpoint on a model: configuration, calibration, keys of known places."""
+    """Entries that describe a model: configuration, calibration, keys of known places."""
     calibration = None if model.calibration is None else model.calibration.state()
     return {
         "model": configuration_of(model),
@@ -171,7 +171,7 @@ def described(model: nn.Module) -> dict:
 
 
 def update(path: Path, model: nn.Module, trained: str | None = None) -> None:
-    """Rewrites what a checkpoint says of its model, and its weights if the model now wraps another.
+    """Rewrites the entries of ``described`` in a checkpoint, and the weights of a wrapped model.
 
     Args:
         path: Checkpoint of a training.

@@ -1,4 +1,4 @@
-"""Means of several models: of seeds, whose scatter shows the uncertainty, or of any models."""
+"""Means of several models: of one model with several seeds, or of different models."""
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -80,7 +80,7 @@ class Ensemble(Wrapper):
         return [*self.members]  # type: ignore[list-item]
 
     def rendering(self, batch: Batch) -> Callable[[], object] | None:
-        """Renders with all members that can, one after the other."""
+        """A function that renders with each member that has a rendering, in turn."""
         asked = (member.rendering(batch) for member in self._members)
         parts = [part for part in asked if part is not None]
         return (lambda: [part() for part in parts]) if parts else None
@@ -97,8 +97,7 @@ class Ensemble(Wrapper):
         return Prediction(torch.tensordot(values.new_tensor(self.weights), values, 1), {})
 
     def deviations(self, batch: Batch) -> Tensor | None:
-        """Deviations of labels: the root mean square difference of the members over a label's
-        numbers.
+        """Deviations of labels: root mean square differences of the members over a label's values.
 
         Few members may agree by chance, so the ``typical`` mean square counts as four more members.
         A blend of different models returns the weighted root mean square of its members'
@@ -168,13 +167,13 @@ class Ensemble(Wrapper):
         return self._of([member.refitted(links) for member in self._members])
 
     def _of(self, members: list) -> "Ensemble":
-        """The same mean of other members."""
+        """An ensemble of other members with the same weights."""
         other = Ensemble(members[0].scene, members, self.weights if self.is_blend else None)
         other.typical = self.typical
         return other.train(self.training)
 
     def _squares(self, batch: Batch) -> Tensor:
-        """Variances of the members' labels, means over a label's numbers (b,)."""
+        """Variances of the members' predictions, averaged over a label's values (b,)."""
         batch = replace(batch, directions=self.scene.task.directions)  # whichever are asked
         return self._each(batch.to(self.device))[..., None].flatten(2).var(0).mean(1)
 

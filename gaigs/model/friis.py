@@ -1,4 +1,4 @@
-"""Free space: only the direct wave."""
+"""Free-space propagation: only the direct wave."""
 
 import torch
 from jaxtyping import Complex, Float
@@ -16,7 +16,7 @@ from gaigs.registry import register
 
 @register("model", "friis")
 class Friis(Model):
-    """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element, with a gain g a receiver.
+    """h = g a lambda / (4 pi d) exp(-j 2 pi f d / c) at each element; each receiver has a gain g.
 
     a is the elements' pattern towards the transmitter. The complex gain g, ``fit_gain`` of the
     known links, contains transmit power, cables and the clock's phase; it is NaN before ``fit``.
@@ -44,7 +44,7 @@ class Friis(Model):
 
     @property
     def frequencies(self) -> Float[Tensor, " s"]:
-        """The subcarriers [Hz]; ``Model.at_frequencies`` exchanges the scene."""
+        """The subcarriers of the present scene [Hz]; ``Model.at_frequencies`` replaces it."""
         return self.scene.task.frequencies
 
     @torch.no_grad()

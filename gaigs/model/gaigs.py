@@ -28,7 +28,7 @@ from gaigs.splatting.rasterizer import Rasterizer
 
 
 class Excited(NamedTuple):
-    """The Gaussians for a transmitter at each of some places."""
+    """The Gaussians for a transmitter at each of b places."""
 
     placed: Placed  # Gaussians before the deformation
     residuals: Residuals  # changes by the deformation
@@ -126,7 +126,7 @@ class GaussianSplatting(Model):
         self.deformation = registry("deformation").build(deformation, **context)
 
     def _built_trend(self, trend: str | Mapping | Model) -> Model:
-        """The trend, without parameters and stored links; adds the buffer ``level``."""
+        """The built trend, which must have no parameters or links; adds the buffer ``level``."""
         built = build_trend(trend, self.scene)
         keeps_links = isinstance(built, LookUp) or not built.state_dict()
         if keeps_links or [*built.parameters()]:
@@ -195,7 +195,7 @@ class GaussianSplatting(Model):
             )
 
     def _built_gaussians(self, options: Mapping | None, zone: Any) -> Gaussians | None:
-        """Free Gaussians, independent of the placement, at elevations in ``zone`` [rad]; or None.
+        """Trainable Gaussians beside the placement's, at elevations in ``zone`` [rad]; or None.
 
         Together with Gaussians of a placement their signal must not depend on the direction (degree
         0).
@@ -341,7 +341,7 @@ class GaussianSplatting(Model):
         return {} if self.rasterizer is None else {"rasterizer": self.rasterizer.used}
 
     def rendering(self, batch: Batch) -> Callable[[], object]:
-        """The rasterizer, or the sum over paths, for links to the first link's receiver."""
+        """A function that only draws the map, or sums the paths, at the first link's receiver."""
         receiver = int(batch.query.receivers[0])
         query = batch.query[(batch.query.receivers == receiver).nonzero()[:, 0]]
         with torch.no_grad():
@@ -353,7 +353,7 @@ class GaussianSplatting(Model):
         return lambda: [self.rasterizer(*arguments) for arguments in calls]
 
     def export(self, folder: Path) -> None:
-        """``gaussians.ply`` of the free Gaussians, for 3-D splatting viewers."""
+        """Writes ``gaussians.ply``, the trainable Gaussians, for 3-D splatting viewers."""
         if self.gaussians is not None:
             self.gaussians.save_ply(folder / "gaussians.ply")
 

@@ -39,12 +39,11 @@ class Solved(NamedTuple):
 
 @register("model", "gaussian_process")
 class GaussianProcess(LookUp):
-    """label = trend + z + noise, with a process z over places with the kernel exp(-d / l),
-    Matern-1/2.
+    """label = trend + z + noise, with a Gaussian process z over places.
 
-    d is the distance of transmitters. With several carriers it combines distance and frequency, d²
-    = |dx|² + (s d ln f)². Pixels of a label, and real and imaginary part, are separate processes
-    with one kernel.
+    The kernel is exp(-d / l), Matern-1/2, with the distance d of transmitters. With several
+    carriers d combines distance and frequency, d² = |dx|² + (s d ln f)². Pixels of a label, and
+    real and imaginary part, are separate processes with one kernel.
 
     Length l [m], nugget (variance of the noise over the signal's) and s [m] maximise the likelihood
     of the validation links given the training links around them, see ``gaigs.kriging.fit``. All
@@ -116,7 +115,7 @@ class GaussianProcess(LookUp):
     def refit(self, links: Links) -> None:
         """Fits to some of the known links, with kernel, noise and trend from ``fit``.
 
-        Labels of many numbers also keep all hyperparameters. For scalar labels lengths and
+        Labels with many values also keep all hyperparameters. For scalar labels lengths and
         deviations are fitted again, unless more than ``ScalarOptions.large`` links are known.
         """
         self._fit(links, chooses=False)
@@ -217,7 +216,7 @@ class GaussianProcess(LookUp):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        """The last of the trends, without a process; for received levels this is a law of distance.
+        """The trend alone, for received levels a path-loss model, without the process.
 
         Residuals at one receiver do not correlate with residuals at others. The process stays if
         the receivers are places of one radio.
@@ -233,7 +232,7 @@ class GaussianProcess(LookUp):
     def facts(self) -> dict[str, object]:
         """``length_m``, ``nugget`` and, with several carriers, ``frequency_scale_m``.
 
-        For scalar labels the facts of ``ScalarProcess`` and the trend.
+        Scalar labels have the facts of ``ScalarProcess`` and of the trend instead.
         """
         if self.scalar is not None:
             return {**self.scalar.facts(), "trend": name_of(self.trend)} | self.trend.facts()
@@ -258,7 +257,7 @@ class GaussianProcess(LookUp):
         return Prediction(at_directions(trend + added, batch, self.scene), {})
 
     def deviations(self, batch: Batch) -> Tensor:
-        """Standard deviations of the labels, means over a label's numbers."""
+        """Standard deviations of the labels, averaged over a label's values."""
         query = batch.query
         radios = self.scene.radio_of(query.receivers)
         if self.scalar is not None:
@@ -293,7 +292,7 @@ class GaussianProcess(LookUp):
         )
 
     def _solve(self, index: Int[Tensor, " k"], factor: Tensor | None) -> Solved:
-        """Solution or factor of a receiver, whichever has fewer numbers."""
+        """Solution K^-1 r or Cholesky factor of a receiver, whichever needs less memory."""
         if factor is None or math.prod(self.scene.task.shape) >= len(index):
             return Solved(None, factor)
         residuals = torch.cat([*self._residuals(index)]).reshape(len(index), -1)
@@ -316,7 +315,7 @@ class GaussianProcess(LookUp):
         """Residuals (b, *shape) that the process predicts for links to one receiver.
 
         The result is k K^-1 r, with the kernel k, and covariances K and residuals r of the known
-        links. K^-1 r is cached unless it has more numbers than K.
+        links. K^-1 r is cached unless it is larger than K.
         """
         index = self.known[receiver]
         task = self.scene.task

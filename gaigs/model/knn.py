@@ -1,4 +1,4 @@
-"""Inverse-distance weighting of the nearest known links: the simplest look-up."""
+"""Inverse-distance weighting of the labels of the nearest known links."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -41,7 +41,7 @@ class HeldOutLinks(NamedTuple):
 class KNearestNeighbours(LookUp):
     """The mean of the k known labels nearest to the transmitter, weighted by 1 / distance^power.
 
-    Links at the distance of the k-th count too, so the order of links has no effect. Channels of
+    Links as far as the k-th one count too, so the order of links has no effect. Channels of
     unknown phase are aligned to the nearest one. The look-up stores all links, with one byte a
     pixel for images.
 
@@ -82,7 +82,7 @@ class KNearestNeighbours(LookUp):
 
     @property
     def any_receiver(self) -> bool:  # type: ignore[override]
-        """True if neighbours are near at both ends."""
+        """True if the receivers are places of one radio; neighbours are then near at both ends."""
         return self.scene.one_radio
 
     def fit(self, links: Links) -> None:
@@ -222,7 +222,7 @@ class KNearestNeighbours(LookUp):
         return torch.cat(errors).mean().item() if errors else 0.0
 
     def _rank(self, count: int, held: Sequence[HeldOutLinks]) -> float:
-        """Mean error, or negative similarity, of held-out links with ``count`` neighbours."""
+        """Mean monitored score of held-out links with ``count`` neighbours, as a cost."""
         self.chosen = count
         task = self.scene.task
         pairs = map(self._predicted, held)

@@ -33,24 +33,22 @@ log = logging.getLogger(__name__)
 
 @register("model", "kriging")
 class Kriging(Wrapper):
-    """weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend.
+    """A trained model, the trend, whose residuals are kriged. Predictions are
 
-    The trend is a trained model. The fallback is a simple model, fitted by this class. z is the
-    mean of a Gaussian process over places, as in ``gaigs.model.gaussian_process``, and 0 far from
-    all known links. With a trend weight of 0 and a weight of 1 the model equals
-    ``gaussian_process`` with the fallback as its trend, except for the hyperparameters of scalar
-    labels.
+        weight (trend_weight trend + (1 - trend_weight) fallback + z) + (1 - weight) trend.
+
+    The fallback is a simple model, fitted by this class. z is the mean of a Gaussian process over
+    places, as in ``gaigs.model.gaussian_process``, and 0 far from all known links.
 
     Trend weight, length and nugget maximise the likelihood of the validation links given the
-    training links around them. The weight gives the validation links their best score when they are
-    predicted from the training links. The likelihood alone would give kriging too much weight if
-    cubes of space are held out.
+    training links around them. The weight maximises the score of validation links predicted from
+    training links. By likelihood it would be too large if cubes of space are held out.
 
     z comes from one of three posteriors. ``ScalarPosterior`` is for scalar labels, with
     hyperparameters for each receiver. ``FieldPosterior`` is for other labels. ``PathPosterior``
     kriges the strengths of paths, for a trend with ``margins``, the deviations of its paths. The
     first and the last have a weight of 1 or 0. Labels are kriged instead of paths if this clearly
-    improves the validation score, as at places closer than half a wavelength.
+    improves the validation score, for example at places closer than half a wavelength.
 
     A run makes this model with ``kriging=true``. A checkpoint stores the residuals as a few
     principal components. If a receiver has more than ``LIMIT`` known links, an evenly spread part
@@ -96,7 +94,7 @@ class Kriging(Wrapper):
         self._make_posterior(self.trend.has_margins)
 
     def _make_posterior(self, by_paths: bool) -> None:
-        """Sets a new posterior: of the trend's paths, or of the task's labels."""
+        """Sets a new posterior, for the strengths of the trend's paths or for the labels."""
         posterior: Posterior
         if self.scene.task.is_scalar:
             posterior = ScalarPosterior(self.scene)
@@ -163,7 +161,7 @@ class Kriging(Wrapper):
         return krige(links, values, is_final)
 
     def law_scores(self, links: Links, held: Int[Tensor, " h"]) -> Float[Tensor, " h"]:
-        """Scores of validation links by the law that may replace the trend; the law is stored."""
+        """Scores of validation links by a path-loss model (stored), which may replace the trend."""
         train, task = links.split.train, self.scene.task
         if self.laws is None or not torch.equal(self.laws[1], train):
             # For levels the law has more terms than the distance to a receiver.
@@ -196,7 +194,7 @@ class Kriging(Wrapper):
         return self._krige_labels(links, values, is_final)
 
     def _krige_labels(self, links: Links, values: Tensor | None, is_final: bool) -> "Kriging":
-        """``krige`` of labels, where a law of distance may replace the trend.
+        """``krige`` with labels; a path-loss model may replace the trend.
 
         ``values`` are the trend's predictions of the known links, validation links last. None for
         scalar labels; they are then computed if the trend may have weight.
@@ -306,7 +304,7 @@ class Kriging(Wrapper):
         self.posterior.to(self.weight.device)
 
     def _features(self, spectra: Tensor) -> tuple[Tensor, ...]:
-        """``coarse`` spectra of a trend without paths at its own receivers; otherwise None."""
+        """``coarse`` spectra, if a trend without paths predicts its own receivers; else None."""
         scene = self.scene
         if scene.task.directions is None or scene.has_band or scene.one_radio:
             return ()
@@ -475,7 +473,7 @@ class Kriging(Wrapper):
 
     @property
     def _at_new(self) -> Model:
-        """The model of receivers without links."""
+        """The model that predicts receivers without links."""
         weight = self.new_weight.item()
         if weight in (0, 1) or self.trend_weight == 0:
             return self._alone if weight else self.fallback

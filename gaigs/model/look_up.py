@@ -33,7 +33,7 @@ class LookUp(Model):
         return self
 
     def get_extra_state(self) -> dict:
-        """Known links and ``learnt``; labels of 8-bit images, multiples of 1 / 255, as bytes."""
+        """Known links and ``learnt``; labels of 8-bit images are stored as bytes."""
         if self.links is None:
             raise ValueError(f"model {name_of(self)!r} has no links to save; fit it first")
         index = torch.cat([*self.known])

@@ -1,4 +1,4 @@
-"""The mean of the known labels: the weakest baseline."""
+"""A baseline that predicts the mean of the known labels."""
 
 import torch
 
@@ -27,7 +27,7 @@ class Mean(Model):
         self.register_buffer("means", torch.full(shape, torch.nan, dtype=scene.task.dtype))
 
     def fit(self, links: Links) -> None:
-        """Computes the means; a receiver without links gets ``common_gain`` of the others'."""
+        """Computes the means; a receiver without links gets ``common_gain`` of the other means."""
         known = known_links(links, any_receiver=True)
         for receiver, index in enumerate(known):
             if not len(index):

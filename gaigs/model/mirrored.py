@@ -49,18 +49,18 @@ class MirroredSplatting(GaussianSplatting):
 
     For channels and spectra, ``ChannelSearch``, ``FieldSearch`` or ``LagSearch`` locates the planes
     before the training. For signal strengths the training begins with powers, which show the
-    obstacles; then ``LevelSearch`` locates planes by phases. Where frequencies are unknown, powers
-    add to the end. For labels that no search reads, planes start at the faces of the box; in the
-    training each is turned square to the others and moved along its normal to the least error.
+    obstacles; then ``LevelSearch`` locates planes by phases. If frequencies are unknown, powers of
+    paths always add. For other labels planes start at the faces of the box. During the training
+    each is turned square to the others, and moved along its normal to the least error.
 
-    Parts are as for ``GaussianSplatting``, with a placement ``mirrored``; each defaults to one that
-    suits it.
+    Parts are as for ``GaussianSplatting``, with the placement ``mirrored`` and suitable defaults.
 
     Args:
-        search: Start with spectra: True for planes of ``LagSearch``, False for the faces of the
-            box, None for both, of which validation chooses.
-        boxes: Search boxes in levels of a known carrier. True: paths have no gains of their own,
-            which suits planned receivers best; False: none. None: with held-out receivers alone.
+        search: Start of a training on spectra. True: planes from ``LagSearch``; False: the faces of
+            the box; None: both, and validation chooses.
+        boxes: Whether boxes are searched in levels of a known carrier. True: always, and single
+            paths have no gains, which suits planned receivers best. False: never. None: only if the
+            split holds out receivers.
 
     Source: ours; docs/methods.md.
     """
@@ -169,7 +169,7 @@ class MirroredSplatting(GaussianSplatting):
             self.second_start = {"search": False}
 
     def _prepare_levels(self, links: Links) -> None:
-        """Makes the search of levels that ``revise`` runs once powers have shown the obstacles."""
+        """Prepares ``LevelSearch``, for ``revise`` once obstacles are learnt from powers."""
         trend = 0 * links.labels
         if self.trend is not None:
             trend = self.trend(Batch(links.query).to(self.device)).value.cpu()
@@ -183,7 +183,7 @@ class MirroredSplatting(GaussianSplatting):
         )
 
     def _prepare_boxes(self, links: Links) -> None:
-        """Draws the levels in which ``revise`` searches boxes, and those that prove them."""
+        """Draws links for the search of boxes in ``revise``, and links that test its boxes."""
         # With so many a search takes a minute; with 600 it finds a third of the furniture.
         rows, held = drawn(links.split.train, 1500), drawn(links.split.validation, 1500)
         # One receiver or two do not tell where along a path an obstacle stands.
@@ -192,10 +192,10 @@ class MirroredSplatting(GaussianSplatting):
             self.proof = Batch(links.query[held], labels=links.labels[held])
 
     def _fit_channels(self, links: Links, task: Task, pooling: ChannelPooling) -> None:
-        """Starts the training from free space, and plans planes for its first revision.
+        """Starts the training from free space, and searches the planes for its first revision.
 
-        ``ChannelSearch`` finds the planes; for channels of few numbers ``FieldSearch``, which needs
-        a common phase. Without one, the faces of the box stay.
+        ``ChannelSearch`` finds the planes. For channels with few values ``FieldSearch`` does, which
+        needs a common phase. Without one, the faces of the box stay.
         """
         placement = self.placement
         received = links.labels
@@ -237,7 +237,7 @@ class MirroredSplatting(GaussianSplatting):
     def _search_field(
         self, links: Links, sign: int, start: Float[Tensor, "w 4"], pooling: ChannelPooling
     ) -> None:
-        """Plans the planes that ``FieldSearch`` finds, and starts from its strengths."""
+        """Searches planes with ``FieldSearch``, and starts from the strengths that it fits."""
         placement = self.placement
         search = FieldSearch(links, sign, placement.order, len(placement.origin), start)
         room = search.run()
@@ -280,7 +280,7 @@ class MirroredSplatting(GaussianSplatting):
         waves: Complex[Tensor, "b e s"],
         pooling: ChannelPooling,
     ) -> Complex[Tensor, " r"]:
-        """Gain of each receiver's training links over the pooling's waves, by ``fit_gain``.
+        """Gain of each receiver, from its training links and the pooling's waves by ``fit_gain``.
 
         The gain is 0.1 where phases follow neither sign convention: a strong start with wrong
         phases would be worse than no signal.
@@ -311,7 +311,7 @@ class MirroredSplatting(GaussianSplatting):
     def _revise_planes(
         self, number: int, train: Batch, validation: Batch | None, loss: Loss
     ) -> str:
-        """``revise`` without boxes of levels."""
+        """The changes of ``revise`` to planes and paths, without the search of boxes in levels."""
         placement = self.placement
         # Channels are sums of waves: powers alone say nothing, and phases count from the start.
         adds_waves = not isinstance(self.pooling, LagPooling)
@@ -347,7 +347,7 @@ class MirroredSplatting(GaussianSplatting):
         return f"phases count; planes moved by {moves} m; loss {before:.4f} -> {loss(train):.4f}"
 
     def _place_boxes(self) -> str:
-        """Puts boxes that explain the shadows at all receivers in place of learnt obstacles."""
+        """Replaces learnt obstacles by boxes, if they explain the shadows at all receivers."""
         obstacles = self.placement.obstacles
         if self.shadowed is None or obstacles is None:
             return ""
@@ -375,7 +375,7 @@ class MirroredSplatting(GaussianSplatting):
         return BoxSearch(paths, errors, ends)
 
     def _shadow_errors(self, query: Query, labels: Tensor) -> ChannelErrors | LevelErrors:
-        """Errors of links by the depths of their paths."""
+        """The function from the depths of paths to the errors of links, for ``BoxSearch``."""
         placement = self.placement
         if not placement.is_complex:
             links = placement.folded(query)
@@ -418,7 +418,7 @@ class MirroredSplatting(GaussianSplatting):
 
     @torch.no_grad()
     def margins(self, query: Query) -> Complex[Tensor, "b n e s"]:
-        """Channels by which each path may deviate, one standard deviation each, for kriging.
+        """Prior standard deviation of the channel of each path, for kriging.
 
         All links are to one receiver. The paths have the strengths of ``PathFields.margins``.
         """
@@ -433,7 +433,7 @@ class MirroredSplatting(GaussianSplatting):
         count, n = paths.amplitudes.shape
 
         def separate(values: Tensor) -> Tensor:
-            """Each path of each link as a link of its own (b n, 1, ...)."""
+            """``values`` (b, n, ...) with one link for each path (b n, 1, ...)."""
             return values.expand(count, *values.shape[1:]).flatten(0, 1)[:, None]
 
         single_paths = replace(
@@ -462,16 +462,16 @@ class MirroredSplatting(GaussianSplatting):
         return facts if self.places is None else facts | summarize(placement, self.places)
 
     def export(self, folder: Path) -> None:
-        """Writes ``planes.obj`` and ``obstacles.ply`` beside the free Gaussians.
+        """Writes ``planes.obj`` and ``obstacles.ply`` beside the trainable Gaussians.
 
-        Planes reach as far as paths of the links ``traced`` meet them.
+        Planes are drawn as far as paths of the links ``traced`` meet them.
         """
         super().export(folder)
         write_room(self.placement, self.traced, folder)
 
     @property
     def traced(self) -> Query:
-        """Links whose paths show where planes end: training links; of a loaded model others."""
+        """Links whose paths outline planes: training links, or spread ones in a loaded model."""
         return spread_links(self.scene) if self.places is None else self.places
 
     def learnt_room(self, links: Links | None = None) -> LearntRoom:

@@ -1,4 +1,4 @@
-"""Copies of a model at other subcarriers, or at receivers that no measurement has."""
+"""Copies of a model for other subcarriers, or for receivers without measurements."""
 
 import copy
 from collections.abc import Sequence
@@ -22,9 +22,9 @@ class Movable(nn.Module):
     Attributes:
         any_frequency: True if channels are a function of frequency, read from
             ``scene.task.frequencies``.
-        any_receiver: True if the model predicts for receivers without links. A module of the model
-            names in ``of_receivers`` its buffers with a row for each receiver: a new receiver gets
-            the mean row. What else has to change, ``take_receivers`` changes.
+        any_receiver: True if the model predicts for receivers without links. In ``of_receivers`` a
+            module names its buffers with a row for each receiver; a new receiver gets the mean row.
+            ``take_receivers`` makes all other changes.
     """
 
     scene: Scene
@@ -48,7 +48,7 @@ class Movable(nn.Module):
     ) -> Any:
         """A copy of a model with ``any_receiver`` for other receivers, without measurements there.
 
-        What the model learns of each receiver, such as a gain, is the mean over known receivers.
+        Quantities learnt for each receiver, such as a gain, become means over known receivers.
 
         Args:
             receivers: Receivers of the copy, in place of the model's own.
@@ -107,17 +107,17 @@ class Movable(nn.Module):
 
     @torch.no_grad()
     def adapt(self, links: Links) -> Any:
-        """A copy at new receivers, which a few links correct; the room stays.
+        """A copy for new receivers, corrected by a few readings there.
 
-        Errors at a receiver are a level, a field over places and noise, whose variances come from
-        receivers that are predicted as new ones. See ``gaigs.model.adapted``.
+        The error at a receiver is a constant, plus a field over places, plus noise. Their variances
+        come from known receivers, predicted as if they were new. See ``gaigs.model.adapted``.
 
         Args:
             links: Readings at one or several receivers without training links; a split is not used.
 
         Raises:
-            ValueError: The labels are no levels, too few receivers have calibrated how receivers
-                differ, or the model is an adapted one.
+            ValueError: The labels are not levels, too few receivers show how receivers differ, or
+                the model is already adapted.
 
         Example:
             >>> levels = gaigs.links("synthetic_rssi", transmitters=100)
@@ -147,9 +147,9 @@ class Movable(nn.Module):
         return adapted
 
     def take_calibration(self, other: "Movable") -> None:
-        """Takes another model's calibration for receivers without links.
+        """Copies another model's calibration for receivers without links.
 
-        Receivers that are places of one radio have links, and take the calibration as it is.
+        If receivers are places of one radio, all have links, and the usual calibration is copied.
         """
         self.calibration = other.calibration
         if other.calibration is not None and not self.scene.one_radio:

@@ -15,16 +15,15 @@ from gaigs.registry import register
 
 @register("model", "path_loss")
 class PathLoss(Model):
-    """T - 10 gamma log10(distance / 1 m) for each receiver; NaN before ``fit``.
+    """Level T - 10 gamma log10(distance / 1 m) for each receiver; NaN before ``fit``.
 
-    It is meant for RSSI [dBm], and accepts any task of one real number a link. T and gamma are
-    fitted by least squares. Exponents gamma are then drawn towards the mean of all receivers, as
-    far as chance explains their scatter (``shrunk``): a few readings alone give wild slopes. A
-    receiver whose links are equally long gets this mean. If no receiver has an exponent, it gets 2,
-    as in free space. Negative exponents are kept: there distance explains nothing. Distances below
-    0.1 m count as 0.1 m: within about a wavelength the field does not follow the law. If a
-    receiver's place is estimated, the logarithm is averaged over the region in which it may stand,
-    so there is no peak in its middle.
+    Labels are RSSI [dBm], or any scalar. T and gamma are fitted by least squares. Exponents gamma
+    from a few readings scatter widely, so they are shrunk towards the mean of all receivers
+    (``shrunk``). A receiver whose links are equally long gets this mean. If no receiver has an
+    exponent, it is 2, as in free space. Negative exponents are kept; distance hardly explains such
+    levels. Distances below 0.1 m count as 0.1 m, since the law fails within about a wavelength. If
+    a receiver's place is estimated, the logarithm is averaged over the region in which it may
+    stand, so there is no peak in its middle.
 
     Raises:
         ValueError: A label is more than one real number.
@@ -88,7 +87,7 @@ class PathLoss(Model):
         return Prediction(self.levels[radios] - 10 * self.exponents[radios] * decades, {})
 
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
-        """Takes new receivers, which stand at known places."""
+        """Replaces the receivers by new ones at known places."""
         self.regions = self.regions.new_zeros(len(scene.receivers))
 
     def _decades(
@@ -111,7 +110,7 @@ class PathLoss(Model):
 def shrunk(
     exponents: Float[Tensor, " r"], weights: Float[Tensor, " r"], noise: Float[Tensor, ""]
 ) -> Float[Tensor, " r"]:
-    """Exponents drawn towards their mean as far as chance explains their scatter.
+    """Exponents shrunk towards their mean, as far as chance explains their scatter.
 
     Args:
         exponents: Exponents fitted by least squares.

@@ -37,7 +37,7 @@ class Subcarriers(NamedTuple):
 
 
 class Request(NamedTuple):
-    """Links to predict, and the arrangement of their values."""
+    """A checked request of ``Model.predict``: links to predict, and axes of the result."""
 
     query: Query  # links, the receivers of a position one after the other
     axes: tuple[int, ...]  # axes of the links in the answer, see ``Query.from_positions``
@@ -199,7 +199,7 @@ def is_same(one: Receiver, other: Receiver) -> bool:
 
 
 def _kind_of(values: Any) -> tuple[str, tuple[int, ...]]:
-    """Numpy's kind of dtype, and the shape, of numbers; kind ``O`` for anything else."""
+    """Shape and numpy's kind of dtype of an array-like; the kind is ``O`` if not numeric."""
     try:
         array = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
     except ValueError:  # ragged lists
@@ -290,7 +290,7 @@ def usual_batch_size(shape: tuple[int, ...], numbers: int = 2**17, most: int = 1
 
 
 def extrapolations(query: Query, scene: Scene) -> list[str]:
-    """Sentences on positions far from the training box, and on carriers beyond the band."""
+    """Warnings for positions far from the training box, and for carriers beyond the band."""
     messages = []
     lower, upper = (corner.to(scene.lower) for corner in scene.box)
     positions = scene.positions(lower)

@@ -1,4 +1,4 @@
-"""Path loss with terms beyond the logarithm of the distance."""
+"""Path loss with further terms: a break point, antenna lobes and heights."""
 
 import torch
 

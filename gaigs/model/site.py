@@ -123,7 +123,7 @@ class Site(Model):
         return Prediction(self.law(batch).value - loss, {})
 
     def _features(self, query: Query) -> Float[Tensor, "b 4"]:
-        """The features of c1 to c4 in the loss of each link; NaN before ``fit``."""
+        """The factors of c1 to c4 in the loss of each link, see ``Site``; NaN before ``fit``."""
         x, y, cell = self.grid.tolist()
         if not cell:  # before the fit
             return query.transmitters.new_full((len(query), 4), torch.nan)

@@ -147,7 +147,7 @@ def build_estimator(given: Any) -> Any:
 
 
 def find_class(target: str) -> type:
-    """A class of scikit-learn; no others, since a checkpoint of a stranger may name them."""
+    """A class of scikit-learn; others are refused, as a stranger's checkpoint may name any."""
     try:
         from sklearn.base import BaseEstimator
         from sklearn.gaussian_process.kernels import Kernel

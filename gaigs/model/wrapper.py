@@ -14,7 +14,7 @@ from gaigs.splatting.gaussians import Gaussians
 
 
 class Wrapper(Model):
-    """Base of a model around an ``underlying`` one; it shows the latter's room and files."""
+    """Base of models that wrap an ``underlying`` model, and show its room and files."""
 
     @property
     @abstractmethod

@@ -1,4 +1,4 @@
-"""Planes along the axes of a room: growth of a room whose first planes are known."""
+"""Search for further planes parallel or perpendicular to a room's known planes."""
 
 import logging
 
@@ -18,9 +18,9 @@ log = logging.getLogger(__name__)
 
 
 class AxisPlanes(PlaneSearch[SlabRoom]):
-    """Search for planes along the axes of a room, near its known planes.
+    """Search for planes whose normals are axes of a room, see ``room_axes``.
 
-    Only offsets along the room's axes are searched. With so few candidates, faint planes exceed the
+    Only the offsets along these axes are searched. With so few candidates, faint planes exceed the
     noise, and walls behind the array differ from the direct path. Walls are added before other
     planes. After each addition all planes are adjusted slightly.
     """
@@ -32,17 +32,18 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         self.data = data
 
     def find_upright(self, room: SlabRoom) -> SlabRoom:
-        """A room of the single vertical plane that explains most; empty if there is none.
+        """A room with one plane: the vertical plane that explains most of the channels.
 
-        The plane is along the axes of ``room``.
+        Its normal is one of the ``room_axes`` of ``room``. The result is empty if no such plane
+        explains anything.
         """
         axes = room_axes(room.planes)
         nothing = SlabRoom(room.planes[:0], room.slabs[:0])
-        walls, amid = self.propose_along(nothing, axes[axes[:, 2].abs() < 0.01], 0.0)
+        walls, between = self.propose_along(nothing, axes[axes[:, 2].abs() < 0.01], 0.0)
         trials = []
-        for candidate in walls + amid:
+        for candidate in walls + between:
             for moved, material in self._propose_by_phases(candidate[None], 0, 0.04):
-                # Level directions alone, with a normal of length 1.
+                # Without its vertical part; the horizontal part of the normal gets length 1.
                 upright = moved * moved.new_tensor([1.0, 1.0, 0.0, 1.0]) / moved[:2].norm()
                 trials.append(SlabRoom(upright[None], material[None]))
         polished = [self.score.refine(trial) for trial in self.score.choose_best(trials)]
@@ -51,23 +52,23 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
     def grow_along(
         self, room: SlabRoom, most: int, others: Float[Tensor, "v 4"] | None = None
     ) -> SlabRoom:
-        """The room with further planes, ``most`` in total.
+        """The room after the addition of planes, with at most ``most`` planes in total.
 
-        Walls along the room's axes are added first, then planes along these axes between the
-        places, then planes of ``others``.
+        Walls with normals along the room's axes are added first. Planes with these normals between
+        the places follow, then planes of ``others``.
         """
         count = len(room.planes)
 
         def extend(room: SlabRoom) -> SlabRoom | None:
             before = self.score.error(room)
-            walls, amid = self.propose_along(
+            walls, between = self.propose_along(
                 room, room_axes(room.planes), self.data.options.added_share
             )
             unused = []
             for plane in others if others is not None else []:
                 if not self.frame.is_like(room.planes, plane).any():
                     unused.append(plane)
-            for candidates in (walls, amid, unused):
+            for candidates in (walls, between, unused):
                 if not candidates:
                     continue
                 larger = self.add_best(room, candidates)
@@ -90,19 +91,22 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
             the places, each list best first. In a single list the latter would displace walls.
         """
         walls: list[Candidate] = []
-        amid: list[Candidate] = []
+        between: list[Candidate] = []
         lines = self.frame.grid(normals, 400, self.data.options.margin)
         for line, shares in zip(lines, self.score.rate(room, lines).ratings, strict=True):
             for plane in room.planes:
                 shares[self.frame.is_like(line, plane)] = 0
             heights = self.frame.points.to(line) @ line[0, :3]
             is_wall = (line[:, 3] < heights.min()) | (line[:, 3] > heights.max())
-            for kind, rated in ((walls, shares * is_wall), (amid, shares * ~is_wall)):
+            for kind, rated in ((walls, shares * is_wall), (between, shares * ~is_wall)):
                 kind += [Candidate(line[at], rated[at].item()) for at in find_maxima(rated, 11)]
-        return _strongest(walls, least), _strongest(amid, least)
+        return _strongest(walls, least), _strongest(between, least)
 
     def add_best(self, room: SlabRoom, candidates: list[Float[Tensor, "4"]]) -> SlabRoom:
-        """The room with the best candidate, moved; unchanged if all move to known planes."""
+        """The room with the best candidate, after a move to where phases agree.
+
+        The room is unchanged if every candidate moves onto a known plane.
+        """
         trials = []
         number = len(room.planes)
         for plane in candidates:
@@ -114,7 +118,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         return self.score.polish(best[0], steps=12, rate=5e-4, only=number) if best else room
 
     def settle(self, room: SlabRoom, polishes: bool = False) -> SlabRoom:
-        """The room with each plane moved again, given the present positions of all others.
+        """The room after each plane moves once more, given the present positions of the others.
 
         ``polishes`` adds a gradient descent to each move.
         """
@@ -125,12 +129,12 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         return self.score.choose_best([room, self.score.polish(room, steps=30, rate=3e-4)])[0]
 
     def _propose_by_phases(self, planes: Float[Tensor, "w 4"], number: int, tilt: float) -> list:
-        """Planes near plane ``number``, with every third slab of ``SLABS``."""
+        """Planes near plane ``number``, by ``propose_by_phases`` with every third of ``SLABS``."""
         return propose_by_phases(self.data, planes, number, self.data.reach, tilt, SLABS[::3])
 
 
 def _strongest(candidates: list[Candidate], least: float) -> list[Float[Tensor, "4"]]:
-    """Planes of at most four candidates whose ratings exceed ``least``, best first."""
+    """Planes of the best four candidates, without ratings up to ``least``; best first."""
     candidates = sorted(candidates, key=lambda candidate: -candidate.rating)[:4]
     return [candidate.plane for candidate in candidates if candidate.rating > least]
 
@@ -150,14 +154,14 @@ def room_axes(planes: Float[Tensor, "w 4"]) -> Float[Tensor, "k 3"]:
 
 
 def is_square(planes: Float[Tensor, "w 4"]) -> bool:
-    """True if planes are horizontal or vertical, parallel or perpendicular, to about a degree."""
+    """True if planes are level or upright, and pairwise parallel or square, to about a degree."""
     normals = torch.cat((planes[:, :3], planes.new_tensor([[0.0, 0.0, 1.0]])))
     cosines = (normals @ normals.mT).abs()
     return bool(((cosines < 0.02) | (cosines > 0.9998)).all())
 
 
 def find_maxima(ratings: Float[Tensor, " k"], width: int) -> list[int]:
-    """Indices of at most two maxima above 0, each the largest of ``width`` neighbours."""
+    """Indices of at most two local maxima above 0, each the largest of ``width`` neighbours."""
     is_peak = functional.max_pool1d(ratings[None], width, 1, width // 2)[0] == ratings
     at = (ratings * is_peak).topk(2).indices
     return at[ratings[at] * is_peak[at] > 0].tolist()

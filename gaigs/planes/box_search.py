@@ -16,22 +16,23 @@ from gaigs.splatting.placement.mirrored.reflections import Folded
 
 
 class ChannelErrors(NamedTuple):
-    """Logarithms of the relative errors of channels h whose paths are dimmed by depths.
+    """Errors of measured channels h if obstacles attenuate each path by a depth [Np].
 
-    F has the field of each path without obstacles, and a = exp(-depths):
+    The error of a link is the logarithm of |h - F a|² / |h|². The columns of F are the paths'
+    fields without obstacles, and a = exp(-depths):
 
         |h - F a|² = |h|² - 2 a' Re(F^H h) + a' Re(F^H F) a
     """
 
     products: Float[Tensor, "b n n"]  # Re(F^H F) / |h|²
     matches: Float[Tensor, "b n"]  # Re(F^H h) / |h|²
-    floor: float = 1e-3  # 30 dB: better links pull less and less
+    floor: float = 1e-3  # relative error, -30 dB, below which a change hardly counts
 
     @classmethod
     def of(
         cls, fields: Complex[Tensor, "b n e s"], channels: Complex[Tensor, "b e s"]
     ) -> "ChannelErrors":
-        """Errors of channels, from the field of each path without obstacles."""
+        """The function for measured channels, from the field of each path without obstacles."""
         fields = fields.flatten(2)
         channels = channels.flatten(1)[..., None]  # (b, numbers, 1)
         power = channels.abs().square().sum((1, 2))[:, None].clamp_min(FAINTEST)
@@ -39,7 +40,7 @@ class ChannelErrors(NamedTuple):
         return cls(products, (fields.conj() @ channels)[..., 0].real / power)
 
     def __call__(self, depths: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
-        """Error of each link with its paths dimmed by ``depths`` [Np]."""
+        """Error of each link if its paths are attenuated by ``depths`` [Np]."""
         passed = (-depths).exp()
         terms = (self.products @ passed[..., None])[..., 0] - 2 * self.matches
         errors = (1 + (passed * terms).sum(1)).clamp_min(0)
@@ -47,18 +48,19 @@ class ChannelErrors(NamedTuple):
 
 
 class LevelErrors(NamedTuple):
-    """Logarithms of the squared errors of levels whose paths' powers are dimmed by depths.
+    """Errors of measured levels if obstacles attenuate each path by a depth [Np].
 
-    The mean error of each receiver drops out: its gain is not yet right while obstacles are wrong.
+    The error of a link is the logarithm of 1 + its squared error over ``scale``². The mean error of
+    each receiver is subtracted first, since its gain is not yet right while obstacles are wrong.
     """
 
     powers: Float[Tensor, "b n"]  # of each path without obstacles
     levels: Float[Tensor, " b"]  # [dB]
     receivers: Int[Tensor, " b"]
-    scale: float = 6.0  # [dB]; larger errors pull less and less
+    scale: float = 6.0  # [dB]; a change of a larger error counts less
 
     def __call__(self, depths: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
-        """Error of each link with its paths dimmed by ``depths`` [Np]."""
+        """Error of each link if its paths are attenuated by ``depths`` [Np]."""
         power = (self.powers * (-2 * depths).exp()).sum(1).clamp_min(FAINTEST)
         errors = 10 * power.log10() - self.levels
         counts = self.receivers.bincount()
@@ -68,14 +70,14 @@ class LevelErrors(NamedTuple):
 
 
 class Cuboid(NamedTuple):
-    """A cuboid that dims the field of each path through it, however long the way inside."""
+    """A cuboid that attenuates each path through it, equally for any length inside."""
 
     corners: Float[Tensor, "2 3"]  # least and largest coordinates [m]
     loss: float  # [Np]
 
 
 class Segments(NamedTuple):
-    """Segments of paths through a cuboid."""
+    """Straight segments of paths that cross a cuboid."""
 
     low: Float[Tensor, "3"]  # least coordinates of the cuboid [m]
     high: Float[Tensor, "3"]
@@ -85,24 +87,25 @@ class Segments(NamedTuple):
 
 
 class BoxSearch:
-    """Boxes, each shared by all paths of all receivers, that lower the errors of links.
+    """Search for boxes whose attenuation of all receivers' paths lowers the errors of links.
 
-    A box starts as one of the cells whose loss lowers the errors most, and its faces then move to
-    the least mean error. A box holds no transmitter and no receiver, since these stand in the open.
-    The box that lowers the error most stays if the fall is clear. Then all boxes are adjusted in
-    turn, and a gap is cut through a box that covers two obstacles.
+    A box starts as one of the grid's cells whose loss lowers the errors most. Its faces then move
+    to the least mean error. No transmitter or receiver may lie in a box, since these stand in the
+    open. The box that lowers the error most is added if the fall is significant. Then all boxes are
+    adjusted in turn, and a gap is cut through a box that covers two obstacles.
 
     Attributes:
-        most: Boxes after which the search ends; cuts at most double them.
-        seeds: Cells from which each box is tried.
+        most: Number of boxes at which the search ends; cuts may double it.
+        seeds: Number of cells from which a new box is tried.
         steps: Moves of a face [cells]; the last is also the shortest edge.
-        losses: Least and largest loss [Np]: below 3 dB materials and gains may be wrong as well.
+        losses: Least and largest loss of a box [Np]. A loss below 3 dB may also be a wrong material
+            or gain.
         clear: Least fall of the mean error [standard errors].
         price: Least fall of the mean error by a box or a cut.
 
     Args:
         folded: Paths of the links.
-        errors: Errors of the links by depths.
+        errors: Function from the depths of paths [Np] to the error of each link.
         places: Transmitters and receivers, in the paths' frame [m].
 
     Source: ours; for the idea Wilson and Patwari, Radio Tomographic Imaging, 2010.
@@ -141,22 +144,22 @@ class BoxSearch:
 
     @torch.no_grad()
     def run(self) -> list[Cuboid]:
-        """The boxes; none if no box is clear. A search whose time is up keeps those it has."""
+        """The boxes found until the time is up; empty if no box helps significantly."""
         with contextlib.suppress(TimeoutError):
             for _ in range(self.most):
                 if len(self.boxes) >= self.most or not self._add():
                     break
-            self._take_turns((*self.steps, 0.1), 5)
+            self._adjust_all((*self.steps, 0.1), 5)
         return self.boxes
 
     def _add(self) -> bool:
-        """Adds the box that helps most; False if none is clear."""
+        """Adds the box that lowers the mean error most; False if no fall is significant."""
         depths = self._depths(self.boxes)
         before = self.errors(depths)
         best = None
         least = before.mean() - self.price
         for seed in self._seeds(depths):
-            box = self._grown(depths, seed, self.steps[:2], 30)
+            box = self._adjust(depths, seed, self.steps[:2], 30)
             fall = before - self.errors(depths + self._depth(box))
             is_clear = fall.mean() > self.clear * fall.std() / len(fall) ** 0.5
             if is_clear and before.mean() - fall.mean() < least:
@@ -164,28 +167,26 @@ class BoxSearch:
         if best is None:
             return False
         self.boxes.append(best)
-        self._take_turns(self.steps[1:], 1)
+        self._adjust_all(self.steps[1:], 1)
         for box in [*self.boxes]:
             self._cut(box)
         return True
 
     @torch.no_grad()
     def gain(self, boxes: list[Cuboid]) -> float:
-        """Fall of the mean error by boxes, which another search may have found; 0 if the time is
-        up.
-        """
+        """Fall of the mean error by ``boxes``, of any search; 0 if the time is up."""
         with contextlib.suppress(TimeoutError):
             return self._error(self.free, []) - self._error(self.free, boxes)
         return 0.0
 
     def _depth(self, box: Cuboid) -> Float[Tensor, "b n"]:
-        """Depths of all paths by a box [Np]."""
+        """Attenuation of all paths by one box [Np]."""
         hit = self._hit(box)
         losses = self.free.new_full((len(hit),), box.loss)
         return self.free.flatten().index_add(0, hit, losses).view_as(self.free)
 
     def _hit(self, box: Cuboid) -> Int[Tensor, " h"]:
-        """Paths of the segments through a box.
+        """Number of the path of each segment that crosses a box.
 
         Raises:
             TimeoutError: The time is up.
@@ -197,24 +198,24 @@ class BoxSearch:
         return self.near.path[passes_box(self.near.start, self.near.end, box.corners)]
 
     def _segments_near(self, box: Cuboid) -> Segments:
-        """The segments through a box or its neighbours: a search tries many of these in turn."""
+        """Segments that cross a box enlarged by a margin, within which its faces will be moved."""
         margin = 3 * self.cell
         low, high = box.corners[0] - margin, box.corners[1] + margin
         rows = passes_box(self.start, self.end, torch.stack((low, high))).nonzero()[:, 0]
         return Segments(low, high, self.start[rows], self.end[rows], self.path[rows])
 
     def _depths(self, boxes: list[Cuboid]) -> Float[Tensor, "b n"]:
-        """Depths of all paths by boxes and in common [Np]."""
+        """Attenuation of all paths by boxes [Np], plus the depth that all paths share."""
         depths = self.free + self.common
         return sum((self._depth(box) for box in boxes), start=depths)
 
     def _error(self, depths: Float[Tensor, "b n"], boxes: list[Cuboid]) -> float:
-        """Mean error with boxes added."""
+        """Mean error of all links if ``boxes`` add to ``depths`` [Np]."""
         return self.errors(depths + self._depths(boxes) - self.common).mean().item()
 
     @cached_property
     def cells(self) -> list[tuple[Cuboid, Int[Tensor, " h"]]]:
-        """Free cells, two apart, with the paths of the segments through each."""
+        """Cells without places, on every second position of each axis, with the paths in each."""
         axes = [
             torch.arange(*ends, 2 * self.cell) for ends in zip(self.lower, self.upper, strict=True)
         ]
@@ -226,7 +227,7 @@ class BoxSearch:
         return cells
 
     def _seeds(self, depths: Float[Tensor, "b n"]) -> list[Cuboid]:
-        """Cells, two apart, that lower the errors most clearly."""
+        """The cells with the largest mean fall of the errors over its standard deviation."""
         before = self.errors(depths)
         rated = []
         for box, hit in self.cells:
@@ -238,22 +239,29 @@ class BoxSearch:
         return [box for _, box in rated[: self.seeds]]
 
     def _is_free(self, box: Cuboid) -> bool:
-        """True for a box of some size, in the room, that holds no place."""
+        """True for a box in the room, above the smallest size, with no transmitter or receiver."""
         low, high = box.corners
         inside = ((self.places > low) & (self.places < high)).all(1)
         is_large = (high - low >= self.steps[-1] * self.cell).all()
         within = (low >= self.lower).all() & (high <= self.upper).all()
         return bool(is_large & within & ~inside.any())
 
-    def _grown(
+    def _adjust(
         self, depths: Float[Tensor, "b n"], box: Cuboid, steps: tuple[float, ...], rounds: int
     ) -> Cuboid:
-        """The box with each face, place and the loss changed in turn while the error falls."""
+        """The box after changes of each face, its position and its loss, while the error falls.
+
+        Args:
+            depths: Attenuation of all paths without the box [Np].
+            box: Initial box.
+            steps: Moves of a face [cells].
+            rounds: Largest number of rounds of changes.
+        """
         least = self._error(depths, [box])
         for _ in range(rounds):
             before = least
-            for part in range(10):
-                for other in self._changed(box, part, steps):
+            for degree in range(10):
+                for other in self._list_changes(box, degree, steps):
                     error = self._error(depths, [other])
                     if error < least - 1e-5:
                         box, least = other, error
@@ -261,31 +269,37 @@ class BoxSearch:
                 break
         return box
 
-    def _changed(self, box: Cuboid, part: int, steps: tuple[float, ...]) -> list[Cuboid]:
-        """Free boxes with face 0 to 5, then the place along axis 0 to 2, then the loss changed."""
-        if part == 9:
+    def _list_changes(self, box: Cuboid, degree: int, steps: tuple[float, ...]) -> list[Cuboid]:
+        """Variants of a box in one degree of freedom, without those that cover a place.
+
+        Degrees 0 to 5 move a face, 6 to 8 the box along an axis, and 9 is the loss.
+        """
+        if degree == 9:
             losses = box.loss * torch.tensor([0.5, 0.7, 0.85, 1.2, 1.4, 2.0])
             return [Cuboid(box.corners, loss) for loss in losses.clamp(*self.losses).tolist()]
-        sides = [part // 3] if part < 6 else [0, 1]
+        sides = [degree // 3] if degree < 6 else [0, 1]
         changed = []
         inwards = [-step for step in steps]
         for step in (*steps, *inwards):
             corners = box.corners.clone()
-            corners[sides, part % 3] += step * self.cell
+            corners[sides, degree % 3] += step * self.cell
             changed.append(Cuboid(corners, box.loss))
         return [other for other in changed if self._is_free(other)]
 
-    def _take_turns(self, steps: tuple[float, ...], rounds: int) -> None:
-        """Changes each box beside the others, then the common depth."""
+    def _adjust_all(self, steps: tuple[float, ...], rounds: int) -> None:
+        """Adjusts each box while the others stay, then the depth that all paths share."""
         for number, box in enumerate(self.boxes):
             others = self._depths(self.boxes[:number] + self.boxes[number + 1 :])
-            self.boxes[number] = self._grown(others, box, steps, rounds)
+            self.boxes[number] = self._adjust(others, box, steps, rounds)
         depths = self._depths(self.boxes)
         changes = torch.linspace(-0.1, 0.1, 9).tolist()  # within 1 dB
         self.common += min(changes, key=lambda change: self._error(depths + change, []))
 
     def _cut(self, box: Cuboid) -> None:
-        """Drops a box that no longer helps, or cuts a gap through it if that does."""
+        """Replaces a box by nothing, itself or two halves, whichever has the lowest error.
+
+        A halving, or the box itself, must lower the error by ``price`` to be kept.
+        """
         others = [other for other in self.boxes if other is not box]
         depths = self._depths(others)
         parts: list[Cuboid] = []
@@ -297,7 +311,7 @@ class BoxSearch:
         self.boxes = others + parts
 
     def _halves(self, box: Cuboid) -> list[list[Cuboid]]:
-        """Pairs of boxes that a gap along an axis leaves."""
+        """Pairs of boxes that remain when a slice across an axis is cut out of a box."""
         pairs = []
         for axis in range(3):
             low, high = box.corners[:, axis].tolist()

@@ -25,41 +25,46 @@ SLABS = (
     .double()
     .log()
 )
-"""Slabs that are tried: logarithms of the relative permittivity's real part over 1 and imaginary
-part, and of the thickness [m]; a metre is a half-space."""
+"""Slabs that are tried, as natural logarithms of three numbers: the real part of the relative
+permittivity minus 1, its negative imaginary part, and the thickness [m]. A thickness of 1 m stands
+for a half-space."""
 
 
 @dataclass(frozen=True)
 class ChannelOptions:
     """Options of the search for planes in channels."""
 
-    ridge: float = 1e-3  # ridge of path strengths over their mean power
-    # Numbers of a channel, elements times delays that its band resolves in the room, below which
-    # free strengths explain it by any planes. A room of six has as many paths of up to two
-    # reflections.
+    # Ridge of the least squares of path strengths, over the mean diagonal of the Gram matrix.
+    ridge: float = 1e-3
+    # Least number of independent values in a channel: elements times the delays that its band
+    # resolves in the room. With fewer, free strengths at any planes explain the channel. A room of
+    # six planes has 37 paths of up to two reflections.
     fewest_free: int = 37
     certain_share: float = 0.006  # share of the power from which a plane is taken
-    # The same share if the residual falls by ``certain_fall``. Validation drops planes later; a few
-    # too many cost time alone.
+    # The same share for a plane by which the residual falls by ``certain_fall``. Validation drops
+    # false planes later, so a few too many only cost time.
     faint_share: float = 0.003
-    # Fall of the mean log of the residual by a true plane behind others: false ones reach 0.3.
+    # Fall of the mean log of the residual's power by which a faint plane is true: false ones reach
+    # 0.3.
     certain_fall: float = 0.5
-    # Least fall of the mean log of what neighbours do not predict by a true plane. Walls have 0.05
-    # and more, false planes up to 0.02, furniture 0.01 to 0.06.
+    # Least fall of the error by a true plane: the mean log of the fraction of power that
+    # neighbouring places do not predict. Walls have 0.05 and more, false planes up to 0.02,
+    # furniture 0.01 to 0.06.
     price: float = 0.02
-    neighbours: int = 8  # places whose strengths predict a place
-    predicted: int = 250  # most places that are predicted
+    neighbours: int = 8  # number of places whose strengths predict a place
+    predicted: int = 250  # largest number of places that are predicted
     # Least share of the residual that a candidate along the room's axes explains.
     added_share: float = 0.05
     # Largest distance of a plane from all transmitters and receivers [diagonals].
     margin: float = 0.3
-    # Most steps of the periodogram on either side. Steps follow the wavelength, of a tilt over the
-    # room's diagonal. At 60 GHz they reach 2 cm, and 0.004 rad in a room of 10 m; in a hall of 100
-    # m 0.007 rad at 3.5 GHz.
+    # Largest numbers of steps of the periodogram on either side, for offsets and for tilts. A step
+    # of the offset is a fraction of the wavelength; a step of the tilt is one over the room's
+    # diagonal. At 60 GHz these steps reach 2 cm, and 0.004 rad in a room of 10 m; at 3.5 GHz 0.007
+    # rad in a hall of 100 m.
     offset_cells: int = 64
     tilt_cells: int = 40
-    # Most waves of ``find_axis_walls``, some seconds' work for each plane: offsets times places
-    # times numbers.
+    # Largest number of waves in ``find_axis_walls``: offsets times places times channel values. It
+    # takes some seconds for each plane.
     most_waves: int = 100_000_000
     drawing_error: float = 0.2  # largest error of a wall in a floor plan [m]
     # Share of the residual that the best of thousands of planes explains by chance, times the
@@ -81,7 +86,7 @@ class SlabRoom(NamedTuple):
     def replace_plane(
         self, number: int, plane: Float[Tensor, "4"], material: Float[Tensor, "3"]
     ) -> "SlabRoom":
-        """The room with another plane as plane ``number``."""
+        """The room with plane ``number`` replaced."""
         room = SlabRoom(self.planes.clone(), self.slabs.clone())
         room.planes[number] = plane
         room.slabs[number] = material
@@ -89,7 +94,7 @@ class SlabRoom(NamedTuple):
 
 
 def half_spaces(planes: Float[Tensor, "w 4"]) -> SlabRoom:
-    """A room with planes as faces of half-spaces: thick slabs, the second of ``SLABS``."""
+    """A room whose planes are faces of half-spaces, with the second material of ``SLABS``."""
     return SlabRoom(planes, SLABS[1].repeat(len(planes), 1))
 
 
@@ -108,7 +113,10 @@ def materials_of(slabs: Float[Tensor, "*w 3"]) -> SlabMaterials:
 
 @dataclass(frozen=True)
 class ReceiverChannels:
-    """The training channels of one receiver, thinned to some elements and subcarriers."""
+    """The training channels of one receiver, at a part of its elements and subcarriers.
+
+    Shapes: b links, e elements, s subcarriers, k = e s channel values, n paths.
+    """
 
     places: Float[Tensor, "b 3"]  # transmitters [m]
     channels: Complex[Tensor, "b e s"]  # with phases as of exp(-j 2 pi f t)
@@ -176,7 +184,7 @@ class ReceiverChannels:
         return replace(self, **parts, channels=self.channels.to(torch.complex64))
 
     def of_unique_places(self) -> "ReceiverChannels":
-        """The first received link of each place: links of one place would predict each other."""
+        """The first link with power of each place, since links of one place predict each other."""
         received = self.at(self.channels.abs().amax((1, 2)) > 0)
         _, which = received.places.unique(dim=0, return_inverse=True)
         first: dict[int, int] = {}
@@ -191,13 +199,13 @@ class ReceiverChannels:
 
     @property
     def few_subcarriers(self) -> slice:
-        """Every fifth subcarrier, or more to keep at least 64 numbers in a channel."""
+        """Every fifth subcarrier, or a smaller step that keeps at least 64 values in a channel."""
         return slice(None, None, min(5, max(1, self.flat.shape[1] // 64)))
 
     def images(
         self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"]
     ) -> Float[Tensor, "b n 3"]:
-        """Images of the transmitters in sequences of planes [m]."""
+        """Images of the transmitters after reflections at each sequence of planes [m]."""
         return images(self.places, sequences, planes[:, :3], planes[:, 3])[-1]
 
     def waves(self, points: Float[Tensor, "b n 3"]) -> Complex[Tensor, "b n k"]:
@@ -215,7 +223,9 @@ class ReceiverChannels:
         sequences: Int[Tensor, "n order"],
         at: Float[Tensor, " s"] | None = None,
     ) -> Complex[Tensor, "b n k"]:
-        """Waves of all paths after their reflections; 0 for a path that does not meet its planes.
+        """Waves of all paths, times their reflection coefficients.
+
+        The wave is 0 for a path that does not exist: it misses one of its planes.
 
         Reflection coefficients are computed at the frequencies ``at`` [Hz], by default at each
         subcarrier. A single frequency saves time for half-spaces, whose reflection is equal at all
@@ -241,10 +251,10 @@ class ReceiverChannels:
 
 
 class ChannelSample(NamedTuple):
-    """Channels of each receiver at some places and subcarriers, and their reference phases."""
+    """Channels of each receiver at a part of its places and subcarriers, with reference phases."""
 
     receivers: list[ReceiverChannels]
-    phases: list[Complex[Tensor, " c"]]
+    phases: list[Complex[Tensor, " c"]]  # see ``ChannelData.reference_phases``
 
     def every(self, step: int) -> "ChannelSample":
         """The sample at every ``step``-th place."""
@@ -329,22 +339,22 @@ class ChannelData:
     def fit_free(
         self, receiver: ReceiverChannels, planes: Float[Tensor, "w 4"], ridge: float | None = None
     ) -> FreeFit:
-        """Complex strengths of all paths at planes, by ``strengths.fit_free`` at each place."""
+        """Complex strengths of all paths at ``planes``, by ``strengths.fit_free`` at each place."""
         waves = receiver.waves(receiver.images(planes, self.sequences(planes)))
         return fit_free(waves, receiver.flat, self.options.ridge if ridge is None else ridge)
 
     def reference_phases(
         self, planes: Float[Tensor, "w 4"], receivers: list[ReceiverChannels]
     ) -> list[Complex[Tensor, " c"]]:
-        """Phase of the direct paths to each receiver, as numbers of magnitude 1.
+        """Phase of the direct paths to each receiver, as complex numbers of magnitude 1.
 
-        Channels that share a phase have one for all places (1,), others one for each place (b,).
+        With a common phase a receiver has one number (1,), otherwise one for each place (b,).
         """
         phases = []
         for receiver in receivers:
             if not self.has_common_phase:
-                # One place alone does not separate direct paths from close ones: they share their
-                # power, and so a phase.
+                # One place alone does not separate the direct path from paths of similar length. A
+                # larger ridge gives them the same phase.
                 phases.append(self.fit_free(receiver, planes, 1e-2).strengths[:, 0].sgn())
                 continue
             # A hundred places in all suffice, with sixteen of each receiver.

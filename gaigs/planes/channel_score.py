@@ -16,7 +16,7 @@ from gaigs.planes.strengths import align_phases, log_share, real_residual, real_
 
 
 class NeighbourLinks(NamedTuple):
-    """Channels of one receiver, and the places nearest to predicted ones."""
+    """Channels of one receiver: predicted places, and the neighbours that predict each."""
 
     receiver: ReceiverChannels  # channels of targets and neighbours
     targets: Int[Tensor, " t"]  # rows of the predicted places
@@ -27,7 +27,7 @@ class NeighbourLinks(NamedTuple):
 
 
 class ChannelScore(Score[SlabRoom]):
-    """Planes by the phases of reflections at slabs, with real, non-negative strengths.
+    """Score of planes by the phases of reflections at slabs, with real, non-negative strengths.
 
     The strengths of a true plane vary little from place to place, so channels are predicted with
     the strengths of the nearest places. The error of a room is the mean log of the unexplained
@@ -117,7 +117,7 @@ class ChannelScore(Score[SlabRoom]):
         return self._best_moves(room, number)[0]
 
     def move_and_polish(self, room: SlabRoom, number: int) -> SlabRoom:
-        """The best result of the three best moves of a plane, each also after a gradient descent.
+        """The best of six rooms: the three best moves of a plane, with and without a descent.
 
         The descent also fits the slab, since a wrong slab may hide the best offset.
         """
@@ -127,7 +127,10 @@ class ChannelScore(Score[SlabRoom]):
         )[0]
 
     def _best_moves(self, room: SlabRoom, number: int) -> list[SlabRoom]:
-        """At most three rooms, best first: the room, or its plane moved to where phases agree."""
+        """The best three of a room and its variants, in which a plane moves to where phases agree.
+
+        The best comes first.
+        """
         trials = [room]
         for plane, material in propose_by_phases(
             self.data, room.planes, number, self.data.reach, 0.006, SLABS
@@ -155,8 +158,8 @@ class ChannelScore(Score[SlabRoom]):
     ) -> Float[Tensor, ""]:
         """Mean log of the fraction of power that real strengths do not explain.
 
-        A plane is ``resolved`` once its offset is known to a fraction of the wavelength. Paths at
-        other planes have complex strengths, since their phases are still meaningless.
+        ``resolved`` is True for planes whose offset is known to a fraction of the wavelength. Paths
+        at other planes have complex strengths, since their phases are still unknown.
         """
         shares = []
         residuals = self.residuals(sample, room, resolved)
@@ -180,7 +183,7 @@ class ChannelScore(Score[SlabRoom]):
             waves = torch.cat((waves, 1j * waves[:, is_free]), 1)
             residual = real_residual(waves, channels, signed, self.options.ridge)
             if not self.data.has_common_phase:
-                # Once more with the phase of each place that explains most.
+                # Once more, with each place's channel turned to the phase of the fit.
                 channels = align_phases(channels, channels - residual)
                 residual = real_residual(waves, channels, signed, self.options.ridge)
             residuals.append(residual)
@@ -226,12 +229,12 @@ class ChannelScore(Score[SlabRoom]):
         return GridRatings(ratings, lambda planes: self.added_shares(room, planes))
 
     def added_shares(self, room: SlabRoom, planes: Float[Tensor, "k 4"]) -> Float[Tensor, " k"]:
-        """Mean fraction, 0 to 1, of the residual's power that an image in each plane explains.
+        """Rating of candidate planes: mean fraction of the residual's power that each explains.
 
-        The residual is the part of a channel that known paths do not explain. The known paths are
-        also removed from the image's wave, in numerator and denominator. Otherwise the image in a
-        wall behind the array, which resembles the direct path, would be underrated. The fraction is
-        0 for a plane between transmitter and receiver.
+        The residual is the part of a channel that known paths do not explain. A candidate explains
+        it by the wave of its image. The known paths are also removed from this wave. Otherwise the
+        image in a wall behind the array, which resembles the direct path, would be underrated. The
+        fraction, 0 to 1, is 0 for a plane between transmitter and receiver.
         """
         total = planes.new_zeros(len(planes))
         count = 0
@@ -254,9 +257,9 @@ class ChannelScore(Score[SlabRoom]):
         return total / max(count, 1)
 
     def _fitted_part(self, values: Tensor) -> Tensor:
-        """Strengths or Gram matrices; only their real part unless strengths are free.
+        """``values`` if strengths are free (complex), otherwise their real part.
 
-        With free strengths any plane would explain channels of few numbers.
+        With free strengths any plane would explain channels with few values.
         """
         return values if self.has_free_strengths else values.real.to(values)
 
@@ -268,7 +271,7 @@ class ChannelScore(Score[SlabRoom]):
         residual: Complex[Tensor, "b k 1"],
         planes: Float[Tensor, "c 4"],
     ) -> Float[Tensor, " c"]:
-        """Sum of ``added_shares`` over the places of one receiver.
+        """Fractions as in ``added_shares``, summed over the places of one receiver.
 
         Args:
             receiver: Places and elements.

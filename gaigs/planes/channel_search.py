@@ -33,7 +33,7 @@ class ChannelSearch:
     3. Planes that do not improve the prediction between neighbouring places are dropped
        (``ChannelScore``). The search is repeated for the power that they explained.
     4. If planes are tilted, or walls known, a second room along the axes is searched. For channels
-       of few numbers ``CommonGains`` finds its planes.
+       with few values ``CommonGains`` finds its planes.
     5. ``AxisPlanes`` adds planes along the room's axes, such as planes hidden behind the direct
        path.
 
@@ -65,7 +65,7 @@ class ChannelSearch:
         self.most = most
         self.start = self.frame.from_world(start)
         self.free = FreeScore(self.data)
-        # Free strengths explain channels of few numbers by any planes.
+        # Free strengths explain channels with few values by any planes.
         self.has_few_numbers = self.free.numbers < options.fewest_free
         self.score = ChannelScore(self.data, not self.has_few_numbers)
         self.along_axes = AxisPlanes(self.data, self.score)
@@ -78,15 +78,16 @@ class ChannelSearch:
 
     def find_room(self) -> SlabRoom:
         """The room of ``run`` in the frame."""
-        with stages.portion(0.6):  # planes that are not resolved are worth nothing
+        with stages.portion(0.6):  # the rest of the time is kept to resolve the planes' offsets
             planes = self.find_free(self.start)
         best = SlabRoom(planes, planes[:, :3])  # kept if it is empty
         if len(planes):
             best = self.prune(self.resolve(self.free.descend(planes, steps=300, rate=5e-3)))
         if stages.is_up():
             return best
-        # Free strengths may find tilted planes in place of upright ones, or no plane, and move
-        # known walls away.
+        # Free strengths have three possible faults: tilted planes in place of upright ones, no
+        # plane at all, and known walls that moved away. Then walls along the coordinate axes are
+        # searched.
         is_doubtful = len(self.start) or not is_square(best.planes)
         if not len(best.planes) or (self.has_few_numbers and is_doubtful):
             walls = self.find_axis_walls()
@@ -108,10 +109,11 @@ class ChannelSearch:
         return self.prune(self.along_axes.grow_along(best, self.most))
 
     def search_anew(self, room: SlabRoom) -> SlabRoom:
-        """The best of three rooms: a room after pruning, and two variants.
+        """The best of a pruned room and two variants.
 
-        The first variant has further planes for the power that the dropped ones explained. The
-        second is the better room so far, resolved again, since false planes had moved the others.
+        In the first, further planes are searched for the power that the dropped planes explained.
+        In the second, the better room so far is resolved again, since false planes had moved the
+        true ones.
         """
         planes = self.find_free(self.free.descend(room.planes, steps=100, rate=1e-2))
         again = self.prune(self.resolve(self.free.descend(planes, steps=300, rate=5e-3)))
@@ -127,7 +129,7 @@ class ChannelSearch:
         return CommonGains(self.data, self.start, self.most).find_axis_walls()
 
     def find_free(self, known: Float[Tensor, "v 4"]) -> Float[Tensor, "w 4"]:
-        """Known planes and further ones by ``FreeScore``, all refined after each addition."""
+        """Known planes and further ones by ``FreeScore``; each addition refines all planes."""
         normals = torch.cat((fibonacci_lattice(400, 0.0, math.pi / 2), torch.eye(3)))
         grid = self.frame.grid(normals.to(self.frame.points), 80, self.data.options.margin)
         search = PlaneSearch(self.frame, self.free)
@@ -154,7 +156,7 @@ class ChannelSearch:
         return search.sweep(room, turns, "search of planes", replace).planes
 
     def resolve(self, planes: Float[Tensor, "w 4"]) -> SlabRoom:
-        """The room with each plane's offset to a fraction of the wavelength, and its best slab.
+        """A room in which each plane has a slab, and an offset exact to a part of a wavelength.
 
         Planes are moved one after the other, in three rounds. Until its first move a plane has
         complex strengths, see ``ChannelScore.measure``.
@@ -200,8 +202,8 @@ class ChannelSearch:
     ) -> list[Float[Tensor, "w 4"]]:
         """Copies of the planes in which plane ``number`` is parallel or perpendicular to others.
 
-        Each possible normal gives two copies, at the best two offsets nearby: a tilted plane may be
-        a fit to two parallel ones.
+        Each possible normal gives two copies, at the best two offsets nearby, since a tilted plane
+        may be a compromise between two parallel planes.
         """
         is_other = torch.arange(len(planes)) != number
         axes = _square_axes(planes, number, is_other)
@@ -209,8 +211,8 @@ class ChannelSearch:
             return []
         profiles = []
         for receiver in self.free.links:
-            rest = self.data.fit_free(receiver, planes[is_other]).residual
-            profiles.append(self.free.compute_profile(receiver, rest))
+            residual = self.data.fit_free(receiver, planes[is_other]).residual
+            profiles.append(self.free.compute_profile(receiver, residual))
         variants = []
         for axis in axes:
             steps = 0.1 * self.frame.diagonal * torch.linspace(-1, 1, 81).double()

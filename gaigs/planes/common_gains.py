@@ -1,4 +1,4 @@
-"""Walls along the coordinate axes, by paths with one gain for all places."""
+"""Search for walls perpendicular to the coordinate axes, with one gain of a path for all places."""
 
 from typing import NamedTuple
 
@@ -29,7 +29,7 @@ class CommonGains:
     """Planes perpendicular to the coordinate axes, found one after the other by matching pursuit.
 
     Each image has one real gain, common to all places, as for a half-space. With a separate
-    strength at each place any plane would explain channels of few numbers. A common gain explains
+    strength at each place any plane would explain channels with few values. A common gain explains
     hardly anything by chance, and determines offsets to millimetres.
 
     Args:
@@ -120,9 +120,10 @@ class CommonGains:
         lines: Float[Tensor, "c 4"],
         by_chance: float,
     ) -> Float[Tensor, "v 4"]:
-        """The planes, and further ones from ``lines`` while one explains more than chance does.
+        """The planes, and further ones chosen from ``lines`` by matching pursuit.
 
-        Each choice is the plane that explains most of the residual (matching pursuit).
+        Each choice is the plane that explains most of the residual. The pursuit ends when that is
+        less than chance explains.
         """
         while len(planes) < self.most:
             known = self.fit(receivers, half_spaces(planes))
@@ -137,11 +138,11 @@ class CommonGains:
     def choose_lobes(
         self, receivers: list[ReceiverChannels], planes: Float[Tensor, "w 4"], by_chance: float
     ) -> Float[Tensor, "w 4"]:
-        """The planes, each moved to the offset with the smallest residual of paths of all orders.
+        """The planes at the offsets with the smallest residual of paths of all orders.
 
-        The fit over an offset has a maximum (a lobe) every half wavelength, where a reflected path
-        is longer by a whole wavelength. Known walls move at most ``drawing_error``, and only if
-        that lowers the residual by more than chance does.
+        The fit as a function of an offset has a maximum (a lobe) every half wavelength, where a
+        reflected path is longer by a whole wavelength. Known walls move at most ``drawing_error``,
+        and only if that lowers the residual by more than chance does.
         """
         options = self.data.options
         order = self.data.order
@@ -171,7 +172,9 @@ class CommonGains:
         plane: Float[Tensor, "4"],
         bonus: float,
     ) -> BestOffset:
-        """The plane moved along its normal, by at most ``drawing_error``, to explain most.
+        """The plane moved along its normal to where its image explains most of the power.
+
+        It moves by at most ``drawing_error``.
 
         Args:
             receivers: Channels.
@@ -191,9 +194,10 @@ class CommonGains:
         return BestOffset(shares.max().item(), line[shares.argmax()])
 
     def fit(self, receivers: list[ReceiverChannels], room: SlabRoom, order: int = 1) -> CommonFit:
-        """Least squares of one real gain for each path, non-negative and common to all places.
+        """Fit of one real, non-negative gain for each path, common to all places.
 
-        All places have equal weight: the squares of each are divided by the place's power.
+        The fit is by least squares. Squared errors are divided by the power of their place, so all
+        places have equal weight.
         """
         sequences = all_sequences(len(room.planes), order)
         waves = []
@@ -212,11 +216,11 @@ class CommonGains:
                 gram = gram + ((wave.conj() @ wave.mT).real / power).sum(0, keepdim=True)
                 products = (wave.conj() @ channel[..., None]).real / power
                 right = right + products.sum(0, keepdim=True)
-            gains = real_strengths(ridged(gram, 1e-6), right)  # slabs have the signs
-            gains = gains.mT.to(waves[0])
+            # Gains need no sign, since the reflection coefficients in the waves have one.
+            gains = real_strengths(ridged(gram, 1e-6), right).mT.to(waves[0])  # (1, 1, n)
             known = [(gains @ wave)[:, 0] for wave in waves]
             if not self.data.has_common_phase:
-                # Phases of the places follow the paths that are known of them.
+                # Each place's channel is turned to the phase of its fit, for the next round.
                 channels = [align_phases(*pair) for pair in zip(channels, known, strict=True)]
             residuals = [channel - part for channel, part in zip(channels, known, strict=True)]
         shares = [

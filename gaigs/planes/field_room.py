@@ -1,4 +1,4 @@
-"""Rooms that explain channels of few numbers: planes with gains common to all places."""
+"""Rooms for channels with few values: planes whose gains are common to all places."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -24,8 +24,8 @@ class FieldRoom(NamedTuple):
     planes: Float[Tensor, "w 4"]
     slabs: Float[Tensor, "w 3"]
     gains: Complex[Tensor, "bands w"]
-    receivers: Complex[Tensor, " r"]
-    uses: Bool[Tensor, "bands w"]
+    receivers: Complex[Tensor, " r"]  # gain of each receiver
+    uses: Bool[Tensor, "bands w"]  # True if the band uses the plane
 
     def with_plane(
         self, plane: Float[Tensor, "4"], slab: Float[Tensor, "3"], uses: Bool[Tensor, " bands"]
@@ -56,14 +56,14 @@ Operator = Callable[[Tensor], Tensor]
 
 
 class Kriged(NamedTuple):
-    """Linear operators on residuals, by kriging each path's field from nearby places."""
+    """Linear operators on residuals, if each path's field is kriged from nearby places."""
 
-    whiten: Operator  # decorrelates residuals: by the inverse Cholesky factor
-    unseen: Operator  # errors of each place as the other places of its block predict it
+    whiten: Operator  # to decorrelated residuals, by the inverse Cholesky factor
+    leave_out: Operator  # to each place's errors when the other places of its block predict it
 
 
 class Variation(NamedTuple):
-    """Variation of path strengths over places: a Gaussian process for each path.
+    """Hyperparameters of the Gaussian process of a path's strength over places.
 
     Attributes:
         share: Standard deviation of a path's field, as a fraction of its mean.
@@ -77,7 +77,7 @@ class Variation(NamedTuple):
 
     @classmethod
     def choices(cls) -> list["Variation"]:
-        """Candidates: no variation, then shadows as wide as furniture or as half a room."""
+        """Hyperparameters to try: no variation, then lengths of furniture and of half a room."""
         candidates = [cls(0.0, 1.0, 1.0)]
         for share in (0.2, 0.5):
             for length in (0.5, 2.0):
@@ -86,9 +86,9 @@ class Variation(NamedTuple):
 
 
 class GainChanges(NamedTuple):
-    """Gains of paths, each a product of plane gains."""
+    """Gains of paths, and their derivatives by the gains of planes."""
 
-    products: Complex[Tensor, " n"]
+    products: Complex[Tensor, " n"]  # of the gains of the path's planes
     derivatives: Complex[Tensor, "n w"]  # of each product by each plane's gain
 
 
@@ -108,11 +108,11 @@ def multiply_gains(gains: Complex[Tensor, " w"], sequences: Int[Tensor, "n order
 
 
 class PlaceBlock(NamedTuple):
-    """Channel values of neighbouring places at one receiver, whose residuals are correlated.
+    """Channel values of one receiver at a group of neighbouring places, which are kriged together.
 
     Attributes:
-        rows: Rows of the values, one place after the other.
-        gaps: Distances between the places of the values [m].
+        rows: Rows of ``FieldFit.values``, one place after the other.
+        gaps: Distances between the places of each pair of values [m].
         each: Number of values at a place.
         band: Number of the receiver's band.
     """
@@ -124,9 +124,10 @@ class PlaceBlock(NamedTuple):
 
 
 class FieldFit:
-    """Least squares of fields by the images in a room's planes, over all places at once.
+    """Fit of plane and receiver gains to the channels of all places at once, by least squares.
 
-    Every number is multiplied by the link's distance; otherwise near places would dominate.
+    Channels are sums of the waves of images in the planes. Every channel value is multiplied by the
+    link's distance; otherwise near places would dominate.
 
     Args:
         data: Training channels with a common phase.
@@ -172,7 +173,7 @@ class FieldFit:
         self.blocks = list(self._divide(largest))
 
     def _divide(self, largest: int) -> Iterator[PlaceBlock]:
-        """Splits ``values`` into blocks of neighbouring places, with about ``largest`` values each.
+        """Yields blocks of neighbouring places, with about ``largest`` values each.
 
         Kriging solves one linear system for each block instead of one for all places.
         """
@@ -231,20 +232,20 @@ class FieldFit:
             room: Planes, and initial gains.
             steps: Number of steps. A step that raises the error is undone, and damping then grows.
             waves: The room's ``waves`` if they are known.
-            kriged: The room's ``krige`` if it is known.
+            kriged: Result of ``krige`` for the room if it is known.
         """
         waves = self.waves(room.planes, room) if waves is None else waves
         best = room
         whiten = (kriged or self.krige(room, waves)).whiten
-        rest = whiten(self.residual(room, waves))
-        least = self.mean_log(rest)
+        residual = whiten(self.residual(room, waves))
+        least = self.mean_log(residual)
         damping = self.damping
         for _ in range(steps):
-            trial = self._step(best, waves, rest, damping, whiten)
-            trial_rest = whiten(self.residual(trial, waves))
-            loss = self.mean_log(trial_rest)
+            trial = self._step(best, waves, residual, damping, whiten)
+            trial_residual = whiten(self.residual(trial, waves))
+            loss = self.mean_log(trial_residual)
             if loss < least:
-                best, rest, least = trial, trial_rest, loss
+                best, residual, least = trial, trial_residual, loss
                 damping = max(damping / 4, self.damping)
             else:
                 damping = 8 * damping
@@ -254,7 +255,7 @@ class FieldFit:
         self,
         room: FieldRoom,
         waves: Complex[Tensor, "m n"],
-        rest: Complex[Tensor, " m"],
+        residual: Complex[Tensor, " m"],
         damping: float,
         whiten: Operator,
     ) -> FieldRoom:
@@ -273,11 +274,12 @@ class FieldFit:
         is_owner = self.owner[:, None] == torch.arange(len(self.receivers))  # (m, r)
         jacobian = torch.cat((by_plane, by_receiver[:, None] * is_owner), 1)  # (m, bands w + r)
         jacobian = whiten(jacobian)
-        weights = 1 / (rest.abs().square() + self.floor)
+        # Weights of the mean log error: the derivative of log(|error|² + floor) by |error|².
+        weights = 1 / (residual.abs().square() + self.floor)
         gram = jacobian.mH @ (weights[:, None] * jacobian)
         size = gram.diagonal().real
         gram = gram + torch.diag(damping * size + 1e-6 * size.mean())
-        change = torch.linalg.solve(gram, jacobian.mH @ (weights * rest))
+        change = torch.linalg.solve(gram, jacobian.mH @ (weights * residual))
         gains, receivers = change.split((room.gains.numel(), len(self.receivers)))
         gains = room.gains + gains.view_as(room.gains)
         return room._replace(gains=gains, receivers=room.receivers + receivers)
@@ -301,7 +303,7 @@ class FieldFit:
 
     @torch.no_grad()
     def krige(self, room: FieldRoom, waves: Complex[Tensor, "m n"]) -> Kriged:
-        """Operators that whiten the residuals of a room, and predict each place from others.
+        """Operators on the residuals of a room: whitening, and prediction of left-out places.
 
         The covariance of two channel values is the sum over paths of the product of their fields,
         times the kernel of their places. Noise is added on the diagonal.
@@ -309,10 +311,10 @@ class FieldFit:
         Source: Dubrule, Cross validation of kriging in a unique neighborhood, 1983.
         """
         if not any(variation.share for variation in self.variations):
-            return Kriged(lambda rest: rest, lambda rest: rest)
+            return Kriged(lambda residual: residual, lambda residual: residual)
         fields = waves * (room.receivers[self.owner, None] * self.products(room)[self.band])
         whitening = []
-        unseen = []
+        leaving_out = []
         for block in self.blocks:
             variation = self.variations[block.band]
             paths = fields[block.rows].to(torch.complex64)  # (c, n)
@@ -328,43 +330,44 @@ class FieldFit:
             of_place = by_place.unflatten(2, (-1, block.each)).diagonal(dim1=0, dim2=2)  # (k, k, b)
             from_others = torch.linalg.solve(of_place.movedim(2, 0), by_place)  # (b, k, c)
             whitening.append(variation.noise * root.to(torch.complex128))
-            unseen.append(from_others.flatten(0, 1).to(torch.complex128))
-        return Kriged(partial(self._apply, whitening), partial(self._apply, unseen))
+            leaving_out.append(from_others.flatten(0, 1).to(torch.complex128))
+        return Kriged(partial(self._apply, whitening), partial(self._apply, leaving_out))
 
-    def _apply(self, operators: list[Tensor], rest: Tensor) -> Tensor:
+    def _apply(self, operators: list[Tensor], residual: Tensor) -> Tensor:
         """Residuals (m, ...), each block multiplied by its matrix of ``operators``."""
-        applied = torch.empty_like(rest)
+        applied = torch.empty_like(residual)
         for block, operator in zip(self.blocks, operators, strict=True):
-            applied[block.rows] = operator @ rest[block.rows]
+            applied[block.rows] = operator @ residual[block.rows]
         return applied
 
-    def unseen(self, room: FieldRoom) -> Complex[Tensor, " m"]:
-        """Scaled errors at each place when predicted from the other places of the block."""
+    def leave_out(self, room: FieldRoom) -> Complex[Tensor, " m"]:
+        """Scaled errors at each place when it is predicted from the other places of its block."""
         waves = self.waves(room.planes, room)
-        return self.krige(room, waves).unseen(self.residual(room, waves))
+        return self.krige(room, waves).leave_out(self.residual(room, waves))
 
     def choose_variation(self, room: FieldRoom) -> None:
-        """Sets ``variations``: for each band the one with the best prediction between places."""
+        """Sets ``variations`` to the choice of each band that best predicts left-out places."""
         waves = self.waves(room.planes, room)
-        rest = self.residual(room, waves)
+        residual = self.residual(room, waves)
         errors = []
         for variation in Variation.choices():
             self.variations = [variation] * len(self.bands)
-            unseen = self.krige(room, waves).unseen(rest)
-            logs = (unseen.abs().square() + self.floor).log()
+            left_out = self.krige(room, waves).leave_out(residual)
+            logs = (left_out.abs().square() + self.floor).log()
             errors.append(logs.new_zeros(len(self.bands)).index_add(0, self.band, logs))
         best = torch.stack(errors).argmin(0).tolist()
         self.variations = [Variation.choices()[number] for number in best]
 
-    def mean_log(self, rest: Complex[Tensor, " m"]) -> Float[Tensor, ""]:
+    def mean_log(self, errors: Complex[Tensor, " m"]) -> Float[Tensor, ""]:
         """Mean of log(|error|² + ``floor``) over scaled errors."""
-        return (rest.abs().square() + self.floor).log().mean()
+        return (errors.abs().square() + self.floor).log().mean()
 
 
 def group_places(places: Float[Tensor, "b 3"], count: int) -> Int[Tensor, " b"]:
-    """Group of each place, in ``count`` groups of neighbours, a power of two.
+    """Number of each place's group; a group has neighbouring places.
 
-    Groups are halved at the median of their longest axis until there are ``count``.
+    All groups are halved, at the median along their longest axis, until there are ``count``. This
+    must be a power of two.
     """
     groups = torch.zeros(len(places), dtype=torch.long)
     while groups.max() + 1 < count:

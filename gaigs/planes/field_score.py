@@ -1,4 +1,4 @@
-"""The score of planes by channels of few numbers: coherent over places."""
+"""The score of planes by channels with few values, summed coherently over places."""
 
 import itertools
 import math
@@ -18,11 +18,11 @@ from gaigs.splatting.placement.mirrored.reflections import reflect
 
 
 class FieldScore(Score[FieldRoom]):
-    """Planes by the power that an image explains with one gain for all places.
+    """Score of planes by the power that an image explains with one gain for all places.
 
-    With a separate gain at each place, any plane would explain one number a place. A common gain
-    makes a few hundred places one large array, over which the phases of a wrong plane do not fit.
-    Powers are summed over receivers and groups of places, whose relative phases are unknown.
+    With a separate gain at each place, any plane would explain a channel of one value. A common
+    gain makes a few hundred places one large array, over which the phases of a wrong plane do not
+    fit. Powers are summed over receivers and groups of places, whose relative phases are unknown.
 
     Args:
         data: Training channels with a common phase.
@@ -57,17 +57,17 @@ class FieldScore(Score[FieldRoom]):
         self.mirror = torch.tensor([0.0, math.log(1e6), 0.0], dtype=torch.float64)
 
     def error(self, room: FieldRoom) -> float:
-        rest = self.fit.unseen(room)
-        return self.fit.mean_log(rest).item() + self.price * len(room.planes)
+        errors = self.fit.leave_out(room)
+        return self.fit.mean_log(errors).item() + self.price * len(room.planes)
 
     # --- ratings ---
 
     def rate(self, room: FieldRoom, grid: Float[Tensor, "n k 4"]) -> GridRatings:
-        """Ratings of planes by the ``rated`` bands. Noise has an expected rating of 1 for each
-        receiver and group.
+        """Ratings of planes by the ``rated`` bands.
 
-        Ratings of the grid treat groups of places as incoherent. The returned function rates single
-        planes by all places coherently.
+        The grid is rated with incoherent groups of places. The returned function rates single
+        planes by all places coherently. The expected rating of noise is 1 for each receiver and
+        group.
         """
         ratings = self._explain(room, grid.flatten(0, 1), self.groups)
         return GridRatings(
@@ -81,18 +81,18 @@ class FieldScore(Score[FieldRoom]):
 
         A matched filter: |sum conj(wave) residual|² / sum |wave|², over residuals of mean power 1.
         """
-        rest = self.fit.unseen(room)
-        # The derivative of the logarithm: a place in shadow counts little.
-        power = rest.abs().square()
-        rest = rest / (power + power.mean())
+        errors = self.fit.leave_out(room)
+        # The derivative of log(|error|² + mean) limits the weight of large errors.
+        power = errors.abs().square()
+        errors = errors / (power + power.mean())
         total = torch.zeros(len(planes))
         for number, receiver in enumerate(self.data.receivers):
             if not self.rated[self.fit.band_numbers[number]]:
                 continue
             at_receiver = self.fit.owner == number
-            power = rest[at_receiver].abs().square().mean()
+            power = errors[at_receiver].abs().square().mean()
             shape = receiver.flat.shape  # (b, k)
-            normalised = (rest[at_receiver] / power.sqrt()).to(torch.complex64).view(shape)
+            normalised = (errors[at_receiver] / power.sqrt()).to(torch.complex64).view(shape)
             scale = self.fit.scale[at_receiver].float().view(shape)[:, :1]  # (b, 1)
             member = functional.one_hot(group_places(receiver.places, groups)).float()  # (b, g)
             step = max(1, self.chunk // len(receiver.places))
@@ -101,16 +101,16 @@ class FieldScore(Score[FieldRoom]):
                 sums = torch.zeros((), dtype=torch.complex64)
                 size = torch.zeros(())
                 waves = self._waves(receiver, part)
-                # Number by number of the channels, so that no tensor has waves of all.
-                for (cosine, sine, reach), values in zip(waves, normalised.mT, strict=True):
+                # One channel value (element and subcarrier) at a time, to save memory.
+                for (cosine, sine, amplitude), values in zip(waves, normalised.mT, strict=True):
                     weights = scale * member
                     real = weights * values.real[:, None]
                     imaginary = weights * values.imag[:, None]
-                    # conj(wave) rest: (cos + j sin) (real + j imaginary).
+                    # conj(wave) error: (cos + j sin) (real + j imaginary).
                     along = cosine @ real - sine @ imaginary  # (c, g)
                     across = cosine @ imaginary + sine @ real
                     sums = sums + torch.complex(along, across)
-                    size = size + reach.square() @ (scale * weights)
+                    size = size + amplitude.square() @ (scale * weights)
                 explained = sums.abs().square() / size.clamp_min(1e-20)
                 total[rows] += explained.sum(1)
         return total.to(planes)
@@ -131,10 +131,10 @@ class FieldScore(Score[FieldRoom]):
             # The squared distance of an image is the place's, and four times the heights' product.
             direct = (places - element).square().sum(1)
             lengths = (direct + 4 * products).clamp_min(1e-4).sqrt()
-            reach = (products > 0) / lengths
+            amplitude = (products > 0) / lengths  # 0 for a plane between the ends
             for frequency in receiver.frequencies.tolist():
                 phases = lengths * (2 * math.pi * frequency / speed_of_light)
-                yield phases.cos() * reach, phases.sin() * reach, reach
+                yield phases.cos() * amplitude, phases.sin() * amplitude, amplitude
 
     # --- changes of a room ---
 
@@ -145,34 +145,36 @@ class FieldScore(Score[FieldRoom]):
         trials = []
         # Bands that do not show the plane may still receive paths at it.
         uses = [self.rated] if self.rated.all() else [self.rated, torch.ones_like(self.rated)]
-        readings = self._readings(room, candidate.plane)
-        for plane, slab, used in itertools.product(readings, (SLABS[1], self.mirror), uses):
+        choices = self._same_image_planes(room, candidate.plane)
+        for plane, slab, used in itertools.product(choices, (SLABS[1], self.mirror), uses):
             if not self.data.frame.is_like(room.planes, plane).any():
                 start = room.with_plane(plane, slab, used)
                 larger = self.fit.fit_gains(start, 5, kriged=kriged)
-                rest = kriged.unseen(self.fit.residual(larger))
-                trials.append((self.fit.mean_log(rest).item(), larger))
+                errors = kriged.leave_out(self.fit.residual(larger))
+                trials.append((self.fit.mean_log(errors).item(), larger))
         trials.sort(key=lambda trial: trial[0])
         polished = [self.descend(larger, 12) for _, larger in trials[:2]]
         best = min(polished, key=self.error, default=None)
         return best if best is not None and self.error(best) < before else None
 
-    def _readings(self, room: FieldRoom, plane: Float[Tensor, "4"]) -> list[Float[Tensor, "4"]]:
-        """A found plane, and the planes that would give its image together with a known plane.
+    def _same_image_planes(
+        self, room: FieldRoom, plane: Float[Tensor, "4"]
+    ) -> list[Float[Tensor, "4"]]:
+        """A candidate plane, and the planes that give its image together with a known plane.
 
         With a single receiver position, an image of second order resembles the image in one further
         plane. The true plane may therefore be one that reflects before or after a known plane.
         """
-        readings = [plane]
+        planes = [plane]
         position = self.data.receivers[0].position
         if any((receiver.position != position).any() for receiver in self.data.receivers):
-            return readings
+            return planes
         image = reflect(position, plane[:3], plane[3])
         for known in room.planes:
             normal, offset = known[:3], known[3]
-            readings.append(bisect(position, reflect(image, normal, offset)))
-            readings.append(bisect(reflect(position, normal, offset), image))
-        return [reading for reading in readings if reading.isfinite().all()]
+            planes.append(bisect(position, reflect(image, normal, offset)))
+            planes.append(bisect(reflect(position, normal, offset), image))
+        return [plane for plane in planes if plane.isfinite().all()]
 
     def remove(self, room: FieldRoom, number: int) -> FieldRoom:
         return self.fit.fit_gains(room.without_plane(number), 5)
@@ -181,9 +183,10 @@ class FieldScore(Score[FieldRoom]):
         return self.descend(room, 40)
 
     def square(self, room: FieldRoom) -> FieldRoom:
-        """The room with planes vertical and along axes, if tilts explain no more than noise does.
+        """The room with small tilts removed, by turns to the vertical or to the coordinate axes.
 
-        Each fitted number may lower the sum of log errors over n values by log(n) / 2 by chance.
+        The room is unchanged if this raises the error by more than chance explains. By chance each
+        fitted angle lowers the sum of log errors over n values by up to log(n) / 2.
 
         Source: Schwarz, Estimating the dimension of a model, 1978.
         """
@@ -204,7 +207,7 @@ class FieldScore(Score[FieldRoom]):
         return trial if self.error(trial) < self.error(room) + chance else room
 
     def descend(self, room: FieldRoom, steps: int, turns: float = 0.4) -> FieldRoom:
-        """The room after gradient descent of the planes; gains are fitted again in each step.
+        """The room after gradient descent of its planes, with gains fitted again in each step.
 
         ``steps`` and ``turns`` are as for ``search.descend``.
 

@@ -1,4 +1,4 @@
-"""Search for planes in channels of few numbers at each place."""
+"""Search for planes in channels with few values at each place."""
 
 import logging
 import math
@@ -23,10 +23,10 @@ log = logging.getLogger(__name__)
 
 
 class PlaneGrid(NamedTuple):
-    """Candidate planes for a rating by groups of places."""
+    """A grid of candidate planes: normals, and offsets along each."""
 
     title: str  # for the log
-    normals: Float[Tensor, "n 3"]  # their normals
+    normals: Float[Tensor, "n 3"]
     offsets: int  # number of offsets of each normal
     groups: int  # number of groups of neighbouring places
     turn: float  # angle between neighbouring normals [rad]
@@ -39,12 +39,13 @@ class PlaneGrid(NamedTuple):
 
 
 class FieldSearch:
-    """Planes whose images explain channels of few numbers, with one unknown phase for all places.
+    """Search for planes whose images explain channels with few values at each place.
 
-    Planes along the axes of the room are searched first, then vertical ones, then tilted ones: more
-    candidates explain more by chance. If a grid of planes is too large for all places at once, a
-    coarser grid is rated by groups of neighbouring places, without the phases between groups.
-    Planes around its maxima are then rated by all places.
+    All places share one unknown phase. Planes along the axes of the room are searched first, then
+    vertical ones, then tilted ones, since more candidates explain more by chance. If a grid of
+    planes is too large for all places at once, a coarser grid is rated by groups of neighbouring
+    places, without the phases between groups. Planes around its maxima are then rated by all
+    places.
 
     Args:
         links: Links of task ``csi`` with a known phase, of which the training links are used.
@@ -146,7 +147,7 @@ class FieldSearch:
     # --- grids ---
 
     def _make_axes(self, room: FieldRoom) -> PlaneGrid:
-        """Planes along three sets of axes: of the room's planes, the places and the coordinates."""
+        """Planes along the axes of the room's planes, of the places' box and of the coordinates."""
         turn = upright_turn(self.frame.points).to(self.frame.points)
         axes = torch.cat((room_axes(room.planes), torch.eye(3).to(turn), turn.mT))
         normals = torch.stack(distinct(axes, 2e-4))
@@ -193,8 +194,12 @@ class FieldSearch:
     def _make_grid(
         self, title: str, groups: int, make: Callable[[float], Float[Tensor, "n 3"]]
     ) -> PlaneGrid:
-        """A grid fine enough that phases of a group of places differ by less than half a turn."""
-        part = groups ** (-1 / 3)  # of the diagonal
+        """A grid whose steps change phases within a group of places by less than half a turn.
+
+        Groups are smaller than the room by the cube root of their number, so more groups allow
+        larger steps.
+        """
+        part = groups ** (-1 / 3)  # diagonal of a group over the room's
         turn = self.data.wavelength / (part * self.frame.diagonal)
         shift = self.data.wavelength / (8 * part)
         extent = (1 + 2 * self.data.options.margin) * self.frame.diagonal

@@ -1,4 +1,4 @@
-"""The frame of a search: transmitters and receivers of a room about its middle."""
+"""The coordinate frame of a search: its origin is the middle of the transmitters and receivers."""
 
 from functools import cached_property
 
@@ -10,7 +10,7 @@ from gaigs.splatting.placement.mirrored.reflections import reflection_points, se
 
 
 class RoomFrame:
-    """Transmitters and receivers about the middle of their box.
+    """Coordinates of a search, with the origin in the middle of the transmitters and receivers.
 
     Near the origin single precision suffices, and a rotated plane moves little. A plane is a row
     (unit normal, offset along it [m]).
@@ -37,11 +37,11 @@ class RoomFrame:
         return torch.Generator().manual_seed(int(torch.randint(2**31, ())))
 
     def from_world(self, planes: Float[Tensor, "*w 4"]) -> Float[Tensor, "*w 4"]:
-        """Planes of the world frame in this frame, float64."""
+        """Planes converted from the world frame to this frame, float64."""
         return seen_from(planes.double(), self.middle)
 
     def to_world(self, planes: Float[Tensor, "*w 4"]) -> Float[Tensor, "*w 4"]:
-        """Planes of this frame in the world frame."""
+        """Planes converted from this frame to the world frame."""
         return seen_from(planes, -self.middle)
 
     def describe(self, plane: Float[Tensor, "4"]) -> str:
@@ -52,7 +52,10 @@ class RoomFrame:
     def grid(
         self, normals: Float[Tensor, "n 3"], count: int, margin: float
     ) -> Float[Tensor, "n k 4"]:
-        """Planes at ``count`` offsets of each normal, to a ``margin`` [diagonals] beyond points."""
+        """Planes at ``count`` evenly spaced offsets along each normal.
+
+        The offsets cover all points and a ``margin`` [diagonals] on both sides.
+        """
         along = self.points @ normals.mT  # (points, n)
         beyond = margin * self.diagonal
         low = along.amin(0) - beyond
@@ -65,14 +68,14 @@ class RoomFrame:
     def is_like(
         self, planes: Float[Tensor, "k 4"], plane: Float[Tensor, "4"]
     ) -> Bool[Tensor, " k"]:
-        """True for planes within 16 degrees of a plane, and within 3 % of the diagonal."""
+        """True for planes close to ``plane``: within 16 degrees, and 3 % of the diagonal."""
         cosines = planes[:, :3] @ plane[:3]
         gaps = (planes[:, 3] * cosines.sign() - plane[3]).abs()
         return (cosines.abs() > 0.96) & (gaps < 0.03 * self.diagonal)
 
 
 def mean_bounces(receivers: list, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "w 3"]:
-    """Mean of the points at which each plane reflects from places to receivers [m].
+    """Mean reflection point of each plane over the links of all receivers [m].
 
     A rotation of the plane about this point changes path lengths least. ``receivers`` are
     ``ReceiverChannels`` or ``ReceiverLags``.

@@ -14,7 +14,7 @@ from gaigs.planes.strengths import fit_free, log_share
 
 
 class FreeRoom(NamedTuple):
-    """Planes, and the fit of channels by their paths, with free strengths at each place."""
+    """Planes, and how well their paths explain channels with free strengths at each place."""
 
     planes: Float[Tensor, "w 4"]  # planes in the frame
     error: float  # mean over links of the log of the share of power that remains
@@ -22,16 +22,16 @@ class FreeRoom(NamedTuple):
 
 
 class FreeScore(Score[FreeRoom]):
-    """Planes by the power of their images, with a free complex strength of each path and place.
+    """Score of planes by the power of their images, with a free strength of each path and place.
 
-    Neither phases nor blockage are assumed. The rating of a candidate is the fraction of the
-    channels' power that its image explains in the residual, a mean over places and receivers: a
-    Hough transform over normals and offsets. Planes are refined by variable projection: each step
-    solves for the strengths.
+    Strengths are complex, so neither phases nor blockage are assumed. The rating of a candidate is
+    the fraction of the channels' power that its image explains in the residual, averaged over
+    places and receivers. This is a Hough transform over normals and offsets. Planes are refined by
+    variable projection: each step solves for the strengths.
 
     Attributes:
         links: At most 200 random training links, for errors and ratings.
-        numbers: Number of independent values in a channel that band and array resolve.
+        numbers: Number of independent values in a channel, which band and array limit.
 
     Source: Golub and Pereyra, The differentiation of pseudo-inverses and nonlinear least squares
     problems whose variables separate, 1973.
@@ -105,7 +105,10 @@ class FreeScore(Score[FreeRoom]):
     def descend(
         self, planes: Float[Tensor, "w 4"], steps: int, rate: float
     ) -> Float[Tensor, "w 4"]:
-        """Planes after gradient descent at random links; arguments as for ``search.descend``."""
+        """Planes after gradient descent at random links.
+
+        ``steps`` and ``rate`` [m] are as for ``search.descend``.
+        """
         sequences = self.data.sequences(planes)
 
         def loss(planes: Float[Tensor, "w 4"]) -> Float[Tensor, ""]:
@@ -123,11 +126,11 @@ class FreeScore(Score[FreeRoom]):
     def compute_profile(
         self, receiver: ReceiverChannels, residual: Complex[Tensor, "b k"]
     ) -> Float[Tensor, "b e t 2"]:
-        """Delay profiles of a residual at each of e elements, at t delays, over the channel's norm.
+        """Delay profiles of a residual at e elements and t delays, over the norm of the channel.
 
-        Rating a candidate plane then takes one look-up for each element, not a sum over
-        subcarriers. Delays are relative to the mean carrier. The last dimension is real and
-        imaginary part.
+        With a profile the rating of a plane needs one look-up for each element, in place of a sum
+        over subcarriers. Profiles are without the phase of the carrier. The last dimension has the
+        real and the imaginary part.
         """
         residual = residual / (
             receiver.flat.norm(dim=1, keepdim=True) * math.sqrt(residual.shape[1])
@@ -152,7 +155,9 @@ class FreeScore(Score[FreeRoom]):
         profiles: list[Float[Tensor, "_ _ t 2"]],
         lines: Float[Tensor, "n k 4"],
     ) -> Float[Tensor, "n k"]:
-        """Mean share of power that one more image explains; 0 for a plane between the ends.
+        """Mean share of power that one more image in each plane explains.
+
+        It is 0 for a plane between transmitter and receiver.
 
         Args:
             receivers: Places and elements of each receiver.
@@ -172,7 +177,10 @@ class FreeScore(Score[FreeRoom]):
 
 
 class _ProfileTable:
-    """Delay profiles of a receiver (b, e, t, 2) up to a path length [m], read at any delay."""
+    """Table of a receiver's delay profiles (b, e, t, 2), with interpolation between delays.
+
+    The table ends at the path length ``longest`` [m].
+    """
 
     def __init__(
         self, receiver: ReceiverChannels, profile: Float[Tensor, "b e t 2"], longest: float
@@ -189,9 +197,10 @@ class _ProfileTable:
     def image_powers(
         self, normal: Float[Tensor, "3"], heights: Float[Tensor, "b k"]
     ) -> Float[Tensor, "b k"]:
-        """Power of profiles after a sum over elements in phase with an image's wave, at b places.
+        """Power of a beam towards the image in each of k planes, at b places.
 
-        The k planes share ``normal``. ``heights`` are the places' signed distances from them [m].
+        Profiles are summed over elements, in phase with the image's wave. The planes share
+        ``normal``. ``heights`` are the signed distances of places from planes [m].
         """
         moves = 2 * heights[..., None].float() * normal.float()
         points = self.places[:, None] - moves  # (b, k, 3)

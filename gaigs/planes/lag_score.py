@@ -1,4 +1,4 @@
-"""The score of planes by spectra: covariances of the array's elements, and blocked paths."""
+"""The score of planes by spectra, from covariances of the array's elements."""
 
 import copy
 import math
@@ -22,20 +22,20 @@ class LagOptions:
     """Options of the search for planes in spectra."""
 
     certain: float = 2.0  # least fall of the mean error by which a plane moves [standard errors]
-    # Rise of a link's log error by which a path counts as blocked there: without it, any plane
-    # explains some links.
+    # A path counts as blocked at a link whose log error falls by this when the path is left out.
+    # Without this price, any plane explains some links.
     blocked: float = 0.1
     gain: float = 0.03  # least fall of the mean log error by a further plane
     faint: float = 1e-3  # share of the power below which paths of several reflections are left out
-    # Bandwidths that are tried, where it is unknown [speed of light over the diagonal]: from a
-    # carrier to a band in which hardly two paths interfere.
+    # Bandwidths that are tried if it is unknown [speed of light over the diagonal]. They range from
+    # a single carrier to a band in which hardly any two paths interfere.
     bands: tuple[float, ...] = (0.01, 1.0, 3.0, 10.0, 30.0, 100.0)
-    # Share of a spectrum that its array cannot explain, from which on the search is left out.
-    # Measured spectra have 0.001, powers in place of amplitudes 0.05.
+    # Largest share of a spectrum that its array cannot explain. With more, the search is left out.
+    # Measured spectra have 0.001; spectra of powers in place of amplitudes have 0.05.
     strange: float = 0.01
     # Largest distance of a plane from all transmitters and receivers [diagonals].
     margin: float = 0.15
-    pairs: int = 16  # most pairs of a receiver and a carrier: each costs a periodogram
+    pairs: int = 16  # largest number of pairs of a receiver and a carrier; each costs a periodogram
 
 
 class LagRoom(NamedTuple):
@@ -45,8 +45,8 @@ class LagRoom(NamedTuple):
     # True where paths are open at a link: column 0 the direct path, then all paths at each plane
     # (b, w + 1).
     open: Bool[Tensor, "b v"]
-    # Error of each link. Where the last moved plane is not open, it is the error without this plane
-    # plus ``LagOptions.blocked``.
+    # Error of each link. If the last moved plane is blocked there, this is the error without the
+    # plane, plus ``LagOptions.blocked``.
     errors: Float[Tensor, " b"]
 
     def opened(self, column: int, value: Bool[Tensor, " b"] | bool) -> Bool[Tensor, "b v"]:
@@ -57,7 +57,7 @@ class LagRoom(NamedTuple):
 
 
 class LinkPaths:
-    """Paths at planes at all receivers, and their periodogram.
+    """Links of all receivers, with functions of their direct and reflected paths.
 
     Attributes:
         bandwidth: Band over which powers are averaged [Hz]; 0 for one carrier. Searches set it.
@@ -84,12 +84,12 @@ class LinkPaths:
         return other
 
     def split(self, passing: Tensor) -> list[tuple[ReceiverLags, Tensor]]:
-        """Pairs of each receiver and the rows of ``passing`` (b, v) of its links."""
+        """Each receiver with the rows of ``passing`` (b, v) for its links."""
         parts = passing.split([len(receiver.places) for receiver in self.receivers])
         return list(zip(self.receivers, parts, strict=True))
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
-        """Sequences of planes; several reflections only if their power is not faint."""
+        """Sequences of planes; those of several reflections only if their power is not faint."""
         sequences = all_sequences(len(planes), self.order)
         powers = self.powers(planes, sequences)
         is_short = (sequences >= 0).sum(1) <= 1
@@ -98,7 +98,7 @@ class LinkPaths:
     def powers(
         self, planes: Float[Tensor, "w 4"], sequences: Int[Tensor, "n order"]
     ) -> Float[Tensor, " n"]:
-        """Mean power of paths, at every fourth link."""
+        """Mean power of each path over every fourth link."""
         powers = []
         for receiver in self.receivers:
             thinned = receiver.at(slice(None, None, 4))
@@ -112,7 +112,7 @@ class LinkPaths:
 
 
 class LagScore(Score[LagRoom]):
-    """Planes by the spectra of an array, with one material and without obstacles.
+    """Score of planes by the spectra of an array, with one material and without obstacles.
 
     Covariances of the array's elements follow from a spectrum (``Beamformer.lags``), so predicted
     covariances are compared with measured spectra. At each link the paths at a plane may be
@@ -136,10 +136,10 @@ class LagScore(Score[LagRoom]):
         sequences: Int[Tensor, "n order"] | None = None,
         every: int = 1,
     ) -> Float[Tensor, " c"]:
-        """Log of the fraction of each spectrum that paths do not explain, at every ``every``-th
-        link.
+        """Log of the fraction of each spectrum that paths do not explain.
 
-        Logarithms limit the weight of single links in a mean. ``open_`` is as in ``LagRoom``.
+        Only every ``every``-th link is used. Logarithms limit the weight of single links in a mean.
+        ``open_`` is as in ``LagRoom``.
         """
         sequences = self.paths.sequences(planes) if sequences is None else sequences
         logs = []
@@ -152,11 +152,11 @@ class LagScore(Score[LagRoom]):
     # --- moves ---
 
     def move(self, room: LagRoom, number: int) -> LagRoom:
-        """The room with plane ``number`` moved to the peak of its periodogram with the lowest
-        error.
+        """The room with plane ``number`` moved to a peak of its periodogram.
 
-        The normals of ``square_normals`` are tried. The plane stays if no peak is clearly better.
-        Its paths are open at links whose error they lower.
+        The peak with the lowest error is taken, over all normals of ``square_normals``. The plane
+        stays if no peak is significantly better. Its paths are open at links whose error they
+        lower.
         """
         # The wave that the other planes' paths lack, and the errors without this plane.
         is_other = torch.arange(len(room.planes)) != number
@@ -189,7 +189,7 @@ class LagScore(Score[LagRoom]):
         open_: Bool[Tensor, "b v"],
         sequences: Int[Tensor, "n order"],
     ) -> list[FurtherWave]:
-        """For each receiver, the wave that the known paths lack to explain the spectra."""
+        """For each receiver, the wave that must join the known paths to explain the spectra."""
         waves = []
         for receiver, passing in self.paths.split(open_):
             paths = receiver.paths(planes, sequences, passing)
@@ -248,10 +248,10 @@ class LagScore(Score[LagRoom]):
     def _rate_powers(
         self, maps: list[Float[Tensor, "b 1 k k"]], planes: Float[Tensor, "c 4"]
     ) -> Float[Tensor, " c"]:
-        """Fall of the errors by the power of a reflection at each plane, over the norm of this
-        power.
+        """Rating of each plane: fall of the errors by the power of its reflection.
 
-        ``maps`` have each link's fall by a wave from each direction, on a grid of k x k sines.
+        The fall is divided by the norm of this power over links. ``maps`` have the fall of each
+        link's error by a wave from each direction, on a grid of k x k sines.
         """
         total, square = planes.new_zeros(2, len(planes))
         for receiver, falls in zip(self.paths.receivers, maps, strict=True):

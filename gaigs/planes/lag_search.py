@@ -42,7 +42,9 @@ def frame_of(links: Links) -> RoomFrame:
 def group_links(
     links: Links, frequencies: Float[Tensor, " n"], frame: RoomFrame, most: int, pairs: int
 ) -> list[LinkGroup]:
-    """Training links in groups by receiver and carrier. Groups and their links are evenly thinned.
+    """Training links in groups by receiver and carrier.
+
+    Groups, and links in them, are evenly thinned to the numbers allowed.
 
     Args:
         links: Links, of which the training links are used.
@@ -67,7 +69,7 @@ def group_links(
 
 
 class LagSearch:
-    """Planes whose reflections explain spectra, see ``LagScore``.
+    """Search for planes whose reflections explain spectra, with ``LagScore``.
 
     Args:
         links: Links of task ``spectrum``, of which the training links are used.
@@ -166,11 +168,11 @@ class LagSearch:
         return self.frame.to_world(room.planes.double())
 
     def _choose_bandwidth(self, start: LagRoom, choices: list[float]) -> LagRoom:
-        """Sets the best of some bandwidths, and returns the start with all planes moved.
+        """Sets the bandwidth to the best of ``choices``; returns the start with all planes moved.
 
-        The best bandwidth gives the smallest error after a move of the strongest plane. It is then
-        compared with the first choice, nearly a single carrier, after moves of all planes: while
-        other planes are wrong, a single plane hardly interferes.
+        One bandwidth gives the smallest error after a move of the strongest plane alone. It is
+        compared with the first choice, nearly a single carrier, after moves of all planes, since
+        interference hardly shows while other planes are wrong.
         """
         best = choices[0]
         if len(choices) > 1:
@@ -188,13 +190,13 @@ class LagSearch:
         return rooms[self.paths.bandwidth]
 
     def move_around(self, room: LagRoom) -> LagRoom:
-        """Each plane moved, the strongest first; then all planes together."""
+        """The room after a move of each plane, the strongest first, and a descent of all planes."""
         numbers = self.paths.sort_by_strength(room.planes)
         room = self.search.sweep(room, numbers, "search of planes")
         return self.score.refine(room)
 
     def find_more(self, room: LagRoom, most: int) -> LagRoom:
-        """The room with further planes, one after the other."""
+        """The room after the addition of planes, one after the other, to at most ``most``."""
         normals = torch.cat((fibonacci_lattice(200, 0.0, math.pi / 2).float(), torch.eye(3)))
         grid = self.frame.grid(normals, 60, self.options.margin)
         return self.search.grow(room, most, lambda room: self.search.extend(room, grid))

@@ -1,4 +1,4 @@
-"""Covariances of an array's elements at the training links of a receiver, and their paths."""
+"""Covariances of the elements of a receiver's array: measured ones, and those that paths give."""
 
 import itertools
 import math
@@ -36,7 +36,7 @@ class ArrayPaths(NamedTuple):
 
 
 class FurtherWave(NamedTuple):
-    """Fall of the error of the known paths' covariances by a further path.
+    """Gradient of a link's error by the wave of a further path, which interferes with known paths.
 
     A weak further path with the wave w at the elements lowers the error by 2 Re sum(w* weights),
     summed over known paths and elements.
@@ -49,7 +49,7 @@ class FurtherWave(NamedTuple):
 
 
 class SingleReflections(NamedTuple):
-    """Paths of one reflection at planes (b, c)."""
+    """Paths with one reflection, from b places at c planes."""
 
     directions: Float[Tensor, "b c 3"]  # unit vectors in the array's frame
     lengths: Float[Tensor, "b c"]  # lengths of the paths [m]
@@ -104,36 +104,40 @@ class ReceiverLags:
 
     @cached_property
     def basis(self) -> Float[Tensor, "m k"]:
-        """Power in each of ``directions`` by the lags from 0 on: real, then imaginary parts."""
+        """Matrix from lags to the power in each of ``directions``.
+
+        Its rows are the real parts of the lags from 0 on, then their imaginary parts.
+        """
         half = len(self.counts) // 2
-        # Opposite lags are conjugate, so one of two counts twice.
+        # Opposite lags are conjugate, so each lag but 0 counts twice.
         weights = self.counts[half:] * torch.where(torch.arange(half + 1) > 0, 2, 1)
         lags = self.array.lags[0][half:].to(self.places)
         phases = self.wavenumber * (lags @ self.directions.to(self.places).T)  # (lags, k)
         return torch.cat((phases.cos() * weights[:, None], phases.sin() * weights[:, None]))
 
     def shape_of(self, lags: Complex[Tensor, "b l"]) -> Float[Tensor, "b k"]:
-        """Amplitudes of spectra in ``directions``, with a mean of 0 and a norm of 1.
+        """Amplitudes of spectra in ``directions``, normalised to a mean of 0 and a norm of 1.
 
-        This removes the unknown factor and offset of labels.
+        The normalisation removes the unknown factor and offset of labels.
         """
         later = lags[:, lags.shape[1] // 2 :]  # the others are their conjugates
         later = later / later[:, :1].real.clamp_min(1e-12)
         powers = torch.cat((later.real, later.imag), 1) @ self.basis  # (b, k)
-        amplitudes = powers.clamp_min(1e-4).sqrt()  # of a mean power of e²
+        amplitudes = powers.clamp_min(1e-4).sqrt()  # the mean power is e² for e elements
         amplitudes = amplitudes - amplitudes.mean(1, keepdim=True)
         return amplitudes / amplitudes.norm(dim=1, keepdim=True).clamp_min(1e-6)
 
     def errors(self, lags: Complex[Tensor, "b l"]) -> Float[Tensor, " b"]:
         """Log of the fraction of each spectrum's variance that a model's lags do not explain."""
         floor = 0.01  # share below which an error hardly counts
-        alike = (self.shape_of(lags) * self.shapes).sum(1).clamp_min(0)
-        return (1 - alike.square() + floor).log()
+        correlations = (self.shape_of(lags) * self.shapes).sum(1).clamp_min(0)
+        return (1 - correlations.square() + floor).log()
 
     def slopes(self, lags: Complex[Tensor, "b l"]) -> Complex[Tensor, "b e e"]:
-        """Negative gradient M of the errors by the covariances.
+        """Negative gradient M of the errors by the covariance matrices.
 
-        A further wave x lowers the errors by x' M x, and by 2 Re x' M y with a known wave y.
+        The power of a further wave x lowers the error by x' M x. Its interference with a known wave
+        y lowers it by 2 Re x' M y.
         """
         with torch.enable_grad():
             lags = lags.detach().requires_grad_()
@@ -147,7 +151,10 @@ class ReceiverLags:
     # --- paths ---
 
     def steer(self, directions: Float[Tensor, "*b d"]) -> Complex[Tensor, "*b e"]:
-        """Phases at the elements of waves from directions in the array's frame (x, y or more)."""
+        """Phase factors at the elements of waves from directions in the array's frame.
+
+        Only the first two coordinates of ``directions`` are used.
+        """
         turns = self.wavenumber * (directions[..., :2] @ self.elements.T)
         return torch.polar(torch.ones_like(turns), turns)
 
@@ -165,10 +172,11 @@ class ReceiverLags:
         sequences: Int[Tensor, "n order"],
         passing: Tensor | None = None,
     ) -> ArrayPaths:
-        """All paths at planes.
+        """The direct path, and the paths that ``planes`` reflect.
 
-        ``passing`` (b, w + 1) is the fraction of the field that obstacles transmit: of the direct
-        path, then of the paths at each plane. Booleans mean 1 and 0. None: all 1.
+        ``passing`` (b, w + 1) is the fraction of the field that obstacles transmit. Column 0 is for
+        the direct path, the others for the paths at each plane. Booleans mean 1 and 0; None means
+        1 everywhere.
         """
         normals, offsets = planes[:, :3], planes[:, 3]
         points = images(self.places, sequences, normals, offsets)
@@ -189,13 +197,16 @@ class ReceiverLags:
         return ArrayPaths(fields, self.steer(directions), lengths)
 
     def covariances(self, paths: ArrayPaths, bandwidth: float) -> Complex[Tensor, "b l"]:
-        """Lags of interfering paths, as in ``LagPooling``; powers are averaged over a band [Hz]."""
+        """Covariances that interfering paths give at each lag, as in ``LagPooling``.
+
+        Powers are averaged over ``bandwidth`` [Hz]; 0 is a single carrier.
+        """
         fields, steering, lengths = paths
         if bandwidth:
             # Over a band the correlation of two paths is sinc(B (L - L') / c).
             gaps = lengths[:, :, None] - lengths[:, None]  # (b, n, n)
-            likeness = sinc(bandwidth / speed_of_light * gaps)
-            together = fields[:, :, None] * fields[:, None].conj() * likeness
+            coherence = sinc(bandwidth / speed_of_light * gaps)
+            together = fields[:, :, None] * fields[:, None].conj() * coherence  # (b, n, n)
             matrices = steering.mT @ together @ steering.conj()  # (b, e, e)
         else:
             waves = (fields[:, None] @ steering).mT  # (b, e, 1)
@@ -205,7 +216,7 @@ class ReceiverLags:
         return sums.index_add(1, self.array.lags[1], flat) / self.counts
 
     def further_wave(self, paths: ArrayPaths, bandwidth: float) -> FurtherWave:
-        """Interference of one more path with known ones."""
+        """How a further path, by interference with the known ``paths``, lowers the errors."""
         slopes = self.slopes(self.covariances(paths, bandwidth))
         weights = (slopes @ paths.steering.mT).mT * paths.fields[..., None]  # (b, n, e)
         if bandwidth:
@@ -213,7 +224,7 @@ class ReceiverLags:
         return FurtherWave(weights.sum(1, keepdim=True), paths.lengths[:, :1])
 
     def reflect_once(self, planes: Float[Tensor, "c 4"]) -> SingleReflections:
-        """Paths of one reflection at planes."""
+        """Paths with one reflection, at each plane alone."""
         normals, offsets = planes[:, :3], planes[:, 3]
         here = self.pose.position @ normals.T - offsets  # (c,)
         there = self.places @ normals.T - offsets  # (b, c)
@@ -224,7 +235,10 @@ class ReceiverLags:
         return SingleReflections(directions, lengths, gains, cosines)
 
     def describe_doubts(self, name: str) -> list[str]:
-        """A sentence for the log if spectra contradict the geometry of the direct path."""
+        """A sentence for the log if spectra fit the direct path better with turned azimuths.
+
+        The list is empty if they do not. ``name`` is the receiver's.
+        """
         _, pairs, _ = self.array.lags
         matrices = self.lags[:, pairs].view(-1, len(self.array), len(self.array))
         directions, _ = self.look_at(self.places)

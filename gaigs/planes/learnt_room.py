@@ -38,7 +38,7 @@ class PlaneTable(NamedTuple):
 
 
 class LearntPlane(NamedTuple):
-    """The drawn part of a learnt plane."""
+    """A learnt plane as a polygon for figures."""
 
     number: int  # as in ``metrics.json``
     # A convex polygon, counterclockwise as seen from outside the room [m].
@@ -48,7 +48,7 @@ class LearntPlane(NamedTuple):
 
 
 class Matter(NamedTuple):
-    """Obstacles: Gaussians, and boxes with sharp edges."""
+    """Learnt obstacles of a room: k Gaussians of matter, and m boxes with sharp edges."""
 
     centres: Float[ndarray, "k 3"]  # [m]
     widths: Float[ndarray, "k 3"]  # standard deviations along the world's axes [m]

@@ -31,12 +31,12 @@ log = logging.getLogger(__name__)
 class LevelOptions:
     """Options of the search for planes in received levels."""
 
-    clear: float = 3.0  # least fall of the errors by a plane whose phases count [standard errors]
-    # Least ratio of this fall to the largest one by chance: of few links some plane always explains
-    # much.
+    clear: float = 3.0  # least fall of the errors by which a plane is located [standard errors]
+    # Least ratio of this fall to the largest fall by chance. With few links some plane always
+    # explains much.
     chance: float = 1.1
-    shuffles: int = 4  # how often chance is tried: with errors that have changed their links
-    maxima: int = 4  # maxima of the periodograms whose errors are compared
+    shuffles: int = 4  # number of trials for the fall by chance, each with errors shuffled
+    maxima: int = 4  # number of maxima of the periodograms whose errors are compared
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,10 @@ class ReceiverLevels(ReceiverLags):
 
 
 class LevelRoom(NamedTuple):
-    """Planes of the room, and facts on their paths from a model that adds powers."""
+    """Planes of the room, and what obstacles transmit of their paths.
+
+    The transmitted fractions come from a model that adds the powers of paths.
+    """
 
     planes: Float[Tensor, "w 4"]  # normals and offsets [m]
     located: Bool[Tensor, " w"]  # True for planes whose paths interfere
@@ -64,15 +67,16 @@ class LevelRoom(NamedTuple):
     # at each link (b, w + 1).
     passing: Float[Tensor, "b v"]
     gain: float = 0.0  # fall of the errors by the plane located last [standard errors]
-    number: int = 0  # number of this plane
-    bandwidth: float = 0.0  # over which powers were averaged [Hz]
+    number: int = 0  # number of the plane located last
+    bandwidth: float = 0.0  # band over which powers were averaged [Hz]
 
 
 class LevelScore(Score[LevelRoom]):
-    """Planes by received levels. Paths at located planes interfere; powers of other paths add.
+    """Score of planes by received levels.
 
-    A plane is located once its phases are known, since a wrong phase is worse than no phase. The
-    error is the negative gain of the plane located last.
+    Paths at located planes interfere; powers of other paths add. A plane is located once the phases
+    of its paths are known, since a wrong phase is worse than no phase. The error is the negative
+    gain of the plane located last.
     """
 
     def __init__(self, paths: LinkPaths, options: LevelOptions):
@@ -126,7 +130,7 @@ class LevelScore(Score[LevelRoom]):
         before: list[Complex[Tensor, "b 1"]],
         sequences: Int[Tensor, "n order"],
     ) -> float:
-        """Mean fall of the errors from powers ``before`` to the room's, in standard errors."""
+        """Mean fall of the errors [standard errors] if the room's powers replace ``before``."""
         phased = is_phased(sequences, room.located)
         gains = []
         for (receiver, passing), old in zip(self.paths.split(room.passing), before, strict=True):
@@ -142,15 +146,16 @@ class LevelScore(Score[LevelRoom]):
         waves = paths.fields[:, phased]
         lengths = paths.lengths[:, phased]
         gaps = lengths[:, :, None] - lengths[:, None]  # (b, n, n)
-        likeness = sinc(self.paths.bandwidth / speed_of_light * gaps)
-        interfering = ((likeness * waves[:, None]).sum(2) * waves.conj()).sum(1)
+        coherence = sinc(self.paths.bandwidth / speed_of_light * gaps)
+        interfering = ((coherence * waves[:, None]).sum(2) * waves.conj()).sum(1)  # (b,)
         powers = (paths.fields[:, ~phased].abs().square()).sum(1) + interfering
         return powers[:, None]
 
     def measure_chance(self, room: LevelRoom, numbers: list[int], enough: float) -> float:
-        """Largest gain of planes ``numbers`` by chance, measured with errors shuffled among links.
+        """Largest gain that chance gives one of the planes ``numbers`` [standard errors].
 
-        Trials end at the first gain above ``enough``. The result is infinite if the time is up.
+        It is measured with the errors shuffled among links. Trials end at the first gain above
+        ``enough``. The result is infinite if the time is up.
         """
         sequences = self.paths.sequences(room.planes)
         phased = is_phased(sequences, room.located)
@@ -175,10 +180,10 @@ class LevelScore(Score[LevelRoom]):
 
 
 class LevelSearch:
-    """Planes whose reflections interfere in received levels.
+    """Search for planes whose reflections interfere in received levels.
 
-    A level is one number, so its phases are useful only after a model has learnt the losses by
-    obstacles from powers. Then planes are located one after the other, the clearest first
+    A level is a single number, so interference shows only after a model has learnt the losses by
+    obstacles. Then planes are located one after the other, the one with the largest gain first
     (``LevelScore``).
 
     Args:
@@ -240,10 +245,12 @@ class LevelSearch:
 
     @torch.no_grad()
     def locate(self, placement: Mirrored) -> list[int]:
-        """Moves the placement's planes to clear maxima, one by one, and lets their paths interfere.
+        """Moves planes of the placement to significant maxima, one by one.
+
+        Paths at a moved plane interfere from then on.
 
         Returns:
-            Numbers of these planes in the placement.
+            Numbers of the moved planes in the placement.
         """
         numbers: list[int] = []
         least = 0.0  # gain above chance; measured with the first clear plane
@@ -278,10 +285,10 @@ class LevelSearch:
     def locate_one(
         self, room: LevelRoom, numbers: list[int], bandwidths: list[float]
     ) -> LevelRoom | None:
-        """The room with the clearest of planes ``numbers`` moved; None if the time is up.
+        """The room after the move of the one plane of ``numbers`` with the largest gain.
 
         Each plane is tried with each of ``bandwidths`` [Hz]. The best bandwidth stays set in
-        ``paths``.
+        ``paths``. The result is None if the time is up.
         """
         trials = []
         pairs = [*itertools.product(bandwidths, numbers)]
@@ -295,7 +302,7 @@ class LevelSearch:
         return best
 
     def room_of(self, placement: Mirrored) -> LevelRoom:
-        """The room of a placement: located planes at their place, others at their start."""
+        """The room of a placement: located planes at their position, others at their start."""
         located = placement.located[self.numbers].cpu()
         placed = self.frame.from_world(placement.planes[self.numbers].cpu()).float()
         planes = torch.where(located[:, None], placed, self.start)
@@ -304,7 +311,7 @@ class LevelSearch:
     def passing(self, placement: Mirrored, planes: Float[Tensor, "w 4"]) -> Float[Tensor, "b v"]:
         """Fractions of fields that a model's obstacles transmit, see ``LevelRoom.passing``.
 
-        They are the model's fields over the fields without obstacles, at most 1. Near Brewster's
+        They are the model's fields over the fields without obstacles, limited to 1: near Brewster's
         angle planes reflect almost nothing, and the quotient is meaningless.
         """
         columns = [0, *(number + 1 for number in self.numbers)]

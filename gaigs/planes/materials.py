@@ -34,11 +34,12 @@ class SlabOption(NamedTuple):
 def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, Material]:
     """Material and thickness of each plane that a query's paths meet, at a carrier [Hz].
 
-    The material's reflections have the smallest squared difference from the learnt ones, at the
-    reflection points of these paths, weighted by the paths' powers. A learnt reflection includes
-    the plane's gain. It also includes a part of the path's gain over the direct path's, equal at
-    each reflection. If phases of paths are learnt, only magnitudes are compared. The thickness is
-    the learnt one, or 1 m if a half-space fits better.
+    Reflection coefficients of each material are compared with the learnt ones at the reflection
+    points of these paths. The material with the smallest squared difference, weighted by the paths'
+    powers, is chosen. A learnt coefficient includes the plane's gain, and a part of the path's gain
+    over the direct path: the same part at each of its reflections. If phases of paths are learnt,
+    only magnitudes are compared. The thickness is the learnt one, or 1 m if a half-space fits
+    better.
 
     Source: ITU-R P.2040-3, table 3; outside 1 to 40 GHz its formulas are extrapolated.
     """

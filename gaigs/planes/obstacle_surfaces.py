@@ -73,10 +73,10 @@ class Legs(NamedTuple):
 
 
 class AttenuatedPaths(NamedTuple):
-    """Fields of paths without obstacles, the fraction that obstacles transmit, and the legs."""
+    """Paths of b links, and what obstacles transmit of each."""
 
-    fields: Float[Tensor, "b n"]
-    passed: Float[Tensor, "b n"]
+    fields: Float[Tensor, "b n"]  # magnitudes without obstacles
+    passed: Float[Tensor, "b n"]  # fractions of the fields that obstacles transmit
     legs: Legs
 
 
@@ -123,9 +123,10 @@ class MatterGrid:
     def mesh(
         self, density: float, number: int
     ) -> tuple[Float[ndarray, "v 3"], Int[ndarray, "f 3"]]:
-        """Corners [m] from the middle of the room, and triangles, of one surface of a density.
+        """Vertices [m] and triangles of surface ``number`` at a density.
 
-        The box closes a surface that reaches beyond it.
+        Vertices are relative to the middle of the room. A surface that reaches beyond the grid's
+        box is closed there.
 
         Source: Lewiner et al., Efficient implementation of marching cubes' cases with topological
         guarantees, 2003.
@@ -225,11 +226,12 @@ def attenuate_paths(
     fields = fields.double()
     powers = fields.square()
     fields[powers < options.faint * powers.sum(1, keepdim=True)] = 0
-    # Legs of the paths that count, of all links in a row (s,).
+    # Legs of the paths whose field is not 0, over all links (s,).
     link, leg = (fields > 0)[:, folded.path].nonzero().T
     paths = link * len(sequences) + folded.path[leg]
     start = folded.start[link, leg].double()
     along = folded.end[link, leg].double() - start
+    # Boxes become sheets of their own, so only the Gaussians attenuate here.
     no_boxes = torch.zeros(len(start), int(obstacles.used.sum()), dtype=torch.bool)
     depths = obstacles(start.float(), (start + along).float(), no_boxes).real.double()
     depths = fields.new_zeros(fields.numel()).index_add(0, paths, depths)  # (b n,), of each path
@@ -243,10 +245,11 @@ def attenuate_paths(
 
 
 def choose_densities(paths: AttenuatedPaths, count: int) -> list[float]:
-    """``count`` densities of matter [Np/m] in which paths lose their fields; empty without loss.
+    """``count`` densities of matter [Np/m] in which paths lose their fields.
 
-    Their logarithms are evenly spaced. A tenth of the loss is in matter thinner than the first
-    density, and a tenth in matter denser than the last.
+    Logarithms of the densities are evenly spaced. A tenth of the loss is in matter thinner than the
+    first density, and a tenth in matter denser than the last. The list is empty if paths lose
+    nothing.
     """
     densities = paths.legs.densities
     # Each leg's loss, spread over its matter.
@@ -294,10 +297,10 @@ class SheetFit:
         for number, log in zip(chosen, logs, strict=True):
             losses = losses + self.crossings[number].losses(log.exp(), count)
         passed = (gain - losses).exp().view_as(self.fields)
-        off = (self.fields * (passed - self.passed)).square().sum(1)
+        squares = (self.fields * (passed - self.passed)).square().sum(1)  # (b,)
         is_reached = self.powers > 0
         # Errors below -40 dB hardly count.
-        return 10 * (off[is_reached] / self.powers[is_reached] + 1e-4).log10().mean()
+        return 10 * (squares[is_reached] / self.powers[is_reached] + 1e-4).log10().mean()
 
     def fit(
         self, chosen: Sequence[int], sizes: Sequence[int], start: Tensor

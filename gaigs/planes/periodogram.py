@@ -15,7 +15,7 @@ from gaigs.planes.lags import FurtherWave, ReceiverLags
 from gaigs.splatting.placement.mirrored.reflections import reflect, tangents
 
 
-class Likeness(NamedTuple):
+class WaveProducts(NamedTuple):
     """Products of the reflections at c planes with a further wave, at b links."""
 
     values: Complex[Tensor, "c b"]  # products of both waves, of about the same size at all links
@@ -25,20 +25,19 @@ class Likeness(NamedTuple):
 
 
 class TilePeak(NamedTuple):
-    """Maximum of a periodogram: height, plane, and pivot of the plane's rotation [m]."""
+    """Maximum of a periodogram."""
 
     height: float
-    plane: Float[Tensor, "4"]
-    pivot: Float[Tensor, "3"]
+    plane: Float[Tensor, "4"]  # normal and offset [m]
+    pivot: Float[Tensor, "3"]  # point about which the plane turns [m]
 
 
 class PlanePeriodogram:
     """Search near a known plane for the plane whose reflections best match a further wave.
 
-    The gradient of the error by the covariances, times the waves of known paths, is the ideal wave
-    of one more path (``FurtherWave``). The phase of a reflection follows from the path's length.
-    Within a tile of offsets and tilts lengths are linear, so the match, summed over links, is a
-    Fourier sum.
+    The further wave is the wave by which one more path lowers the error most (``FurtherWave``). The
+    phase of a reflection follows from the path's length. Within a small range of offsets and tilts,
+    a tile, lengths are nearly linear. The match, summed over links, is then a Fourier sum.
 
     Args:
         receivers: Training links.
@@ -96,9 +95,9 @@ class PlanePeriodogram:
         values = []
         rates = []
         for receiver, wave in zip(self.receivers, waves, strict=True):
-            likeness = compare_with_wave(receiver, wave, bandwidth, centres, pivots, axes)
-            values.append(likeness.values)
-            rates.append(likeness.rates)
+            products = compare_with_wave(receiver, wave, bandwidth, centres, pivots, axes)
+            values.append(products.values)
+            rates.append(products.rates)
         peaks = []
         for pivot, value, rate in zip(
             pivots, torch.cat(values, 1), torch.cat(rates, 1), strict=True
@@ -115,14 +114,14 @@ class PlanePeriodogram:
         return self._distinct(peaks)
 
     def _turns(self, bounce: Float[Tensor, "3"]) -> Float[Tensor, " t"]:
-        """Rotations of a tile from 0 up [rad], with phase changes of about 2 rad in each step."""
+        """Rotations from 0 to half a tile [rad]; a step changes phases by about 2 rad."""
         gaps = torch.cat([receiver.places - bounce for receiver in self.receivers])
         spread = gaps.norm(dim=1).mean().item()  # [m]
         step = max(min(self.tile / 5, self.turn * self.wavelength / spread), self.tile / 20)
         return torch.linspace(0, self.tile, math.ceil(self.tile / step) + 1)
 
     def _distinct(self, peaks: list[TilePeak]) -> list[TilePeak]:
-        """At most six of sorted peaks above 0, no two in the same main lobe."""
+        """The first six peaks that are above 0 and not in the main lobe of an earlier one."""
         distinct: list[TilePeak] = []
         for peak in peaks:
             if peak.height <= 0 or len(distinct) == 6:
@@ -132,7 +131,7 @@ class PlanePeriodogram:
         return distinct
 
     def _is_apart(self, peak: TilePeak, other: TilePeak) -> bool:
-        """True if two planes differ by a quarter of a tile, or of a wavelength at the pivot."""
+        """True if normals differ by a quarter of ``tile``, or pivots by a quarter wavelength."""
         gap = peak.plane - other.plane
         move = (gap[3] - gap[:3] @ peak.pivot).abs()
         return bool(gap[:3].norm() > self.tile / 4 or move > self.wavelength / 4)
@@ -145,7 +144,7 @@ def compare_with_wave(
     planes: Float[Tensor, "c 4"],  # planes (normal, offset [m])
     pivots: Float[Tensor, "c 3"],  # points about which the planes turn [m]
     axes: Float[Tensor, "2 3"],  # unit vectors towards which the normals turn
-) -> Likeness:
+) -> WaveProducts:
     """Products of the reflection at each plane with a further wave, at each link."""
     single = receiver.reflect_once(planes)
     directions = single.directions.transpose(0, 1)  # (c, b, 3)
@@ -153,12 +152,12 @@ def compare_with_wave(
     gains = single.gains.transpose(0, 1)
     cosines = single.cosines.transpose(0, 1)
     # Over the band, paths with a difference of length d are coherent by sinc(bandwidth d / c).
-    alike = sinc(bandwidth / speed_of_light * (wave.lengths - lengths[..., None]))  # (c, b, n)
-    weights = torch.einsum("cbn,bne->cbe", alike.to(wave.weights), wave.weights)
+    coherence = sinc(bandwidth / speed_of_light * (wave.lengths - lengths[..., None]))  # (c, b, n)
+    weights = torch.einsum("cbn,bne->cbe", coherence.to(wave.weights), wave.weights)
     # The product with the reflection's field: steering vector, gain, and phase of its length.
     values = (receiver.steer(directions).conj() * weights).sum(2) * gains.conj()  # (c, b)
     values = values * torch.polar(torch.ones_like(lengths), receiver.wavenumber * lengths)
-    # Saturation at the median, so that no link rules.
+    # Magnitudes saturate at the median, so that no link dominates.
     sizes = values.abs()
     medians = torch.where(sizes > 0, sizes, math.nan).nanmedian(1, keepdim=True).values
     values = values / (sizes + medians.nan_to_num(1.0))
@@ -171,7 +170,7 @@ def compare_with_wave(
     aside = (receiver.places - pivots[:, None]) @ axes.T  # (c, b, 2)
     turned = aside * cosines[..., None] + heights[..., None] * (units @ axes.T)
     rates = 2 * receiver.wavenumber * torch.cat((cosines[..., None], -turned), 2)
-    return Likeness(values, rates)
+    return WaveProducts(values, rates)
 
 
 def periodogram(
@@ -180,12 +179,12 @@ def periodogram(
     moves: Float[Tensor, " m"],
     turns: Float[Tensor, " t"],
 ) -> Float[Tensor, "m 2*t-1 2*t-1"]:
-    """Sums of ``Likeness`` over links, for planes that are moved and rotated.
+    """Sums of ``WaveProducts`` over links, for one plane at each move and rotation.
 
     Sums are Re sum_b v_b exp(j (r_b0 move + r_b1 turn + r_b2 turn')).
 
     Args:
-        values, rates: From ``Likeness`` of one plane.
+        values, rates: From ``WaveProducts``, for one plane.
         moves: Moves of the plane along the normal [m].
         turns: Rotations towards two axes [rad], from 0 up; the result starts with their negatives.
     """

@@ -1,4 +1,4 @@
-"""Planes near a known one whose reflections have equal phases at all places: a periodogram."""
+"""A periodogram that finds planes near a known one whose reflections have equal phases."""
 
 import math
 from typing import NamedTuple
@@ -15,11 +15,11 @@ from gaigs.splatting.placement.mirrored.reflections import polarised, reflect, t
 
 
 class Phasors(NamedTuple):
-    """Single reflections at a plane, at b places."""
+    """Paths with a single reflection at a plane, from b places."""
 
-    # Strengths over the channels' root power, with the phase against the direct path.
+    # Strengths over the root of the channels' power, with phases relative to the direct path.
     values: Complex[Tensor, " b"]
-    slopes: Float[Tensor, "b 3"]  # change of the length by offset and two tilts
+    slopes: Float[Tensor, "b 3"]  # derivatives of the path length by offset and two tilts
     cosines: Float[Tensor, " b"]  # cosines of the angles of incidence
 
 
@@ -27,8 +27,8 @@ class SlabPeak(NamedTuple):
     """Maximum of the periodogram over both tilts, at one offset."""
 
     height: float
-    shift: Float[Tensor, "3"]
-    slab: Float[Tensor, "3"]
+    shift: Float[Tensor, "3"]  # change of the offset [m] and two tilts [rad]
+    slab: Float[Tensor, "3"]  # as in ``SLABS``
 
 
 def propose_by_phases(
@@ -39,7 +39,7 @@ def propose_by_phases(
     tilt: float,  # largest turn towards either side [rad]
     slabs: Float[Tensor, "m 3"],  # slabs that are tried
 ) -> list[tuple[Float[Tensor, "4"], Float[Tensor, "3"]]]:
-    """Planes near plane ``number``, with slabs, whose reflections have equal phases at all places.
+    """Variants of plane ``number``, with slabs, whose reflections have equal phases at all places.
 
     Returns:
         Planes (4,) and slabs (3,): at most eight half-spaces and eight slabs, highest maxima of the
@@ -114,9 +114,10 @@ def _phasors(
     planes: Float[Tensor, "w 4"],
     number: int,
 ) -> Phasors:
-    """Single reflections at plane ``number``, with strengths fitted together with all other paths.
+    """Paths of one receiver with a single reflection, at plane ``number``.
 
-    About 120 places are used, over all receivers: the places with the strongest reflections.
+    Their strengths are fitted together with those of all other paths. Only the places with the
+    strongest reflections are used, about 120 over all receivers.
     """
     sequences = data.sequences(planes)
     is_single = sequences[:, :-1].lt(0).all(1) & (sequences[:, -1] == number)
@@ -142,7 +143,10 @@ def _phasors(
 
 
 def _distinct_peaks(peaks: list[SlabPeak], least: float) -> list[SlabPeak]:
-    """The best half-space and the best slab of each lobe; lobes are ``least`` apart [m]."""
+    """At most eight half-spaces and eight slabs, the best one of each lobe.
+
+    Two peaks of one kind are in the same lobe if their offsets differ by less than ``least`` [m].
+    """
     distinct: list[SlabPeak] = []
     for peak in peaks:
         alike = [other for other in distinct if (other.slab[2] < 0) == (peak.slab[2] < 0)]

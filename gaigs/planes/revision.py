@@ -17,11 +17,11 @@ from gaigs.splatting.placement.mirrored.reflections import square_normals
 log = logging.getLogger(__name__)
 
 Loss = Callable[[Batch], float]
-"""Loss of the model as it stands, on a batch."""
+"""A function that returns the model's present loss on a batch."""
 
 
 def thin_batch(batch: Batch, rows: int) -> Batch:
-    """The batch with at least ``rows`` rows of its maps, and columns in proportion.
+    """The batch with fewer pixels: about ``rows`` rows of its maps, and columns in proportion.
 
     Labels without a grid of directions are unchanged.
     """
@@ -38,23 +38,24 @@ def thin_batch(batch: Batch, rows: int) -> Batch:
 def move_planes(
     model, batch: Batch, wavelength: float, least: float, widest: float = 50.0
 ) -> list[float]:
-    """Moves each used plane to the lowest error, the strongest plane first.
+    """Moves each used plane to the position with the lowest error, the strongest plane first.
 
-    A plane moves along its normal, and may rotate perpendicular to other planes, see
-    ``square_normals``. Planes of a model that draws maps do not rotate, since a trial takes long.
+    A plane moves along its normal. It may also turn to be parallel or perpendicular to other
+    planes, see ``square_normals``. Planes of a model that draws maps do not turn, since each trial
+    takes long.
 
     Args:
         model: Model with a placement ``mirrored``.
         batch: Links for the errors.
         wavelength: Wavelength of the carrier [m].
-        least: Smallest distance searched on either side [m].
-        widest: Limit of this distance [wavelengths].
+        least: Distance searched on either side [m]; at least four wavelengths are searched.
+        widest: Limit of ``least`` [wavelengths].
 
     Returns:
         Moves along the normals [m].
     """
     placement: Mirrored = model.placement
-    placement.enable_phases(wavelength)  # adds the steps so far to the planes
+    placement.enable_phases(wavelength)  # adds the learnt moves so far to the planes' positions
     thinned = thin_batch(batch, 12)
     reach = max(4.0 * wavelength, min(least, widest * wavelength))
     if least > reach:  # steps cannot be coarser than a fraction of the wavelength
@@ -101,9 +102,9 @@ def move_plane(
 def _measure_moves(
     model, batch: Batch, plane: int, moves: Float[Tensor, " m"]
 ) -> Float[Tensor, " m"]:
-    """Mean error of the links after each move of a plane along its normal [m].
+    """Mean error of the links for each move [m] of a plane along its normal.
 
-    Only path lengths change; strengths of paths are constant.
+    Strengths of paths are computed once; only path lengths change with the move.
     """
     placement = model.placement
     count = len(batch.query)
@@ -128,18 +129,18 @@ def _measure_moves(
 
 
 def _measure_links(value: Tensor, label: Tensor) -> Float[Tensor, " b"]:
-    """Error of each link: mean absolute error; of channels ``log_share``."""
+    """Error of each link: ``log_share`` for channels, otherwise the mean absolute error."""
     error = (value - label).reshape(len(value), -1)
     if not error.is_complex():
         return error.abs().mean(1)
-    # A strong channel must not rule, and a weak one has no squares in float32.
+    # Channels are scaled to a largest value of 1: squares of weak ones would be 0 in float32.
     label = label.reshape(len(value), -1)
     largest = label.abs().amax(1, keepdim=True).clamp_min(FAINTEST)
     return log_share(error / largest, label / largest)
 
 
 def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: float = 1e-6) -> str:
-    """Drops planes, then paths, weakest first, if no batch's loss rises by 0.1 % without them.
+    """Drops planes, then paths, weakest first, as long as no batch's loss rises by 0.1 %.
 
     Args:
         placement: Placement whose ``kept`` is changed.
@@ -188,7 +189,7 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: flo
 
 
 def sort_by_strength(placement: Mirrored, batch: Batch) -> list[int]:
-    """Numbers of used planes, the one with the most received power first."""
+    """Numbers of used planes, sorted by the received power of their paths, strongest first."""
     shares = _path_shares(placement, batch)
     sequences = placement.sequences[placement.kept]
     powers = {
@@ -198,7 +199,10 @@ def sort_by_strength(placement: Mirrored, batch: Batch) -> list[int]:
 
 
 def _path_shares(placement: Mirrored, batch: Batch) -> Float[Tensor, " n"]:
-    """Mean fraction of each kept path in a link's received power; 0 without power."""
+    """Fraction of each kept path in the received power, averaged over links.
+
+    A link without power counts as 0.
+    """
     query, _ = batch.query.unique(with_receivers=True)
     powers = placement(None, query).gains.abs().square()
     total = powers.sum(1, keepdim=True)

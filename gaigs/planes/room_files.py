@@ -19,10 +19,11 @@ from gaigs.splatting.placement.mirrored.paths import Mirrored
 
 
 def summarize(placement: Mirrored, query: Query) -> dict[str, list]:
-    """Tables of planes, strongest first, and of paths by their planes, for ``metrics.json``.
+    """Tables of the learnt planes and paths, for ``metrics.json``.
 
-    Fractions of the received power are means of the kept paths over the links of the query.
+    ``planes`` has the strongest plane first. ``paths`` has a row for each number of reflections.
     ``unseen`` has a sentence for each axis along which places do not vary, see ``Scene.flat_axes``.
+    Fractions of the received power are averages over the links of the query.
     """
     traced = trace_paths(placement, query)
     facts: dict[str, list] = {
@@ -36,7 +37,7 @@ def summarize(placement: Mirrored, query: Query) -> dict[str, list]:
 
 
 def _summarize_planes(placement: Mirrored, traced: TracedPaths) -> list[dict]:
-    """Position, loss and fraction of the power of each plane, strongest first."""
+    """A row for each plane: position, loss, and fraction of the received power; strongest first."""
     table = tabulate_planes(placement, traced.ends)
     planes = []
     for number, share in traced.plane_shares.items():
@@ -56,7 +57,7 @@ def _summarize_planes(placement: Mirrored, traced: TracedPaths) -> list[dict]:
 
 
 def _summarize_paths(traced: TracedPaths) -> list[dict]:
-    """Number and fraction of the power of the kept paths with 0, 1, ... reflections."""
+    """A row for 0, 1, ... reflections: number of kept paths, and their fraction of the power."""
     counts = (traced.sequences >= 0).sum(1)
     means = traced.shares.mean(0)
     paths = []

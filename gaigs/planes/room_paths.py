@@ -1,4 +1,4 @@
-"""Paths through a learnt room: their powers, and the points where planes reflect them."""
+"""Paths in a learnt room: their powers, and the points where planes reflect them."""
 
 import math
 from typing import NamedTuple
@@ -17,7 +17,7 @@ class TracedPaths(NamedTuple):
     """Powers and bounces of the kept paths of some links."""
 
     sequences: Int[ndarray, "n order"]  # numbers of the planes of each path, -1 for a missing plane
-    powers: Float[ndarray, "b n"]  # free space included; 0 for a path that does not exist
+    powers: Float[ndarray, "b n"]  # received powers; 0 for a path that does not exist
     # Points on the planes of each sequence, NaN for a missing plane [m].
     bounces: Float[ndarray, "b n order 3"]
     # Ends of the links [m].
@@ -37,7 +37,11 @@ class TracedPaths(NamedTuple):
 
     @property
     def plane_shares(self) -> dict[int, float]:
-        """Mean share of the paths at each used plane in the power, largest first."""
+        """Share of the received power that paths at each used plane carry, largest first.
+
+        Keys are numbers of planes. Shares are averages over links. A path with two planes counts
+        for both.
+        """
         means = self.shares.mean(0)
         numbers = np.unique(self.sequences[self.sequences >= 0]).tolist()
         shares = {
@@ -98,7 +102,10 @@ def trace_paths(placement: Mirrored, query: Query) -> TracedPaths:
 
 
 def list_paths(placement: Mirrored, query: Query) -> list[LearntPath]:
-    """At most 20 paths of some links together, within 30 dB of the strongest, which comes first."""
+    """The strongest paths of all links together, strongest first.
+
+    At most 20 paths are listed, within 30 dB of the strongest.
+    """
     traced = trace_paths(placement, query)
     powers = traced.powers / traced.powers.max(initial=np.finfo(float).tiny)
     strongest = np.argsort(-powers, axis=None)[:20]
@@ -107,7 +114,7 @@ def list_paths(placement: Mirrored, query: Query) -> list[LearntPath]:
         if powers[link, path] < 1e-3:
             continue
         bounces = traced.bounces[link, path][traced.sequences[path] >= 0]
-        ends = traced.transmitters[link, None], traced.receivers[link, None]
-        points = np.concatenate((ends[0], bounces, ends[1]))
+        transmitter, receiver = traced.transmitters[link, None], traced.receivers[link, None]
+        points = np.concatenate((transmitter, bounces, receiver))  # (p, 3)
         paths.append(LearntPath(points, 10 * math.log10(powers[link, path])))
     return paths

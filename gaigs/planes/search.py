@@ -1,4 +1,4 @@
-"""A search for planes, and the contract of its score for one kind of labels."""
+"""A search for planes, and the methods that its score needs for each kind of labels."""
 
 from collections.abc import Callable, Iterable
 from typing import Generic, NamedTuple, Protocol, TypeVar, runtime_checkable
@@ -39,10 +39,10 @@ class GridRatings(NamedTuple):
 
 
 class Score(Generic[R]):
-    """Quality of planes for labels of one kind: everything that ``PlaneSearch`` knows of the
-    labels.
+    """Quality of planes for labels of one kind.
 
-    Labels of a new kind need two classes. The first is a NamedTuple for rooms, with ``planes`` and
+    ``PlaneSearch`` itself knows nothing of the labels. Labels of a new kind need two classes. The
+    first is a NamedTuple for rooms, with ``planes`` and
     further fitted quantities, such as materials. The second is a subclass of this class. It
     implements the methods for the steps that its search uses; no method changes a room:
 
@@ -134,7 +134,7 @@ class PlaneSearch(Generic[R]):
         if not starts:
             return []
         planes = torch.stack(starts)
-        # A random search about each maximum, over half the distance in each round.
+        # A random search around each maximum. Each round halves the distance of the last one.
         turn, shift = self.turn, self.shift * self.frame.diagonal
         for _ in range(4):
             noise = torch.randn(len(planes), 24, 4, generator=self.frame.generator).to(planes)
@@ -155,12 +155,12 @@ class PlaneSearch(Generic[R]):
         return candidates
 
     def list_extensions(self, room: R, grid: Float[Tensor, "n k 4"]) -> list[R]:
-        """The room with each candidate that explains enough."""
+        """Larger rooms, each with one candidate that ``Score.add`` accepts."""
         larger = [self.score.add(room, candidate) for candidate in self.propose(room, grid)]
         return [trial for trial in larger if trial is not None]
 
     def extend(self, room: R, grid: Float[Tensor, "n k 4"]) -> R | None:
-        """The room with the best candidate; None without one."""
+        """The room with the candidate of the lowest error; None if ``Score.add`` accepts none."""
         return min(self.list_extensions(room, grid), key=self.score.error, default=None)
 
     def grow(self, room: R, most: int, extend: Callable[[R], R | None]) -> R:

@@ -1,4 +1,4 @@
-"""Strengths of known waves in channels, by least squares at each place: complex (free) or real."""
+"""Least squares of the strengths of known waves in channels: free (complex) or real."""
 
 from typing import NamedTuple
 
@@ -15,7 +15,10 @@ class FreeFit(NamedTuple):
 
 
 def ridged(gram: Inexact[Tensor, "b n n"], ridge: float) -> Inexact[Tensor, "b n n"]:
-    """Gram matrices plus ``ridge`` times their mean power: unresolved waves share their power."""
+    """Gram matrices plus ``ridge`` times their mean diagonal.
+
+    The ridge lets waves that the channel does not resolve share their power.
+    """
     power = gram.diagonal(dim1=1, dim2=2).real.mean(1)  # (b,)
     power = torch.where(power > 0, power, 1)  # without waves strengths are 0
     return gram + ridge * power[:, None, None] * torch.eye(gram.shape[-1], dtype=gram.real.dtype)
@@ -60,16 +63,16 @@ def real_strengths(
 
 
 def log_share(
-    rest: Complex[Tensor, "b k"], channels: Complex[Tensor, "b k"], floor: float = 1e-3
+    residual: Complex[Tensor, "b k"], channels: Complex[Tensor, "b k"], floor: float = 1e-3
 ) -> Float[Tensor, " b"]:
     """log(|residual|² / |channel|² + ``floor``) of each of b channels."""
     power = channels.abs().square().sum(-1)
-    return (rest.abs().square().sum(-1) / torch.where(power > 0, power, 1) + floor).log()
+    return (residual.abs().square().sum(-1) / torch.where(power > 0, power, 1) + floor).log()
 
 
 def align_phases(
     channels: Complex[Tensor, "b k"], known: Complex[Tensor, "b k"]
 ) -> Complex[Tensor, "b k"]:
-    """Channels, each rotated to the phase of its known part; unchanged if this is 0."""
+    """Channels, each rotated to the phase of its ``known`` part; unchanged if this part is 0."""
     turns = (known * channels.conj()).sum(1, keepdim=True).sgn()
     return torch.where(turns == 0, channels, channels * turns)

@@ -67,8 +67,7 @@ class Holder:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the sources: the component's source, and all files in ./plugins that it
-        imports.
+        """SHA-256 of the component's source and of all files in ./plugins that it imports.
 
         The component's source is its package or, outside packages, its file.
         """
@@ -174,7 +173,7 @@ def _installed_holders(kind: str) -> list[Holder]:
 
 @functools.lru_cache
 def _entry_points(_: tuple) -> dict[str, metadata.EntryPoints]:
-    """Entry points of gaigs by group, from the packages on ``sys.path``: to read them is slow."""
+    """Entry points of gaigs by group; cached, since the file of every package must be read."""
     points = metadata.entry_points()
     groups = [group for group in points.groups if group.startswith("gaigs.")]
     return {group: points.select(group=group) for group in groups}

@@ -35,7 +35,7 @@ class Located(NamedTuple):
 
 
 class UnclearSource(Exception):
-    """The source does not show an option or its default; an import does."""
+    """An option or its default cannot be read from the source; an import is needed."""
 
 
 def registrations(file: Path) -> list[Registration]:
@@ -91,7 +91,8 @@ def read_options(file: Path, definition: str | Definition, given: tuple[str, ...
 
 
 def registering_statement(component: Callable) -> str:
-    """The present registering statement of a component, with its definition; empty if unknown."""
+    """The statement that registers a component now, with its definition; empty if unknown."""
+    # The calling frame that belongs to the component's module, and the line that it executes.
     frame: Any = sys._getframe()
     while frame is not None and frame.f_globals.get("__name__") != component.__module__:
         frame = frame.f_back

@@ -1,4 +1,4 @@
-"""The table of a multirun: its runs, their baselines, their spread over seeds, their speed."""
+"""The table of a multirun: runs, baselines, spread over seeds, and speed."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -239,7 +239,7 @@ def _text(value: float | int | str | Spread | None, separator: str) -> str:
 
 
 def _without_errors(row: Mapping) -> dict:
-    """A row without columns of standard errors; coverages include theirs after ±."""
+    """A row without columns of standard errors; those of coverages follow their value after ±."""
     shown = {key: value for key, value in row.items() if not key.endswith("_error")}
     for key in row.keys() & {"coverage_50", "coverage_90"}:
         error = row.get(f"{key}_error")

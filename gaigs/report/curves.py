@@ -266,7 +266,7 @@ def learning_curves(
 
 
 def _round_ticks(axis: Axis, steps: Sequence[int]) -> None:
-    """Ticks of a logarithmic axis at these multiples of powers of ten, as plain numbers."""
+    """Sets ticks of a logarithmic axis to ``steps`` times powers of ten, as plain numbers."""
     axis.set(
         major_locator=LogLocator(subs=steps), major_formatter="{x:g}", minor_locator=NullLocator()
     )

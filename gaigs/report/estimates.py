@@ -23,13 +23,13 @@ def plot_estimate(
 ) -> Any:
     """Draws predictions with their intervals.
 
-    Real numbers are drawn for all places, a colour for each receiver. A spectrum or a channel is
+    Scalars are drawn for all places, in a colour for each receiver. A spectrum or a channel is
     drawn for one place, a channel at its strongest element.
 
     Args:
         result: Estimate of ``model.predict``.
-        ax: Axes; None: a figure of its own.
-        receiver: Name or index of the receiver; None: all receivers for real numbers, else the
+        ax: Axes; None: a new figure.
+        receiver: Name or index of the receiver; None: all receivers for scalars, otherwise the
             first.
         place: Number of the place, for a spectrum or a channel.
     """
@@ -99,7 +99,7 @@ def _draw_channel(
 ) -> None:
     """Draws a channel's magnitude over frequency at its strongest element.
 
-    The interval of a complex number is a disc: the band spans magnitudes within it.
+    The interval of a complex value is a disc. The drawn band spans the magnitudes within it.
     """
     element = int(np.nansum(abs(parts["value"]) ** 2, 1).argmax())
     value = abs(parts["value"][element])

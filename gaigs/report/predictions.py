@@ -10,7 +10,7 @@ from numpy import ndarray
 
 
 def as_baseline(name: str) -> str:
-    """The displayed name of a baseline, if a system has the same name."""
+    """The displayed name of a baseline, to tell it from a system of the same name."""
     return f"{name} (baseline)"
 
 

@@ -91,7 +91,7 @@ def _by_number(run: Run) -> list[str | int]:
 
 
 def _read_run(folder: Path, name: str) -> Run:
-    """The run in a folder; a ``ValueError`` if its files are damaged or of two configurations."""
+    """The run in a folder; a ``ValueError`` if files are damaged or of two configurations."""
     file = folder / "metrics.json"
     configs = []
     for path in (folder / "config.yaml", folder / ".hydra" / "config.yaml"):

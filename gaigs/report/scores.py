@@ -154,7 +154,7 @@ def score_latex(metrics: Mapping) -> str:
 
 
 def verdict(metrics: Mapping) -> str:
-    """A sentence on a run's main score: of its model, the best baseline, and before kriging."""
+    """A sentence that compares main scores: of the model, the best baseline, and before kriging."""
     (model, scores), *baselines = metrics["models"].items()
     name, metric = headline(metrics["task"], metrics["models"])
     quantity, _, unit = metric.title.removesuffix("]").partition(" [")

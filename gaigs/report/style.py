@@ -185,7 +185,7 @@ def wrapped(label: str, width: int = 48) -> str:
 def named_ones(
     scores: Mapping[str, float], higher_is_better: bool, own: str | None = None, most: int = 6
 ) -> list[str]:
-    """Names of the lines with a colour and a label, best first; all others are grey.
+    """Names of the lines that get a colour and a label, best score first; others are grey.
 
     There are at most ``most``, since more colours are hard to distinguish. Line ``own`` is always
     one of them.
@@ -240,7 +240,7 @@ def distinct_looks(named: Sequence[str], systems: Iterable[str]) -> dict[str, tu
 
 
 def _models(systems: Iterable[str]) -> dict[str, str]:
-    """The model of each system by name, for its look.
+    """The model of each system by the system's name; systems of a model look alike.
 
     A variant such as "GAI-GS split=a" counts as its model, unless the model is also a system.
     """
@@ -265,7 +265,7 @@ def _titles() -> dict[str, str]:
 
 @cache
 def _places() -> dict[str, int]:
-    """Place in ``LINES`` of each known model; gaigs's two predictors have solid lines."""
+    """Index into ``LINES`` of each known model; the two predictors of gaigs get solid lines."""
     places = {
         "gaigs": 0,
         "mirrored": 26,

@@ -27,7 +27,7 @@ log = logging.getLogger(__name__)
 
 
 def run(config: dict, folder: Path, launcher: str | None = None) -> dict | None:
-    """Trains, tests, and writes the run folder; a stopped run of this configuration goes on.
+    """Trains, tests, and writes the run folder; resumes a stopped run of this configuration.
 
     Args:
         config: The resolved configuration.
@@ -245,7 +245,7 @@ def _log_links(links: Links, name: str) -> None:
 
 
 def _facts(links: Links, seed: int, model: Model, fitted: Any, best: Path) -> dict:
-    """What ``metrics.json`` has beside the scores; ``fitted`` is a result of ``training.fit``."""
+    """Entries of ``metrics.json`` beside the scores; ``fitted`` is a result of ``fit``."""
     from gaigs.runs import evaluation
     from gaigs.runs.fitting import count_gaussians
 

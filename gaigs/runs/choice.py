@@ -203,7 +203,7 @@ def _with_changes(made: dict, config: dict, changes: Mapping[str, tuple]) -> dic
 
 
 def look_up(label: str, config: dict, links: Links, folder: Path) -> Tried:
-    """A look-up with its scores at known places, each predicted without its fold."""
+    """A look-up with its scores at known places; each place is predicted without its fold."""
     began = time.monotonic()
     model = registry("model").build(config["model"], scene=links.scene)
     model.fit(links)

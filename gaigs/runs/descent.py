@@ -1,4 +1,4 @@
-"""Gradient descent of a model by Lightning: started or resumed, stopped, and its best step."""
+"""Gradient descent of a model by Lightning, from its start or resumption to its best step."""
 
 import logging
 import math
@@ -44,7 +44,7 @@ def descend(
 ) -> tuple[Model, float]:
     """Trains a model by gradient descent, after ``Model.fit``, which took ``searched`` [s].
 
-    The training ends early if its validation score would stay below ``rival``.
+    The training ends early if an extrapolation of its validation score stays below ``rival``.
 
     Returns:
         The model at the step with the best validation score, or at the last step without validation
@@ -70,7 +70,7 @@ def descend(
     batches = Batches(links, links.split.train, module.batch_size, seed, steps)
     validation = None
     if len(links.split.validation) and links.task.is_scalar:
-        # Links of one number need little memory, and few large batches less time.
+        # Scalar labels need little memory, and large batches less time.
         validation = InOrder(links, drawn(links.split.validation), batch_size(links))
     elif len(links.split.validation):
         validation = InOrder(links, links.split.validation, module.batch_size)
@@ -92,7 +92,7 @@ def descend(
 
 
 def _identity(links: Links, config: dict) -> dict:
-    """The entry of a checkpoint beside the weights."""
+    """Entries of a checkpoint beside the weights: scene, configuration and split."""
     scene = links.scene.state()
     return {
         "version": checkpoint.VERSION,
@@ -106,7 +106,7 @@ def _identity(links: Links, config: dict) -> dict:
 
 
 def _callbacks(module: Any, links: Links, config: dict) -> list[Callback]:
-    """What happens between the steps, as far as it is configured."""
+    """Callbacks between the steps: density control, revisions, progress line; if configured."""
     callbacks: list[Callback] = []
     if module.density is not None:
         callbacks.append(call("density", DensityControl, module.density, seed=config["seed"]))
@@ -130,7 +130,7 @@ def _loggers(folder: Path, tensorboard: bool) -> list[Logger]:
 
 
 def _check_processes(trainer: lightning.Trainer, config: dict) -> None:
-    """Raises a ``ValueError`` for what only a single process can do."""
+    """Raises a ``ValueError`` if several processes would train with a single-process option."""
     if trainer.world_size == 1:
         return
     if config["ensemble"] > 1:
@@ -200,7 +200,7 @@ def _run(
 
 
 def _log_speed(trainer: lightning.Trainer, budget: Budget, places: int) -> None:
-    """Logs the rate of steps, and whether the time limit of the run has left some out."""
+    """Logs the rate of steps, and whether the time limit of the run ended the training early."""
     seconds = budget.seconds - budget.searched
     steps = trainer.global_step
     words = "trained %d steps of %d places in %.0f s: %.1f steps/s"

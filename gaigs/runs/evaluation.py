@@ -75,7 +75,7 @@ def build_baselines(configurations: Sequence, model_name: str, scene: Scene) -> 
 def fitted(
     look_up: Model, links: Links, before: Model | None = None, many: int = ScalarOptions.large
 ) -> Model:
-    """A copy of a model without a training, fitted to the known links.
+    """A copy of a ``look_up``, a model without a training, fitted to the known links.
 
     With more than ``many`` known links the copy takes hyperparameters from ``before``, the same
     model fitted to most of these links.
@@ -109,7 +109,7 @@ class Evaluation(JupyterMixin):
 
     @property
     def models(self) -> dict[str, dict[str, float]]:
-        """The numbers of the table, by name of the model and of the metric."""
+        """The values of the table, by name of the model and of the metric."""
         return {name: summary(self.task, values) for name, values in self.scores.items()}
 
     @cached_property
@@ -227,7 +227,7 @@ def compare(task: Task, scores: Scores, places: Tensor) -> Paired | None:
 
 
 def summary(task: Task, scores: dict[str, Tensor]) -> dict[str, float]:
-    """The numbers of a table, including intervals of models that have them."""
+    """Metrics of a model for a table, with those of its intervals if it has any."""
     of_task = task_scores(scores)
     of_intervals = {
         name.removeprefix(INTERVALS): score for name, score in scores.items() if name not in of_task
@@ -248,7 +248,9 @@ def score(
     has_intervals: bool = True,
     fits: dict[str, Model] | None = None,
 ) -> Scores:
-    """Scores of every test link by models and look-ups; predictions of the first in a folder.
+    """Scores of every test link, for models and look-ups.
+
+    Predictions of the first model are written to ``folder``.
 
     Models and look-ups with a calibration also have scores of intervals. If subcarriers are held
     out, ``nearest_frequency`` predicts the label at the nearest known subcarrier, as uplink
@@ -302,7 +304,7 @@ def score(
 
 
 def _lack(calibration: Calibration | None) -> str:
-    """What a model lacks for intervals of 90 %."""
+    """A text that says what a model lacks for intervals of 90 %."""
     count = 0 if calibration is None else int(calibration.counts.min())
     if count >= fewest(0.9):
         return "at new receivers three others with links must calibrate them"
@@ -310,7 +312,7 @@ def _lack(calibration: Calibration | None) -> str:
 
 
 def able_look_ups(look_ups: Mapping[str, Model], links: Links) -> dict[str, Model]:
-    """Look-ups that predict for all receivers of the test, also for those without known links."""
+    """Look-ups that can predict all receivers of the test links, also ones without known links."""
     new = links.split.by_receivers
     return {key: model for key, model in look_ups.items() if model.any_receiver or not new}
 
@@ -383,7 +385,10 @@ def validate(
     links: Links,
     fits: dict[str, Model] | None = None,
 ) -> Scores:
-    """Scores of validation links by models trained without them; empty without such links."""
+    """Scores of the validation links, by models and by look-ups fitted without these links.
+
+    The result is empty without validation links.
+    """
     if not len(links.split.validation):
         return {}
     split = links.split.validating()
@@ -393,7 +398,7 @@ def validate(
 
 
 def by_receiver(scores: Scores, links: Links) -> dict[str, dict]:
-    """Numbers of the table for each receiver with test links, by receiver and model."""
+    """Metrics of the table for each receiver with test links, by receiver and model."""
     receivers = links.query.receivers[links.split.test]
     summaries: dict[str, dict] = {}
     for number, receiver in enumerate(links.receivers):

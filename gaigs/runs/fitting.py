@@ -132,7 +132,7 @@ def _checked(model: Model | None, links: Links, config: dict) -> Model:
 
 
 def _untrained_kriging(trend: Model, links: Links, config: dict) -> Kriging | None:
-    """Kriging of what a model leaves over, if it is configured."""
+    """The kriging of a model's residuals, not yet fitted; None if it is not configured."""
     return Kriging(links.scene, trend, config["kriging_fallback"]) if config["kriging"] else None
 
 
@@ -153,7 +153,7 @@ def _log_parts(model: Model, config: dict) -> None:
 
 
 def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float, Tensor]:
-    """Fits what needs no gradient, as a search for planes does.
+    """Calls ``Model.fit``, for parts that need no gradient, such as a search for planes.
 
     Returns:
         The duration [s], and the keys of all places that the model has learnt from.

@@ -1,4 +1,4 @@
-"""Shares of models in a blend, by their errors where they have not learnt."""
+"""Weights of models in a blend, from their errors at links that they have not learnt."""
 
 import torch
 from jaxtyping import Float, Inexact, Int
@@ -14,16 +14,17 @@ def stack(
     places: Int[Tensor, " k"],
     folds: Int[Tensor, " k"],
 ) -> tuple[Float[Tensor, " c"], Float[Tensor, "c k"]]:
-    """Shares of c models in a blend with the least mean square error.
+    """Weights of c models in the blend with the least mean square error.
 
     Args:
         labels: Labels of some links.
-        values: Predictions of each model that has not seen them (k, *shape), the simplest first.
-        places: Number of each link's place; all count alike.
+        values: Predictions (k, *shape) of each model, which has not seen these links; the simplest
+            model comes first.
+        places: Number of each link's place; all places have equal weight.
         folds: Number of each link's fold.
 
     Returns:
-        The shares (c,), and for each link the shares fitted to all folds but the link's (c, k).
+        The weights (c,), and for each link the weights fitted to the other folds (c, k).
 
     Source: Breiman, Stacked regressions, 1996; van der Laan, Polley and Hubbard, Super learner,
     2007.
@@ -41,8 +42,9 @@ def stack(
 
 
 def shares_of(products: Float[Tensor, "k c c"], places: Int[Tensor, " k"]) -> Float[Tensor, " c"]:
-    """Shares w >= 0 of sum 1 with the least w' G w, in tenths; G is the mean of ``products`` of the
-    models' errors over places.
+    """Weights w >= 0 with sum 1, in steps of a tenth, that minimise w' G w.
+
+    G is the mean over places of ``products``, the products of the models' errors at each link.
     """
     _, which, links = places.unique(return_inverse=True, return_counts=True)
     gram = torch.tensordot(1.0 / links[which].double() / len(links), products, 1)  # (c, c)

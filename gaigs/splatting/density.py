@@ -1,6 +1,6 @@
 """Density control: prune, clone and split Gaussians.
 
-The optimizer keeps its state of the remaining Gaussians.
+The optimizer's state of the remaining Gaussians is kept.
 
 Source: Kerbl et al., 3D Gaussian Splatting, 2023, section 5.2.
 """

@@ -1,4 +1,4 @@
-"""Gaussians: parameters, initial lattice, .ply files; Gaussians of a query, and their tokens."""
+"""Gaussians: parameters, initial lattice and .ply files; their values and tokens for a query."""
 
 import itertools
 import math
@@ -144,7 +144,7 @@ class Gaussians(nn.Module):
 
     @property
     def bands(self) -> Float[Tensor, "n c k"]:
-        """Spherical harmonics' coefficients of the signal up to ``degree``: n, c channels, k."""
+        """The signal's k spherical-harmonic coefficients up to ``degree``, for c channels."""
         return self.signal[..., : (self.degree + 1) ** 2]
 
     def resize(self, count: int) -> None:
@@ -155,7 +155,7 @@ class Gaussians(nn.Module):
             setattr(self, name, new)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        """Takes the checkpoint's number of Gaussians, which density control may have changed."""
+        """Resizes to the checkpoint's number of Gaussians, which density control may change."""
         means = state_dict.get(f"{prefix}means")
         if means is not None and len(means) != len(self):
             self.resize(len(means))
@@ -164,9 +164,9 @@ class Gaussians(nn.Module):
     def save_ply(self, path: str | Path) -> None:
         """Writes the Gaussians as a .ply that 3-D Gaussian splatting viewers open.
 
-        Positions [m], log scales, quaternions (w, x, y, z), opacity logits; the signal's first
-        three channels are in f_dc_*, missing ones as 0. f_rest_* hold, channel by channel, the
-        higher coefficients of these three and all coefficients of further channels.
+        The file has positions [m], log scales, quaternions (w, x, y, z) and opacity logits. f_dc_*
+        has the signal's first three channels, or 0 for a missing channel. f_rest_* has, channel by
+        channel, the higher coefficients of these three and all coefficients of further channels.
         """
         comment = f"gaigs: {self.signal.shape[1]} signal channels"
         write_ply(path, dict(self.named_parameters()), comment)
@@ -222,7 +222,7 @@ class Placed(NamedTuple):
     """The Gaussians of each query before a deformation.
 
     Attributes:
-        means: Centres, world frame (1 or b, n, 3) [m]; 1 where they do not depend on the query.
+        means: Centres, world frame (1 or b, n, 3) [m]; 1 if they do not depend on the query.
         lengths: Length of each Gaussian's path from transmitter to receiver (b, n) [m]; None if
             unknown.
         quats, scales, opacities, signal: As in ``Gaussians``; scales (1 or b, n, 3) [m], signal (n,
@@ -245,7 +245,7 @@ class Placed(NamedTuple):
 
 
 class Tokens(NamedTuple):
-    """Embeddings that a tokenizer gives to a deformation; the last axis of each may be 0 long.
+    """Embeddings from a tokenizer for a deformation; each may have a last axis of length 0.
 
     Attributes:
         scene: CLS for each query.

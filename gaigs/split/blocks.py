@@ -1,4 +1,4 @@
-"""Cubes of space are held out."""
+"""A split that holds out cubes of space."""
 
 import torch
 

@@ -1,4 +1,4 @@
-"""The parts that came with the data."""
+"""The split that came with the data."""
 
 from gaigs.data import Links, Split
 from gaigs.registry import register

@@ -1,4 +1,4 @@
-"""Single places are held out."""
+"""A split that holds out random places."""
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
@@ -9,8 +9,7 @@ from gaigs.split import part, places_of, rows_of
 def random(
     links: Links, test: float = 0.2, validation: float | None = None, seed: int = 0
 ) -> Split:
-    """Random places test. This measures interpolation: on a dense trajectory a neighbour is always
-    near.
+    """Tests on random places. This measures interpolation, as a known place is always near.
 
     Options and errors: see ``gaigs.split.part``.
     """

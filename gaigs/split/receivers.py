@@ -1,4 +1,4 @@
-"""Whole receivers are held out."""
+"""A split that holds out whole receivers."""
 
 from collections.abc import Sequence
 
@@ -20,9 +20,10 @@ def receivers(
     validation: float | None = None,
     seed: int = 0,
 ) -> Split:
-    """Whole receivers test. This measures the error at new positions of receivers.
+    """Tests on whole receivers. This measures the error at new positions of receivers.
 
-    If three receivers or more remain, whole receivers validate, too; otherwise random places.
+    If three receivers or more remain, validation is on whole receivers, too; otherwise on random
+    places.
 
     Args:
         hold: Names of the test receivers, or one name; None: random receivers.

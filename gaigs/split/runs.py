@@ -1,4 +1,4 @@
-"""Contiguous runs of rows are held out."""
+"""A split that holds out contiguous runs of rows."""
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
@@ -9,7 +9,7 @@ from gaigs.split import part, runs_of
 def runs(
     links: Links, length: int, test: float = 0.2, validation: float | None = None, seed: int = 0
 ) -> Split:
-    """Random runs test: a trajectory with gaps.
+    """Tests on random runs of rows: the gaps in a trajectory.
 
     Args:
         length: Rows in a run. Other options and errors: see ``gaigs.split.part``.

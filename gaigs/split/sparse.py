@@ -1,4 +1,4 @@
-"""Only few places train."""
+"""A split with few training places."""
 
 from gaigs.data import Links, Split
 from gaigs.registry import register
@@ -9,7 +9,7 @@ from gaigs.split import part, places_of, rows_of
 def sparse(
     links: Links, train: int, test: float = 0.2, validation: float | None = None, seed: int = 0
 ) -> Split:
-    """Few random places train and validate; test places are as with ``random``.
+    """Trains and validates on few random places; test places are as with ``random``.
 
     With the same seed a smaller number of places is a subset of a larger one.
 

@@ -26,7 +26,7 @@ def require_empty(got: Sequence[int], shapes: Collection[Sequence[int]], rule: s
 
 
 def require_refusal(call: Callable[[], object], rule: str) -> None:
-    """Requires that a call raises a ``ValueError``, or a ``TypeError`` like type checkers."""
+    """Requires that a call raises a ``ValueError``, or a ``TypeError`` as type checkers do."""
     try:
         call()
     except (ValueError, TypeError):
@@ -44,7 +44,7 @@ def require_close(actual: Tensor, expected: Tensor, tolerance: float, rule: str)
 
 
 def require_same(actual: Tensor, expected: Tensor, rule: str) -> None:
-    """Requires equal tensors; on a GPU equal up to rounding, since its sums have no fixed order."""
+    """Requires equal tensors, on a GPU up to rounding, as the order of its sums varies."""
     rounds = actual.is_floating_point() or actual.is_complex()
     if actual.device.type == "cpu" or not rounds:
         require(torch.equal(actual, expected), rule)

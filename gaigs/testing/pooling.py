@@ -186,7 +186,7 @@ def _real_dtype(received: Tensor | ReceivedPaths) -> torch.dtype:
 
 
 def rows_of(received: Tensor | ReceivedPaths, rows: slice) -> Tensor | ReceivedPaths:
-    """Maps or paths of some queries."""
+    """Maps or paths of the queries in ``rows``."""
     if isinstance(received, Tensor):
         return received[rows]
     names = ("means", "semi_axes", "amplitudes", "lengths", "carriers")

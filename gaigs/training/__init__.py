@@ -7,7 +7,7 @@ from gaigs.core.task import Task
 
 
 def seeded(*numbers: int) -> torch.Generator:
-    """A random generator seeded by some numbers, such as a seed and a step."""
+    """A random generator seeded by all ``numbers``, such as a seed and a step."""
     return torch.Generator().manual_seed(hash(numbers) % 2**63)
 
 
@@ -27,7 +27,7 @@ class MeanScores:
             self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
 
     def over_processes(self, strategy) -> dict[str, float]:
-        """Means of all scores by ``Task.logged``; every process must call it."""
+        """Means over all processes' links, as ``Task.logged``; every process must call it."""
         numbers = [self.count, *self.sums.values()]
         totals = torch.tensor(numbers, dtype=torch.float64, device=strategy.root_device)
         count, *sums = strategy.reduce(totals, reduce_op="sum").tolist()

@@ -28,8 +28,8 @@ class Batches:
     equal to the mean over the batch.
 
     Args:
-        index: Links to draw from.
-        size: Places in a batch, of all processes together; the last batch of a pass may be smaller.
+        index: Indices of the links to draw from.
+        size: Number of places in a batch, over all processes; a pass may end with a smaller one.
         seed: Seed of the order.
         steps: Number of batches.
     """

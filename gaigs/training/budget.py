@@ -1,4 +1,4 @@
-"""The budget of a training, in steps, wall time, or both, and its spent part."""
+"""The budget of a training in steps, wall time or both, and the fraction that is spent."""
 
 import contextlib
 import math
@@ -78,8 +78,9 @@ class Budget(Callback):
 
     def on_fit_start(self, trainer, module) -> None:
         names = ("searched", "spent", "began", "validated")
-        first = trainer.strategy.broadcast([getattr(self, name) for name in names])
-        for name, value in zip(names, first, strict=True):
+        # All processes take the times of the first one.
+        of_first = trainer.strategy.broadcast([getattr(self, name) for name in names])
+        for name, value in zip(names, of_first, strict=True):
             setattr(self, name, value)
         self.end = self.spent + stages.left()
         self._stop_in_time(trainer)  # a run that was killed once its time was up

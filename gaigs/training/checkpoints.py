@@ -50,7 +50,7 @@ class KeepBest(Checkpoint):
             setattr(self, name, value)
 
     def on_train_start(self, trainer, module) -> None:
-        """Scores also the start of a model that predicts untrained."""
+        """Scores the model before the first step, too, if it ``predicts_untrained``."""
         self._stop_without_progress(trainer)  # a run that was killed once it had stopped
         if trainer.enable_validation and self.best == -math.inf and module.model.predicts_untrained:
             self._validate(trainer, module)
@@ -70,7 +70,7 @@ class KeepBest(Checkpoint):
         self._stop_without_progress(trainer)
 
     def on_train_end(self, trainer, module) -> None:
-        """Scores also the last step, if no validation was due."""
+        """Scores the model after the last step, if no validation was due there."""
         if trainer.enable_validation and trainer.global_step % trainer.val_check_batch:
             self._validate(trainer, module)
 
@@ -100,7 +100,7 @@ class KeepBest(Checkpoint):
         return is_better
 
     def _stop_without_progress(self, trainer) -> None:
-        """Asks Lightning to stop below the rival, or ``patience`` validations after the best."""
+        """Asks Lightning to stop if the score stays below the rival or after ``patience``."""
         if self.is_behind or (self.patience is not None and self.waited >= self.patience):
             trainer.should_stop = True
 

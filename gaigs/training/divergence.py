@@ -1,4 +1,4 @@
-"""Divergence: the first quantity of a training step that is not finite."""
+"""Search for the first quantity that is not finite in a diverged training step."""
 
 from collections.abc import Mapping
 from functools import partial

@@ -1,4 +1,4 @@
-"""Revisions: changes of a model by itself between two steps."""
+"""Calls of ``Model.revise``, by which a model changes itself between two training steps."""
 
 import contextlib
 import functools
@@ -106,7 +106,7 @@ class Revision(Callback):
             log.info("step %d: %s", trainer.global_step, outcome)
 
     def _batch(self, trainer, module, index: Int[Tensor, " k"], number: int) -> Batch | None:
-        """Up to ``max_links`` random links of a part, thinned as in a step; None if it is empty."""
+        """Up to ``max_links`` random links of ``index``, thinned as in a step; None if empty."""
         if not len(index):
             return None
         generator = seeded(self.seed, number, len(index))

@@ -1,4 +1,4 @@
-"""Agreement between labels, by the distance of their places and the order of measurement."""
+"""Agreement of labels with each other, by distance of places and order of measurement."""
 
 import logging
 from pathlib import Path

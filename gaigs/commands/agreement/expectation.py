@@ -1,4 +1,4 @@
-"""Scores to expect on a split, from the agreement of labels."""
+"""Expected scores on a split, from the agreement of labels at similar distances."""
 
 import math
 from collections.abc import Mapping
@@ -25,9 +25,10 @@ def on_split(
 ) -> tuple[dict[str, dict[str, float]], list[str]]:
     """Expected metrics of the split's test links, the baselines' metrics, and remarks.
 
-    Cells of ``agreement`` classify pairs of labels by distance and separation. Each test link forms
-    a pair with its nearest known link of the same receiver and carrier. Expected scores are the
-    scores of compared pairs in the same cells. Cells without compared pairs are skipped.
+    The expected metrics are those of a look-up of the nearest known link of the same receiver and
+    carrier. Each test link belongs, by its distance and separation from this link, to a cell of
+    ``agreement``. Its expected score is that of pairs in this cell. Cells without compared pairs
+    are skipped.
 
     Args:
         random: Draws the pairs.
@@ -107,7 +108,7 @@ def drawn_scores(
     random: np.random.Generator,
     fewest: int = 20_000,
 ) -> dict[str, Tensor]:
-    """Scores of random pairs, by name of the score.
+    """Scores of random compared pairs, with the test links' distribution over cells.
 
     The number of pairs is ``fewest``, or the number of test links if larger.
 

@@ -103,8 +103,7 @@ def measure(
         counted: Largest number of computed distances. If there are more pairs, links are drawn at
             random, and only their pairs with all other links are counted.
         block: Number of distances in memory at a time.
-        most: Largest number of pairs of a cell whose labels are compared; large labels take less,
-            at least 30.
+        most: Largest number of compared pairs in a cell; fewer for large labels, at least 30.
     """
     places = links.query.transmitters.double().numpy()
     groups = groups_of(links)
@@ -158,14 +157,14 @@ def distance_edges(links: Links, places: Float[ndarray, "n 3"]) -> Float[ndarray
 def visits(links: Links) -> Int[ndarray, " n"]:
     """Number of the measurement to which each link belongs, ascending from 0.
 
-    Links follow in the order of the files. Consecutive links of one row (one transmission to all
-    receivers) are one measurement; a row that comes back later starts another one.
+    Links are in the order of the files. Consecutive links of one row (one transmission to all
+    receivers) are one measurement. Later links of the same row are another measurement.
     """
     return np.concatenate(([0], (rows_of(links).diff() != 0).numpy().cumsum()))
 
 
 def groups_of(links: Links) -> list[Int[ndarray, " k"]]:
-    """Links of one receiver and carrier, ascending, where there are two or more."""
+    """Groups of two or more links with the same receiver and carrier; ascending indices."""
     keys = [links.query.receivers.double()]
     if links.query.frequencies is not None:
         keys.append(links.query.frequencies.double())

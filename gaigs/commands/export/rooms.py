@@ -33,7 +33,7 @@ from gaigs.registry import name_of
 
 
 def write_room(model: Model, file: Path, frequency: float | None = None) -> list[Path]:
-    """Writes the planes and obstacles that a model has learnt; an ensemble's first member counts.
+    """Writes the planes and obstacles that a model, or an ensemble's first member, has learnt.
 
     Args:
         file: ``.gltf``, ``.glb``, ``.obj``, or a scene ``.xml`` of Mitsuba, whose meshes get a
@@ -69,7 +69,7 @@ def write_room(model: Model, file: Path, frequency: float | None = None) -> list
 
 
 def _carrier(mirrored: MirroredSplatting, frequency: float | None) -> float:
-    """The carrier of a scene's materials [Hz]; a ``ValueError`` if neither option nor data tell."""
+    """The carrier of a scene's materials [Hz]; a ``ValueError`` if option and data lack one."""
     if frequency is None:
         frequency = mirrored.scene.middle_frequency
     if frequency is None:
@@ -82,7 +82,7 @@ def _carrier(mirrored: MirroredSplatting, frequency: float | None) -> float:
 
 
 def mirrored_of(kind: str, model: Model) -> MirroredSplatting:
-    """The mirrored Gaussians of a model, without its kriging; an ensemble's first member counts."""
+    """The mirrored Gaussians within a model with kriging, or in an ensemble's first member."""
     while isinstance(model, Wrapper):
         if not model.has_room:
             raise ValueError(
@@ -102,8 +102,8 @@ def traced_gains(model: MirroredSplatting, rest: float) -> Complex[Tensor, " rec
     """Factor of each receiver by which traced channels of Sionna RT become the model's channels.
 
     Args:
-        rest: Gain [Np] that ``fit_sheets`` leaves to all paths beside the sheets, the thin
-            absorbers that stand for obstacles.
+        rest: Common gain of all paths from ``fit_sheets`` [Np], beside the losses in sheets, the
+            thin absorbers that replace obstacles.
     """
     placement = model.placement
     nepers = placement.receiver_gains + placement.path_gains[..., 0].mean() + rest

@@ -107,8 +107,7 @@ def near_candidates(
     links: Links,
     known: Int[Tensor, " k"],
 ) -> Candidates:
-    """Candidates drawn from the prior ``PlaceDensity``: a quarter on a grid, the others near known
-    places.
+    """Candidates for ``PlaceDensity`` as prior: a quarter on a grid, the others near known places.
 
     Args:
         box: Corners of the box of the grid [m].

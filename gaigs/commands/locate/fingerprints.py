@@ -39,7 +39,7 @@ class Fingerprints:
         frequency: Carrier [Hz]; None if unknown.
         receivers: Names of the r receivers.
         candidates: The g places of the predictions, with their prior.
-        axes: Axes (m, k) along which the errors of a label's m numbers are independent, with equal
+        axes: Axes (m, k) along which the errors of a label's m values are independent, with equal
             variances.
         values: Predictions at the candidates along these axes (g, r, k).
         deviations: Standard deviations of scalar labels (g, r); 1 for other labels.
@@ -81,7 +81,7 @@ class Fingerprints:
         return sum(len(fold.truth) for fold in self.held)
 
     def drops(self, unknown_power: bool = False, step: float | None = None) -> Float[Tensor, " h"]:
-        """Log ratios of the highest posterior density to the density at the true place, ascending.
+        """Log ratios of the highest posterior density to that at the true place, ascending (h,).
 
         Each held-out fingerprint gives one ratio. With a ``step`` [m] the fingerprints are sorted
         into a ``walk`` and located as a track. Results are cached, since a track takes long.
@@ -112,7 +112,7 @@ class Transmissions(NamedTuple):
 
 
 def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor, " k"]:
-    """Links at a carrier [Hz], of some parts of the split."""
+    """Indices of the links at a carrier [Hz] in the given ``parts`` of the split."""
     index = torch.cat([getattr(links.split, part) for part in parts])
     if frequency is None or links.query.frequencies is None:
         return index
@@ -120,7 +120,7 @@ def at_carrier(links: Links, frequency: float | None, *parts: str) -> Int[Tensor
 
 
 def transmissions(links: Links, index: Int[Tensor, " k"]) -> Transmissions:
-    """The transmissions of some links, with the labels of these links only."""
+    """The transmissions of the links ``index``, with the labels of these links only."""
     rows, which = rows_of(links)[index].unique(return_inverse=True)
     labels = torch.cat([links.task.fingerprint(links.labels[part]) for part in index.split(256)])
     values = labels.new_full((len(rows), len(links.receivers), labels.shape[1]), math.nan)
@@ -133,7 +133,7 @@ def transmissions(links: Links, index: Int[Tensor, " k"]) -> Transmissions:
 def receptions(
     links: Links, index: Int[Tensor, " k"]
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n r"]]:
-    """Places of the transmissions of some links [m], and 1 for each receiver with a link."""
+    """Places of n transmissions [m], and 1 for each receiver with a link, otherwise 0."""
     rows, which = rows_of(links)[index].unique(return_inverse=True)
     places = torch.zeros(len(rows), 3)
     places[which] = links.query.transmitters[index]

@@ -1,4 +1,4 @@
-"""The likelihood of places, and its choice by held-out fingerprints."""
+"""The likelihood of fingerprints at places, and its choice by held-out fingerprints."""
 
 import itertools
 from collections.abc import Iterable, Sequence
@@ -14,7 +14,7 @@ from gaigs.core.query import ROUNDING, evenly
 
 
 def independent(errors: Float[Tensor, "n m"], most: int = 4000) -> Float[Tensor, "m k"]:
-    """Axes along which errors of a label's numbers are independent.
+    """Axes (in columns) along which the errors of a label's m values are independent.
 
     Squared errors of a label along these axes sum to 1 on average. At most ``most`` labels are
     used, at even steps.
@@ -84,7 +84,7 @@ def _level_squares(
     is_received: Bool[Tensor, "n r"],
     unknown_power: bool,
 ) -> tuple[Float[Tensor, "n g"], Float[Tensor, "n g"]]:
-    """``Mismatch.squares`` and ``Mismatch.log_deviations`` of scalar labels."""
+    """``Mismatch.squares`` and ``Mismatch.log_deviations`` for scalar labels."""
     total = torch.zeros(len(received), len(prints.values))
     log_deviations = torch.zeros_like(total)
     errors_sum = torch.zeros_like(total)
@@ -112,7 +112,7 @@ def _array_squares(
     is_received: Bool[Tensor, "n r"],
     unknown_power: bool,
 ) -> Float[Tensor, "n g"]:
-    """``Mismatch.squares`` of labels of several numbers."""
+    """``Mismatch.squares`` for labels of several values."""
     products = torch.zeros(len(received), len(prints.values))
     predicted_powers = torch.zeros_like(products)
     powers = torch.zeros(len(received), 1)
@@ -132,14 +132,15 @@ def _array_squares(
 
 
 def log_likelihood(difference: Mismatch, freedom: float, temper: float) -> Float[Tensor, "n g"]:
-    """Log likelihood of candidates: Student's t over all receivers, plus the log probability of
-    reception.
+    """Log likelihood of g candidates for n received fingerprints.
+
+    It is the log density of Student's t over all receivers, plus the log probability of reception.
 
     Args:
         difference: Errors of the received fingerprints.
         freedom: Degrees of freedom. With fewer of them a large error counts less.
-        temper: Exponent of Student's t, below 1 if the errors of receivers are correlated: together
-            they are less evidence than independent errors.
+        temper: Exponent of Student's t. It is below 1 if the errors of receivers are correlated,
+            since they are then less evidence than independent errors.
     """
     exponent = (freedom + difference.counts[:, None]) / 2
     together = exponent * torch.log1p(difference.squares / freedom) + difference.log_deviations

@@ -121,7 +121,7 @@ def posterior(
 ) -> Location:
     """The location of fingerprints ``values``, by the options of ``locate``.
 
-    Each of the n transmissions has m numbers a receiver, from ``Task.fingerprint``.
+    Each of the n transmissions has m values at each receiver, from ``Task.fingerprint``.
 
     Raises:
         ValueError: ``level`` or ``step`` is out of range.
@@ -153,8 +153,8 @@ def conformal_drop(
 ) -> Float[Tensor, ""] | None:
     """Drop of the log density from its maximum to the edge of a region.
 
-    A region has all candidates within this drop. Held-out fingerprints show which drop holds the
-    transmitter with probability ``level``. None without held-out fingerprints.
+    A region has all candidates within this drop, so that it holds the transmitter with probability
+    ``level``. Held-out fingerprints determine the drop; it is None without them.
     """
     drops = prints.drops(unknown_power, step)
     count = prints.held_out_count

@@ -48,7 +48,7 @@ def fingerprints(
         model: A trained, fitted or loaded model with intervals.
         links: Links that the model was trained on. Transmitters are then likely where known places
             are dense. Held-out links calibrate the likelihood and the size of regions. None: all
-            places are equally likely, and errors of a label's numbers count as independent, which
+            places are equally likely, and errors of a label's values count as independent, which
             makes regions too small.
         region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m] in which all places are equally
             likely; None: the box of the training transmitters.
@@ -116,7 +116,7 @@ def affordable_points(
     fewest: int = 1000,
     seconds: float = 60.0,
 ) -> int:
-    """Number of candidate places, ``fewest`` to ``most``, that take a model ``seconds``."""
+    """Number of candidate places that a model predicts in ``seconds``, in given limits."""
     places = even_places(box[0], box[1], 512)
     predicted(model, places[:2], frequency)  # the first prediction compiles and loads
     start = time.perf_counter()
@@ -160,7 +160,7 @@ def predicted(model: Model, places: Float[Tensor, "g 3"], frequency: float | Non
 
 @dataclass(frozen=True)
 class MapMaker:
-    """Makes maps of models trained on all or on some of the links."""
+    """Makes maps of models that were trained on all links or on a part of them."""
 
     box: Float[Tensor, "2 3"]  # corners of the box of the candidates [m]
     is_region: bool  # True if all places in the box are equally likely
@@ -169,7 +169,7 @@ class MapMaker:
     links: Links | None = None  # links with a split; None for a map of the model alone
 
     def make(self, model: Model, known: Int[Tensor, " k"]) -> Fingerprints:
-        """The map of a model that was trained on ``known`` links; axes are the label's numbers."""
+        """The map of a model trained on ``known`` links; each label value is an axis."""
         scene = model.scene
         if self.is_region:
             candidates = even_candidates(self.box, self.points)
@@ -273,7 +273,7 @@ def trials_of(folds: Sequence[PrintFold], most: int = 200) -> list[UnseenPrints]
 
 
 def along(prints: Fingerprints, errors: Sequence[Float[Tensor, "_ r m"]]) -> Fingerprints:
-    """The map with predictions along axes on which errors of a label's numbers are independent.
+    """The map with predictions along axes on which errors of a label's values are independent.
 
     Args:
         errors: Errors of held-out fingerprints by fold, NaN where nothing was received. If empty,

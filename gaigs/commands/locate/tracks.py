@@ -12,11 +12,10 @@ from gaigs.kriging.links import distances
 
 
 def walk(places: Float[Tensor, "n 3"], step: float, most: int = 10) -> Int[Tensor, " k"]:
-    """Numbers of the places in the order of a walk, always to the nearest unvisited place.
+    """Numbers of the places in the order of a walk, which always goes to the nearest new place.
 
     Each number is repeated as often as a transmitter with moves of ``step`` would transmit on its
-    way to the next place. Repeated fingerprints have equal errors, like fingerprints received close
-    together.
+    way to the next place. Repeats have equal errors, as fingerprints at nearby places do.
 
     Args:
         step: Standard deviation of a move along each axis [m].
@@ -43,13 +42,13 @@ def track(
     is_received: Bool[Tensor, " n"],
     spread: int = 75,
 ) -> tuple[Candidates, Float[Tensor, "n j"]]:
-    """The posterior of a track over every m-th candidate, since ``smoothed`` takes few candidates.
+    """The posterior of a track by ``smoothed``, over every m-th candidate to save time.
 
     Args:
         logarithms: Log posterior of each transmission alone.
         step, is_received: See ``smoothed``.
-        spread: Number of the j candidates over which the posterior of one transmission spreads; m
-            follows from it. Regions of tracks reach far beyond the likeliest candidates.
+        spread: Number of the remaining candidates over which the posterior of one transmission
+            spreads; it sets m. Regions of tracks reach far beyond the likeliest candidates.
 
     Returns:
         The j candidates, and the log posterior of the track at them.
@@ -85,7 +84,7 @@ class Moves:
         start: Int[Tensor, " k"],
         end: Int[Tensor, " k"],
     ) -> Float[Tensor, " k"]:
-        """Logarithms of probabilities at the candidates ``end``, from those at ``start``."""
+        """Logarithms of probabilities after one move, at candidates ``end`` from ``start``."""
         # The logarithm is of a number above 0, as each move may be a jump.
         return (self._densities(start, end) @ (logarithm - logarithm.max()).exp()).log()
 
@@ -137,7 +136,7 @@ def smoothed(
     spacing = distances(first, first).fill_diagonal_(math.inf).amin(1).median()
     moves = Moves(places, math.hypot(step, spacing.item()), jump)
 
-    # forward: given the values until each one; backward: given those after it.
+    # forward: log posterior given the transmissions up to each one; backward: given later ones.
     forward = [single[0]]  # n of (k,)
     for value, pair in zip(single[1:], itertools.pairwise(indices), strict=True):
         forward.append(value + moves.take(forward[-1], *pair))

@@ -1,4 +1,4 @@
-"""What receivers received, as a user gives it: tensors, mappings and files."""
+"""Received values in the forms that a user may give: tensors, mappings and files."""
 
 import math
 from collections.abc import Mapping
@@ -83,8 +83,8 @@ def as_values(value: object, prints: Fingerprints) -> Tensor:
 def read_value(file: Path, links: Links) -> object:
     """The ``value`` of ``locate`` from a file.
 
-    A ``.npy`` file gives its array (n, r, *shape). For labels of one number, a table with a column
-    for each receiver gives its columns by name, NaN for an empty cell.
+    A ``.npy`` file gives its array (n, r, *shape). For scalar labels, a table with a column for
+    each receiver gives its columns by name, with NaN for an empty cell.
 
     Args:
         links: Links of the model, whose task and receivers' names the file must have.

@@ -1,4 +1,4 @@
-"""Placement: where to put access points, and what they bring."""
+"""Placement of access points: the best places, and the quality that each adds."""
 
 from pathlib import Path
 from typing import Any
@@ -52,7 +52,7 @@ def figure(plan: SitePlan) -> Figure:
 
 
 def plot_plan(result: SitePlan, ax: Any = None) -> Any:
-    """Draws the map with the new places on ``ax``; without it a figure of its own."""
+    """Draws the map with the new places on ``ax``, or in a new figure without it."""
     if ax is None:
         return figure(result).axes[:-1]
     draw_map(ax, result, result.qualities[-1], result.places)

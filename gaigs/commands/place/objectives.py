@@ -44,8 +44,8 @@ class Coverage:
 class MeanLevel(Coverage):
     """Expected reading of the best receiver [dBm]; arguments are as for ``Coverage``.
 
-    For a level a below all readings it is a + the integral of P(best reading > t) over t from a on.
-    The integral runs over ``steps`` levels.
+    With a level a below all readings it is a + the integral of P(best reading > t) over t >= a,
+    computed at ``steps`` levels.
     """
 
     def __init__(

@@ -31,7 +31,7 @@ def run(config: dict, folder: Path) -> None:
 
 
 def figure(plan: SurveyPlan) -> Figure:
-    """Places from above and, if it falls, the expected error after each new place."""
+    """A figure of places from above and, if it falls, of the error after each new place."""
     with rc_context(style.STYLE):
         drawn = style.new_figure(style.PAGE, 0.52 * style.PAGE, "compressed")
         # A flat curve says no more than the text.

@@ -39,14 +39,14 @@ class SurveyPlan:
         errors: Expected mean absolute error of a label over the region and all receivers, before
             and after each place, in the label's unit (n + 1,); None without a model.
         known: Places that were measured (k, 3) [m].
-        losses: Rise of ``known_error`` if this known place had been left out (k,).
+        losses: Rise of ``known_error`` if each known place had been left out (k,).
         superfluous: Known places that together raise ``known_error`` by at most 5 % if left out
             (k,).
         unit: Unit of the errors.
         frame: Place of x and y on a map; None if unknown.
         known_error: Expected mean error before any new place, over the region or else the box of
             the training transmitters.
-        scatter: Part of the error that no measurement lowers: labels of one place scatter by it.
+        scatter: Part of the error that no measurement lowers: the noise of labels at one place.
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
@@ -135,14 +135,14 @@ def survey(
     """The next places to measure: each lowers the mean variance over a region and receivers most.
 
     A receiver counts at a place by its probability of reception, from the measured places around.
-    Labels do not enter beyond the fitted process, so a plan is made before anything is measured.
-    The largest variance would be a poor guide: it is in the corners. Places stand half a
-    correlation length apart or more, as long as there is room. The first places of a longer plan
-    are the shorter plan. It ends where labels of one place scatter by nearly the whole error.
+    Labels affect a plan only through the fitted process, so new measurements need not be known. The
+    place of largest variance would be a poor choice, since it is in a corner. Places are at least
+    half a correlation length apart, as long as there is room. The first places of a longer plan are
+    the shorter plan. A plan ends when the noise of labels is nearly the whole error.
 
     Args:
-        model: ``gaussian_process``, or a trained model with kriging; None: nothing is measured yet,
-            and a default process takes its place.
+        model: ``gaussian_process``, or a trained model with kriging. None: nothing is measured yet,
+            and a default process is used.
         region: Two corners of a box ``[[x, y, z], [x, y, z]]`` [m], over which the error is stated;
             None: the candidates or, without these, the box of the training transmitters, or a box
             for each of several floors.
@@ -150,8 +150,8 @@ def survey(
         candidates: Places that can be measured (c, 3) [m]; None: a grid over the region.
         frequency: Carrier [Hz]; None: the training links' carrier, of several the middle one.
             Without a model it has no effect.
-        stop: Share of the expected error: the plan ends where no number of further places can lower
-            the error by more; 0 gives all places. Without a model it has no effect.
+        stop: Fraction of the expected error. The plan ends when no number of further places can
+            lower the error by more; 0 gives all places. Without a model it has no effect.
         progress: False for no bars.
 
     Raises:
@@ -242,7 +242,7 @@ class SurveyPlaces(NamedTuple):
 
 
 def survey_places(model: Model | None, region: object, candidates: object) -> SurveyPlaces:
-    """The places that the arguments of ``survey`` mean; a ``ValueError`` without any."""
+    """Candidates and other places from the arguments of ``survey``; a ``ValueError`` if none."""
     none = torch.zeros(0, 3)
     even = none
     if region is not None:

@@ -1,4 +1,4 @@
-"""Contents of the viewer for one model, in plain numbers for its page."""
+"""Contents of the viewer for one model, as JSON values for its page."""
 
 import base64
 import math
@@ -344,8 +344,8 @@ def plain(values: Any) -> Any:
 def grey(image: Float[Tensor, "rows columns"], step: int = 1) -> dict:
     """Every ``step``-th row and column of an image, in the page's encoding.
 
-    Pixels are bytes, 255 for an amplitude of 1. Each is stored as the difference from the pixel
-    before, since differences compress well.
+    Pixels are bytes, 255 for an amplitude of 1. Each is stored as its difference from the previous
+    pixel, since differences compress well.
     """
     levels = (255 * image[::step, ::step].clamp(0, 1)).round().to(torch.uint8).numpy()
     changes = np.diff(levels.ravel(), prepend=np.uint8(0))

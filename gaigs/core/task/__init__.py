@@ -42,7 +42,7 @@ class Axis(NamedTuple):
 
 
 class Task(ABC):
-    """The contract of kind ``task``.
+    """Base class of components of kind ``task``.
 
     A data set makes its task, and a checkpoint stores it with the scene.
 
@@ -57,10 +57,10 @@ class Task(ABC):
         elements: Elements of an array, the first axis of channels; 1 for other labels.
         frequencies: Subcarriers [Hz], the last axis of channels; None for other labels.
         phase: Unknown part of a channel's phase, see ``Csi``.
-        lowest: Least possible number of a real label.
-        limits: Bounds of labels in files. Numbers beyond them have another unit, or mean "not
+        lowest: Least possible value of a real label.
+        limits: Bounds of labels in files. Values beyond them have another unit, or mean "not
             received".
-        beyond: Advice in errors on numbers beyond these bounds.
+        beyond: Advice in errors about values beyond these bounds.
     """
 
     name: str
@@ -119,7 +119,7 @@ class Task(ABC):
 
     @property
     def compared_by(self) -> str:
-        """The score of two labels of one data set; by default ``monitor``."""
+        """Name of the score that compares two labels of a data set; by default ``monitor``."""
         return self.monitor
 
     @abstractmethod
@@ -147,10 +147,10 @@ class Task(ABC):
         return means
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor] | None:
-        """Scores of a prediction that is the mean of many labels at the place; by default None.
+        """Scores if the mean of many labels at a place predicts each of them; by default None.
 
-        Two labels with independent noise of variance s² have a mean square difference of 2 s². A
-        label and the mean of many differ by s².
+        Two labels with independent noise of variance s² have a mean square difference of 2 s²; a
+        label and the mean of many labels have s².
 
         Args:
             scores: Scores of one label as the prediction of another at the same place.
@@ -204,8 +204,8 @@ class Task(ABC):
     def fingerprint(self, values: Tensor) -> Tensor:
         """Real numbers (k, m) of labels or predictions that change smoothly with the place.
 
-        By default these are at most 512 evenly spread numbers of the label: an array resolves
-        fewer.
+        By default these are at most 512 evenly spread values of the label, more than an array
+        resolves.
         """
         return thin_labels(values, 512).float()
 

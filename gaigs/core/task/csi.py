@@ -25,9 +25,9 @@ class Csi(Task):
 
     Scores of a link, with error e = h - h' over its elements and subcarriers:
 
-    - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is the SNR after the best global phase of
-      the prediction, for a receiver and a transmitter without a common clock. Where ``phase`` is
-      not known, the aligned SNR is the only one, and all scores use the aligned error.
+    - SNR [dB], -10 log10(|e|² / |h|²). ``snr_aligned_db`` is the SNR after the best common phase of
+      the prediction, for a receiver and a transmitter without a common clock. If ``phase`` is not
+      known, only the aligned SNR exists, and all scores use the aligned error.
     - SINAD [dB], 10 log10((|h|² + |e|²) / |e|²), at least 0. Its mean is monitored: a few links in
       deep shadow, with an SNR of -50 dB, would dominate a mean SNR.
 
@@ -37,8 +37,8 @@ class Csi(Task):
         elements: Number of elements of the largest array; 1 for single antennas. Labels are 0 at
             the missing elements of a smaller array.
         frequencies: Absolute frequencies of the subcarriers (s,) [Hz].
-        phase: ``known``; ``per_link`` if each link has its own random phase; ``per_link_and_delay``
-            if each link also has its own delay and gain. Elements and subcarriers of a link share
+        phase: ``known``; ``per_link`` if each link has a random phase; ``per_link_and_delay`` if
+            each link also has a random delay and gain. Elements and subcarriers of a link share
             them.
 
     Raises:

@@ -62,7 +62,7 @@ class Scalar(Task):
     def stored(
         self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]
     ) -> dict[str, np.ndarray]:
-        """``error``: prediction minus label."""
+        """The array ``error``, predictions minus labels."""
         return {"error": (values - labels).numpy()}
 
 

@@ -103,9 +103,9 @@ class Spectrum(Task):
         """Scores of the mean of many spectra as a prediction of each.
 
         An SSIM of s becomes 2 s / (1 + s), an SSIM below 0 becomes 0, and absolute errors fall by
-        the root of 2. Reason: the SSIM of two noisy labels with the same mean is the fraction s of
-        their variance that the common pattern has. The SSIM of the pattern and one label is 2 s /
-        (1 + s).
+        the root of 2. The reason is that the SSIM of two noisy labels is the fraction s of their
+        variance that comes from their common pattern. The SSIM of this pattern with one label is
+        2 s / (1 + s).
         """
         shares = scores["ssim"].clamp(min=0)
         return {"ssim": 2 * shares / (1 + shares), "mae": scores["mae"] / math.sqrt(2)}
@@ -162,5 +162,5 @@ class Spectrum(Task):
     def stored(
         self, labels: Tensor, values: Tensor, scores: dict[str, Tensor]
     ) -> dict[str, np.ndarray]:
-        """``ssim``."""
+        """The array ``ssim``, the similarity of each prediction."""
         return {"ssim": scores["ssim"].numpy()}

@@ -1,4 +1,4 @@
-"""Checks of data against their geometry: other units, axes, signs and orders that explain them."""
+"""Checks of data: units, axes, signs and orders under which geometry explains labels better."""
 
 from collections.abc import Iterator
 from typing import Any

@@ -1,4 +1,4 @@
-"""Checks of complex channels: conventions that explain them, and phases without geometry."""
+"""Checks of complex channels: wrong conventions, and phases that do not follow geometry."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -59,7 +59,7 @@ def check_channels(links: Any) -> Iterator[Finding]:
 
 
 def check_signs(sample: Sample) -> Iterator[Finding]:
-    """A finding if no real part of the channels is negative, and one if no imaginary part is."""
+    """Findings if no channel has a negative real part, or none a negative imaginary part."""
     parts = {"real": sample.labels.real, "imaginary": sample.labels.imag}
     for name, part in parts.items():
         if sample.labels.numel() < 100 or part.min() < 0:
@@ -131,7 +131,7 @@ def check_phases(links: Any, train: Int[Tensor, " k"], sample: Sample) -> Iterat
 
 
 def _without_sign(few: Sample, is_enough: bool) -> Iterator[Finding]:
-    """A finding about channels whose phases follow the distance with neither sign."""
+    """A finding if phases of channels follow the distance neither with one sign nor the other."""
     explained = "distance explains {} of the levels' spread"
     by_level = Measure(level_share, 0.22, 0.3, explained, "of the spread of levels")
     finding = best_convention(few, by_level)
@@ -148,7 +148,7 @@ def _without_sign(few: Sample, is_enough: bool) -> Iterator[Finding]:
 
 
 def _strange_findings(name: str, parts: StrangeParts) -> Iterator[Finding]:
-    """Findings about elements and subcarriers of a receiver with fixed phases."""
+    """Findings about a receiver's elements and subcarriers whose phases never change."""
     unexplained = "have phases that geometry does not explain, the same at all links"
     if parts.elements:
         yield Finding(
@@ -169,8 +169,8 @@ def _strange_findings(name: str, parts: StrangeParts) -> Iterator[Finding]:
 def best_convention(sample: Sample, score: Measure) -> Finding | None:
     """A finding about the conventions by which geometry explains channels clearly better.
 
-    Conventions that explain the channels equally well are named together. ``score`` is the measure,
-    with the bounds for "clearly".
+    Conventions that explain the channels equally well are named together. ``score`` has the bounds
+    above which an improvement is clear.
     """
     read = score.measure(sample)
     if read > score.enough or len(sample.labels) < MANY:

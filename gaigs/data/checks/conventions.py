@@ -21,12 +21,12 @@ Move = Callable[[Tensor], Tensor]
 
 
 def conventions(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[Hypothesis]:
-    """All conventions other than the one read, the likeliest faults first.
+    """Other conventions in which the data may have been written, most likely first.
 
     Args:
         sample: Links as read.
-        measure: How well geometry explains a sample, such as ``coherence``; the order of receivers
-            that it finds best is one of the conventions.
+        measure: Function that rates how well geometry explains a sample, such as ``coherence``. The
+            order of receivers with the best rating is one of the conventions.
     """
     ends: list[tuple[str, ...]] = [("tx",), ("rx",), ("tx", "rx")]
     yield from of_subcarriers(sample)
@@ -41,7 +41,7 @@ def conventions(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[
 
 
 def of_subcarriers(sample: Sample) -> Iterator[Hypothesis]:
-    """Conventions of subcarriers: their order and unit, and phases that lack a part."""
+    """Conventions of subcarriers: order, unit, and phases without the carrier's part."""
     if len(sample.frequencies) > 1:
         name = "subcarriers are in reversed order, or path coefficients are conjugate"
         mend = "h = h[..., ::-1], or of conjugate coefficients h = h.conj()[..., ::-1]"
@@ -86,7 +86,7 @@ def of_arrays(sample: Sample) -> Iterator[Hypothesis]:
 
 
 def of_orientations(sample: Sample) -> Iterator[Hypothesis]:
-    """Other readings of the receivers' rotations; none if all look along the world's axes."""
+    """Other conventions of rotations; none if all receivers have the world's axes."""
     if torch.allclose(sample.rotations, torch.eye(3).to(sample.rotations)):
         return
     for name, move, mend in (
@@ -136,7 +136,7 @@ def of_axes(sample: Sample, ends: Sequence[Sequence[str]]) -> Iterator[Hypothesi
 
 
 def of_angles() -> Iterator[Hypothesis]:
-    """Places computed from angles, about their receiver or the origin."""
+    """Faults of places that were computed from angles at their receiver or at the origin."""
     north = "azimuths clockwise from north"
     polar = "elevations taken for polar angles, or the reverse"
     complement = "elevation = np.pi / 2 - elevation"
@@ -165,7 +165,7 @@ def of_frames() -> Iterator[Hypothesis]:
 
 
 def of_plans(sample: Sample) -> Iterator[Hypothesis]:
-    """Receivers that are drawn from another end or point of the transmitters' plan."""
+    """Receivers whose coordinates count from another corner or point of the floor plan."""
     low, high = sample.transmitters.amin(0), sample.transmitters.amax(0)
     for name, axes in {"x": [0], "y": [1], "x and y": [0, 1]}.items():
         move = partial(_mirrored, ends=low + high, axes=axes)
@@ -191,7 +191,7 @@ def of_plans(sample: Sample) -> Iterator[Hypothesis]:
 
 
 def of_receivers(sample: Sample, measure: Callable[[Sample], float]) -> Iterator[Hypothesis]:
-    """The order in which receivers' links fit the places best; shifts by one of many receivers."""
+    """The order of receivers that fits best; with many receivers only shifts by one are tried."""
     count = len(sample.positions)
     read = torch.arange(count)
     orders = [read.roll(1), read.roll(-1)][: count - 1]
@@ -215,7 +215,10 @@ def changing(name: str, parts: Sequence[str], move: Move, mend: str) -> Hypothes
 
 
 def _everywhere(ends: Sequence[str], name: str, mend: str, matrix: Tensor) -> Hypothesis:
-    """A convention that multiplies points of ``ends`` by a matrix, as ``mend`` does in numpy."""
+    """The convention that points of ``ends`` need multiplication by a matrix.
+
+    ``mend`` is this multiplication as text in numpy, which the advice appends to array names.
+    """
     parts = {"tx": "transmitters", "rx": "positions", "elements": "elements"}
     lines = "; ".join(f"{end} = {end}{mend}" for end in ends)
     return changing(
@@ -252,7 +255,7 @@ def _from_receivers(sample: Sample) -> Sample:
 def _mirrored(
     points: Float[Tensor, "r 3"], ends: Float[Tensor, "3"], axes: Sequence[int]
 ) -> Float[Tensor, "r 3"]:
-    """Points whose coordinates along ``axes`` count from the other end; ``ends`` are low + high."""
+    """Points mirrored along ``axes``; ``ends`` is the sum of lowest and highest coordinates."""
     moved = points.clone()
     moved[:, axes] = (ends - points)[:, axes]
     return moved
@@ -265,20 +268,20 @@ def _transposed(labels: Complex[Tensor, "n e s"], rows: int) -> Complex[Tensor, 
 
 
 def _rolled(rotations: Float[Tensor, "r 3 3"], by: int) -> Float[Tensor, "r 3 3"]:
-    """Rotations of quaternions whose four numbers are rolled."""
+    """Rotations after the four numbers of their quaternions are rolled by ``by``."""
     quaternions = Rotation.from_matrix(rotations.numpy()).as_quat()
     rolled = np.roll(quaternions, by, 1)
     return torch.from_numpy(Rotation.from_quat(rolled).as_matrix())
 
 
 def _tilted(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Points with their angle from the z axis as elevation."""
+    """Points whose angle from the z axis becomes their elevation."""
     azimuths, elevations, distances = to_spherical(points)
     return distances[:, None] * from_spherical(azimuths, math.pi / 2 - elevations)
 
 
 def _widened(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3"]:
-    """Points at 180 / pi times their azimuth and elevation."""
+    """Points whose azimuth and elevation are multiplied by 180 / pi."""
     azimuths, elevations, distances = to_spherical(points)
     return distances[:, None] * from_spherical(
         math.degrees(1) * azimuths, math.degrees(1) * elevations

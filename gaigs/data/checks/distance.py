@@ -1,4 +1,4 @@
-"""The law of distance of levels, and its fit under other conventions."""
+"""Log-distance path loss of levels (the law of distance), fitted under several conventions."""
 
 import math
 from typing import NamedTuple
@@ -25,7 +25,7 @@ class Gain(NamedTuple):
     evidence: float  # gain of the log likelihood
 
     def is_clear(self, share: float = 0.85, evidence: float = 8.0) -> bool:
-        """True if the error falls below a fraction of itself, and the evidence exceeds a bound."""
+        """True if the ratio of errors is below ``share``, and ``evidence`` is exceeded."""
         return self.fits < share * self.read and self.evidence > evidence
 
 
@@ -41,8 +41,7 @@ def decades_of(distances: Float[Tensor, "*h n"]) -> Float[Tensor, "*h n"]:
 
 
 def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = False) -> Law:
-    """The law of distance of each receiver, by Huber's weights, which limit the effect of wrong
-    levels.
+    """The law of distance of each receiver, fitted robustly with Huber's weights.
 
     Args:
         logarithms: Decimal logarithms of the links' distances, for h conventions at once.
@@ -83,7 +82,7 @@ def explained(sample: Sample) -> float:
 def compare(
     read: Float[Tensor, " n"], fits: Float[Tensor, " n"], sample: Sample, cells: int = 6
 ) -> Gain:
-    """Comparison of the errors ``read`` of one law with the errors ``fits`` of another law [dB].
+    """Improvement from the errors ``read`` of one law to the errors ``fits`` of another [dB].
 
     Errors above 30 dB count as 30 dB. Shadowing is similar at nearby places, so all links of a
     receiver in a cell of the floor plan are one observation. There are at most ``cells`` cells

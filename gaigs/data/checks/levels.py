@@ -37,7 +37,7 @@ def check_levels(links: Any) -> Iterator[Finding]:
 
 
 def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
-    """A finding about positive levels: powers, amplitudes, or decibels of another sign or unit."""
+    """A finding if levels are positive: powers, amplitudes, or decibels with a wrong sign."""
     low, high = np.quantile(levels.numpy(), (0.05, 0.95)).tolist()
     text = (
         f"{int((levels > 0).sum())} levels are above 0 dBm, {levels.min():.3g} to "
@@ -64,9 +64,9 @@ def check_unit(links: Any, levels: Float[Tensor, " n"]) -> Iterator[Finding]:
 def _linear_unit(sample: Sample | None, text: str, median: float) -> Finding:
     """The finding that positive levels are in volts, watts, mW or less instead of decibels.
 
-    Amplitudes fall with 1 / distance: 10 log10 of them falls by 10 dB a decade, 10 log10 of powers
-    by 20 dB. A slope near 10 dB therefore means volts. Otherwise the size of the levels
-    distinguishes watts from mW.
+    Amplitudes fall with 1 / distance, so 10 log10(amplitude) falls by 10 dB in each decade of
+    distance; 10 log10(power) falls by 20 dB. A slope near 10 dB therefore means volts. Otherwise
+    the size of the levels distinguishes watts from mW.
 
     Args:
         sample: Links of the receivers with given places, for the slope; None without given places.
@@ -223,7 +223,10 @@ def check_places_of_levels(
 
 
 def _scale(errors: Float[Tensor, " n"], sample: Sample) -> Float[Tensor, " r"]:
-    """Robust standard deviation at each receiver; with under 10 links, of all receivers."""
+    """Robust standard deviation of errors at each receiver.
+
+    A receiver with under 10 links gets the deviation over all receivers.
+    """
     scales = (1.4826 * errors.abs().median()).expand(len(sample.positions)).clone()
     for number in range(len(scales)):
         at_receiver = errors[sample.receivers == number]

@@ -73,7 +73,7 @@ def check_extent(links: Any) -> Iterator[Finding]:
 
 
 def scale_of(places: Float[Tensor, "n 3"]) -> str:
-    """Apparent scaling of places, such as to 0..1, or standardised; empty if not scaled."""
+    """Name of an apparent scaling of places, such as to 0..1; empty if there is none."""
     low, high = places.min().item(), places.max().item()
     for lower, upper in ((0.0, 1.0), (-1.0, 1.0), (-0.5, 0.5)):
         margin = 0.15 * (upper - lower)  # places seldom reach the walls of the room that was scaled
@@ -160,7 +160,7 @@ def check_edges(links: Any) -> Iterator[Finding]:
 
 
 def check_constant(links: Any) -> Iterator[Finding]:
-    """A finding about labels of several numbers that are all equal."""
+    """A finding about labels of several values that are all equal."""
     labels = links.labels[evenly(torch.arange(len(links)), 256)].flatten(1)  # (k, m)
     constant = (labels == labels[:, :1]).all(1)
     if labels.shape[1] > 1 and constant.any():
@@ -169,7 +169,7 @@ def check_constant(links: Any) -> Iterator[Finding]:
 
 
 def _measured(links: Any) -> list[int]:
-    """Receivers with a measured place, not one estimated from levels."""
+    """Numbers of the receivers whose place is given, and not estimated from levels."""
     numbers = range(len(links.receivers))
     return [k for k in numbers if links.uncertainties is None or not links.uncertainties[k]]
 

@@ -1,4 +1,4 @@
-"""Checks of receivers' places by the levels: units, axes, order, and wrong places."""
+"""Checks of receivers' places against levels: units, axes, order, and wrong places."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -84,7 +84,7 @@ def sample_of_given(
 
 
 def check_conventions(sample: Sample) -> Iterator[Finding]:
-    """A finding if levels follow the distance clearly better in another unit or with other axes."""
+    """A finding if levels follow the distance much better in another unit or other axes."""
     rows = [
         *of_frames(),
         *of_units([("tx",), ("rx",)]),
@@ -177,14 +177,14 @@ def best_shift(sample: Sample, cells: int = 5) -> tuple[Float[Tensor, "2"], Gain
 def _gain(sample: Sample, fits: Float[Tensor, " n"], is_fitted: bool = False) -> Gain | None:
     """The gain of a law with the errors ``fits`` over the law of the data as read.
 
-    None if chance or directional antennas explain the gain. ``is_fitted`` means that places were
-    fitted to the levels; the bounds for chance are then higher.
+    None if chance explains the gain, or if antennas do: a directional law of the data as read then
+    fits as well. ``is_fitted`` means that places were fitted to the levels, so chance does more.
     """
     logarithms = decades(sample)
     gain = compare(fit_law(logarithms, sample).errors, fits, sample)
     directed = fit_law(logarithms, sample, patterns=True)
     beyond = compare(directed.errors, fits, sample)
-    # Within the beam of a directional antenna levels still fall with the distance.
+    # If levels still fall with distance in the beam of a directional antenna, places may be right.
     evidence = 6.5 if is_fitted and directed.slopes.median() < -8 else -math.inf
     is_beyond = beyond.is_clear(0.85 if is_fitted else 1.0, evidence)
     return gain if gain.is_clear(0.75 if is_fitted else 0.85) and is_beyond else None

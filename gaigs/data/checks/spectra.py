@@ -81,10 +81,10 @@ class Limits:
 def check_directions(links: Any, limits: Limits | None = None) -> Iterator[Finding]:
     """A finding if spectra are bright towards their transmitters only under another convention.
 
-    The score of a link is the rareness of pixels as bright as the pixel towards its transmitter,
-    less the mean of the same over all spectra of the receiver. Pixels that are bright in every
-    spectrum therefore add nothing, and a link behind walls scores about 0 under every convention.
-    The score does not need the strongest pixel to be the direct path.
+    The score of a link is how rare pixels are that are as bright as the pixel towards its
+    transmitter, minus the mean of this quantity over all spectra of the receiver. So pixels that
+    are bright in every spectrum have no effect, and a link behind walls scores about 0 under every
+    convention. The strongest pixel need not be the direct path.
     """
     limits = limits or Limits()
     sample = sample_of(links, limits.most)
@@ -192,7 +192,7 @@ def best_directions(
 
 
 def near_likeness(sample: Sample) -> float:
-    """Mean correlation of each spectrum with the nearest place's, after removal of the mean."""
+    """Mean correlation of each spectrum with that of the nearest place, without the mean."""
     pixels = sample.labels.flatten(1)
     likeness = torch.corrcoef(pixels - pixels.mean(0))  # (n, n)
     apart = torch.cdist(sample.transmitters, sample.transmitters).fill_diagonal_(math.inf)
@@ -240,7 +240,7 @@ class Directions:
 
 
 def both(first: Hypothesis, second: Hypothesis) -> Hypothesis:
-    """Two conventions at once."""
+    """The hypothesis that two conventions hold at once."""
 
     def change(sample: Sample) -> Sample:
         return second.change(first.change(sample))

@@ -43,7 +43,7 @@ def constant_subcarriers(links: Any) -> Bool[Tensor, " s"]:
 
 
 def constant_sentence(constant: Bool[Tensor, " s"], frequencies: Float[Tensor, " s"]) -> str:
-    """The sentence about constant subcarriers, with {} for a verb."""
+    """A sentence that lists the constant subcarriers; {} stands for a verb."""
     named = shortened([f"{carrier / 1e9:.6g}" for carrier in frequencies[constant].tolist()])
     return (
         f"{int(constant.sum())} of {len(constant)} subcarriers have one value in every link, {{}}: "
@@ -62,7 +62,7 @@ def check_constant_subcarriers(links: Any) -> Iterator[Finding]:
 
 
 def check_powers(sample: Sample) -> Iterator[Finding]:
-    """A finding about subcarriers 30 dB from the median: guards, pilots or unscaled ones."""
+    """A finding about subcarriers whose power is 30 dB from the median, such as pilots."""
     powers = sample.labels.abs().square().mean((0, 1)).clamp_min(1e-300)  # (s,)
     odd = (10 * (powers / powers.median()).log10()).abs() > 30
     if len(sample.labels) >= 5 and odd.any():

@@ -1,4 +1,4 @@
-"""How well the direct wave explains channels: over links, within each link, and by power."""
+"""Measures of how well the direct wave explains channels: phases over links, or powers."""
 
 import math
 from dataclasses import replace
@@ -27,7 +27,7 @@ class FewWaves(NamedTuple):
     frequencies: Float[Tensor, " s"]
 
     def without_waves(self) -> tuple[Complex[Tensor, "n e s"], Complex[Tensor, "n e s"]]:
-        """Channels without the phase of ``waves``, and channels without the opposite phase."""
+        """Channels divided by the waves' phases, and by the opposite phases."""
         return self.channels * self.waves.conj(), self.channels * self.waves
 
 

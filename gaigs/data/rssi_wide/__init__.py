@@ -1,4 +1,4 @@
-"""Received signal strength in a table, a place a row and a gateway a column (docs/data.md)."""
+"""Received signal strength in wide tables: rows are places, columns gateways (docs/data.md)."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -38,29 +38,28 @@ def read(
     receiver: str | None = None,
     level: str | None = None,
 ) -> Links:
-    """A data set from a wide table: one link for each gateway that a place hears.
+    """A data set from a wide table: one link for each place and each gateway received there.
 
-    Columns are separated by commas, semicolons, tabs or bars, numbers have a decimal point or
-    comma. Coordinates are found by the names ``x``, ``y``, ``z``, ``easting``, ``northing``,
-    ``longitude``, ``latitude``, ``altitude`` and the like, with a unit as in ``x [cm]``. Gateways
-    are the columns of ``gateways``, and all others that mostly hold levels with a median of at most
-    -20 dBm. Rows of one place are averaged in dB. Gateways look along the world's axes.
+    Columns are separated by commas, semicolons, tabs or bars; numbers have a decimal point or
+    comma. Columns of coordinates have usual names, such as ``x``, ``easting``, ``longitude`` or
+    ``altitude``, and may state a unit, as in ``x [cm]``. Gateways are the columns named in
+    ``gateways``, and columns of mostly levels with a median of at most -20 dBm. Rows of one place
+    are averaged in dB. Gateways have the world's axes.
 
     Args:
         file: The table. Levels lie in [-150, 30] dBm. Empty cells and NaN were not received.
         gateways: Table of ``name,x,y,z``, or YAML of ``name: [x, y, z]``, in the coordinates of the
-            places. Gateways that the table lacks, or all without a table, get their place from the
-            training links.
+            places. Places of other gateways are estimated from the training links.
         coordinates: Columns of x, y and optionally z or floor; longitude and easting come first.
-            None: by their names.
-        ignore: Columns that are no gateways.
-        not_heard: Values that mean "not heard"; None: those that ``gaigs.data.readings.marks_of``
-            finds.
+            None: columns with usual names.
+        ignore: Columns that are not gateways.
+        not_heard: Values that mean "not heard"; None: the result of
+            ``gaigs.data.readings.marks_of``.
         height: Height of all places and gateways without one, and of floor 0 [m].
         storey: Height of a storey [m], for a column ``floor``.
-        epsg: System of the coordinates, e.g. 32632 or 3857, in whose unit x and y are; None: WGS 84
-            for degrees, none for metres. Coordinates of another system than UTM are converted to
-            it, which takes ``gaigs[maps]``.
+        epsg: Code of the coordinate system, such as 32632; x and y are in its unit. None: WGS 84
+            for degrees, no system for metres. Coordinates of other systems than UTM are converted
+            to UTM, which needs ``gaigs[maps]``.
         frequency: Carrier [Hz]; None if it is unknown or changes from reading to reading.
         receiver: Column of the gateways' names, for a table with a reading a line; needs ``level``.
         level: Column of the readings of such a table [dBm].
@@ -88,10 +87,10 @@ def from_table(
     level: str | None = None,
     levels: Sequence[str] = (),
 ) -> Links:
-    """A data set from a wide table in memory, as ``read`` makes it of a file.
+    """A data set from a wide table in memory; ``read`` does the same for a file.
 
     Args:
-        table: One place a row and one gateway a column.
+        table: Table with a row for each place and a column for each gateway.
         gateways: As for ``read``, or a mapping of names to [x, y, z], or a table in memory.
         levels: Columns that are gateways whatever their numbers look like.
     """
@@ -172,7 +171,7 @@ def _to_links(
 
 
 def _read_table(file: str | Path) -> tables.Table:
-    """The table of readings; a ``ValueError`` for a table with a reading a line."""
+    """The wide table of a file; a ``ValueError`` for one with a reading in each line."""
     path = tables.find_file(file, "a table of readings")
     table = tables.read_table(path, "a heading x,y,ap1,ap2,... and one place a line")
     if {"tx_x", "rx_x"} <= {name.lower() for name in table.names}:
@@ -206,7 +205,7 @@ def _remarks_on_readings(
 
 
 def _remarks_on_heights(axes: Axes, placed: Mapping, height: float, storey: float) -> list[str]:
-    """Remarks on heights that options gave."""
+    """Remarks on heights that come from options, as the table or the gateways have none."""
     if axes.z < 0:
         return [f"all places are {height:g} m high (data.height)"]
     if axes.is_floor:
@@ -232,7 +231,7 @@ def _remarks_on_gateways(
 
 
 class World(NamedTuple):
-    """Points in the world frame, and where it lies."""
+    """Points in the world frame, and the frame's place on a map."""
 
     points: Float[ndarray, "n 3"]  # places, then gateways [m]
     frame: Frame | None  # the frame's place on a map; None if unknown

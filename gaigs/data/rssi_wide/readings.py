@@ -1,4 +1,4 @@
-"""Readings of a table: rearranged from one in each row, and averaged at each place."""
+"""Readings of a table: long tables made wide, and means of the readings at each place."""
 
 import math
 from typing import NamedTuple

@@ -80,7 +80,7 @@ def conductivity(material: str, frequency: float) -> float:
 
 
 def cells(order: int) -> Int[Tensor, "p 3"]:
-    """Numbers i along x, j along y and k along z of the mirrored copies of the room.
+    """Numbers (i, j, k) along x, y and z of the room's mirrored copies.
 
     A path to a copy has |i| + |j| + |k| reflections, at most ``order``. Copies with fewer
     reflections come first.

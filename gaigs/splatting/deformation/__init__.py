@@ -11,7 +11,7 @@ from gaigs.splatting.gaussians import Placed, Tokens
 
 
 class Residuals(NamedTuple):
-    """Changes of the Gaussians for a query; None: no change.
+    """Changes of the Gaussians for a query. A change that is None does not occur.
 
     Attributes:
         delta_quats: d_rotation, added to the unit quaternions.
@@ -31,14 +31,14 @@ class Residuals(NamedTuple):
 
 
 class Deformation(nn.Module, ABC):
-    """The contract of kind ``deformation``.
+    """Base class of components of kind ``deformation``.
 
     A constructor may take ``scene``; ``channels``, the number of signal channels;
     ``tokenizer_widths``; and ``count``, the number of Gaussians. ``count`` is None if a placement
     adds further Gaussians.
 
     Attributes:
-        reads_tokens: True if it needs tokens; if False, no tokenizer is built.
+        reads_tokens: True if the deformation needs tokens; if False, no tokenizer is built.
         sees_receivers: True if the residuals depend on the receiver.
         follows: Names of parameters with a row for each Gaussian; density control prunes and copies
             their rows.

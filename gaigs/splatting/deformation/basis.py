@@ -1,4 +1,4 @@
-"""A network of the transmitter only; each Gaussian has its weights of the network's features."""
+"""A network whose input is the transmitter only; each Gaussian weights its output features."""
 
 import torch
 from jaxtyping import Float

@@ -9,7 +9,7 @@ from gaigs.core.query import Batch
 
 @runtime_checkable
 class Loss(Protocol):
-    """The contract of kind ``loss``; a constructor takes the labels' ``task``."""
+    """Base class of components of kind ``loss``; a constructor takes the labels' ``task``."""
 
     def __call__(self, values: Tensor, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         """Compares predictions with the labels of a batch.

@@ -1,4 +1,4 @@
-"""Common part of the losses that average a function of the error."""
+"""Base class of the losses that average a function of the error."""
 
 from abc import ABC, abstractmethod
 
@@ -28,4 +28,4 @@ class MeanError(ABC):
 
     @abstractmethod
     def mean(self, values: Tensor, labels: Tensor) -> Tensor:
-        """Only the loss."""
+        """The loss, without terms for the log."""

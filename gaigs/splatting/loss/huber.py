@@ -10,7 +10,7 @@ from gaigs.splatting.loss.errors import MeanError
 
 @register("loss", "huber")
 class Huber(MeanError):
-    """The mean of half the squared error up to ``delta``, and a linear function of larger errors.
+    """A mean over errors: quadratic up to ``delta``, as error² / 2, and linear above.
 
     Args:
         delta: Error at which the loss becomes linear, in the label's unit (dB for RSSI).

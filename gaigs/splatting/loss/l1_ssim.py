@@ -53,8 +53,7 @@ class L1Ssim:
 
 
 def find_window(loss: str, directions: Directions | None, pitch: float, pixels: int) -> int:
-    """Edge of an SSIM window on a thinned grid [pixels], odd, with the same angle as on the full
-    grid.
+    """Odd edge of the SSIM window on a thinned grid [pixels], for the angle on the full grid.
 
     Args:
         loss: Name of the loss, for errors.

@@ -12,14 +12,14 @@ from gaigs.splatting.gaussians import Gaussians, Placed
 
 
 class Placement(nn.Module, ABC):
-    """The contract of kind ``placement``; a constructor may take ``scene`` and ``channels``.
+    """Base class of kind ``placement``; a constructor may take ``scene`` and ``channels``.
 
     Attributes:
         sees_receivers: True if the Gaussians of a transmitter depend on the receiver.
         model: Name of the only model that may use this placement, so that results named GAI-GS
             always have the paper's placement; None: any model.
-        has_own: True if the placement makes Gaussians, so that the free (trainable) ones of
-            ``Gaussians`` may be missing.
+        has_own: True if the placement itself makes Gaussians; the trainable ``Gaussians`` may then
+            be missing.
         learning_rates: Default learning rate of each parameter group; ``training.learning_rates``
             overrides it.
         penalty_weights: Default weight of each penalty; ``training.penalties`` overrides it.
@@ -36,8 +36,7 @@ class Placement(nn.Module, ABC):
         """The Gaussians of each query.
 
         Args:
-            gaussians: The free Gaussians. None for a placement with ``has_own``, which needs
-                none.
+            gaussians: The trainable Gaussians; may be None for a placement with ``has_own``.
             query: The links.
         """
 

@@ -12,12 +12,12 @@ from gaigs.data import Links
 
 
 class Pooling(nn.Module, ABC):
-    """The contract of kind ``pooling``. A pooling reads maps; a ``PathPooling`` reads paths.
+    """Base class of kind ``pooling``. A pooling reads maps; a ``PathPooling`` reads paths.
 
     Attributes:
-        channels: Real numbers that a Gaussian emits: channels of the map, or real and imaginary
-            part of a path.
-        grid: Directions of the map that it sums. None: the map is rendered in the label's
+        channels: Number of real values that a Gaussian emits: channels of the map, or real and
+            imaginary part of a path.
+        grid: Directions of the map that the pooling sums. None: the map is rendered in the label's
             directions.
         zone: Lowest and highest elevation from which the receiver gets power [rad]; used with
             ``grid``.
@@ -39,13 +39,13 @@ class Pooling(nn.Module, ABC):
         Args:
             received: Maps (b, c, rows, columns), or ``ReceivedPaths``.
             query: The link of each map or set of paths. All links are to one receiver.
-            directions: Requested directions of labels with directions, if different from the map's;
-                None: the task's.
+            directions: Requested directions of the label, if different from the map's. None: the
+                directions of the task.
         """
 
 
 def sphere(option: str, shape: Sequence[int]) -> Grid:
-    """The grid of a pooling from its option [rows, columns].
+    """The part of a grid over the sphere that a pooling sums, from its option [rows, columns].
 
     Args:
         option: Name of the option, for errors.

@@ -1,4 +1,4 @@
-"""The conventional beamformer: from the covariance of an array's elements to a spectrum's label."""
+"""The conventional beamformer: from covariances of an array's elements to a spectrum label."""
 
 import math
 from collections.abc import Iterator
@@ -110,7 +110,7 @@ class Beamformer:
         return values.unflatten(1, asked.shape)
 
     def lags(self, labels: Float[Tensor, "b rows columns"], query: Query) -> LagFit:
-        """Fits covariances to labels by least squares, in float64: the inverse of a call.
+        """Fits covariances to labels by least squares, in float64; it inverts ``__call__``.
 
         The scale of a label is unknown. A label of zeros has covariances of 0.
 
@@ -163,7 +163,10 @@ class Beamformer:
     def _amplitudes(
         self, parts: Float[Tensor, "b m"], carrier: float, query: Query, directions: Directions
     ) -> Float[Tensor, "b k"]:
-        """Amplitudes of the beamformer in some directions, from ``parts`` as rows of ``_basis``."""
+        """Amplitudes of the beamformer in k directions.
+
+        ``parts`` are covariances as real numbers, in the order of the rows of ``_basis``.
+        """
         power = parts @ self._stored_basis(parts, carrier, query, directions)  # (b, k)
         least = 1e-6  # of the mean power: sums of tens of float32 terms round at this
         if torch.is_grad_enabled():
@@ -190,7 +193,7 @@ class Beamformer:
         return self._bases[key]
 
     def _basis(self, carrier: float, query: Query, directions: Directions) -> Float[Tensor, "m k"]:
-        """Contribution of each covariance to the power in each direction, float64.
+        """Matrix from covariances (m real numbers) to the power in k directions, float64.
 
         Rows are the real, then the imaginary parts of the second half of the lags. The first half
         is their conjugate.
@@ -209,9 +212,9 @@ class Beamformer:
 def _scaled(amplitudes: Float[Tensor, "b k"], shown: Float[Tensor, "b j"]) -> Float[Tensor, "b k"]:
     """Amplitudes scaled so that the range of ``shown`` becomes [0, 1].
 
-    Reading all pixels from memory takes as long as the beamformer. Gradients of ``amin`` and
-    ``amax`` read them four times, gradients of ``min`` and ``max`` hardly once. Without gradients
-    ``amin`` and ``amax`` are faster.
+    One read of all pixels takes as long as the beamformer. The gradients of ``amin`` and ``amax``
+    read them four times, so training uses ``min`` and ``max``. Without gradients ``amin`` and
+    ``amax`` are faster.
     """
     if shown.requires_grad:
         low = shown.min(1, keepdim=True).values  # (b, 1)

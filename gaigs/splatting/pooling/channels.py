@@ -1,4 +1,4 @@
-"""Base of poolings to complex channels: their strength and the signs of their phases."""
+"""Base class of poolings to complex channels; it fits their strength and phase signs."""
 
 import math
 
@@ -15,8 +15,7 @@ from gaigs.splatting.pooling import Pooling
 
 
 class ChannelPooling(Pooling):
-    """Base of poolings to channels; fits the level and the phase convention of the training
-    channels.
+    """Base of poolings to channels; fits strength and phase convention of the training channels.
 
     Args:
         scene: Scene with the task's subcarriers and the receivers' elements.
@@ -41,7 +40,7 @@ class ChannelPooling(Pooling):
 
     @property
     def frequencies(self) -> Float[Tensor, " s"]:
-        """The subcarriers [Hz]; ``Model.at_frequencies`` exchanges the scene."""
+        """The subcarriers of the present scene [Hz]; ``Model.at_frequencies`` replaces it."""
         return self.scene.task.frequencies
 
     def received(

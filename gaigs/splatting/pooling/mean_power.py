@@ -64,7 +64,7 @@ class MeanPower(Pooling):
 
 
 def noise_amplitude(floor_db: float) -> float:
-    """Amplitude of a receiver's noise, from its level [dB] after a check."""
+    """Amplitude of a receiver's noise from its level [dB]; a ``ValueError`` if out of range."""
     if not -300 <= floor_db <= 0:
         raise ValueError(f"pooling option floor_db must lie between -300 and 0 dB, got {floor_db}")
     return 10 ** (floor_db / 20)

@@ -16,7 +16,7 @@ from gaigs.splatting.pooling.paths import PathPooling, ReceivedPaths, element_fi
 
 @register("pooling", "path_csi")
 class PathCsi(ChannelPooling, PathPooling):
-    """h(e, f) = g lambda / (4 pi) y(e, f), with the gain g and the field y of the paths [1/m].
+    """Channels h(e, f) = g lambda / (4 pi) y(e, f), with a gain g and the paths' field y [1/m].
 
     Source: GAI-GS, eq. (2), for the sum; Friis for lambda / (4 pi); ``element_fields`` for y.
     """

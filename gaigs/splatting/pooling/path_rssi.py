@@ -13,7 +13,7 @@ from gaigs.splatting.pooling.paths import LagPooling
 
 @register("pooling", "path_rssi")
 class PathRssi(LagPooling):
-    """The mean power at the elements plus the receiver's noise, in dB relative to a path of 1 m.
+    """Mean power at the elements plus receiver noise, in dB relative to a direct path of 1 m.
 
     Args:
         scene: Scene whose receivers have planar arrays.

@@ -73,7 +73,7 @@ class PathPooling(Pooling):
 
 
 class LagPooling(PathPooling):
-    """Base of poolings that read covariances of the array's elements, where powers may add.
+    """Base of poolings that read covariances of the array's elements, by partly coherent paths.
 
     Args:
         scene: Scene whose receivers have planar arrays.
@@ -91,7 +91,7 @@ class LagPooling(PathPooling):
         self.take_receivers(scene)
 
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
-        """Takes a scene, possibly with other receivers."""
+        """Sets ``is_same_for_all`` for a scene's receivers, whose arrays must be planar."""
         self.is_same_for_all = all(receiver.array.is_point for receiver in scene.receivers)
         for receiver in scene.receivers:
             height = receiver.array.elements[:, 2].abs().max()
@@ -145,7 +145,7 @@ class LagPooling(PathPooling):
 
 
 class _Steering:
-    """Responses of an array to paths, at vectors D in the array's plane, from its middle.
+    """Responses of an array to n paths, at points D in its plane, relative to its middle.
 
     Args:
         paths: The paths.
@@ -237,7 +237,7 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
 
 
 class _PathDifferences(NamedTuple):
-    """Distances to the elements minus the distance to the middle of the array."""
+    """Distances from points to the elements, minus the distance to the array's middle."""
 
     differences: Float[Tensor, "b n e"]  # |p - x| - |p| [m]
     ratios: Float[Tensor, "b n e"]  # |p| / |p - x|, each at least ``NEAREST``
@@ -246,7 +246,7 @@ class _PathDifferences(NamedTuple):
 def _path_differences(
     points: Float[Tensor, "b n 3"], elements: Float[Tensor, "e 3"]
 ) -> _PathDifferences:
-    """Distances from points to elements minus those to the array's middle, without cancellation."""
+    """Distances from points to elements minus distances to the middle, without cancellation."""
     to_middle = points.norm(dim=-1, keepdim=True)  # |p|, (b, n, 1)
     # Plain differences: by the matrix product an element far from a near point would lose its
     # digits.
@@ -269,7 +269,7 @@ def _sum_by_series(
     reach: float,  # largest delay over the array [s]
     widest: float,  # largest phase of the band over the array [rad]
 ) -> Complex[Tensor, "b e s"]:
-    """Sum over the paths by one matrix product, without a wave for each path and frequency.
+    """Fields at elements and frequencies, summed over paths by matrix products of a series.
 
         exp(j rate (t + dt)) = exp(j rate t) sum_k (j rate dt)^k / k!
 

@@ -63,7 +63,7 @@ class Plane:
 
 
 class Projection(ABC):
-    """The contract of kind ``projection``.
+    """Base class of components of kind ``projection``.
 
     A projection is a smooth map ``coordinates`` from directions to the plane. The footprint of a
     Gaussian follows from the map linearised at its centre, ``jacobian`` (EWA splatting). The
@@ -71,7 +71,7 @@ class Projection(ABC):
     centres. docs/methods.md states the limits.
 
     Args:
-        pixel: Edge of that pixel, the pitch of the label's grid [rad].
+        pixel: Edge of the added pixel, the pitch of the label's grid [rad].
 
     Source: GAI-GS, "Projection and Render Module"; Zwicker et al., EWA Splatting, 2002.
     """
@@ -98,7 +98,7 @@ class Projection(ABC):
         """Period of u; None without one."""
 
     def check_sees(self, directions: Directions) -> None:
-        """Raises a ``ValueError`` for directions below the array's plane if they are folded up."""
+        """Raises a ``ValueError`` for directions that coincide with others in this projection."""
         if not self.sees_below and directions.elevations.min() < 0:
             raise ValueError(
                 f"the grid reaches below the array's plane, which {name_of(self)} folds up; "
@@ -150,7 +150,7 @@ def project(
     projection: str | Mapping | Projection = "mercator",
     pixel: float | None = None,
 ) -> tuple[Splats, Plane]:
-    """Gaussians as a receiver sees them, in 2-D. Quaternions are (w, x, y, z) of any length.
+    """Projects Gaussians to a receiver's 2-D plane. Quaternions are (w, x, y, z) of any length.
 
     Args:
         means: Centres, world frame (n, 3) [m].
@@ -218,7 +218,9 @@ def _pitch_of_row(grid: Grid) -> float:
 def factor(
     across: Float[Tensor, "*batch k"], along: Float[Tensor, "*batch k"], variance: float
 ) -> Float[Tensor, "*batch 3"]:
-    """p, q and r of the lower triangular factor of [across; along] [across; along]' + variance I.
+    """p, q and r of the factor [[p, 0], [q, r]] of the covariance M M' + variance I.
+
+    ``across`` and ``along`` are the two rows of M.
 
     With e = across / p: q = e . along and r² = variance + |e x along|² + variance |along|² / p².
     All roots are of sums of squares, so no difference cancels, even for a long, thin ellipse.

@@ -32,7 +32,7 @@ Without it float32 would overflow; at an attenuation of 0 the gradient is 0.
 
 @runtime_checkable
 class Rasterizer(Protocol):
-    """The contract of kind ``rasterizer``.
+    """Base class of components of kind ``rasterizer``.
 
     A rasterizer computes eq. (13) and (14) at each pixel,
 
@@ -175,7 +175,7 @@ def rasterize(
 
 
 def _rows(values: Tensor, row: slice) -> Tensor:
-    """Rows of some transmitters, or the single row shared by all."""
+    """The rows of a slice of transmitters, or the single row that all share."""
     return values[row] if values.ndim == 3 and len(values) > 1 else values
 
 

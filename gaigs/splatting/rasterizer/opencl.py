@@ -22,7 +22,7 @@ from gaigs.splatting.rasterizer.devices import cause_of, find_fault, is_forked, 
 
 @dataclass(frozen=True)
 class KernelLayout:
-    """Sizes that the kernels also have, and limits of a work-item."""
+    """Sizes of tiles and lists, equal to constants of the kernels, and limits of a work-item."""
 
     # Edges of a tile [pixels].
     rows: int = 16
@@ -89,7 +89,7 @@ class OpenCLRasterizer:
         attenuations: Tensor | None,
         plane: Plane,
     ) -> bool:
-        """True if dtypes, devices and counts match, and OpenCL works in this process."""
+        """True if the kernels can draw these tensors, and OpenCL works in this process."""
         floats = [splats.means2d, splats.factors, splats.depths, signal, opacities]
         floats += [plane.u, plane.v]
         if attenuations is not None:
@@ -171,7 +171,7 @@ class OpenCLRasterizer:
 
 @functools.cache
 def _pool(queue: cl.CommandQueue) -> cl.tools.MemoryPool:
-    """Buffers reused by all calls: fresh memory would cost a page fault every 4 KiB."""
+    """A pool of buffers that all calls reuse, since new memory costs a page fault every 4 KiB."""
     return cl.tools.MemoryPool(cl.tools.ImmediateAllocator(queue))
 
 
@@ -184,7 +184,7 @@ def _source() -> str:
 
 @functools.cache
 def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel]:
-    """The kernels of one shape family; PoCL caches the compiled program on disk."""
+    """The kernels compiled with these macros; PoCL caches the compiled program on disk."""
     # -w: no warning about a CPU without registers of the vectors' width.
     options = ["-w", *(f"-D{macro}={value}" for macro, value in macros.items())]
     try:
@@ -199,7 +199,7 @@ def _kernels(queue: cl.CommandQueue, **macros: str | int) -> dict[str, cl.Kernel
 
 
 class _CompositeByKernels(torch.autograd.Function):
-    """``_Render`` with its gradient.
+    """The autograd function of ``_Render``.
 
     Autograd needs the tensors of the splats as arguments of ``forward``, although ``_Render`` has
     them.
@@ -219,7 +219,7 @@ class _CompositeByKernels(torch.autograd.Function):
 
 
 class _Sizes(ctypes.Structure):
-    """The kernels' ``sizes_t``."""
+    """The fields of the kernels' struct ``sizes_t``."""
 
     _fields_ = [
         ("transmitters", ctypes.c_int32),
@@ -363,7 +363,7 @@ class _Render:
             self.kernels[kernel](self.queue, (items,), (1,), self.sizes, *buffers)
 
     def _share(self, values):
-        """The host's memory as a buffer of the device; the null pointer for no values."""
+        """A device buffer over the host's memory of ``values``; a null pointer without values."""
         if isinstance(values, Tensor):
             values = values.detach().numpy()
         if values is None or not values.size:
@@ -372,7 +372,7 @@ class _Render:
         return cl.Buffer(self.queue.context, flags, hostbuf=np.ascontiguousarray(values))
 
     def _empty(self, size):
-        """Four-byte values on the device; at least one, since OpenCL has no empty buffers."""
+        """A device buffer of ``size`` four-byte values, at least one, since none may be empty."""
         return _pool(self.queue).allocate(4 * max(1, int(size)))
 
     def _finish(self, *buffers):
@@ -384,7 +384,7 @@ class _Render:
 
 
 def _measure(splats: Splats, signal: Tensor, plane: Plane) -> _Sizes:
-    """Sizes of a call; the entries of its lists are counted later."""
+    """Sizes of a call, without the number of list entries, which is counted later."""
     b, n, _ = signal.shape
     height, width = plane.shape
     sets = len(splats.factors)
@@ -414,7 +414,7 @@ def _content(tensor: Tensor) -> tuple[bytes, tuple[int, ...]]:
 
 
 def _front_to_back(depths: Tensor) -> np.ndarray:
-    """Indices by depth, ties by index: sorted as integers whose low half is the index."""
+    """Indices sorted by depth, ties by index, through integers whose low half is the index."""
     bits = np.ascontiguousarray(depths.detach().numpy()).view(np.int32)
     # Integers in the order of the floats, negative ones too.
     bits = bits ^ (bits >> 31 & 0x7FFFFFFF)
@@ -431,7 +431,7 @@ def _tiling(
     v_content: tuple[bytes, tuple],
     period: float | None,
 ) -> list[cl.Buffer | None]:
-    """A plane in whole tiles, in the form that the kernels read.
+    """The pixels of a plane in whole tiles, as buffers for the kernels.
 
     Args:
         queue: Command queue of the device.

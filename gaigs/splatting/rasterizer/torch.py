@@ -57,24 +57,26 @@ class TorchRasterizer:
 
 
 class _Period(NamedTuple):
-    """A period as the sum of two numbers."""
+    """A period as the sum of two floats, for exact subtraction."""
 
     rounded: float  # the nearest number of the tensors' dtype
     rest: float  # what the rounding leaves
 
 
 class _Tiles:
-    """Lists of the splats that reach each tile, in chunks of tiles with lists of similar lengths.
+    """Tiles of a plane, with the list of the splats that reach each tile.
+
+    Tiles with lists of similar lengths are in one chunk.
 
     Args:
         plane: The pixels.
         means, factors, opacities: Splats front to back.
-        triples: (transmitter, splat, pixel) triples of a chunk.
+        triples: Number of (transmitter, splat, pixel) triples of a chunk.
 
     Attributes:
         edge: Edge of a tile [pixels].
         u, v: Coordinates of the tiles' pixels (t, y or 1, x or 1).
-        chunks: Tiles (t,), and the splats of each tile (t, k), filled up with the number n.
+        chunks: Numbers of tiles (t,), and of their splats (t, k), padded with n, a null splat.
     """
 
     edge = 16
@@ -121,7 +123,7 @@ class _Tiles:
     def _cut(self, coordinate: Tensor) -> Tensor:
         """Cuts a plane coordinate (rows or 1, columns or 1) into tiles (t, y or 1, x or 1).
 
-        Repetition fills the last tiles.
+        Tiles beyond the plane's edge are padded with its last row or column.
         """
         for axis, tiles in enumerate((self.down, self.across)):
             size = self.shape[axis]
@@ -213,7 +215,7 @@ class _SplatParts(NamedTuple):
 
 
 class _Weights(NamedTuple):
-    """One composited chunk, for b transmitters, t tiles, k splats a tile, y x pixels a tile."""
+    """Weights of splats in a chunk: b transmitters, t tiles, k splats and y x pixels a tile."""
 
     # (du, dv) of the pixels, in units of the splat's factor (1 or b, t, k, y or 1, x or 1).
     s: Tensor

@@ -1,4 +1,4 @@
-"""Fourier features of positions: metric structure, no scene token."""
+"""A tokenizer of Fourier features of positions, without a scene token."""
 
 import math
 from collections.abc import Sequence
@@ -35,7 +35,7 @@ class EuclideanTokenizer(nn.Module):
             and of the transmitters' box.
         gaussian_octaves: Lowest and highest octave k of the Gaussians' features, 2^k cycles a
             metre.
-        transmitter_octaves: The same for the transmitter; None: ``learnable_octaves``.
+        transmitter_octaves: Octaves of the transmitter's features; None: ``learnable_octaves``.
         hidden: Width of the transmitter network's hidden layer.
         width: Width of E(P_TX). If ``hidden`` and ``width`` are None, there is no network, and
             E(P_TX) are the features themselves.
@@ -107,8 +107,8 @@ def learnable_octaves(scene: Scene) -> tuple[int, int]:
 
     Periods range from twice the box's longest edge to 16 distances between neighbouring
     transmitters. The output of the network has multiples of its input frequencies, so input
-    frequencies must be well below the sampling limit. Periods for noisy labels are at least 16 m:
-    neighbouring RSSI labels differ by decibels, and longer periods still allow a sharp shadow.
+    frequencies must be well below the sampling limit. Periods for noisy labels are at least 16 m,
+    since shorter ones would fit noise; the network's multiples can still form a sharp shadow.
     """
     neighbours = 16  # chosen on validation parts of rfid-s23-200 and the built-in room
     highest = min(round(-math.log2(neighbours * scene.spacing)), MAX_OCTAVE)

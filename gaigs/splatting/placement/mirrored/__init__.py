@@ -1,1 +1,1 @@
-"""Mirrored Gaussians: each is at an image of the transmitter in the learnt walls."""
+"""Mirrored Gaussians: each is at the transmitter's mirror image in learnt walls."""

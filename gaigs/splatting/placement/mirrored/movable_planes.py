@@ -1,4 +1,4 @@
-"""Planes that a placement learns: their start, their moves, and their paths."""
+"""Planes whose positions a placement learns, and the sequences of planes of its paths."""
 
 import logging
 from pathlib import Path
@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 
 
 class MovablePlanes(Placement):
-    """Planes about the middle of the room, and the sequences in which paths meet them.
+    """Trainable planes of a room, and the sequences in which paths meet them.
 
     Offsets of planes are measured from the middle of the room. Rounding and rotations of a plane
     therefore do not depend on the world's origin.
@@ -34,9 +34,9 @@ class MovablePlanes(Placement):
         origin: Normals and offsets (w, 4) to which ``shifts`` are added: the first planes, or the
             planes at the last change of ``step``. Offsets are from ``middle`` [m].
         first: ``origin`` before any training; ``fit`` compares it to find new planes.
-        shifts: Learnt changes of normals and offsets (w, 4), in units of ``step`` for normals, and
-            of ``step`` times ``unit`` diagonals for offsets.
-        step: Size of a unit of ``shifts``; it follows the wavelength once phases count.
+        shifts: Learnt changes of normals and offsets (w, 4). The unit is ``step`` for normals, and
+            ``step`` times ``unit`` diagonals for offsets.
+        step: Size of a unit of ``shifts``; proportional to the wavelength once paths interfere.
         sequences: Planes of each path, -1 for no plane (n, order).
         kept: True for paths in use (n,); pruning drops paths.
         most: Number of paths in use at the start.
@@ -133,7 +133,7 @@ class MovablePlanes(Placement):
         return is_face & ~torch.isin(self.sequences, blind).any(1)
 
     def fit(self, links: Links) -> None:
-        """Starts from the user's walls, or rotates the box's faces to the axes of the places."""
+        """Sets the first planes: the user's walls, or the box's faces turned to the places."""
         if self.walls is not None:
             self._place_walls(Path(self.walls))
             return
@@ -148,7 +148,7 @@ class MovablePlanes(Placement):
             self.origin[: self.faces, 3] = farthest + self.margin * self.diagonal
 
     def _place_walls(self, file: Path) -> None:
-        """Starts from the largest planes of a file, with paths at only these planes."""
+        """Sets the first planes to the largest of a file; only paths at these are in use."""
         planes = read_planes(file, *self.box).to(self.origin)
         most = len(self.origin)
         if len(planes) > most:
@@ -181,12 +181,12 @@ class MovablePlanes(Placement):
 
     @property
     def used(self) -> Int[Tensor, " k"]:
-        """Numbers of the planes that kept paths meet, ascending."""
+        """Numbers of the planes of all kept paths, ascending."""
         numbers = self.sequences[self.kept].unique()
         return numbers[numbers >= 0]
 
     def sequences_of(self, planes: Int[Tensor, " k"]) -> Bool[Tensor, " n"]:
-        """True for each sequence of only these planes, including the direct path."""
+        """True for sequences without other planes than these; also for the direct path."""
         planes = torch.cat((planes, planes.new_tensor([-1]))).to(self.sequences.device)
         return torch.isin(self.sequences, planes).all(1)
 
@@ -208,7 +208,7 @@ class MovablePlanes(Placement):
 
     @torch.no_grad()
     def move_by_wavelengths(self, wavelength: float) -> None:
-        """Lets planes move in fractions of the wavelength [m]."""
+        """Sets ``step`` to a fraction of the wavelength [m]; moves so far go into ``origin``."""
         self.origin.copy_(torch.cat((self.normals, self.offsets[:, None]), 1))
         self.shifts.zero_()
         # 2.2 wavelengths: a usual step of 0.01 then turns a phase by a tenth of a radian.
@@ -218,14 +218,14 @@ class MovablePlanes(Placement):
 def upright_turn(
     places: Float[Tensor, "n 3"], smaller: float = 0.85, width: float = 0.25, enough: int = 40
 ) -> Float[Tensor, "3 3"]:
-    """Rotation about z to the axes of the upright box of least area around all places.
+    """Rotation about z from the world's axes to those of the smallest upright box of the places.
 
     Args:
         places: Transmitters [m].
         smaller: Largest ratio of the box's area to the area of the box along the world's axes. With
             a larger ratio there is no rotation.
-        width: Smallest ratio of the box's width to its length: places along a line do not show the
-            orientation of walls.
+        width: Smallest ratio of the box's width to its length, since places along a line do not
+            show the orientation of walls.
         enough: Smallest number of places for a rotation. In a room along the world's axes, a false
             rotation is very rare with 40 places, and occurs in a quarter of cases with 10.
     """

@@ -1,4 +1,4 @@
-"""Obstacles: Gaussians of matter in the room that attenuate paths."""
+"""Obstacles that attenuate paths: Gaussians of matter, and boxes."""
 
 import math
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 
 class Obstacles(nn.Module):
-    """Gaussians of matter: along a segment the field is multiplied by exp(-depth).
+    """Obstacles as Gaussians of matter: along a segment they multiply the field by exp(-depth).
 
     depth = sum_i rho_i integral exp(-|S_i^-1 (x - c_i)|² / 2) dx along the segment, with S_i =
     diag(widths). For a segment from a to b, in units of the widths, let ray = b - a, offset = a -
@@ -70,7 +70,7 @@ class Obstacles(nn.Module):
     def place_boxes(
         self, axes: Float[Tensor, "3 3"], boxes: Float[Tensor, "k 2 3"], depths: Float[Tensor, " k"]
     ) -> None:
-        """Sets boxes with their depths [Np], and resets Gaussians to their faint start."""
+        """Sets boxes with their depths [Np], and resets Gaussians to their faint initial values."""
         self.box_axes.copy_(axes)
         self.boxes.zero_()
         self.boxes[: len(boxes)] = boxes
@@ -97,7 +97,7 @@ class Obstacles(nn.Module):
 
     @property
     def used(self) -> Bool[Tensor, " k"]:
-        """True for used boxes, found by a search."""
+        """True for each of the k boxes that ``place_boxes`` has set."""
         return self.boxes[:, 1, 0] > self.boxes[:, 0, 0]
 
     @property
@@ -115,7 +115,7 @@ class Obstacles(nn.Module):
     ) -> Inexact[Tensor, "*batch"]:
         """Optical depth along segments [Np]; with phases the imaginary part is the phase lag [rad].
 
-        Used boxes count where ``counts`` is true; None: everywhere.
+        A used box attenuates only segments for which ``counts`` is True; None: all segments.
         """
         starts = start.reshape(-1, 3)
         ends = end.reshape(-1, 3)
@@ -139,7 +139,7 @@ class Obstacles(nn.Module):
     def are_outside(self, sites: Float[Tensor, "b e 3"]) -> Bool[Tensor, "b k"]:
         """True for links (b) and used boxes (k) if no end of the link is inside the box.
 
-        Transmitters and receivers are in the open, so a box around one of them is wrong there.
+        Transmitters and receivers are in the open, so a box that holds one is wrong for its links.
         """
         along = (sites @ self.box_axes)[:, :, None]  # (b, e, 1, 3)
         low, high = self.boxes[self.used].unbind(1)
@@ -166,7 +166,7 @@ class Obstacles(nn.Module):
 def passes_box(
     start: Float[Tensor, "s 3"], end: Float[Tensor, "s 3"], corners: Float[Tensor, "2 3"]
 ) -> Bool[Tensor, " s"]:
-    """True for segments through a box along the axes: the last entry is before the first exit."""
+    """True for segments through a box with edges along the axes, by the slab method."""
     ray = end - start
     inverse = 1 / torch.where(ray.abs() < 1e-9, 1e-9, ray)
     first = (corners[0] - start) * inverse  # (s, 3)
@@ -180,7 +180,7 @@ _FAINTEST = -80.0
 
 
 class _Depth(torch.autograd.Function):
-    """Optical depth (segments, columns of densities), and its gradient in half of autograd's time.
+    """Optical depth (segments, columns of densities), with a hand-written, faster gradient.
 
     With A, B, C and rho of ``Obstacles``, l the length of a segment, and
 
@@ -246,7 +246,7 @@ class _Depth(torch.autograd.Function):
 
 
 class _Legs(NamedTuple):
-    """Symbols of ``_Depth`` for each segment and obstacle (s, k), and lengths of segments (s,) [m].
+    """Terms of ``_Depth`` for each segment and obstacle (s, k), and lengths of segments (s,) [m].
 
     ``near`` is g, the value of an obstacle where the line is closest to it. ``inside`` is E, the
     part of the line's integral between the ends of the segment.
@@ -261,7 +261,7 @@ class _Legs(NamedTuple):
 
 
 def _measure_legs(start: Tensor, end: Tensor, centres: Tensor, log_widths: Tensor) -> _Legs:
-    """The symbols of segments (s, 3) and obstacles (k, 3)."""
+    """The terms of ``_Depth`` for segments (s, 3) and obstacles (k, 3)."""
     ray = end - start
     # Contiguous columns: an outer product of others takes a CPU four times as long.
     inverse = (-log_widths).exp().T.contiguous()

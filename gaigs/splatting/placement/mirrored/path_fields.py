@@ -20,7 +20,7 @@ from gaigs.splatting.placement.mirrored.reflections import Folded, fold, images,
 
 
 class FoldedLinks(NamedTuple):
-    """Links with their paths through a room; positions are from its middle [m]."""
+    """Links with their paths in a room; positions are relative to the room's middle [m]."""
 
     seen: list[Float[Tensor, "b n 3"]]  # images of the transmitters, see ``reflections.images``
     receivers: Float[Tensor, "b 3"]  # position of each link's receiver
@@ -33,7 +33,7 @@ class FoldedLinks(NamedTuple):
 
 
 class PathFields(MovablePlanes):
-    """Strengths of paths by sequences of planes, with learnt parameters.
+    """Fields of paths with learnt materials, gains and obstacles.
 
     The field of path k of length L is
 
@@ -44,9 +44,9 @@ class PathFields(MovablePlanes):
 
     * F: the element's pattern towards the image, times a learnt power of the cosine;
     * g_k, phi_k: gain and phase of a path, in each band of the receivers; phi_k is 0 for channels
-      of many numbers;
+      with many values;
     * g_r, phi_r: gain and phase of a receiver; phi_r is 0 unless labels are channels;
-    * g_w: the gain of a plane, which falls off as a Gaussian about the plane's middle;
+    * g_w: the gain of a plane, which falls with the distance from its middle as a Gaussian;
     * Gamma_w: Fresnel's reflection with a learnt permittivity; for channels that of a slab with a
       learnt thickness. Polarisation is vertical: TE at upright planes, TM at level ones, weighted
       by n_z² between;
@@ -59,13 +59,13 @@ class PathFields(MovablePlanes):
         bands: Different bands of the receivers [Hz].
         is_bare: True while channels have only the direct path, without obstacles.
         is_heard: True for receivers with training links (r,); others have ``_common_gain``.
-        known_blur: Logarithm of the standard deviation [rad] of a path's phase at the start, for a
-            path that interferes.
+        known_blur: Logarithm of the initial standard deviation [rad] of the phase of a path that
+            interferes.
         unknown_blur: The same logarithm for a path that adds as power, whose coherence is 0.
-        faint: Share of a link's power, without obstacles, up to which a path's obstacles are not
-            computed. That saves two of three paths.
-        fewest_numbers: Elements times subcarriers of a channel below which few paths explain any
-            channel, so that only all places together locate planes.
+        faint: Largest share of a link's power, without obstacles, for which the obstacles of a path
+            are not computed. That saves two of three paths.
+        fewest_numbers: Number of channel values (elements times subcarriers) below which a few
+            paths explain any channel, so that only all places together locate planes.
     """
 
     known_blur = math.log(0.3)
@@ -138,7 +138,7 @@ class PathFields(MovablePlanes):
         self.boresights = self._boresights()
 
     def _boresights(self) -> list[Tensor]:
-        """``boresight`` of each receiver; of powers and spectra the z axis."""
+        """``boresight`` of each receiver for channels; the z axis for powers and spectra."""
         receivers = self.scene.receivers
         if not self.is_complex:
             return [torch.tensor([0.0, 0.0, 1.0])] * len(receivers)
@@ -147,7 +147,7 @@ class PathFields(MovablePlanes):
     def _load_from_state_dict(self, state_dict, prefix, *args):
         # Receivers without training links had gains of their own before.
         state_dict.setdefault(prefix + "is_heard", torch.ones_like(self.is_heard))
-        if self.path_phases is not None:  # channels of few numbers had none before
+        if self.path_phases is not None:  # channels with few values had none before
             state_dict.setdefault(prefix + "path_phases", torch.zeros_like(self.path_phases))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
@@ -155,9 +155,9 @@ class PathFields(MovablePlanes):
     def place(
         self, number: int, plane: Float[Tensor, "4"], material: Float[Tensor, "3"] | None = None
     ) -> None:
-        """Replaces plane ``number`` by one in the world's frame, with a slab's material if given.
+        """Replaces plane ``number`` by ``plane`` in the world's frame, and its slab if given.
 
-        A material has logarithms: of the permittivity's real part over 1, of its imaginary part,
+        ``material`` has logarithms of the permittivity's real part minus 1, of its imaginary part,
         and of the thickness [m].
         """
         super().place(number, plane)
@@ -179,7 +179,7 @@ class PathFields(MovablePlanes):
     def strengths(
         self, query: Query, folded: Folded, blocked: bool = True
     ) -> Complex[Tensor, "b n"]:
-        """Field of each kept path over free space, after reflections and obstacles.
+        """Field of each kept path, relative to free space over the same length.
 
         It is 0 for a path that does not exist. With ``blocked`` False obstacles are left out.
         """
@@ -236,9 +236,10 @@ class PathFields(MovablePlanes):
         return depths.flatten().index_add(0, paths, blocked).view(count, n)
 
     def passing(self, query: Query) -> Float[Tensor, "b v"]:
-        """Fields over free space of the direct path, then of the single reflection at each plane.
+        """Fields of the direct path and of the single reflection at each plane, in this order.
 
-        They contain obstacles but no receiver gains, and are 0 where a path does not exist.
+        They are relative to free space, with obstacles and without receiver gains. The field of a
+        path that does not exist is 0.
         """
         sequences = self.sequences[self.kept]
         strengths = self.strengths(query, self.folded(query).paths).abs()
@@ -249,10 +250,10 @@ class PathFields(MovablePlanes):
         return fields / self.gains_at(query.receivers).real[:, None].exp()
 
     def margins(self, query: Query) -> Complex[Tensor, "b n"]:
-        """Field by which each of n kept paths may deviate, one standard deviation, over free space.
+        """Prior standard deviation of the field of each of n kept paths, relative to free space.
 
-        The deviation before any residual is known is the path's field times the share that
-        obstacles block, plus a tenth of the field without obstacles. Its phase is the field's.
+        It is the path's field times the share that obstacles block, plus a tenth of the field
+        without obstacles. Its phase is the phase of the path's field.
         """
         links = self.folded(query)
         field = self.strengths(query, links.paths)
@@ -263,7 +264,7 @@ class PathFields(MovablePlanes):
     # --- bands ---
 
     def _number_bands(self) -> None:
-        """Numbers the band of each receiver; a new receiver must have one of the known bands."""
+        """Sets the number of each receiver's band; new receivers must have one of the bands."""
         for receiver in self.scene.receivers:
             if receiver.band not in self.bands:
                 raise ValueError(
@@ -274,7 +275,7 @@ class PathFields(MovablePlanes):
         self.register_buffer("band_numbers", torch.tensor(numbers), persistent=False)
 
     def of_bands(self, strengths: Float[Tensor, "*bands n"], query: Query) -> Float[Tensor, "c n"]:
-        """Gains or phases of all paths in the band of each link's receiver, c = 1 or b."""
+        """Gains or phases of paths in the band of each link's receiver; c is 1 with one band."""
         if len(self.bands) == 1:
             return strengths[None]
         return strengths[self.band_numbers[query.receivers]]
@@ -288,7 +289,7 @@ class PathFields(MovablePlanes):
         self.is_heard.fill_(False)[heard] = True
 
     def gains_at(self, receivers: Int[Tensor, " b"]) -> Complex[Tensor, " b"]:
-        """Logarithms of the receivers' complex gains; the phases are 0 unless labels have some."""
+        """Logarithms of the receivers' complex gains; phases are 0 unless labels are channels."""
         gains = self._receiver_gains
         if not self.is_heard.all():
             gains = torch.where(self.is_heard, gains, self._common_gain(self.is_heard))
@@ -301,13 +302,13 @@ class PathFields(MovablePlanes):
         return torch.complex(gains, torch.zeros_like(gains) if phases is None else phases)
 
     def _common_gain(self, known: Tensor) -> Complex[Tensor, ""]:
-        """Logarithm of the gain of an unknown receiver: mean decibels, or mean channel gain."""
+        """Logarithm of the gain for an unknown receiver: the mean in dB, or of complex gains."""
         gains = self._receiver_gains[known]
         return gains.exp().mean().log() if self.is_complex else gains.mean()
 
     @torch.no_grad()
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
-        """Takes a scene with other receivers, whose gains are the mean of the ``known`` ones."""
+        """Replaces the scene; new receivers get the mean gain of the ``known`` receivers."""
         is_known = self.is_heard if known is None or scene.one_radio else known
         gains = self._common_gain(is_known)
         gains = gains.repeat(scene.radios)
@@ -319,7 +320,7 @@ class PathFields(MovablePlanes):
         self._number_bands()
 
     def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Field gain of a receiver's elements in its frame; of arrays times the learnt cos^q."""
+        """Field gain of a receiver's elements in its frame, for arrays times the learnt cos^q."""
         array = self.scene.receivers[receiver].array
         gain = array.gain(directions)
         normal = self.boresights[receiver]

@@ -32,10 +32,10 @@ class Mirrored(PathFields):
     Attributes:
         coherent: True once paths interfere.
         is_bare: True while channels have only the direct path.
-        planned: True for paths in use after ``is_bare`` ends (n,).
+        planned: True for paths that will be in use after ``enable_reflections`` (n,).
         found: True once a search has found the planes.
-        held: Strengths of the first query within ``holding``.
-        tried: Offsets that replace the planes' offsets within ``holding``.
+        held: Path strengths of the first query, reused within ``holding``.
+        tried: Trial offsets, which replace the planes' offsets within ``holding``.
 
     Args:
         scene: Its box and receivers give the first planes.
@@ -92,7 +92,7 @@ class Mirrored(PathFields):
 
     @torch.no_grad()
     def enable_phases(self, wavelength: float) -> None:
-        """Lets paths interfere, and planes move in fractions of the wavelength [m]."""
+        """Makes paths interfere, and planes move in fractions of the wavelength [m]."""
         self.move_by_wavelengths(wavelength)
         self.coherent.fill_(True)
 
@@ -110,7 +110,7 @@ class Mirrored(PathFields):
 
     @torch.no_grad()
     def locate(self, *planes: int) -> None:
-        """Lets paths interfere if all their planes are in ``planes`` or located before.
+        """Marks ``planes`` as located, so that paths at located planes only interfere.
 
         Powers of all other paths add. Without an argument no plane is located any longer, and only
         the direct path has a phase.
@@ -163,16 +163,16 @@ class Mirrored(PathFields):
 
     @torch.no_grad()
     def enable_reflections(self) -> None:
-        """Ends ``start_from_free_space``."""
+        """Restores the paths that ``start_from_free_space`` removed."""
         self.kept.copy_(self.planned)
         self.is_bare.fill_(False)
 
     @contextmanager
     def holding(self) -> Iterator[None]:
-        """Keeps the first query's strengths within the context, while images follow the planes.
+        """A context in which path strengths stay constant while planes are moved.
 
-        The strengths are in ``held``. ``tried`` may hold offsets of the planes for each transmitter
-        (b, w) [m].
+        ``held`` has the strengths of the first query. ``tried`` may have offsets of the planes for
+        each transmitter (b, w) [m].
         """
         self.holds = True
         try:
@@ -185,7 +185,7 @@ class Mirrored(PathFields):
     # --- paths ---
 
     def forward(self, gaussians: Gaussians | None, query: Query) -> Placed:
-        """Gaussians at the images of each transmitter, followed by the free ones."""
+        """Gaussians at the images of each transmitter, followed by the trainable ``gaussians``."""
         sequences = self.sequences[self.kept]
         normals = self.normals
         offsets = self.offsets if self.tried is None else self.tried
@@ -249,7 +249,7 @@ class Mirrored(PathFields):
     # --- training ---
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Positions of planes; other parameters of planes, paths and receivers; obstacles."""
+        """Groups: positions of planes, parameters of planes, paths and receivers, and obstacles."""
         obstacles = [] if self.obstacles is None else [*self.obstacles.parameters()]
         others = {id(parameter) for parameter in (self.shifts, *obstacles)}
         groups = {} if self.fixed else {"planes": [self.shifts]}
@@ -261,14 +261,14 @@ class Mirrored(PathFields):
         return groups
 
     def penalties(self) -> dict[str, Float[Tensor, ""]]:
-        """The obstacles' mean density over a diagonal of the room [Np]."""
+        """The obstacles' mean density times the diagonal of the room [Np]."""
         if self.obstacles is None:
             return {}
         return {"obstacles": self.obstacles.densities.mean() * self.diagonal}
 
 
 def _beside(placed: Placed, gaussians: Gaussians) -> Placed:
-    """Mirrored Gaussians followed by free ones, whose path lengths and phases are unknown."""
+    """Mirrored Gaussians followed by trainable ones, of unknown path lengths and phases."""
     b, free = len(placed.lengths), len(gaussians)
     ones = placed.lengths.new_ones(b, free)
     return Placed(

@@ -1,4 +1,4 @@
-"""Reflection paths: sequences of planes, images, and legs of each path."""
+"""Reflection paths: sequences of planes, images, and the straight legs of each path."""
 
 import itertools
 from collections.abc import Iterator
@@ -46,24 +46,23 @@ class Folded(NamedTuple):
     def parts(
         self, values: Inexact[Tensor, "b w *s"]
     ) -> Iterator[tuple[int, Inexact[Tensor, "b k *s"]]]:
-        """Splits values of bounces into parts: the last bounce of every path, then the last but
-        one, ....
+        """Yields the values at the last bounce of every path, then at the last but one, and so on.
 
-        Each part comes with the number of its first sequence; it covers this and all later
-        sequences.
+        Each part comes with the number of the first path that has such a bounce. All later paths
+        have it, too.
         """
         counts = [self.exists.shape[1] - first for first in self.firsts]
         return zip(self.firsts, values.split(counts, 1), strict=True)
 
 
 def seen_from(planes: Float[Tensor, "*w 4"], origin: Float[Tensor, "3"]) -> Float[Tensor, "*w 4"]:
-    """Planes (normal, offset along it [m]) in a frame with another origin [m]."""
+    """Planes (normal, offset along it [m]), with offsets from another ``origin`` [m]."""
     normals, offsets = planes[..., :3], planes[..., 3:]
     return torch.cat((normals, offsets - normals @ origin.to(normals)[:, None]), -1)
 
 
 def largest_order(planes: int, most: int) -> int:
-    """Largest order at which ``planes`` (two or more) have at most ``most`` sequences."""
+    """Largest order with at most ``most`` sequences of ``planes``, a number of two or more."""
     order = 0
     count = 1
     longest = planes  # sequences of the next order
@@ -75,9 +74,9 @@ def largest_order(planes: int, most: int) -> int:
 
 
 def all_sequences(planes: int, order: int) -> Int[Tensor, "n order"]:
-    """All sequences of at most ``order`` planes in the order in which a wave meets them.
+    """All sequences of at most ``order`` planes, each in the order in which a wave meets them.
 
-    No plane is repeated directly. Shorter sequences come first, and start with -1.
+    No plane follows itself. Shorter sequences come first, and are padded with -1 at their start.
     """
     sequences = []
     for length in range(order + 1):
@@ -118,7 +117,7 @@ def images(
 
 
 def _firsts(sequences: Int[Tensor, "n order"]) -> list[int]:
-    """Number of the first sequence with a plane (not -1), for each column."""
+    """For each column, number of the first sequence whose entry is a plane (not -1)."""
     return (sequences < 0).sum(0).tolist()
 
 
@@ -131,9 +130,9 @@ def fold(
 ) -> Folded:
     """Folds straight lines from the receivers to the last images back into the room.
 
-    A path does not exist if its line does not cross its plane; its line is then bent at the end
-    nearer to the plane. A path with an end on the plane does not exist either, so no path meets two
-    coincident planes in succession.
+    A path does not exist if its line does not cross one of its planes. Its bounce is then set to
+    the end nearer to the plane. A path with an end on the plane does not exist either, so no path
+    meets two coincident planes in succession.
     """
     # Where each path has arrived on its way back from the receiver (b, n, 3).
     here = receivers[:, None].expand(-1, len(sequences), -1)
@@ -187,7 +186,7 @@ def fold(
 
 
 def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, "3"]]:
-    """Normals without repetition; normals with a cosine within ``least`` of 1 are parallel."""
+    """Normals without repetition; two count as parallel if |cosine| is within ``least`` of 1."""
     apart: list[Tensor] = []
     for normal in normals:
         if all((normal @ other).abs() < 1 - least for other in apart):
@@ -198,8 +197,8 @@ def distinct(normals: Float[Tensor, "k 3"], least: float) -> list[Float[Tensor, 
 def square_normals(normals: Float[Tensor, "w 3"], plane: int) -> list[Float[Tensor, "3"]]:
     """The normal of a plane, and normals within 18 degrees of it that would make the room square.
 
-    Such normals are horizontal, vertical, or perpendicular to another plane. Reason: a fit of
-    powers leaves tilt errors of some degrees, and with a wrong tilt phases fit at few places only.
+    Such normals are horizontal, vertical, or perpendicular to another plane's. They are worth a
+    trial, since a fit of powers leaves tilt errors of some degrees, and phases need exact tilts.
     """
     up = normals.new_tensor([0.0, 0.0, 1.0])
     normal = normals[plane]

@@ -25,7 +25,7 @@ def read_planes(
     upper: Float[Tensor, "3"],
     shortest: float = 1e-3,
 ) -> Float[Tensor, "k 4"]:
-    """Planes of a room as rows (normal, offset [m]), the largest area first.
+    """Planes of a file as rows (normal, offset [m]), the largest area first.
 
     Args:
         file: ``.csv`` with consecutive vertices x,y of a floor plan [m], whose walls are upright,
