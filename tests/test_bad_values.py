@@ -33,6 +33,12 @@ ROOT = Path(__file__).parents[1]
 DATA = {"spectrum": "synthetic", "rssi": "synthetic_rssi", "csi": "synthetic_csi"}
 PLAIN = ("rasterizer=torch", "gaussians.count=8")
 MIRRORED = ("model=mirrored", "placement.planes=6", "placement.order=1", "placement.obstacles=2")
+SMALL = {
+    "nerf_apt": ("model.samples=4", "model.rays=[3,8]", "model.widths=[2,3,4]"),
+    "newrf": ("model.arrivals=2", "model.samples=4"),
+}
+"""Options of models that are slow in their own size."""
+
 GIVEN = {"adversarial": ["model=dcgan"], "adaptive": ["model=gaigs"]}
 """Options that a configuration file leaves open."""
 
@@ -119,7 +125,7 @@ def compositions(kind, name):
         for more in {"data": [()], "model": [PLAIN, ()]}.get(
             kind, [PLAIN, MIRRORED] if kind in PARTS else [PLAIN]
         ):
-            config = copy.deepcopy(composed(*chosen, *more))
+            config = copy.deepcopy(composed(*chosen, *more, *SMALL.get(name, ())))
             if config is None:
                 continue
             if is_part:

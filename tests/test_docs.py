@@ -522,6 +522,7 @@ from gaigs.__main__ import main
 from gaigs.report import run_figures
 from gaigs.runs import evaluation
 evaluation.paired = functools.partial(evaluation.paired, resamples=20)
+evaluation.median_ms = lambda work: (work(), 1.0)[1]
 draw, runs = run_figures.write_figures, json.loads(sys.argv[1])
 for number, words in enumerate(runs):
     sys.argv = ["gaigs", *words]

@@ -1,5 +1,6 @@
 """Extensions of Hydra: its search path, the options of constructors, and resolvers."""
 
+import functools
 import hashlib
 import logging
 from collections.abc import Mapping
@@ -45,6 +46,9 @@ class Constructors(ConfigSource):
         for kind in CONSTRUCTED:
             for name in registry(kind).names():
                 self.components[f"{kind}/{name}"] = (kind, name)
+        # A run composes twice, and each search for a component's file lists all plug-ins.
+        self.options = functools.cache(lambda kind, name: registry(kind).options(name))
+        self.choices = functools.cache(lambda kind, name: registry(kind).choices(name))
 
     def __deepcopy__(self, memo: dict) -> "Constructors":
         return self  # Hydra copies its sources for each group that it lists
@@ -55,7 +59,7 @@ class Constructors(ConfigSource):
 
     def load_config(self, config_path: str) -> ConfigResult:
         kind, name = self.components[self._component_path(config_path)]
-        choices = registry(kind).choices(name)
+        choices = self.choices(kind, name)
         package = None
         if choices and not config_path.startswith("constructors/"):
             # As a file of conf that begins with # @package _global_.
@@ -64,7 +68,7 @@ class Constructors(ConfigSource):
             overrides = [{f"override /{group}": choice} for group, choice in choices.items()]
             node = OmegaConf.create({"defaults": [options, *overrides]})
         else:
-            node = OmegaConf.create({**registry(kind).options(name), "name": name})
+            node = OmegaConf.create({**self.options(kind, name), "name": name})
         return ConfigResult(self.provider, f"{self.scheme()}://", node, {"package": package})
 
     def available(self) -> bool:
@@ -139,6 +143,8 @@ def install() -> None:
     # Hydra refuses a new key on the command line, except in a mapping that is open.
     node = OmegaConf.create({}, flags={"struct": False})
     ConfigStore.instance().store(name="open", node=node)
+    # Hydra copies the store, with all that it holds, for each of 210 groups that --help lists.
+    ConfigStore.__deepcopy__ = lambda store, _: store  # type: ignore[attr-defined]
     if PluginConfigurations not in Plugins.instance().discover(SearchPathPlugin):
         Plugins.instance().register(Constructors)
         Plugins.instance().register(PluginConfigurations)

@@ -166,16 +166,18 @@ def _installed_holders(kind: str) -> list[Holder]:
         if os.path.isdir(folder or ".")
     )
     holders = []
-    for point in _entry_points(path).select(group=f"gaigs.{kind}"):
+    for point in _entry_points(path).get(f"gaigs.{kind}", ()):
         where = f"distribution {point.dist.name} {point.dist.version}"
         holders.append(Holder(kind, point.name, where, point.value))
     return holders
 
 
 @functools.lru_cache
-def _entry_points(_: tuple) -> Any:
-    """All entry points, from a file of each package on ``sys.path``: reading is slow."""
-    return metadata.entry_points()
+def _entry_points(_: tuple) -> dict[str, metadata.EntryPoints]:
+    """Entry points of gaigs by group, from the packages on ``sys.path``: to read them is slow."""
+    points = metadata.entry_points()
+    groups = [group for group in points.groups if group.startswith("gaigs.")]
+    return {group: points.select(group=group) for group in groups}
 
 
 def _dropped_holders(kind: str | None = None) -> tuple[list[Holder], list[str]]:
@@ -237,6 +239,7 @@ def _with_imports(place: Path) -> set[Path]:
     """The source files of a module or package, and of those in ./plugins that they import."""
     plugins = Path.cwd() / "plugins"
     roots = [plugins, *sources(plugins)]
+    entries = [path for root in roots if root.is_dir() for path in root.iterdir()]
     known: set[Path] = set()
     places = [place]
     while places:
@@ -248,8 +251,6 @@ def _with_imports(place: Path) -> set[Path]:
             words: set[str] = set()
             for line in re.findall(r"^\s*(?:from|import)\s(.*)", text, re.M):
                 words |= {*re.findall(r"(?:plugins\.)?(\w+)", line)}
-            for root in roots:
-                names = [*words, *(f"{word}.py" for word in words)]
-                places += [root / name for name in names if (root / name).exists()]
+            places += [path for path in entries if path.name.removesuffix(".py") in words]
         known |= files
     return known
