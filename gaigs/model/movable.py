@@ -135,7 +135,7 @@ class Movable(nn.Module):
                 "one radio, whose level it knows; train with all readings"
             )
         if not isinstance(links, Links):
-            raise TypeError(f"adapt takes links, got {type(links).__name__}; gaigs.links makes them")
+            raise TypeError(f"adapt takes links, got {type(links).__name__}")
         if links.task.name != self.scene.task.name:
             raise ValueError(
                 f"adapt takes links of the model's task, {self.scene.task.name!r}, got "
