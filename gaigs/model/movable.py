@@ -116,8 +116,9 @@ class Movable(nn.Module):
             links: Readings at one or several receivers without training links; a split is not used.
 
         Raises:
-            ValueError: The labels are not levels, too few receivers show how receivers differ, or
-                the model is already adapted.
+            TypeError: The links are not ``gaigs.Links``.
+            ValueError: The labels are not levels or are of another task, too few receivers show how
+                receivers differ, or the model is already adapted.
 
         Example:
             >>> levels = gaigs.links("synthetic_rssi", transmitters=100)
@@ -132,6 +133,13 @@ class Movable(nn.Module):
             raise ValueError(
                 "adapt learns the level of a new receiver, and the model's receivers are places of "
                 "one radio, whose level it knows; train with all readings"
+            )
+        if not isinstance(links, Links):
+            raise TypeError(f"adapt takes links, got {type(links).__name__}")
+        if links.task.name != self.scene.task.name:
+            raise ValueError(
+                f"adapt takes links of the model's task, {self.scene.task.name!r}, got "
+                f"{links.task.name!r}"
             )
         moved = self.at_receivers(links.receivers)
         new = moved.calibration

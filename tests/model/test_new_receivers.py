@@ -225,8 +225,13 @@ def test_readings_at_a_new_receiver_correct_its_level():
     torch.testing.assert_close(model.adapt(repeated).predict(PLACES), once)
     with pytest.raises(ValueError, match="all readings together"):
         moved.adapt(far)
+    spectra = gaigs.links("synthetic", transmitters=20, order=0)
+    with pytest.raises(ValueError, match="links of the model's task, 'rssi', got 'spectrum'"):
+        model.adapt(spectra)
+    with pytest.raises(TypeError, match="adapt takes links, got list"):
+        model.adapt([-50.0])
     with pytest.raises(ValueError, match="adapt takes a model of levels"):
-        gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0)).adapt(far)
+        gaigs.train("mean", spectra).adapt(spectra)
 
 
 @pytest.mark.parametrize("levels", [[-50.0], [-50.0, -52.0], [-50.0, float("nan"), -52.0]])
