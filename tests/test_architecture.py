@@ -23,7 +23,7 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-    "lines of gaigs/": 49_755,
+    "lines of gaigs/": 50_020,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
     "module constants": 100,
@@ -36,7 +36,8 @@ Lines of 100 characters in place of 120, and dense steps opened up, made 31,400 
 frames, plots, the choice of a model and channels of few numbers made them 44,600; receivers
 without measurements, placement, front ends, large surveys and buildings 47,500. Shorter docstrings
 of internal parts left 46,100. Reasons, shapes and docstrings added 1,020; boxes in shadows,
-averages of models and large surveys 700. Terms and parameters that docstrings explain added 100.
+averages of models and large surveys 700. Terms and parameters that docstrings explain added 100,
+and terrain 240.
 """
 
 

@@ -394,7 +394,7 @@ def test_training(device):
 def test_a_task_that_a_component_is_not_made_for_is_refused(kind, name, task):
     links = example_links(task)
     with pytest.raises(
-        ValueError, match=r"label|needs (option (base|trend|members|buildings)|a regressor)"
+        ValueError, match=r"label|needs (option (base|trend|members)|a regressor|a map)"
     ):
         registry(kind).build({"name": name}, scene=links.scene, task=links.task)
 

@@ -30,6 +30,7 @@ from gaigs.io.files import atomic_write
 from gaigs.kriging.scalar import ScalarProcess
 from gaigs.kriging.scalar_fit import ScalarOptions
 from gaigs.model import checkpoint
+from gaigs.model.mirrored import MirroredSplatting
 from gaigs.planes.channel_links import SLABS, SlabRoom
 from gaigs.planes.channel_search import ChannelSearch
 from gaigs.planes.lag_search import LagSearch
@@ -687,10 +688,12 @@ def test_several_processes_have_one_start(tmp_path, monkeypatch):
 @pytest.mark.usefixtures("two_starts")
 def test_a_given_model_is_trained_in_place_from_one_start(tmp_path):
     links = gaigs.links("synthetic", transmitters=20, order=0)
-    options = {"max_steps": 1, "enable_progress_bar": False, "planes": 6, "order": 1}
-    model = gaigs.train("mirrored", links, kriging=False, **options)
-    assert gaigs.train(model, links, "trainer.max_steps=1", kriging=False, folder=tmp_path) is model
-    assert not (tmp_path / "second_start").exists()
+    placement = {"name": "mirrored", "planes": 6, "order": 1}
+    model = MirroredSplatting(links.scene, placement=placement)
+    for steps in (1, 2):  # an untrained model, and a trained one
+        options = {"max_steps": steps, "enable_progress_bar": False, "kriging": False}
+        assert gaigs.train(model, links, folder=tmp_path / str(steps), **options) is model
+        assert not (tmp_path / str(steps) / "second_start").exists()
 
 
 @pytest.mark.usefixtures("two_starts")

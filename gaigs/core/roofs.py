@@ -1,4 +1,4 @@
-"""Buildings between the ends of a link: blocking of the direct path, and the loss over roofs."""
+"""Buildings and ground between the ends of a link: blocking of the direct path, loss over edges."""
 
 import math
 from collections.abc import Sequence
@@ -10,47 +10,95 @@ from jaxtyping import Float
 from matplotlib.path import Path as Outline
 from numpy import ndarray
 from torch import Tensor
+from torch.nn import functional
 
-Building = tuple[list[Float[ndarray, "_ 2"]], float]
-"""A footprint, as an outline and its holes [m], and the height of its roof [m]."""
+
+class Building(NamedTuple):
+    """A block with a flat roof."""
+
+    rings: list[Float[ndarray, "_ 2"]]  # footprint: the outline and its holes [m]
+    height: float  # of the roof above the ground [m]
+    ground: float = math.nan  # height of the ground, world frame; NaN: that of the grid [m]
+
+
+class SiteGrid(NamedTuple):
+    """Square cells over an area."""
+
+    lower: tuple[float, float]  # lower corner, x and y [m]
+    cell: float  # edge of a cell [m]
+    rows: int  # along y
+    columns: int  # along x
 
 
 class Roofs(NamedTuple):
-    """Heights of roofs on a grid."""
+    """Heights of roofs and of the ground on a grid."""
 
     # Height of the roof above each cell's middle, world frame, far below it without a building [m].
     heights: Float[Tensor, "rows columns"]
     lower: tuple[float, float]  # lower corner of the grid, x and y [m]
     cell: float  # edge of a cell [m]
+    ground: Float[Tensor, "rows columns"] | None = None  # None: no terrain is known [m]
+
+    def ground_at(self, points: Float[Tensor, "b 3"]) -> Float[Tensor, " b"]:
+        """Height of the ground below points, linear between cells; at the margin outside [m]."""
+        if self.ground is None:
+            return torch.zeros_like(points[:, 0])
+        sides = self.cell * torch.tensor(self.ground.shape[::-1]).to(points)
+        corner = torch.tensor(self.lower).to(points)
+        places = 2 * (points[:, :2] - corner) / sides - 1  # (b, 2), from -1 to 1 within the grid
+        ground = self.ground.to(points)[None, None]  # (1, 1, rows, columns)
+        kinds = {"padding_mode": "border", "align_corners": False}
+        return functional.grid_sample(ground, places[None, None], **kinds)[0, 0, 0]
 
 
-def rasterize_roofs(
-    buildings: Sequence[Building],
+def plan_grid(
     lower: Float[ndarray, "2"],
     upper: Float[ndarray, "2"],
     cell: float = 1.0,  # [m]; footprints are seldom known better
     most: float = 4e6,  # cells; 16 MB of a checkpoint
-    nothing: float = -1e4,  # [m], without a building; a checkpoint takes finite numbers alone
-) -> Roofs:
-    """The roofs within a box; cells are enlarged if there would be more than ``most``."""
+) -> SiteGrid:
+    """A grid over a box [m]; cells are enlarged if there would be more than ``most``."""
     size = upper - lower
     cell = max(cell, math.sqrt(size.prod() / most))
     columns, rows = np.ceil(size / cell).astype(int) + 1
-    heights = np.full((rows, columns), nothing, dtype=np.float32)
-    for rings, roof in buildings:
-        corners = (rings[0] - lower) / cell  # in cells
+    return SiteGrid((float(lower[0]), float(lower[1])), cell, int(rows), int(columns))
+
+
+def rasterize_roofs(
+    buildings: Sequence[Building],
+    grid: SiteGrid,
+    ground: Float[ndarray, "rows columns"] | None = None,
+    nothing: float = -1e4,  # [m], without a building; a checkpoint takes finite numbers alone
+) -> Roofs:
+    """The roofs on a grid.
+
+    Args:
+        ground: Height of the ground in each cell [m]. A building without a height of its ground
+            stands on the mean below its footprint. Without ``ground`` it stands at 0.
+    """
+    heights = np.full((grid.rows, grid.columns), nothing, dtype=np.float32)
+    for building in buildings:
+        corners = (building.rings[0] - grid.lower) / grid.cell  # in cells
         first = np.floor(corners.min(0)).astype(int).clip(0)
-        last = np.ceil(corners.max(0)).astype(int).clip(max=(columns, rows))
+        last = np.ceil(corners.max(0)).astype(int).clip(max=(grid.columns, grid.rows))
         if (first >= last).any():
             continue
         x, y = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]))
         middles = np.stack((x.ravel(), y.ravel()), 1) + 0.5  # (k, 2)
         is_inside = Outline(corners).contains_points(middles)
-        for hole in rings[1:]:
-            is_inside &= ~Outline((hole - lower) / cell).contains_points(middles)
-        part = heights[first[1] : last[1], first[0] : last[0]]
-        np.maximum(part, np.where(is_inside.reshape(x.shape), roof, nothing), out=part)
-    return Roofs(torch.from_numpy(heights), (float(lower[0]), float(lower[1])), cell)
+        for hole in building.rings[1:]:
+            is_inside &= ~Outline((hole - grid.lower) / grid.cell).contains_points(middles)
+        if not is_inside.any():
+            continue
+        is_inside = is_inside.reshape(x.shape)
+        area = slice(first[1], last[1]), slice(first[0], last[0])
+        base = building.ground
+        if math.isnan(base):
+            base = 0.0 if ground is None else float(ground[area][is_inside].mean())
+        roof = np.where(is_inside, base + building.height, nothing)
+        heights[area] = np.maximum(heights[area], roof)
+    below = None if ground is None else torch.from_numpy(ground)
+    return Roofs(torch.from_numpy(heights), grid.lower, grid.cell, below)
 
 
 def obstruct(
@@ -60,15 +108,18 @@ def obstruct(
     wavelength: float,
     most: int = 2**21,  # samples at a time; a temporary of 8 MB
 ) -> Float[Tensor, "b 4"]:
-    """Obstruction of the direct paths from ``starts`` to ``ends`` [m] by roofs.
+    """Obstruction of the direct paths from ``starts`` to ``ends`` [m] by roofs and ground.
 
     Paths are sampled about once a cell. Samples within 1.5 cells of an end do not count, since the
     cell of an antenna at a wall may belong to the building. The knife-edge loss depends on the
-    ``wavelength`` [m].
+    ``wavelength`` [m]. An effective radius of the earth of 8,500 km raises what is far from the
+    ends.
 
     Returns:
         Four numbers for each path: 1 if a roof is above it, else 0; its length inside buildings
-        [m]; the number of walls that it crosses; its knife-edge loss over the roofs [dB].
+        [m]; the number of walls that it crosses; its knife-edge loss over roofs and ground [dB].
+
+    Source: ITU-R P.526-15, sections 4.1 and 4.5.1.
     """
     plan = (ends - starts)[:, :2].norm(dim=1, keepdim=True).clamp_min(1e-3)  # (b, 1)
     count = max(2, math.ceil(plan.max().item() / roofs.cell)) if len(plan) else 2
@@ -83,44 +134,49 @@ def obstruct(
     row = ((y - roofs.lower[1]) / roofs.cell).floor().long()
     counts = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     counts &= torch.minimum(before, plan - before) > 1.5 * roofs.cell
-    heights = roofs.heights.to(x.device)
-    roof = heights[row.clamp(0, rows - 1), column.clamp(0, columns - 1)].where(counts, -math.inf)
+    cells = row.clamp(0, rows - 1), column.clamp(0, columns - 1)
+    bulge = before * (plan - before) / (2 * 8.5e6)  # of the earth (b, k)
+    roof = (roofs.heights.to(x)[cells] + bulge).where(counts, -math.inf)
+    surface = roof
+    if roofs.ground is not None:
+        ground = (roofs.ground.to(x)[cells] + bulge).where(counts, -math.inf)
+        surface = torch.maximum(roof, ground)
     is_blocked = roof > path  # (b, k)
     inside = is_blocked.sum(1) * (ends - starts).norm(dim=1) / count
     walls = (is_blocked[:, 1:] != is_blocked[:, :-1]).sum(1).to(path)
-    loss = knife_edge(_bullington(roof, starts[:, 2:], ends[:, 2:], before, plan, wavelength))
+    loss = knife_edge(_bullington(surface, starts[:, 2:], ends[:, 2:], before, plan, wavelength))
     loss += (1 - (-loss / 6).exp()) * (10 + 2e-5 * plan[:, 0])  # for the edges beside the highest
     return torch.stack((is_blocked.any(1).to(path), inside, walls, loss), 1)
 
 
 def _bullington(
-    roof: Float[Tensor, "b k"],
+    surface: Float[Tensor, "b k"],
     start: Float[Tensor, "b 1"],
     end: Float[Tensor, "b 1"],
     before: Float[Tensor, "b k"],
     plan: Float[Tensor, "b 1"],
     wavelength: float,
 ) -> Float[Tensor, " b"]:
-    """Parameter v of ``knife_edge`` for each path, with all its roofs as one edge.
+    """Parameter v of ``knife_edge`` for each path, with all that stands in it as one edge.
 
-    If roofs block the path, the edge is where the steepest lines from both ends meet. Otherwise it
-    is the roof with the largest v.
+    If the surface blocks the path, the edge is where the steepest lines from both ends meet.
+    Otherwise it is the sample with the largest v.
 
     Args:
-        roof: Heights at the samples of the path [m], -inf without a roof.
+        surface: Heights at the samples of the path [m], -inf where nothing counts.
         start, end: Heights of the ends [m].
         before: Horizontal distance of each sample from the start [m].
         plan: Horizontal distance between the ends [m].
         wavelength: Wavelength [m].
 
-    Source: ITU-R P.526-15, section 4.5.1, over a flat earth.
+    Source: ITU-R P.526-15, section 4.5.1.
     """
-    up = ((roof - start) / before).amax(1, keepdim=True)
-    down = ((roof - end) / (plan - before)).amax(1, keepdim=True)
+    up = ((surface - start) / before).amax(1, keepdim=True)
+    down = ((surface - end) / (plan - before)).amax(1, keepdim=True)
     is_free = up <= (end - start) / plan
     meeting = (end - start + down * plan) / (up + down)  # (b, 1)
     meeting = torch.where(is_free, before, meeting)  # (b, k)
-    edge = torch.where(is_free, roof, start + up * meeting)
+    edge = torch.where(is_free, surface, start + up * meeting)
     rest = plan - meeting  # distance from the edge to the end
     above = edge - (start * rest + end * meeting) / plan
     v = above * (2 * plan / (wavelength * meeting * rest)).sqrt()

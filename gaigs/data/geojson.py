@@ -1,6 +1,7 @@
 """Polygons of GeoJSON files in metres of the world frame."""
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -45,10 +46,7 @@ def read_polygons(file: Path, frame: Frame | None, mend: str) -> list[tuple[Ring
 def read_buildings(
     file: str | Path, frame: Frame | None, height: float | None = None
 ) -> list[Building]:
-    """Buildings of a file: each polygon with its property ``height`` [m].
-
-    The roof is ``height`` above the property ``ground`` [m]. Without ``ground`` it is above 0 of
-    the world frame.
+    """Buildings of a file: each polygon with its properties ``height`` and ``ground`` [m].
 
     Args:
         height: Height of buildings without this property [m].
@@ -59,8 +57,9 @@ def read_buildings(
     for rings, properties in read_polygons(file, frame, "draw buildings"):
         above = _number(properties.get("height"), height)
         lacking += above is None
-        ground = _number(properties.get("ground"), 0.0)
-        buildings.append(([ring[:, :2] for ring in rings], ground + (above or 0.0)))
+        ground = _number(properties.get("ground"), math.nan)
+        outlines = [ring[:, :2] for ring in rings]
+        buildings.append(Building(outlines, above or 0.0, ground))
     if lacking:
         raise ValueError(
             f"{file}: {lacking} of {len(buildings)} polygons have no number as property 'height' "

@@ -111,8 +111,8 @@ class LocalMixtures(NamedTuple):
         number of their set of places: receivers that hear the same places have the same sets.
         """
         bits = self.readings.places.contiguous().view(torch.int64)  # (k, d)
-        # A hash of each reading's place; past 64 bits it wraps.
-        codes = torch.zeros_like(bits[:, 0])
+        # A hash of each reading's place; past 64 bits it wraps. That of the origin is not 0 either.
+        codes = torch.ones_like(bits[:, 0])
         for column in bits.unbind(1):
             codes = (codes ^ column ^ (column >> 29)) * 0x5851F42D4C957F2D
         rows, exists = nearest

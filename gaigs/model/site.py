@@ -1,4 +1,4 @@
-"""Log-distance path loss, and the loss by buildings on a map."""
+"""Log-distance path loss, and the loss by buildings and terrain on a map."""
 
 import logging
 import math
@@ -12,10 +12,11 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from gaigs.core.query import Batch, Query
-from gaigs.core.roofs import Roofs, obstruct, rasterize_roofs
+from gaigs.core.roofs import Roofs, obstruct, plan_grid, rasterize_roofs
 from gaigs.core.scene import Scene
 from gaigs.data import Links
 from gaigs.data.geojson import read_buildings
+from gaigs.data.terrain import read_extent, read_ground
 from gaigs.kriging.gross_errors import without_gross_errors
 from gaigs.model import Model, Prediction
 from gaigs.model.path_loss import PathLoss
@@ -26,53 +27,83 @@ log = logging.getLogger(__name__)
 
 @register("model", "site")
 class Site(Model):
-    """``path_loss`` of each receiver, minus a common loss by buildings; NaN before ``fit``.
+    """``path_loss`` of each receiver, minus a common loss by buildings and terrain.
 
     Loss = c1 [a roof is above the direct path] + c2 10 log10(1 + length inside / 1 m) + c3 (walls
-    crossed) + c4 (knife-edge loss over the roofs). The coefficients are fitted by least squares
-    together with the level and exponent of each receiver, see ``shared_coefficients``. ``fit``
-    reads the file. A checkpoint stores the roofs on a grid of 1 m, or coarser for a large site.
+    crossed) + c4 (knife-edge loss over roofs and ground). The coefficients are fitted by least
+    squares together with the level and exponent of each receiver, see ``shared_coefficients``. They
+    are NaN before ``fit``, which reads the files. A checkpoint stores roofs and ground on a grid of
+    1 m, or coarser for a large site; without buildings it has the pixels of the terrain.
 
     Args:
         buildings: GeoJSON file, see ``gaigs.data.geojson.read_buildings``. Coordinates are
             longitude and latitude, or easting and northing, if the data have a frame; otherwise
             metres of the data.
         height: Height of buildings without this property [m]; None: each must have it.
+        terrain: GeoTIFF file of heights of the ground [m], see ``gaigs.data.terrain.read_ground``.
+        above_ground: True if the heights of transmitters and receivers are above the terrain, False
+            if they have its zero. None: above it if half of them would be below the ground
+            otherwise. Distances of path loss do not change.
 
     Raises:
         FileNotFoundError: ``fit`` finds no such file.
-        ValueError: A label is more than one real number. In ``fit``: the file has a defect, or no
-            building is near the links.
+        ImportError: rasterio is not installed, which terrain needs.
+        ValueError: A label is more than one real number, or neither file is given. In ``fit``: a
+            file has a defect, or is not near the links.
 
     Source: ITU-R P.526-15, sections 4.1 and 4.5.1; Lawson and Hanson, Solving Least Squares
     Problems, 1974, chapter 23.
     """
 
     any_receiver = True
+    roofs: Tensor
+    ground: Tensor
 
-    def __init__(self, scene: Scene, buildings: str, height: float | None = None):
+    def __init__(
+        self,
+        scene: Scene,
+        buildings: str | None = None,
+        height: float | None = None,
+        terrain: str | None = None,
+        above_ground: bool | None = None,
+    ):
         super().__init__(scene)
+        if buildings is None and terrain is None:
+            raise ValueError(
+                "model 'site' needs a map\ngive buildings, a GeoJSON file, terrain, a GeoTIFF "
+                "file, or both"
+            )
         self.buildings = buildings
         self.height = height
+        self.terrain = terrain
+        self.above_ground = above_ground
         self.law = PathLoss(scene)
         self.register_buffer("losses", torch.full((4,), torch.nan))  # c1 to c4
         self.register_buffer("roofs", torch.zeros(1, 1))  # (rows, columns) [m]
+        self.register_buffer("ground", torch.zeros(0, 0))  # the same, empty without terrain [m]
         self.register_buffer("grid", torch.zeros(3))  # lower corner, cell [m]
+        self.register_buffer("is_lifted", torch.tensor(False))  # heights are above the ground
 
     def _load_from_state_dict(self, state_dict, prefix, *args):
-        self.roofs = torch.empty_like(state_dict.get(f"{prefix}roofs", self.roofs))  # a grid's size
+        # Older checkpoints have no terrain.
+        for name in ("ground", "is_lifted"):
+            state_dict.setdefault(f"{prefix}{name}", getattr(self, name))
+        for name in ("roofs", "ground"):  # a grid's size
+            setattr(self, name, torch.empty_like(state_dict.get(f"{prefix}{name}", self.roofs)))
         super()._load_from_state_dict(state_dict, prefix, *args)
 
     def fit(self, links: Links) -> None:
-        """Reads the buildings, and fits coefficients and path loss."""
-        roofs = self._read_roofs()
+        """Reads the maps, and fits coefficients and path loss."""
+        roofs = self._read_roofs(links)
         self.roofs = roofs.heights.to(self.roofs)
+        if roofs.ground is not None:
+            self.ground = roofs.ground.to(self.roofs)
         self.grid.copy_(torch.tensor([*roofs.lower, roofs.cell]))
         kept = without_gross_errors(links)
         index = kept.split.known
         query = links.query[index]
         features = self._features(query).double()  # (k, 4)
-        if not features[:, 0].any():
+        if self.buildings and not features[:, 0].any():
             log.warning(
                 "%s: no roof is above the direct path of any link\n"
                 "compare heights of buildings and places: both are above 0 of the data's z",
@@ -82,7 +113,7 @@ class Site(Model):
         positions = self.scene.positions(query.transmitters)[query.receivers]  # (k, 3)
         lengths = (query.transmitters - positions).norm(dim=1).double()
         self.losses.copy_(shared_coefficients(columns, lengths, query.receivers))
-        log.info("losses by buildings, their length, walls and edges: %s", self.losses.tolist())
+        log.info("losses by roofs, length inside, walls and edges: %s", self.losses.tolist())
         corrected = links.labels.clone()
         corrected[index] += (features @ self.losses.double()).to(corrected)
         self.law.fit(replace(kept, labels=corrected))
@@ -98,29 +129,79 @@ class Site(Model):
             return query.transmitters.new_full((len(query), 4), torch.nan)
         # Another wavelength adds a constant to the loss behind an edge, which c1 takes.
         wavelength = speed_of_light / (self.scene.middle_frequency or 2e9)
-        positions = self.scene.positions(query.transmitters)[query.receivers]  # (b, 3)
-        features = obstruct(
-            Roofs(self.roofs, (x, y), cell), positions, query.transmitters, wavelength
-        )
+        starts = self.scene.positions(query.transmitters)[query.receivers].clone()  # (b, 3)
+        ends = query.transmitters.clone()
+        roofs = Roofs(self.roofs, (x, y), cell, self.ground if self.ground.numel() else None)
+        if self.is_lifted:
+            starts[:, 2] += roofs.ground_at(starts)
+            ends[:, 2] += roofs.ground_at(ends)
+        features = obstruct(roofs, starts, ends, wavelength)
         features[:, 1] = 10 * (1 + features[:, 1]).log10()
         return features
 
-    def _read_roofs(self) -> Roofs:
-        """Roofs in the area where predictions give no warning of extrapolation."""
-        buildings = read_buildings(self.buildings, self.scene.frame, self.height)
-        corners = np.concatenate([rings[0] for rings, _ in buildings])
+    def _read_roofs(self, links: Links) -> Roofs:
+        """Roofs and ground in the area where predictions give no warning of extrapolation."""
+        frame = self.scene.frame
+        buildings = read_buildings(self.buildings, frame, self.height) if self.buildings else []
         lower, upper = (corner[:2].double().numpy() for corner in self.scene.box)
-        first = np.maximum(lower - self.scene.extent, corners.min(0))
-        last = np.minimum(upper + self.scene.extent, corners.max(0))
-        if (first >= last).any():
-            ends = [*corners.min(0), *corners.max(0), *lower, *upper]
+        cell = 1.0  # [m]
+        corners = []  # of both maps (2, 2) [m]
+        if self.buildings:
+            edges = np.concatenate([building.rings[0] for building in buildings])
+            corners.append(np.stack((edges.min(0), edges.max(0))))
+            self._check_near("buildings", self.buildings, corners[-1])
+        if self.terrain:
+            extent = read_extent(self.terrain, frame)
+            corners.append(np.stack((extent.lower, extent.upper)))
+            self._check_near("terrain", self.terrain, corners[-1])
+            cell = cell if self.buildings else extent.cell
+        first = np.maximum(lower - self.scene.extent, np.stack(corners)[:, 0].min(0))
+        last = np.minimum(upper + self.scene.extent, np.stack(corners)[:, 1].max(0))
+        grid = plan_grid(first, last, cell)
+        if not self.terrain:
+            return rasterize_roofs(buildings, grid)
+        ground, is_known = read_ground(self.terrain, frame, grid)
+        roofs = rasterize_roofs(buildings, grid, ground)
+        covered = roofs._replace(ground=torch.from_numpy(is_known).float())
+        self._place_ends(links, roofs, covered)
+        return roofs
+
+    def _check_near(self, content: str, file: str, corners: Float[np.ndarray, "2 2"]) -> None:
+        """Raises a ``ValueError`` if a map with these corners [m] is far from the links."""
+        lower, upper = (corner[:2].double().numpy() for corner in self.scene.box)
+        is_beside = (corners[0] >= upper + self.scene.extent).any()
+        if is_beside or (corners[1] <= lower - self.scene.extent).any():
+            ends = [*corners.flatten(), *lower, *upper]
             raise ValueError(
-                "{}: buildings from ({:.0f}, {:.0f}) to ({:.0f}, {:.0f}) m are far from the links, "
+                "{}: {} from ({:.0f}, {:.0f}) to ({:.0f}, {:.0f}) m are far from the links, "
                 "({:.0f}, {:.0f}) to ({:.0f}, {:.0f}) m\n"
-                "give both in one frame: data.epsg of the links, or buildings less their "
-                "origin".format(self.buildings, *ends)
+                "give both in one frame: data.epsg of the links, or the map less their "
+                "origin".format(file, content, *ends)
             )
-        return rasterize_roofs(buildings, first, last)
+
+    def _place_ends(self, links: Links, roofs: Roofs, covered: Roofs) -> None:
+        """Decides whether heights of the ends are above the ground.
+
+        Args:
+            covered: The grid with 1 where the file has a height of the ground, else 0.
+        """
+        known = links.query[links.split.known]
+        positions = self.scene.positions(known.transmitters)[known.receivers]
+        ends = torch.cat((known.transmitters, positions))  # (2 k, 3)
+        outside = (covered.ground_at(ends) < 0.5).float().mean().item()
+        if outside:
+            log.warning(
+                "%s: no height of the ground at %.0f %% of the ends of links\n"
+                "they get the nearest one; give terrain of the whole site",
+                self.terrain,
+                100 * outside,
+            )
+        is_above = self.above_ground
+        if is_above is None:
+            is_above = bool((ends[:, 2] - roofs.ground_at(ends)).median() < 0)
+        self.is_lifted.fill_(is_above)
+        reference = "the ground" if is_above else "the zero of the terrain"
+        log.info("heights of transmitters and receivers are above %s", reference)
 
 
 def shared_coefficients(

@@ -174,7 +174,7 @@ def _installed_holders(kind: str) -> list[Holder]:
 
 @functools.lru_cache
 def _entry_points(_: tuple) -> dict[str, metadata.EntryPoints]:
-    """Entry points of gaigs by group, from a file of each package on ``sys.path``, which is slow."""
+    """Entry points of gaigs by group, from the packages on ``sys.path``: to read them is slow."""
     points = metadata.entry_points()
     groups = [group for group in points.groups if group.startswith("gaigs.")]
     return {group: points.select(group=group) for group in groups}

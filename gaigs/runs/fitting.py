@@ -53,12 +53,15 @@ class Start(NamedTuple):
 def fit(model: Model | None, loss: Loss, links: Links, config: dict, folder: Path) -> Fitted | None:
     """Builds, fits, trains and kriges a model as configured; None in further processes."""
     name = config["model"]["name"]
+    is_given = model is not None
     model = _checked(model, links, config)
     kriged = _untrained_kriging(model, links, config)
     _log_parts(model, config["model"])
     # Shares of the run's limit at which parts end: the search 0.3, the training 0.5, kriging and
     # intervals 0.8.
     searched, places = _prepare(model, links, name, until=0.3 if model.is_trained else 0.8)
+    if is_given:
+        model.second_start = {}  # a better second start would be another object
     start = count_gaussians(model)
     best = folder / "best.ckpt"
     if not model.is_trained:

@@ -100,7 +100,6 @@ def _made(model: str | Model) -> Model | None:
     if isinstance(model, str):
         return None
     made = copy.deepcopy(model.trend) if isinstance(model, Kriging) else model
-    made.second_start = {}  # a better second start would be another object
     if isinstance(made, Ensemble):
         members = "members" if made is model else "trend.members"
         raise ValueError(

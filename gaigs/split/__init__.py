@@ -46,6 +46,8 @@ def part(
 ) -> Split:
     """Holds out whole groups of links, first for the test, then in the same way for validation.
 
+    Of links at a single place, such as readings at a new receiver, none are held out.
+
     Args:
         name: Name of the split with its specific options; the common options are appended.
         links: All links.
@@ -61,10 +63,14 @@ def part(
     check("test", test, 0 <= test < 1, "in [0, 1)")
     check_validation(validation)
     generator = generator_of(seed)
-    votes = links.query.votes
+    votes, places = links.query.votes, links.query.place_keys
+    if (places == places[0]).all():
+        test = validation = 0.0
     training, testing, _ = hold_out(
         "test", torch.arange(len(links)), groups, votes, test, generator, rows=rows
     )
+    if validation is None and (places[training] == places[training[0]]).all():
+        validation = 0.0
     if train is not None:
         order = drawn(groups, training, generator, rows)
         bounds = f"in 1..{len(order)}, the places that do not test"

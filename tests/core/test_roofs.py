@@ -9,17 +9,25 @@ import pytest
 import torch
 from scipy.special import fresnel
 
-from gaigs.core.roofs import knife_edge, obstruct, rasterize_roofs
+from gaigs.core.roofs import Building, knife_edge, obstruct, plan_grid, rasterize_roofs
 
 
 def box(x0, y0, x1, y1, roof, *holes):
     corners = [np.array([[a, b], [c, b], [c, d], [a, d]], float) for a, b, c, d in holes]
     outline = np.array([[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]], float)
-    return [outline, *corners], roof
+    return Building([outline, *corners], roof)
 
 
 def roofs_of(*buildings, cell=0.25):
-    return rasterize_roofs(buildings, np.array([0.0, -30.0]), np.array([100.0, 30.0]), cell)
+    grid = plan_grid(np.array([0.0, -30.0]), np.array([100.0, 30.0]), cell)
+    return rasterize_roofs(buildings, grid)
+
+
+def slope(length, rise, cell=1.0):
+    """Ground of 100 m to the side that rises along x, and its grid."""
+    grid = plan_grid(np.array([0.0, -50.0]), np.array([length, 50.0]), cell)
+    middles = (np.arange(grid.columns) + 0.5) * grid.cell
+    return np.tile(np.float32(rise * middles), (grid.rows, 1)), grid
 
 
 def between(roofs, start, end):
@@ -77,9 +85,8 @@ def test_an_antenna_at_a_wall_and_paths_beyond_the_map_are_clear():
 
 
 def test_large_sites_get_larger_cells():
-    roofs = rasterize_roofs(
-        [box(20, -10, 60, 10, 15.0)], np.array([0.0, -50.0]), np.array([100.0, 50.0]), most=100
-    )
+    grid = plan_grid(np.array([0.0, -50.0]), np.array([100.0, 50.0]), most=100)
+    roofs = rasterize_roofs([box(20, -10, 60, 10, 15.0)], grid)
     assert roofs.cell == 10
     assert (roofs.heights == 15).sum() == 8
 
@@ -93,3 +100,40 @@ def test_many_links_are_computed_in_parts():
     assert whole[:, 0].any()
     # A part's longest path sets its samples, so lengths differ by a cell.
     torch.testing.assert_close(parts[:, 1], whole[:, 1], rtol=0, atol=0.5)
+
+
+def test_a_ridge_has_the_loss_of_its_edge_and_blocks_no_path_as_a_roof():
+    ground, grid = slope(100.0, 0.0, cell=0.1)
+    ground[:, 499:501] = 20.0
+    blocked, inside, walls, loss = between(
+        rasterize_roofs([], grid, ground), [0.0, 0.0, 10.0], [100.0, 0.0, 2.0]
+    )
+    v = (20 - 6) * math.sqrt(2 / 0.1 * (1 / 50 + 1 / 50))
+    edge = 6.9 + 20 * math.log10(math.hypot(v - 0.1, 1) + v - 0.1)
+    assert (blocked, inside, walls) == (0, 0, 0)
+    assert loss == pytest.approx(edge + (1 - math.exp(-edge / 6)) * 10, abs=0.05)
+
+
+def test_ground_is_linear_between_cells_and_level_beyond_the_margin():
+    ground, grid = slope(100.0, 0.5, cell=10.0)
+    roofs = rasterize_roofs([], grid, ground)
+    points = torch.tensor([[7.0, 3.0, 0.0], [83.0, -41.0, 9.0], [-500.0, 0.0, 0.0]])
+    assert roofs.ground_at(points).tolist() == pytest.approx([3.5, 41.5, 2.5], abs=1e-4)
+
+
+def test_a_building_stands_on_the_ground_or_on_its_own():
+    ground, grid = slope(100.0, 0.5)
+    own = box(70, -10, 80, 10, 6.0)._replace(ground=3.0)
+    heights = rasterize_roofs([box(20, -10, 40, 10, 6.0), own], grid, ground).heights
+    assert heights[50, 30].item() == pytest.approx(15 + 6)
+    assert heights[50, 75].item() == pytest.approx(3 + 6)
+
+
+def test_the_earth_rises_between_distant_ends():
+    ground, grid = slope(30000.0, 0.0, cell=10.0)
+    roofs = rasterize_roofs([], grid, ground)
+    edge = 15000**2 / 2 / 8.5e6  # 13.2 m in the middle
+    *_, loss = between(roofs, [0.0, 0.0, edge], [30000.0, 0.0, edge])
+    # The path grazes the middle: half of the field.
+    grazing = 20 * math.log10(2)
+    assert loss == pytest.approx(grazing + (1 - math.exp(-grazing / 6)) * (10 + 0.6), abs=0.3)

@@ -1,6 +1,7 @@
 """Buildings of GeoJSON files: heights in many spellings, frames, defects."""
 
 import json
+import math
 
 import numpy as np
 import pytest
@@ -23,12 +24,10 @@ def test_heights_above_the_ground(tmp_path):
     file = write(
         tmp_path, {"height": 12}, {"height": "7.5"}, {"height": "9 m", "ground": 100}, None
     )
-    assert [roof for _, roof in read_buildings(file, None, height=4.0)] == [
-        12,
-        7.5,
-        109,
-        4,
-    ]
+    buildings = read_buildings(file, None, height=4.0)
+    assert [building.height for building in buildings] == [12, 7.5, 9, 4]
+    assert buildings[2].ground == 100
+    assert math.isnan(buildings[0].ground)
 
 
 def test_buildings_without_a_height_are_counted(tmp_path):
@@ -48,8 +47,8 @@ def test_degrees_take_the_frame_of_the_data(tmp_path):
     with pytest.raises(ValueError, match=r"look like degrees\nthe data have no place on a map"):
         read_buildings(file, None)
     pytest.importorskip("pyproj")
-    ((rings, _),) = read_buildings(file, Frame(32632, 691000.0, 5335000.0))
-    assert np.ptp(rings[0], axis=0) == pytest.approx([14.9, 23.4], abs=0.5)
+    (building,) = read_buildings(file, Frame(32632, 691000.0, 5335000.0))
+    assert np.ptp(building.rings[0], axis=0) == pytest.approx([14.9, 23.4], abs=0.5)
 
 
 def test_no_such_file(tmp_path):

@@ -102,6 +102,20 @@ def test_receivers_share_matrices_without_a_difference():
             torch.testing.assert_close(one, other[which == receiver])
 
 
+def test_a_reading_at_the_origin_is_of_its_receiver_alone():
+    rng = np.random.default_rng(0)
+    places = torch.from_numpy(6 * rng.uniform(size=(10, 3)))
+    places = torch.cat((places, torch.zeros(1, 3), places))
+    readings = Readings(example_links("rssi").scene, places, torch.arange(21) // 11, 8)
+    logarithms = torch.tensor([[1.5, 2.0, 1.0], [1.5, 1.0, 0.5]]).double().log()
+    values = torch.from_numpy(rng.standard_normal(21))
+    all_of = LocalMixtures(readings, values, logarithms, Choice(0.5))
+    origin, which = torch.zeros(2, 3).double(), torch.tensor([0, 1])
+    together = all_of.at(origin, which).mean
+    alone = [all_of.at(origin[:1], which[row : row + 1]).mean for row in range(2)]
+    torch.testing.assert_close(together, torch.cat(alone))
+
+
 def test_the_density_is_that_of_a_mixture_of_students_t():
     weights, means, squares = [0.3, 0.7], [-1.0, 2.0], [0.5, 4.0]
     fields = (torch.tensor([field]).double() for field in (weights, means, squares))
@@ -162,6 +176,8 @@ def test_deviations_take_the_mixtures_of_the_means_until_hyperparameters_change(
     process(places, which)
     before = process.deviations(places, which)
     assert len(asked_for) == 1
+    process(places, which)
+    assert len(asked_for) == 2, "a second prediction takes the time of the first"
     other = ScalarProcess(links.scene)
     other.logarithms, other.choice = process.logarithms + 1, process.choice
     process.take(other)

@@ -229,6 +229,16 @@ def test_readings_at_a_new_receiver_correct_its_level():
         gaigs.train("mean", gaigs.links("synthetic", transmitters=20, order=0)).adapt(far)
 
 
+@pytest.mark.parametrize("levels", [[-50.0], [-50.0, -52.0], [-50.0, float("nan"), -52.0]])
+def test_readings_too_few_for_a_split_are_taken(law, levels):
+    door = Receiver("door", Pose.at([3.0, 0.2, 2.0]))
+    spots = [[1.0, 2.0, 1.5], [2.0, 1.0, 1.5], [4.0, 2.5, 1.0]][: len(levels)]
+    few = gaigs.links(task="rssi", transmitters=spots, receivers=[door], labels=levels)
+    assert "degrees" not in few.remarks
+    assert law[0].adapt(few).predict(spots).isfinite().all()
+    assert len(few.split.train)
+
+
 def drawn_errors(count, generator):
     """Errors of receivers with a level of 3 dB, a field of 4 dB and 2 m, and noise of 2 dB."""
     errors, places = [], []
@@ -249,6 +259,13 @@ def test_the_law_of_errors_is_found_again():
     torch.testing.assert_close(law, torch.tensor([9.0, 4.0, 16.0, 2.0]).double(), rtol=0.3, atol=0)
     nothing = fit_law([torch.zeros(4)] * 3, [torch.zeros(4, 3)] * 3)
     assert nothing.isfinite().all()
+
+
+def test_sparse_places_do_not_take_noise_for_a_field():
+    """By their likelihood alone readings so far apart have no noise."""
+    links = gaigs.links("synthetic_rssi", transmitters=80, receivers=9, split="receivers")
+    scatter = gaigs.train("path_loss", links, progress=False).calibration.elsewhere.scatter
+    assert 1 < scatter[1] < 9, "the noise of the simulated levels is 4 dB squared"
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,14 @@
-"""Path loss less the loss by buildings: coefficients of a law, checkpoints, kriging on top."""
+"""Path loss less the loss by buildings and terrain: coefficients of a law, checkpoints, kriging on top."""
 
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
+import rasterio
 import torch
+from rasterio import Affine
+from scipy.special import fresnel
 
 import gaigs
 from gaigs.core.roofs import obstruct
@@ -46,7 +50,7 @@ def site(tmp_path):
         split="random",
     )
     model = Site(links.scene, file)
-    roofs = model._read_roofs()
+    roofs = model._read_roofs(links)
     starts = links.scene.positions(places)[links.query.receivers]
     blocked = obstruct(roofs, starts, links.query.transmitters, 0.15)[:, 0]
     assert 0.2 < blocked.mean() < 0.8
@@ -93,6 +97,95 @@ def test_roofs_below_all_paths_are_a_warning(site, caplog):
     Path(file).write_text(text)
     Site(links.scene, file).fit(links)
     assert "no roof is above the direct path of any link" in caplog.text
+
+
+@pytest.fixture
+def hills(tmp_path):
+    """Two masts and 400 places about a ridge of 40 m, 1,400 m above the sea; 1 dB of noise.
+
+    Heights of masts and places are above the ground. Fresnel's integrals give the loss behind the
+    ridge.
+    """
+    draw = np.random.default_rng(0)
+    places = np.column_stack((draw.uniform(0, (1000, 600), (400, 2)), np.full(400, 1.5)))
+    masts = np.array([[20.0, 300.0, 10.0], [900.0, 100.0, 10.0]])
+
+    def ground(x):
+        return 1400 + 40 * np.exp(-0.5 * ((x - 500) / 15) ** 2)
+
+    crest = 1440.0
+    labels = np.empty((400, 2))
+    for column, mast in enumerate(masts):
+        start, end = mast[2] + ground(mast[0]), places[:, 2] + ground(places[:, 0])
+        along = (500 - mast[0]) / (places[:, 0] - mast[0])  # share of the path before the ridge
+        lengths = np.hypot(places[:, 0] - mast[0], places[:, 1] - mast[1])
+        labels[:, column] = -30 - (22 + 4 * column) * np.log10(lengths)
+        between = (along > 0.05) & (along < 0.95)
+        above = (crest - start - along * (end - start))[between]
+        before = (along * lengths)[between]
+        behind = lengths[between] - before
+        sine, cosine = fresnel(above * np.sqrt(2 / 0.15 * (1 / before + 1 / behind)))
+        loss = -20 * np.log10(np.hypot(1 - cosine - sine, cosine - sine) / 2)
+        labels[between, column] -= loss.clip(0)
+    labels += draw.standard_normal(labels.shape)
+    file = tmp_path / "ground.tif"
+    columns = ground(-100 + 5 * (np.arange(240) + 0.5)).astype(np.float32)
+    with rasterio.open(
+        file,
+        "w",
+        driver="GTiff",
+        height=160,
+        width=240,
+        count=1,
+        dtype="float32",
+        transform=Affine(5, 0, -100, 0, -5, 700),
+    ) as raster:
+        raster.write(np.tile(columns, (160, 1)), 1)
+    links = gaigs.links(
+        task="rssi", transmitters=places, receivers=masts, labels=labels, split="random"
+    )
+    return links, str(file)
+
+
+def test_the_loss_behind_a_ridge_is_found_and_loads_without_the_file(hills, tmp_path):
+    links, file = hills
+    model = Site(links.scene, terrain=file)
+    model.fit(links)
+    assert model.is_lifted
+    test = links.split.test
+    error = (model.predict(links.query[test]) - links.labels[test]).abs().mean()
+    without = gaigs.registries["model"].build("path_loss", scene=links.scene)
+    without.fit(links)
+    before = (without.predict(links.query[test]) - links.labels[test]).abs().mean()
+    assert error < before / 2
+    model.save(tmp_path / "site.ckpt")
+    Path(file).unlink()
+    loaded = gaigs.load(tmp_path / "site.ckpt")
+    torch.testing.assert_close(loaded.predict(links.query), model.predict(links.query))
+
+
+def test_heights_above_the_sea_are_not_lifted(hills):
+    links, file = hills
+    model = Site(links.scene, terrain=file, above_ground=False)
+    model.fit(links)
+    assert not model.is_lifted  # all links are deep under ground, which the option demands
+
+
+def test_ends_beyond_the_terrain_are_a_warning(hills, caplog):
+    links, file = hills
+    with rasterio.open(file) as raster:
+        heights = raster.read(1)
+    heights[:, 200:] = -9999
+    with rasterio.open(file, "r+") as raster:
+        raster.nodata = -9999
+        raster.write(heights, 1)
+    Site(links.scene, terrain=file).fit(links)
+    assert "no height of the ground at" in caplog.text
+
+
+def test_a_map_must_be_given(hills):
+    with pytest.raises(ValueError, match="needs a map\ngive buildings, a GeoJSON file, terrain"):
+        Site(hills[0].scene)
 
 
 def test_coefficients_are_not_negative_and_a_constant_feature_has_none():

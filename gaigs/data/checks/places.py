@@ -59,7 +59,7 @@ def check_extent(links: Any) -> Iterator[Finding]:
             text,
             "are they degrees? convert them to metres, as data=rssi_wide does",
         )
-    elif links.frame is None and span < 0.3:  # less than a table
+    elif links.frame is None and len(sites) > 1 and span < 0.3:  # less than a table
         yield Finding("unit of places", f"places span {span:.3g} m", "are they in km or degrees?")
     elif links.task.is_scalar and scale_of(sites):  # spectra and channels show it themselves
         text = f"places span {span:.3g} m, as if {scale_of(sites)}"

@@ -1,0 +1,103 @@
+"""Heights of the ground in GeoTIFF files, on a grid in the world frame."""
+
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from scipy.ndimage import distance_transform_edt
+
+from gaigs.core.geometry import Frame
+from gaigs.core.roofs import SiteGrid
+from gaigs.io.tables import find_file
+
+
+class Extent(NamedTuple):
+    """What a file covers in the world frame."""
+
+    lower: Float[ndarray, "2"]  # corners, x and y [m]
+    upper: Float[ndarray, "2"]
+    cell: float  # distance of its heights [m]
+
+
+def read_extent(file: str | Path, frame: Frame | None) -> Extent:
+    """The area that a file covers; see ``read_ground``."""
+    rasterio = find_rasterio()
+    with _open(rasterio, file) as raster:
+        source, target, origin = _systems(raster, frame)
+        transform, columns, rows = rasterio.warp.calculate_default_transform(
+            source, target, raster.width, raster.height, *raster.bounds
+        )
+    cell = transform.a
+    upper = np.array([transform.c + columns * cell, transform.f]) - origin
+    return Extent(upper - cell * np.array([columns, rows]), upper, cell)
+
+
+def read_ground(
+    file: str | Path, frame: Frame | None, grid: SiteGrid
+) -> tuple[Float[ndarray, "rows columns"], Float[ndarray, "rows columns"]]:
+    """Heights of the ground at the middles of a grid's cells [m], and whether the file has them.
+
+    Heights are the file's first band, linear between its pixels. A cell without one gets the
+    nearest height. With a frame, the file's coordinate system is converted to that of the frame,
+    and a file without a system has the frame's. Without a frame, coordinates are metres of the
+    world frame.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        ImportError: rasterio is not installed.
+        ValueError: The file is no raster, or it is in degrees and the data have no frame.
+    """
+    rasterio = find_rasterio()
+    heights = np.full((grid.rows, grid.columns), np.nan, dtype=np.float32)
+    with _open(rasterio, file) as raster:
+        source, target, origin = _systems(raster, frame)
+        x, y = origin + grid.lower
+        rasterio.warp.reproject(
+            rasterio.band(raster, 1),
+            heights,
+            src_crs=source,
+            dst_crs=target,
+            dst_transform=rasterio.Affine(grid.cell, 0, x, 0, grid.cell, y),
+            dst_nodata=np.nan,
+            resampling=rasterio.warp.Resampling.bilinear,
+        )
+    is_known = np.isfinite(heights)
+    if is_known.any():
+        nearest = distance_transform_edt(~is_known, return_distances=False, return_indices=True)
+        heights = heights[tuple(nearest)]
+    return heights, is_known
+
+
+def find_rasterio() -> Any:
+    """The module rasterio; if missing, an ``ImportError`` with the command to install it."""
+    try:
+        import rasterio.warp
+    except ImportError:
+        raise ImportError("terrain needs rasterio: pip install 'gaigs[terrain]'") from None
+    return rasterio
+
+
+def _open(rasterio: ModuleType, file: str | Path) -> Any:
+    """An open file; a ``ValueError`` if it is no raster."""
+    file = find_file(file, "terrain", "terrain")
+    try:
+        return rasterio.open(file)
+    except rasterio.errors.RasterioIOError as error:
+        raise ValueError(f"cannot read {file} as GeoTIFF: {error}") from error
+
+
+def _systems(raster: Any, frame: Frame | None) -> tuple[Any, Any, Float[ndarray, "2"]]:
+    """Coordinate systems of a file and of the world frame, and the world's origin there."""
+    if frame is not None:
+        target = f"EPSG:{frame.epsg}"
+        return raster.crs or target, target, np.array([frame.x, frame.y])
+    if raster.crs is not None and raster.crs.is_geographic:
+        raise ValueError(
+            f"{raster.name} is in degrees, and the data have no place on a map\n"
+            "give data.epsg of the links, or terrain in metres of the data"
+        )
+    source = raster.crs or "EPSG:3857"  # any one, since nothing is converted
+    return source, source, np.zeros(2)
