@@ -28,12 +28,15 @@ from gaigs.planes.field_room import FieldFit, FieldRoom, Variation
 from gaigs.report.table import markdown
 
 
-def write_built_in(frequency: float, pattern: str, is_empty: bool, file: Path) -> None:
+def write_built_in(
+    frequency: float, pattern: str, is_empty: bool, file: Path, places: int = 0
+) -> None:
     """Channels of the built-in room at one antenna of its array, whose pattern no file tells.
 
     The places are those of the furnished room, also with ``is_empty``.
+    ``places`` is the seed of their draw.
     """
-    links = simulate_channels(default_room(2), 500, frequency, 1e6, 1, 0)
+    links = simulate_channels(default_room(2), 500, frequency, 1e6, 1, places)
     receiver = links.receivers[0]
     antenna = replace(receiver, array=replace(receiver.array, pattern=pattern))
     room = replace(ROOM, furniture=()) if is_empty else ROOM
@@ -152,13 +155,14 @@ def main() -> None:
     parser.add_argument("--frequency", type=float, default=2.4e9)
     parser.add_argument("--isotropic", action="store_true", help="the built-in room's antenna")
     parser.add_argument("--empty", action="store_true", help="the built-in room without furniture")
+    parser.add_argument("--places", type=int, default=0, help="seed of the built-in room's places")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     file, box = Path(arguments.file), arguments.box
     if arguments.file == "built-in":
         file, box = Path("runs/field.npz"), [0.0, 0.0, 0.0, *ROOM.size]
         pattern = "isotropic" if arguments.isotropic else "cosine"
-        write_built_in(arguments.frequency, pattern, arguments.empty, file)
+        write_built_in(arguments.frequency, pattern, arguments.empty, file, arguments.places)
     links = load_field(file)
     rows = [("order", "strength a path", "shared gains", "varying over places")]
     rows += [scores(links, walls_of(box), order) for order in (1, 2, 3)]

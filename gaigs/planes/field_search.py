@@ -12,7 +12,7 @@ from torch import Tensor
 from gaigs.data import Links
 from gaigs.planes.axis_planes import room_axes
 from gaigs.planes.channel_links import ChannelData, ChannelOptions
-from gaigs.planes.field_room import FieldRoom
+from gaigs.planes.field_room import FieldRoom, Variation
 from gaigs.planes.field_score import FieldScore
 from gaigs.planes.search import PlaneSearch
 from gaigs.splatting.gaussians import fibonacci_lattice
@@ -97,13 +97,24 @@ class FieldSearch:
             self.most,
             largest + self._make_axes(room).size,
         )
-        search = PlaneSearch(self.frame, self.score)
-        room = search.grow(room, self.most, lambda room: self._extend(room, grids))
-        room = self.score.refine(search.prune(room, len(self.start)))
+        alone = self.score.error(room)
+        room = self._grow(room, grids)
+        if len(room.planes) == len(self.start):
+            # Kriging may have taken the reflections for variations of the direct path. Other
+            # paths vary more: the largest variation leaves a further plane its part.
+            fit.variations = [Variation(share=0.5, length=2.0, noise=0.1)] * len(fit.bands)
+            varied = self._grow(room, grids)
+            room = varied if self.score.error(varied) < alone else room
         if not len(room.planes):
             log.info("no plane explains more of %d numbers than chance would", fit.count)
             return room
         return self.score.square(room)
+
+    def _grow(self, room: FieldRoom, grids: list[PlaneGrid]) -> FieldRoom:
+        """The room with the planes that lower the error."""
+        search = PlaneSearch(self.frame, self.score)
+        room = search.grow(room, self.most, lambda room: self._extend(room, grids))
+        return self.score.refine(search.prune(room, len(self.start)))
 
     def _extend(self, room: FieldRoom, grids: list[PlaneGrid]) -> FieldRoom | None:
         """The room with one more plane; None if no plane lowers the error.

@@ -103,6 +103,24 @@ def test_noise_has_no_planes():
     assert not len(found.planes)
 
 
+@pytest.mark.parametrize("noise", [0.1, 0.3])
+def test_a_room_without_planes_is_searched_once_more_with_the_largest_variation(noise, monkeypatch):
+    search = FieldSearch(room(), -1, 1, 4, torch.zeros(0, 4))
+    fit = search.score.fit
+    walls = fit.start(search.frame.from_world(torch.from_numpy(WALLS)))
+    monkeypatch.setattr(fit, "choose_variation", lambda room: None)
+    fit.variations = [Variation(0.0, 1.0, noise)]
+
+    def grow(alone, grids):
+        return walls if fit.variations == [Variation(0.5, 2.0, 0.1)] else alone
+
+    monkeypatch.setattr(search, "_grow", grow)
+    errors = {0: -1.0, 3: -1.0 - (0.2 - noise)}  # by the number of planes
+    monkeypatch.setattr(search.score, "error", lambda room: errors[len(room.planes)])
+    monkeypatch.setattr(search.score, "square", lambda room: room)
+    assert len(search.run().planes) == (3 if noise == 0.1 else 0)
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_few_places_tell_no_planes(caplog):
     caplog.set_level("INFO")
