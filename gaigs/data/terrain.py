@@ -5,7 +5,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy import ndarray
 from scipy.ndimage import distance_transform_edt
 
@@ -37,7 +37,7 @@ def read_extent(file: str | Path, frame: Frame | None) -> Extent:
 
 def read_ground(
     file: str | Path, frame: Frame | None, grid: SiteGrid
-) -> tuple[Float[ndarray, "rows columns"], Float[ndarray, "rows columns"]]:
+) -> tuple[Float[ndarray, "rows columns"], Bool[ndarray, "rows columns"]]:
     """Heights of the ground at the middles of a grid's cells [m], and whether the file has them.
 
     Heights are the file's first band, linear between its pixels. A cell without one gets the
