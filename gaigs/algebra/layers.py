@@ -42,6 +42,7 @@ class EquivariantLinear(nn.Module):
     def __init__(self, algebra: Algebra, multivectors: tuple[int, int], scalars: tuple[int, int]):
         super().__init__()
         self.algebra = algebra
+        # Number of the basis map from each wedge with null vectors to each component.
         maps = algebra.table("linear_maps", torch.empty(0)).long()  # (2**r, k)
         self.register_buffer("maps", maps, persistent=False)
         self.weight = nn.Parameter(torch.empty(int(maps.max()) + 1, *multivectors))

@@ -378,10 +378,12 @@ def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float
     weights = counts / total
     parts = held / total
     share = parts.sum().item()
-    links = 1 / weights.square().sum().item()
+    effective_links = 1 / weights.square().sum().item()
     scatter = (parts - share * weights).square().sum().item()
-    # A share p of n independent numbers has the variance p (1 - p) / n, which is solved for n.
-    return max(links, share * (1 - share) * (1 - 1 / links) / max(scatter, 1e-12))
+    # A share p of n independent numbers has the variance p (1 - p) / n, which is solved for n. The
+    # estimate of this variance is the scatter with Bessel's correction, 1 / (1 - 1 / links).
+    unbiased = 1 - 1 / effective_links
+    return max(effective_links, share * (1 - share) * unbiased / max(scatter, 1e-12))
 
 
 def fewest(level: float) -> int:

@@ -58,7 +58,7 @@ class Estimate(EstimateParts):
             the label's unit; None for other labels.
         snr_db: Expected signal-to-noise ratio of each link's channel [dB], without the axes of
             elements and subcarriers; None for other labels.
-        asked: Names and coordinates of the axes, which the tuple lacks; None if unknown.
+        asked: Names and coordinates of the tensors' axes; None if unknown. No item of the tuple.
 
     Example:
         >>> model = gaigs.train("knn", gaigs.links("synthetic_rssi", transmitters=100))

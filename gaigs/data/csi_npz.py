@@ -251,7 +251,7 @@ def _load(
 
     Args:
         given: Names of arrays in the file where they differ from gaigs's.
-        axis: Option ``parts`` of ``read``.
+        axis: Axis of real and imaginary part, "first" or "last"; None for complex numbers.
     """
     arrays: dict[str, np.ndarray] = {}
     used: set[str] = set()

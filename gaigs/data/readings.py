@@ -29,10 +29,10 @@ def gateway(name: str, position: Sequence[float] | Float[Tensor, "3"]) -> Receiv
 def are_one_radio(places: int, links: int, sent: int, given: bool | None = None) -> bool:
     """True if the receivers are places of one moving radio, or identical radios.
 
-    One radio has at least 12 places with fewer than 12 links each on average. Its transmitters have
-    fewer than two links each on average, or are a few beacons: at least four receiver places for
-    each transmitter place. In a survey of access points, by contrast, each transmitter place has a
-    link to every access point in range.
+    Without an answer of the user this is a guess. It is true for at least 12 receiver places with
+    fewer than 12 links each on average, if transmitter places have fewer than two links each on
+    average, or are a few beacons: one for four receiver places or more. In a survey of access
+    points, by contrast, each transmitter place has a link to every access point in range.
 
     Args:
         places: Number of places of receivers.

@@ -152,13 +152,14 @@ class PathField(nn.Module):
         towards = kernel(around, places[:, None], process.length)  # (b, j, 1)
         variances = []
         for precisions in self.precisions.unbind(1):  # of one path
-            # k - c' (C + P^-1)^-1 c = k - b' (1 + R C R)^-1 b, with R the roots of P and b = R c.
+            # In units of the prior variance: 1 - c' (C + P^-1)^-1 c = 1 - b' (I + R C R)^-1 b. C is
+            # ``between``, c is ``towards``, P has the precisions, R their roots, and b = R c.
             roots = (precisions[near] * process.deviation**2).sqrt()[..., None]
             matrix = roots * between * roots.mT
             matrix.diagonal(dim1=1, dim2=2).add_(1)
             factor = torch.linalg.cholesky(matrix)
-            known = torch.linalg.solve_triangular(factor, roots * towards, upper=False)
-            variances.append(1 - known.square().sum((1, 2)))
+            whitened = torch.linalg.solve_triangular(factor, roots * towards, upper=False)
+            variances.append(1 - whitened.square().sum((1, 2)))
         return process.deviation**2 * torch.stack(variances, 1)
 
     def _load_from_state_dict(self, state_dict, prefix, *args):

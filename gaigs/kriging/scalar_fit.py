@@ -173,8 +173,10 @@ class HeldOutCost:
         return likelihood + prior.item(), gradient.numpy()
 
     def _likelihood(self, point: np.ndarray) -> tuple[float, Float[Tensor, "r 3"], float]:
-        """Negative log likelihood, and its gradients by all logarithms and by the scale.
+        """Negative log likelihood with its gradients.
 
+        The gradients are with respect to the logarithms of all receivers' hyperparameters, and to
+        the scale of carriers.
         The gradient of the matrices is written out; autograd would take several times as long.
         """
         logarithms, choice = self.unpacked(torch.from_numpy(point))

@@ -130,9 +130,9 @@ class Request(NamedTuple):
     def arranged(self, values: Tensor, scene: Scene, axes: tuple[int, ...] | None = None) -> Any:
         """Reshapes values of links (b, ...) to the axes of the result, or to other axes.
 
-        Channels are padded to the largest array and to all subcarriers. If receivers differ in
-        these, the padding is removed. A request for all receivers then returns a dictionary of
-        tensors by name, a request for one receiver its tensor.
+        Channels in ``values`` are padded to the largest array and to all subcarriers. If receivers
+        differ in these, the result has no padding: a request for all receivers returns a dictionary
+        of tensors by name, a request for one receiver its tensor.
         """
         axes = self.axes if axes is None else axes
         receivers = scene.receivers

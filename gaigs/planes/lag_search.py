@@ -35,8 +35,8 @@ def frame_of(links: Links) -> RoomFrame:
     train = links.split.train
     transmitters = links.query.transmitters
     used = links.query.receivers[train].unique()
-    positions = links.scene.positions(transmitters)[used]
-    return RoomFrame(torch.cat((transmitters[train], positions)))
+    receivers = links.scene.positions(like=transmitters)[used]
+    return RoomFrame(torch.cat((transmitters[train], receivers)))
 
 
 def group_links(

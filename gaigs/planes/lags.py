@@ -134,7 +134,7 @@ class ReceiverLags:
         return (1 - correlations.square() + floor).log()
 
     def slopes(self, lags: Complex[Tensor, "b l"]) -> Complex[Tensor, "b e e"]:
-        """Negative gradient M of the errors by the covariance matrices.
+        """Negative gradient M of the errors with respect to the covariance matrices.
 
         The power of a further wave x lowers the error by x' M x. Its interference with a known wave
         y lowers it by 2 Re x' M y.

@@ -109,8 +109,9 @@ def tabulate_planes(placement: Mirrored, ends: Float[ndarray, "k 3"]) -> PlaneTa
     middles = placement.middles + placement.middle.double()  # from the world's origin
     parts = placement.normals, placement.planes[:, 3], gains, middles, placement.log_extents.exp()
     normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in parts)
-    # The middle of the reflecting area need not lie on the plane: take the plane's point with the
-    # least loss. By Lagrange's multiplier it is middle + apart / (n' E² n) E² n, with E = extents.
+    # The middle of the reflecting area need not lie on the plane: take the plane's point x with
+    # the least loss |E^-1 (x - middle)|² / 2 [Np], where E = diag(extents). By Lagrange's
+    # multiplier it is middle + apart / spread steep, with steep = E² n and spread = n' E² n.
     steep = extents**2 * normals
     spread = (steep * normals).sum(1)
     apart = offsets - (normals * middles).sum(1)

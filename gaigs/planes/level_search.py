@@ -253,7 +253,7 @@ class LevelSearch:
             Numbers of the moved planes in the placement.
         """
         numbers: list[int] = []
-        least = 0.0  # gain above chance; measured with the first clear plane
+        threshold = 0.0  # ``chance`` times the largest gain by chance; 0 until it is measured
         while True:
             waiting = [k for k, number in enumerate(self.numbers) if not placement.located[number]]
             if not waiting:
@@ -268,10 +268,12 @@ class LevelSearch:
             best = self.locate_one(room, waiting, bandwidths)
             if best is None:
                 return numbers
-            if best.gain >= self.options.clear and not least:
+            if best.gain >= self.options.clear and not threshold:
+                # The measurement may end once the gain by chance is enough to reject this plane.
                 chance = self.options.chance
-                least = chance * self.score.measure_chance(room, waiting, best.gain / chance)
-            if best.gain < max(self.options.clear, least):
+                enough = best.gain / chance
+                threshold = chance * self.score.measure_chance(room, waiting, enough)
+            if best.gain < max(self.options.clear, threshold):
                 return numbers
             if is_unknown:
                 placement.log_bandwidth.fill_(math.log(best.bandwidth))

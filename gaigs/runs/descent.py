@@ -139,7 +139,7 @@ def _check_processes(trainer: lightning.Trainer, config: dict) -> None:
         )
     if math.isfinite(stages.left()):
         raise ValueError(
-            "max_time and model=auto limit a run of one process; of several set trainer.max_time"
+            "max_time and model=auto work with one process; with several, set trainer.max_time"
         )
 
 

@@ -173,7 +173,7 @@ def _prepare(model: Model, links: Links, name: str, until: float) -> tuple[float
 def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, folder: Path) -> Start:
     """The trained model, or one from its second start if that validates better.
 
-    A limit in time is for one training, so the second one is left out.
+    With ``trainer.max_time`` there is no second start, since that limit is for a single training.
     """
     own = Start(model, config, 0.0)
     is_limited = config["trainer"].get("max_time") is not None
@@ -193,7 +193,7 @@ def _try_second_start(model: Model, loss: Loss, links: Links, config: dict, fold
     other.known_places = model.known_places
     content = checkpoint.read(place / "best.ckpt")
     scores = []
-    # A resumed run may find the second start in best.ckpt already.
+    # last.ckpt has the first start's score: after a resume best.ckpt may be of the second start.
     for trained in (checkpoint.read(folder / "last.ckpt"), content):
         scores.append(trained["callbacks"][KeepBest.__name__]["best"])
     log.info("validation: %.4f from the first start, %.4f from %s", *scores, model.second_start)

@@ -245,12 +245,12 @@ class Placed(NamedTuple):
 
 
 class Tokens(NamedTuple):
-    """Embeddings from a tokenizer for a deformation; each may have a last axis of length 0.
+    """Embeddings that a tokenizer gives to a deformation. Absent ones have a last axis of length 0.
 
     Attributes:
         scene: CLS for each query.
-        gaussians: E(P_x) for each Gaussian, or for each query and Gaussian.
-        transmitters: E(P_TX) for each query.
+        gaussians: Embedded positions E(P_x) for each Gaussian, or for each query and Gaussian.
+        transmitters: Embedded positions E(P_TX) for each query.
 
     Source: GAI-GS, "Multi-view Tokenizer", eq. (10).
     """

@@ -98,7 +98,7 @@ def test_an_ensemble_has_a_member_and_one_process_and_is_not_trained_again(links
         gaigs.train("gaigs", links, "trainer.devices=2", "trainer.strategy=ddp", ensemble=2, **FEW)
     with pytest.raises(
         ValueError,
-        match=r"max_time and model=auto limit a run of one process; of several set trainer",
+        match=r"max_time and model=auto work with one process; with several, set trainer",
     ):
         gaigs.train(
             "gaigs",

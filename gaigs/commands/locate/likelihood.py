@@ -182,10 +182,11 @@ def choose_likelihood(
     half_octaves: Iterable[int] = range(-8, 17),
     fewest: int = 20,
 ) -> Fingerprints:
-    """The map with the degrees of freedom and the exponent of the lowest energy score.
+    """The map with the likelihood that gives held-out fingerprints the lowest energy score.
 
-    The fingerprints in ``held`` calibrate regions, so they must not influence their own likelihood.
-    The likelihood of each fold is therefore chosen by the other folds.
+    Two numbers are chosen: the degrees of freedom of Student's t, and the exponent (``temper``) of
+    its likelihood. The fingerprints in ``held`` calibrate regions, so they must not influence their
+    own likelihood. The likelihood of each fold is therefore chosen by the other folds.
 
     Args:
         prints: The map of the model that knows all training links.
@@ -193,8 +194,8 @@ def choose_likelihood(
         freedoms: Degrees of freedom to choose from, the heaviest tails first.
         half_octaves: Integers i; the exponents to choose from are 2^(i / 2).
         fewest: Smallest number of fingerprints that choose the degrees of freedom: fewer rarely
-            contain an outlier. With fewer, levels keep the likelihood of ``prints``, and other
-            labels take the heaviest tails.
+            contain an outlier. With fewer, scalar labels keep the likelihood of ``prints``, and
+            other labels take the heaviest tails.
     """
     tempers = [2.0 ** (power / 2) for power in half_octaves]
     if sum(len(trial.truth) for trial in trials) >= fewest:

@@ -156,8 +156,9 @@ def rasterize(
     moves = means.ndim == 3
     maps = []
     transmittances = []
-    for row in [slice(k, k + 1) for k in range(b)] if moves else [slice(None)]:
-        places = means[row.start if len(means) > 1 else 0] if moves else means  # (n, 3)
+    rows = [slice(k, k + 1) for k in range(b)] if moves else [slice(None)]
+    for row in rows:
+        places = _rows(means, row)[0] if moves else means  # (n, 3)
         shape = [_rows(values, row) for values in (quats, scales)]
         splats, plane = project(
             places, *shape, receiver=receiver, grid=grid, projection=projection, pixel=pixel

@@ -102,8 +102,8 @@ class _Tiles:
 
         NaN also gives True, so that the fault shows in the map.
         """
-        # The footprint is ALPHA_MIN / a at x' C^-1 x = 2 ln(a / ALPHA_MIN): an ellipse whose box
-        # has these halves.
+        # A splat of opacity a falls to ALPHA_MIN on the ellipse x' C^-1 x = reach². Half the edges
+        # of its bounding box are reach sqrt(diag C), with C = F F' and F = [[p, 0], [q, r]].
         reach = (2 * (opacities / ALPHA_MIN).log().clamp_min(0)).sqrt()  # (b, n)
         p, q, r = factors.unbind(-1)
         boxes = torch.stack((p, torch.hypot(q, r)), -1)  # (1 or b, n, 2)
@@ -303,8 +303,11 @@ class _Composite(torch.autograd.Function):
                 if gradient is not None:
                     gradient.index_add_(axis, k.flatten(), part.flatten(axis, axis + 1))
         if inputs.logs is not None:
+            # The inputs are logarithms of attenuations a: d / d log a = a d / da. STEEPEST keeps
+            # the gradient finite at a = 0.
             gradients[-1] /= inputs.logs.exp().clamp_min(STEEPEST)
-        means, *others = gradients  # the last splat is the filling
+        # The last splat fills the lists of tiles, and is no input.
+        means, *others = gradients
         return (
             None,
             means[:-1],
