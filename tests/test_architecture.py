@@ -23,7 +23,7 @@ FILES = {
 }
 LONGEST_CHAIN = 10
 LIMITS = {
-    "lines of gaigs/": 50_198,
+    "lines of gaigs/": 50_244,
     "lines of a file": 500,
     "lines of a function, without its docstring": 61,
     "module constants": 100,
@@ -37,7 +37,7 @@ frames, plots, the choice of a model and channels with few values made them 44,6
 without measurements, placement, front ends, large surveys and buildings 47,500. Shorter docstrings
 of internal parts left 46,100. Reasons, shapes and docstrings added 1,020; boxes in shadows,
 averages of models and large surveys 700. Terms and parameters that docstrings explain added 100,
-and terrain 240. Docstrings that need no knowledge of the code added 145.
+and terrain 290. Docstrings that need no knowledge of the code added 145.
 """
 
 

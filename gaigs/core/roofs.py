@@ -139,7 +139,8 @@ def obstruct(
     roof = (roofs.heights.to(x)[cells] + bulge).where(counts, -math.inf)
     surface = roof
     if roofs.ground is not None:
-        ground = (roofs.ground.to(x)[cells] + bulge).where(counts, -math.inf)
+        points = torch.stack((x, y, path), -1).flatten(0, 1)  # (b k, 3)
+        ground = (roofs.ground_at(points).view_as(x) + bulge).where(counts, -math.inf)
         surface = torch.maximum(roof, ground)
     is_blocked = roof > path  # (b, k)
     inside = is_blocked.sum(1) * (ends - starts).norm(dim=1) / count

@@ -1,5 +1,7 @@
 """Heights of the ground in GeoTIFF files, on a grid in the world frame."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -27,9 +29,10 @@ def read_extent(file: str | Path, frame: Frame | None) -> Extent:
     rasterio = find_rasterio()
     with _open(rasterio, file) as raster:
         source, target, origin = _systems(raster, frame)
-        transform, columns, rows = rasterio.warp.calculate_default_transform(
-            source, target, raster.width, raster.height, *raster.bounds
-        )
+        with _named(rasterio, file):
+            transform, columns, rows = rasterio.warp.calculate_default_transform(
+                source, target, raster.width, raster.height, *raster.bounds
+            )
     cell = transform.a
     upper = np.array([transform.c + columns * cell, transform.f]) - origin
     return Extent(upper - cell * np.array([columns, rows]), upper, cell)
@@ -40,35 +43,53 @@ def read_ground(
 ) -> tuple[Float[ndarray, "rows columns"], Bool[ndarray, "rows columns"]]:
     """Heights of the ground at the middles of a grid's cells [m], and whether the file has them.
 
-    Heights are the file's first band, linear between its pixels. A cell without one gets the
-    nearest height. With a frame, the file's coordinate system is converted to that of the frame,
-    and a file without a system has the frame's. Without a frame, coordinates are metres of the
-    world frame.
+    Heights are the file's first band with its scale and offset, linear between pixels. A cell
+    without one gets the nearest height. With a frame, the file's coordinate system is converted to
+    that of the frame, and a file without a system has the frame's. Without a frame, coordinates are
+    metres of the world frame.
 
     Raises:
         FileNotFoundError: The file does not exist.
         ImportError: rasterio is not installed.
-        ValueError: The file is no raster, or it is in degrees and the data have no frame.
+        ValueError: The file is no raster, has no place on a map, is in degrees while the data have
+            no frame, or has no heights of ground in the grid: all missing, or below -1 km or above
+            10 km.
     """
     rasterio = find_rasterio()
     heights = np.full((grid.rows, grid.columns), np.nan, dtype=np.float32)
     with _open(rasterio, file) as raster:
         source, target, origin = _systems(raster, frame)
         x, y = origin + grid.lower
-        rasterio.warp.reproject(
-            rasterio.band(raster, 1),
-            heights,
-            src_crs=source,
-            dst_crs=target,
-            dst_transform=rasterio.Affine(grid.cell, 0, x, 0, grid.cell, y),
-            dst_nodata=np.nan,
-            resampling=rasterio.warp.Resampling.bilinear,
-        )
+        with _named(rasterio, file):
+            rasterio.warp.reproject(
+                rasterio.band(raster, 1),
+                heights,
+                src_crs=source,
+                dst_crs=target,
+                dst_transform=rasterio.Affine(grid.cell, 0, x, 0, grid.cell, y),
+                dst_nodata=np.nan,
+                resampling=rasterio.warp.Resampling.bilinear,
+            )
+        heights = np.float32(raster.scales[0]) * heights + np.float32(raster.offsets[0])
     is_known = np.isfinite(heights)
-    if is_known.any():
-        nearest = distance_transform_edt(~is_known, return_distances=False, return_indices=True)
-        heights = heights[tuple(nearest)]
-    return heights, is_known
+    if not is_known.any():
+        raise ValueError(f"{file} has no height near the links\ngive terrain of the site")
+    if heights[is_known].min() < -1e3 or heights[is_known].max() > 1e4:
+        raise ValueError(
+            f"{file}: heights from {np.nanmin(heights):.0f} to {np.nanmax(heights):.0f} m are no "
+            "ground\ndeclare the value of missing heights, such as: gdal_edit.py -a_nodata -9999"
+        )
+    nearest = distance_transform_edt(~is_known, return_distances=False, return_indices=True)
+    return heights[tuple(nearest)], is_known
+
+
+@contextmanager
+def _named(rasterio: ModuleType, file: str | Path) -> Iterator[None]:
+    """Makes an error of GDAL a ``ValueError`` that names the file."""
+    try:
+        yield
+    except (rasterio.errors.RasterioError, rasterio.errors.CRSError) as error:
+        raise ValueError(f"cannot place {file} on the map of the data: {error}") from error
 
 
 def find_rasterio() -> Any:
@@ -84,9 +105,13 @@ def _open(rasterio: ModuleType, file: str | Path) -> Any:
     """An open file; a ``ValueError`` if it is no raster."""
     file = find_file(file, "terrain", "terrain")
     try:
-        return rasterio.open(file)
+        raster = rasterio.open(file)
     except rasterio.errors.RasterioIOError as error:
         raise ValueError(f"cannot read {file} as GeoTIFF: {error}") from error
+    if raster.transform.is_identity:
+        raster.close()
+        raise ValueError(f"{file} has no place: write its corner and pixel size, or a .tfw file")
+    return raster
 
 
 def _systems(raster: Any, frame: Frame | None) -> tuple[Any, Any, Float[ndarray, "2"]]:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from scipy.constants import speed_of_light
 from scipy.optimize import nnls
 from torch import Tensor
+from torch.nn import functional
 
 from gaigs.core.query import Batch, Query
 from gaigs.core.roofs import Roofs, obstruct, plan_grid, rasterize_roofs
@@ -106,7 +107,7 @@ class Site(Model):
         if self.buildings and not features[:, 0].any():
             log.warning(
                 "%s: no roof is above the direct path of any link\n"
-                "compare heights of buildings and places: both are above 0 of the data's z",
+                "compare heights of buildings, ground and places: they need one zero",
                 self.buildings,
             )
         columns = torch.cat((links.labels[index, None].double(), -features), 1)  # (k, 5)
@@ -162,7 +163,10 @@ class Site(Model):
             return rasterize_roofs(buildings, grid)
         ground, is_known = read_ground(self.terrain, frame, grid)
         roofs = rasterize_roofs(buildings, grid, ground)
-        covered = roofs._replace(ground=torch.from_numpy(is_known).float())
+        # A margin without heights: beyond the grid the file has none either.
+        known = functional.pad(torch.from_numpy(is_known).float(), (1, 1, 1, 1))
+        lower = roofs.lower[0] - roofs.cell, roofs.lower[1] - roofs.cell
+        covered = roofs._replace(ground=known, lower=lower)
         self._place_ends(links, roofs, covered)
         return roofs
 
@@ -197,11 +201,27 @@ class Site(Model):
                 100 * outside,
             )
         is_above = self.above_ground
+        heights = ends[:, 2] - roofs.ground_at(ends)  # above the ground, if z has its zero
         if is_above is None:
-            is_above = bool((ends[:, 2] - roofs.ground_at(ends)).median() < 0)
+            is_above = bool(heights.median() < 0)
         self.is_lifted.fill_(is_above)
+        heights = ends[:, 2] if is_above else heights
+        below = (heights < -2.0).float().mean().item()  # [m]; terrain is seldom known better
+        if below > 0.05:
+            log.warning(
+                "%s: %.0f %% of the ends of links are over 2 m below the ground\n"
+                "set above_ground=%s, or compare the zeros of terrain and places",
+                self.terrain,
+                100 * below,
+                not is_above,
+            )
         reference = "the ground" if is_above else "the zero of the terrain"
-        log.info("heights of transmitters and receivers are above %s", reference)
+        log.info(
+            "z of transmitters and receivers is above %s: they stand %.0f m above the ground "
+            "(median)",
+            reference,
+            heights.median().item(),
+        )
 
 
 def shared_coefficients(

@@ -121,6 +121,15 @@ def test_ground_is_linear_between_cells_and_level_beyond_the_margin():
     assert roofs.ground_at(points).tolist() == pytest.approx([3.5, 41.5, 2.5], abs=1e-4)
 
 
+def test_a_slope_obstructs_no_path_between_ends_above_it():
+    ground, grid = slope(3000.0, 0.4, cell=30.0)
+    roofs = rasterize_roofs([], grid, ground)
+    ends = torch.tensor([[100.0, 0.0, 10.0], [1333.0, 11.0, 1.5], [2900.0, -7.0, 40.0]])
+    ends[:, 2] += roofs.ground_at(ends)
+    loss = obstruct(roofs, ends[[0, 0, 2]], ends[[1, 2, 0]], wavelength=0.15)[:, 3]
+    assert (loss < 3).all()  # the slope lies below the path: some of Fresnel's zone alone
+
+
 def test_a_building_stands_on_the_ground_or_on_its_own():
     ground, grid = slope(100.0, 0.5)
     own = box(70, -10, 80, 10, 6.0)._replace(ground=3.0)

@@ -77,12 +77,41 @@ def test_missing_heights_are_the_nearest_ones(tmp_path):
     assert found[5, 39] == found[5, 19]
 
 
+def test_scale_and_offset_of_the_file_count(tmp_path):
+    transform = Affine(10, 0, 0, 0, -10, 300)
+    file = write(tmp_path / "ground.tif", 10 * (plane() - 400), transform)
+    with rasterio.open(file, "r+") as raster:
+        raster.scales, raster.offsets = (0.1,), (400.0,)
+    grid = plan_grid(np.array([0.0, 0.0]), np.array([390.0, 290.0]), 10.0)
+    heights, _ = read_ground(file, None, grid)
+    np.testing.assert_allclose(heights, expected(grid), atol=0.26)
+
+
+def test_heights_that_are_no_ground_are_named(tmp_path):
+    heights = plane()
+    heights[:, 20:] = -32768
+    transform = Affine(10, 0, 0, 0, -10, 300)
+    file = write(tmp_path / "ground.tif", heights, transform)
+    grid = plan_grid(np.array([0.0, 0.0]), np.array([390.0, 290.0]), 10.0)
+    with pytest.raises(ValueError, match=r"heights from -32768 to .* m are no ground\ndeclare"):
+        read_ground(file, None, grid)
+    away = plan_grid(np.array([5e3, 5e3]), np.array([6e3, 6e3]), 10.0)
+    with pytest.raises(ValueError, match="has no height near the links"):
+        read_ground(file, None, away)
+
+
 def test_defects_are_named(tmp_path):
     text = tmp_path / "ground.tif"
     text.write_text("no raster")
     with pytest.raises(ValueError, match=r"cannot read .*ground.tif as GeoTIFF"):
         read_extent(text, None)
     transform = Affine(1e-4, 0, 11.5, 0, -1e-4, 48.1)
+    damaged = tmp_path / "damaged.tif"
+    whole = write(tmp_path / "whole.tif", np.random.default_rng(0).random((90, 90)), transform)
+    damaged.write_bytes(whole.read_bytes()[:-9000])
+    grid = plan_grid(np.array([11.5, 48.091]), np.array([11.509, 48.1]), 1e-4)
+    with pytest.raises(ValueError, match=r"cannot place .*damaged.tif on the map"):
+        read_ground(damaged, None, grid)
     degrees = write(tmp_path / "degrees.tif", plane(), transform, "EPSG:4326")
     with pytest.raises(ValueError, match="is in degrees, and the data have no place on a map"):
         read_extent(degrees, None)

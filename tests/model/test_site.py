@@ -164,23 +164,23 @@ def test_the_loss_behind_a_ridge_is_found_and_loads_without_the_file(hills, tmp_
     torch.testing.assert_close(loaded.predict(links.query), model.predict(links.query))
 
 
-def test_heights_above_the_sea_are_not_lifted(hills):
-    links, file = hills
-    model = Site(links.scene, terrain=file, above_ground=False)
-    model.fit(links)
-    assert not model.is_lifted  # all links are deep under ground, which the option demands
-
-
-def test_ends_beyond_the_terrain_are_a_warning(hills, caplog):
+@pytest.mark.parametrize(("first", "percent"), [(0, 53), (120, 47)], ids=["west", "east"])
+def test_ends_beyond_the_terrain_are_a_warning(first, percent, hills, caplog):
     links, file = hills
     with rasterio.open(file) as raster:
-        heights = raster.read(1)
-    heights[:, 200:] = -9999
-    with rasterio.open(file, "r+") as raster:
-        raster.nodata = -9999
-        raster.write(heights, 1)
+        part = raster.read(window=((0, 160), (first, first + 120)))
+        profile = raster.profile | {"width": 120}
+    profile["transform"] = Affine(5, 0, -100 + 5 * first, 0, -5, 700)
+    with rasterio.open(file, "w", **profile) as raster:
+        raster.write(part)
     Site(links.scene, terrain=file).fit(links)
-    assert "no height of the ground at" in caplog.text
+    assert f"no height of the ground at {percent} % of the ends" in caplog.text
+
+
+def test_ends_below_the_ground_are_a_warning(hills, caplog):
+    links, file = hills
+    Site(links.scene, terrain=file, above_ground=False).fit(links)
+    assert "100 % of the ends of links are over 2 m below the ground" in caplog.text
 
 
 def test_a_map_must_be_given(hills):
