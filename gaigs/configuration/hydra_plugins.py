@@ -1,6 +1,5 @@
 """Extensions of Hydra: its search path, the options of constructors, and resolvers."""
 
-import functools
 import hashlib
 import logging
 from collections.abc import Mapping
@@ -47,8 +46,7 @@ class Constructors(ConfigSource):
             for name in registry(kind).names():
                 self.components[f"{kind}/{name}"] = (kind, name)
         # A run composes twice, and each search for a component's file lists all plug-ins.
-        self.options = functools.cache(lambda kind, name: registry(kind).options(name))
-        self.choices = functools.cache(lambda kind, name: registry(kind).choices(name))
+        self.contents: dict[tuple[str, str], tuple[dict, dict]] = {}  # choices and options
 
     def __deepcopy__(self, memo: dict) -> "Constructors":
         return self  # Hydra copies its sources for each group that it lists
@@ -58,8 +56,11 @@ class Constructors(ConfigSource):
         return "constructors"
 
     def load_config(self, config_path: str) -> ConfigResult:
-        kind, name = self.components[self._component_path(config_path)]
-        choices = self.choices(kind, name)
+        kind, name = component = self.components[self._component_path(config_path)]
+        if component not in self.contents:
+            own = registry(kind)
+            self.contents[component] = own.choices(name), own.options(name)
+        choices, defaults = self.contents[component]
         package = None
         if choices and not config_path.startswith("constructors/"):
             # As a file of conf that begins with # @package _global_.
@@ -68,7 +69,7 @@ class Constructors(ConfigSource):
             overrides = [{f"override /{group}": choice} for group, choice in choices.items()]
             node = OmegaConf.create({"defaults": [options, *overrides]})
         else:
-            node = OmegaConf.create({**self.options(kind, name), "name": name})
+            node = OmegaConf.create({**defaults, "name": name})
         return ConfigResult(self.provider, f"{self.scheme()}://", node, {"package": package})
 
     def available(self) -> bool:
