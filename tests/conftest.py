@@ -8,7 +8,6 @@ import copy
 import functools
 import gc
 import inspect
-import itertools
 import os
 import pickle
 import re
@@ -258,47 +257,6 @@ def files_read_once():
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ConfigRepository, "load_config", once)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def mapped_if_needed():
-    """A quarter of a composition is a map of choices for each file of the defaults' tree; only
-    interpolations read it.
-    """
-    from hydra._internal import defaults_list
-
-    choices = defaults_list._create_interpolation_map
-
-    def needed(overrides, defaults, self_added):
-        if any(default.is_interpolation() for default in defaults):
-            return choices(overrides, defaults, self_added)
-        return None
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(defaults_list, "_create_interpolation_map", needed)
-        yield
-
-
-@pytest.fixture(scope="session", autouse=True)
-def hydra_joined_once():
-    """Copies of Hydra's own defaults joined: each composition begins with them, a third of its time."""
-    from hydra._internal.config_loader_impl import ConfigLoaderImpl
-
-    join, found = ConfigLoaderImpl._compose_config_from_defaults_list, {}
-    own = re.compile(r"hydra/(\w+/(default|basic)|config)")
-
-    def once(self, defaults, repo):
-        first = [*itertools.takewhile(lambda one: own.fullmatch(str(one.config_path)), defaults)]
-        key = repr(first)
-        if key not in found:
-            found[key] = pickle.dumps(join(self, first, repo))
-        config = pickle.loads(found[key])
-        config.merge_with(join(self, defaults[len(first) :], repo))
-        return config
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ConfigLoaderImpl, "_compose_config_from_defaults_list", once)
         yield
 
 

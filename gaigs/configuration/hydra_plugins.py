@@ -4,6 +4,7 @@ import hashlib
 import logging
 from collections.abc import Mapping
 from importlib import metadata
+from typing import Any
 
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.config_store import ConfigStore
@@ -31,6 +32,11 @@ class PluginConfigurations(SearchPathPlugin):
         search_path.append(provider="constructors", path=f"{Constructors.scheme()}://")
 
 
+def _keep(part: Any, memo: dict) -> Any:
+    """The deep copy of a part that stays as it is: Hydra copies it for each of 210 groups."""
+    return part
+
+
 class Constructors(ConfigSource):
     """The configuration of a component: ``name``, and its constructor's options with defaults.
 
@@ -48,19 +54,18 @@ class Constructors(ConfigSource):
         # A run composes twice, and each search for a component's file lists all plug-ins.
         self.contents: dict[tuple[str, str], tuple[dict, dict]] = {}  # choices and options
 
-    def __deepcopy__(self, memo: dict) -> "Constructors":
-        return self  # Hydra copies its sources for each group that it lists
+    __deepcopy__ = _keep
 
     @staticmethod
     def scheme() -> str:
         return "constructors"
 
     def load_config(self, config_path: str) -> ConfigResult:
-        kind, name = component = self.components[self._component_path(config_path)]
-        if component not in self.contents:
-            own = registry(kind)
-            self.contents[component] = own.choices(name), own.options(name)
-        choices, defaults = self.contents[component]
+        kind, name = self.components[self._component_path(config_path)]
+        if (kind, name) not in self.contents:
+            components = registry(kind)
+            self.contents[kind, name] = components.choices(name), components.options(name)
+        choices, defaults = self.contents[kind, name]
         package = None
         if choices and not config_path.startswith("constructors/"):
             # As a file of conf that begins with # @package _global_.
@@ -144,8 +149,7 @@ def install() -> None:
     # Hydra refuses a new key on the command line, except in a mapping that is open.
     node = OmegaConf.create({}, flags={"struct": False})
     ConfigStore.instance().store(name="open", node=node)
-    # Hydra copies the store, with all that it holds, for each of 210 groups that --help lists.
-    ConfigStore.__deepcopy__ = lambda store, _: store  # type: ignore[attr-defined]
+    ConfigStore.__deepcopy__ = _keep  # type: ignore[attr-defined]
     if PluginConfigurations not in Plugins.instance().discover(SearchPathPlugin):
         Plugins.instance().register(Constructors)
         Plugins.instance().register(PluginConfigurations)

@@ -238,7 +238,9 @@ def _with_imports(place: Path) -> set[Path]:
     """The source files of a module or package, and of those in ./plugins that they import."""
     plugins = Path.cwd() / "plugins"
     roots = [plugins, *sources(plugins)]
-    entries = [path for root in roots if root.is_dir() for path in root.iterdir()]
+    entries: list[Path] = []
+    for root in filter(Path.is_dir, roots):
+        entries += root.iterdir()
     known: set[Path] = set()
     places = [place]
     while places:
