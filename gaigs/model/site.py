@@ -165,8 +165,8 @@ class Site(Model):
         roofs = rasterize_roofs(buildings, grid, ground)
         # A margin without heights: beyond the grid the file has none either.
         known = functional.pad(torch.from_numpy(is_known).float(), (1, 1, 1, 1))
-        lower = roofs.lower[0] - roofs.cell, roofs.lower[1] - roofs.cell
-        covered = roofs._replace(ground=known, lower=lower)
+        corner = roofs.lower[0] - roofs.cell, roofs.lower[1] - roofs.cell
+        covered = roofs._replace(ground=known, lower=corner)
         self._place_ends(links, roofs, covered)
         return roofs
 
