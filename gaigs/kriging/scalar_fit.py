@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,8 @@ from gaigs.kriging.likelihood import (
     slopes,
 )
 from gaigs.kriging.links import scale_bounds
-from gaigs.kriging.neighbours import HeldOutReadings
+from gaigs.kriging.neighbours import Around, HeldOutReadings
+from gaigs.processes import in_threads
 
 
 @dataclass(frozen=True)
@@ -180,23 +182,37 @@ class HeldOutCost:
         The gradient of the matrices is written out; autograd would take several times as long.
         """
         logarithms, choice = self.unpacked(torch.from_numpy(point))
-        receivers, hyperparameters = self.around.receivers, logarithms.exp()
-        noises = hyperparameters[receivers, 2].square()  # (m,)
-        between = covariances(self.around, hyperparameters, choice)
-        noise_power = noises[:, None] * self.factors  # (m, j)
-        given = conditional(between, self.readings, noise_power)
+        parts = [slice(first, first + 64) for first in range(0, len(self.asked), 64)]
+        totals, of_places = zip(
+            *in_threads(partial(self._likelihood_of, logarithms, choice), parts), strict=True
+        )
+        of_place = torch.cat(of_places)  # (m, 4)
+        gradient = torch.zeros_like(logarithms)
+        gradient.index_add_(0, self.around.receivers, of_place[:, :3])
+        return sum(totals), gradient, of_place[:, 3].sum().item()
+
+    def _likelihood_of(
+        self, logarithms: Float[Tensor, "r 3"], choice: Choice, rows: slice
+    ) -> tuple[float, Float[Tensor, "m 4"]]:
+        """Negative log likelihood of some held-out readings, and its ``slopes`` at each."""
+        around = Around(*(field if field is None else field[rows] for field in self.around))
+        hyperparameters = logarithms.exp()
+        noises = hyperparameters[around.receivers, 2].square()  # (m,)
+        between = covariances(around, hyperparameters, choice)
+        noise_power = noises[:, None] * self.factors[rows]  # (m, j)
+        given = conditional(between, self.readings[rows], noise_power)
         with torch.enable_grad():
             leaves = [given.means, given.variances, noises]
             leaves = [leaf.detach().requires_grad_() for leaf in leaves]
             means, variances, noise = leaves
-            total = -log_density(self.asked - means, variances, noise, choice.degrees).sum()
+            errors = self.asked[rows] - means
+            total = -log_density(errors, variances, noise, choice.degrees).sum()
             of_mean, of_variance, of_noise = torch.autograd.grad(total, leaves)
         of_place = slopes(  # (m, 4)
-            self.around, hyperparameters, choice, between, noise_power, given, of_mean, of_variance
+            around, hyperparameters, choice, between, noise_power, given, of_mean, of_variance
         )
         of_place[:, 2] += 2 * of_noise * noises
-        gradient = torch.zeros_like(logarithms).index_add(0, receivers, of_place[:, :3])
-        return total.item(), gradient, of_place[:, 3].sum().item()
+        return total.item(), of_place
 
     def start(self, logarithms: Float[Tensor, "r 3"] | None) -> np.ndarray:
         """The initial point: from earlier hyperparameters, or the best of a coarse grid."""
