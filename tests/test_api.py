@@ -322,7 +322,8 @@ def numbers(path):
     links = gaigs.links(
         task="rssi", transmitters=places, receivers=array, labels=-40 - places[:, 0]
     )
-    model = gaigs.train("mirrored", links, max_steps=2, enable_progress_bar=False)
+    few = {"placement.planes": 6, "placement.order": 0}
+    model = gaigs.train("mirrored", links, max_steps=2, enable_progress_bar=False, **few)
     return [*values, model.predict(PLACES), array.array.elements, gaigs.Grid.degrees().elevations]
 
 

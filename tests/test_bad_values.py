@@ -114,23 +114,28 @@ def composed(*words):
 def compositions(kind, name):
     """Configurations that may choose the component, each with its task, the plainest first.
 
-    A part without a file of its own is put into the composition of the others, as Hydra does: a
-    composition takes 0.2 s.
+    A component without a file of its own is put into the composition of the others, as Hydra does:
+    a composition takes 0.2 s.
     """
-    is_part = kind in (*PARTS, "loss", "split") and not files.files_of(kind, name)
+    is_put = kind != "training" and kind in SWEPT and not files.files_of(kind, name)
+    variants = [PLAIN, MIRRORED] if kind in PARTS else [PLAIN]
+    if not is_put:
+        variants = {"data": [()], "model": [PLAIN, ()]}.get(kind, variants)
     for task in DATA:
-        chosen = [f"{kind}={name}"] if kind == "data" else [f"data={DATA[task]}"]
-        if kind != "data" and not is_part:
-            chosen += [f"{kind}={name}", *GIVEN.get(name, [])]
-        for more in {"data": [()], "model": [PLAIN, ()]}.get(
-            kind, [PLAIN, MIRRORED] if kind in PARTS else [PLAIN]
-        ):
+        chosen = [f"data={DATA[task]}"]
+        if not is_put:
+            own = [f"{kind}={name}", *GIVEN.get(name, [])]
+            chosen = own if kind == "data" else chosen + own
+        for more in variants:
             config = copy.deepcopy(composed(*chosen, *more, *SMALL.get(name, ())))
             if config is None:
                 continue
-            if is_part:
+            if is_put:
                 options = registry(kind).options(name) | WITHOUT_DEFAULT.get(name, {})
                 node = OmegaConf.create({**options, "name": name})  # lists in place of tuples
+                for key in ("root", "file"):
+                    if kind == "data" and OmegaConf.is_missing(node, key):
+                        node[key] = "nowhere"
                 (config["model"] if kind in PARTS else config)[kind] = OmegaConf.to_container(node)
             yield task, config
 

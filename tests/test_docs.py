@@ -4,7 +4,6 @@ import contextlib
 import csv
 import functools
 import importlib
-import itertools
 import json
 import os
 import pkgutil
@@ -46,6 +45,8 @@ PAGES = sorted(
 OURS = tuple(f"{folder}/" for folder in ("gaigs", "conf", "plugins", "tests", "docs", "benchmarks"))
 FILES = {".csv", ".json", ".png", ".ply", ".log"}
 """Endings of files that look like keys."""
+
+PARTS = {*CHOSEN} - {"trainer"}
 
 PLUGINS = ROOT / "docs/plugins.md"
 BRIEF = [
@@ -239,16 +240,38 @@ def together():
     return found
 
 
+def key(word):
+    """What a word chooses or sets."""
+    return word.lstrip("~+").partition("=")[0]
+
+
+BRINGING = {"experiment", "variant", "data", "task", "model"}
+"""Choices that bring other parts."""
+
+
+def facts(choice, words):
+    """The choices, and each option beside the choices that may have it."""
+    chosen = {key(word): word for word in choice}
+    bringing = [word for word in choice if key(word) in BRINGING]
+    found = {*choice}
+    for option in map(key, words.values()):
+        part = option.partition(".")[0]
+        if part in chosen:
+            found.add((chosen[part], option))
+        else:  # keys of no part are always there
+            found |= {(word, option) for word in (bringing if part in PARTS else [""])}
+    return found
+
+
 @functools.cache
 def telling():
-    """The choices that have a word, or an option beside a word, that no other ones have."""
-    known, kept = set(), set()
-    for choice, words in sorted(together().items(), key=lambda item: -len(item[1])):
-        options = words.keys() - {word.partition("=")[0] for word in choice}
-        facts = {*choice, *itertools.product(choice, options)} or {()}
-        if not facts <= known:
-            kept.add(choice)
-            known |= facts
+    """The fewest choices that have all facts, the one that adds most first."""
+    left = {choice: facts(choice, words) for choice, words in together().items()}
+    kept = set()
+    while any(left.values()):
+        most = max(left, key=lambda choice: len(left[choice]))
+        kept.add(most)
+        left = {choice: found - left[most] for choice, found in left.items()}
     return kept
 
 
@@ -296,10 +319,8 @@ def test_configuration_keys_exist(page, composed, place):
             assert value.strip('"') in options, word
         elif not _has(composed(), key):
             # A key that only some option of its group has, such as data.root, exists too.
-            names = sorted(
-                options, key=lambda name: rest[0] not in options[name]
-            )  # likely ones first
-            if not any(_has(composed(f"{top}={name}"), key) for name in names):
+            own = any(_has(option, ".".join(rest)) for option in options.values())
+            if not (own or any(_has(composed(f"{top}={name}"), key) for name in options)):
                 assert "=" in word, word
                 composed(word)  # of a section to which any key may be added
 
@@ -310,16 +331,12 @@ def options_of(top, place):
     with contextlib.chdir(place):
         folders = [configuration.conf_dir(), *configuration.plugin_conf_dirs()]
         options = {
-            file.stem: OmegaConf.load(file)
+            file.stem: OmegaConf.to_container(OmegaConf.load(file))
             for folder in folders
             for file in folder.glob(f"{top}/*.yaml")
         }
-        if top in CONSTRUCTED:
-            options |= {
-                name: registry(top).options(name)
-                for name in registry(top).names()
-                if name not in options
-            }
+        for name in registry(top).names() if top in CONSTRUCTED else ():
+            options[name] = registry(top).options(name) | options.get(name, {})
     return options
 
 

@@ -14,7 +14,7 @@ from gaigs.core.task.spectrum import Spectrum
 from gaigs.testing import check_model
 
 IMAGES = "model.octaves=[-2,0] model.pixel=20"
-SPLATS = "gaussians.count=40 deformation.width=16 rasterizer=torch"
+SPLATS = "gaussians.count=40 deformation.width=16"
 SMALL = {
     "array_response": "model.rows=4 model.columns=4 model.pitch=0.5 model.octaves=[-1,1] model.width=16 model.layers=1",
     "mlp": f"model.widths=[6,5] model.dropout=0.25 {IMAGES}",
@@ -26,7 +26,7 @@ SMALL = {
     "newrf": "model.arrivals=3 model.samples=4 model.octaves=2 model.width=8 model.layers=5",
     "ngrf": "model.count=3 model.width=8 model.layers=2",
     "gsrf": "model.count=60",
-    "rf_3dgs": "gaussians.count=40 rasterizer=torch",
+    "rf_3dgs": "gaussians.count=40",
     "swift_wrf": "model.count=40 model.width=16 model.layers=3",
     **dict.fromkeys(("wide_gs", "wrf_gs", "wrf_gs_plus"), SPLATS),
 }
@@ -45,7 +45,9 @@ class Delay(Scalar):
 
 
 def configured(name, task):
-    return composed(f"data={DATA[task]}", f"model={name}", *SMALL.get(name, "").split())
+    small = SMALL.get(name, "").split()
+    # The choices of a run, whose configuration then differs by values alone.
+    return composed(f"data={DATA[task]}", f"model={name}", *small, "rasterizer=torch")
 
 
 def make(name, scene, task="spectrum", **options):
@@ -53,7 +55,14 @@ def make(name, scene, task="spectrum", **options):
 
 
 @pytest.mark.parametrize(
-    ("name", "task"), [(name, task) for name in SMALL for task in TASKS.get(name, DATA)]
+    ("name", "task"),
+    [
+        (name, task)
+        for name in SMALL
+        for task in TASKS.get(name, DATA)
+        # Three have the parts of wide_gs but for the deformation, which reads no task.
+        if task == "spectrum" or name not in ("wrf_gs", "wrf_gs_plus")
+    ],
 )
 def test_systems_keep_the_contract_of_models(name, task):
     check_model(lambda scene: make(name, scene, task), links_of(task))
@@ -113,7 +122,6 @@ def test_a_run_stores_the_model_that_it_scores(name, tmp_path, monkeypatch):
     ("words", "pooling"),
     [
         ((), None),
-        (("data=synthetic_rssi",), "softmax_attention"),
         (("+experiment=rssi",), "softmax_attention"),
         (("+experiment=csi",), "element_sum"),
     ],

@@ -65,7 +65,7 @@ def locate(
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
-        >>> prints = gaigs.fingerprints(gaigs.train("gaussian_process", links), links, points=500)
+        >>> prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=500)
         >>> walk = [[-50.0, -48.0, -55.0, -61.0], [-51.0, -47.0, -56.0, -60.0]]  # [dBm]
         >>> found = gaigs.locate(prints, walk, step=0.5)
         >>> found.mean.shape, found.region.shape == (2, len(found.places))

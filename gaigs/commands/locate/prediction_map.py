@@ -63,7 +63,7 @@ def fingerprints(
 
     Example:
         >>> links = gaigs.links("synthetic_rssi", transmitters=60)
-        >>> prints = gaigs.fingerprints(gaigs.train("gaussian_process", links), links, points=500)
+        >>> prints = gaigs.fingerprints(gaigs.train("knn", links), links, points=500)
         >>> gaigs.locate(prints, [-50.0, -48.0, float("nan"), -61.0]).mean.shape
         torch.Size([1, 3])
     """
