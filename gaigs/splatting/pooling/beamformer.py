@@ -179,7 +179,7 @@ class Beamformer:
     def _stored_basis(
         self, parts: Tensor, carrier: float, query: Query, directions: Directions
     ) -> Float[Tensor, "m k"]:
-        """``_basis`` in the dtype and on the device of ``parts``, cached for grids.
+        """The matrix ``_basis`` in the dtype and on the device of ``parts``, cached for grids.
 
         A training uses the same few thinned grids repeatedly. Lists of rays rarely repeat.
         """

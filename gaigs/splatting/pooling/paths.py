@@ -121,8 +121,8 @@ class LagPooling(PathPooling):
         coherences = paths.coherences  # (n,)
         steering = _Steering(paths, self.least_spread)
         steps = array.lags[0].to(paths.lengths)  # (l, 3) [m]
-        # Powers add of the share of each path whose phase is unknown. Half of the lags are the
-        # conjugates of the others.
+        # The part of a path's power with an unknown phase adds without interference. Half of the
+        # lags are the conjugates of the others.
         powers = torch.view_as_real(amplitudes).square().sum(-1) * (1 - coherences.square())
         later_steps = steps[len(steps) // 2 :]
         later = (powers[..., None] * steering.at(later_steps)).sum(1)  # (b, l / 2 + 1)
@@ -130,8 +130,8 @@ class LagPooling(PathPooling):
         coherent = coherences.nonzero()[:, 0]
         if not len(coherent):
             return lags
-        # The others interfere: eq. (2) at each element, and the products of two elements. From here
-        # n counts coherent paths.
+        # The parts with a known phase interfere: eq. (2) at each element, and the products of two
+        # elements. From here n counts paths with such a part.
         response = steering.at(array.elements.to(steps))  # (b, n, e)
         waves = ((amplitudes * coherences)[..., None] * response)[:, coherent]
         if paths.bandwidth is None:

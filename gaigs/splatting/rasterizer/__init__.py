@@ -66,7 +66,10 @@ class Rasterizer(Protocol):
         attenuations: Float[Tensor, "b n"] | None,
         plane: Plane,
     ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
-        """Draws the map, and the transmittance behind the last splat."""
+        """Draws the map, and the transmittance behind the last splat.
+
+        Splats have c channels of ``signal``, opacities a_i, and attenuations d_i; None: d_i = 1.
+        """
         ...
 
 

@@ -254,6 +254,7 @@ class _Render:
         self.tiles = sizes.down * sizes.across
         self.lists = sizes.sets * self.tiles  # one for each tile and set
         self.groups_per_list = sizes.groups if sizes.sets == 1 else 1
+        # Transmitters that a work-item has room for, a constant of the kernels.
         self.group_capacity = 1 if sizes.group == 1 else LAYOUT.group
         # Opacity, attenuation and signal of one transmitter.
         self.appearance_size = 1 + self.attenuates + self.channels
@@ -263,10 +264,12 @@ class _Render:
         self.kernels = _kernels(queue, **self._macros(plane.period))
         self.order = self._share(_front_to_back(splats.depths))
         self._list_splats(splats, signal, opacities, attenuations, plane)
+        # Largest magnitude of each transmitter's signal: where the rest of a list cannot change a
+        # pixel, the kernel ends early.
         self.loudest = self._share(np.abs(signal.detach().numpy()).max((1, 2), initial=0))
 
     def _macros(self, period: float | None) -> dict[str, str | int]:
-        """Macros for building the kernels."""
+        """Constants of the kernels for the compiler; ``period`` is as in ``Plane``."""
         macros: dict[str, str | int] = {
             "CHANNELS": self.channels,
             "ATTENUATION": int(self.attenuates),
@@ -298,14 +301,8 @@ class _Render:
         spans_of_tiles = sizes.across + sizes.down if self.is_separable else 2 * self.tiles
         # A bit for each splat and span of tiles: 1 if the splat's bounding box meets the span.
         hits = self._empty(sizes.sets * sizes.words * spans_of_tiles)
-        tensors = (
-            splats.means2d,
-            splats.factors,
-            splats.visible,
-            signal,
-            opacities,
-            attenuations,
-        )
+        shapes = splats.means2d, splats.factors, splats.visible
+        tensors = *shapes, signal, opacities, attenuations
         inputs = [self._share(tensor) for tensor in tensors]  # they outlive the kernels
         outputs = (geometry, appearance, hits)
         self._run("prepare", sizes.sets * sizes.words, self.order, *inputs, spans, *outputs)
@@ -337,10 +334,11 @@ class _Render:
         transmittance = torch.empty(shape[:1] + shape[2:], dtype=torch.float32)
         outputs = self._share(image), self._share(transmittance)
         items = sizes.groups * self.tiles  # work-items
-        ends = self._empty(items)
+        ends = self._empty(items)  # entries of its list that each work-item has drawn
         checkpoints, bounds = None, None
         if differentiate:
-            # A checkpoint for each chunk of a list; the last chunk of a list may be incomplete.
+            # A checkpoint for each chunk of a list, whose last chunk may be incomplete. It has the
+            # transmittances of the tile's pixels, and the first and last row still drawn.
             count = self.groups_per_list * (sizes.entries // LAYOUT.chunk + self.lists)
             pixels = LAYOUT.rows * LAYOUT.columns
             checkpoints = self._empty(count * self.group_capacity * pixels)

@@ -190,8 +190,8 @@ def _nearest(a: Tensor, b: Tensor, period: _Period | None) -> Tensor:
     offset = a - b
     if period is None:
         return offset
-    back = offset - a
-    rest = (a - (offset - back)) - (b + back)
+    minus_b = offset - a  # -b as far as the rounded offset has it
+    rest = (a - (offset - minus_b)) - (b + minus_b)  # errors of a and of b by this rounding
     turns = (offset / period.rounded).round_()
     return (offset - turns * period.rounded) + (rest - turns * period.rest)
 

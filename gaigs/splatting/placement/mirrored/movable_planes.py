@@ -209,9 +209,10 @@ class MovablePlanes(Placement):
 
     @property
     def room_axes(self) -> Float[Tensor, "3 3"]:
-        """Axes of an upright room in columns; the first is normal to the first vertical plane.
+        """Axes of an upright room in columns; the third is the z axis.
 
-        Without a vertical plane in use it is the x axis. The last one is the z axis.
+        The first axis is the normal of the first vertical plane in use, or the world's x axis if
+        there is none.
         """
         normals = self.normals[self.used]
         upright = normals[normals[:, 2].abs() < 0.1]  # normals of vertical planes

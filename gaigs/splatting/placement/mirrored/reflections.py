@@ -260,6 +260,7 @@ def reflection_points(
     end_feet = ends[:, None] - end_heights[..., None] * normals
     # Angles of incidence and reflection are equal, so the bounce divides the line between both
     # feet of the perpendiculars in the ratio of the heights.
+    # At least 1e-6 m, so that ends on the plane do not divide by 0.
     start_heights = start_heights.abs().clamp_min(1e-6)[..., None]
     end_heights = end_heights.abs().clamp_min(1e-6)[..., None]
     return (start_feet * end_heights + end_feet * start_heights) / (start_heights + end_heights)

@@ -74,11 +74,12 @@ class _Faces(NamedTuple):
 
 def _faces(vertices: Float[Tensor, "v 3"], faces: Iterable[Face], shortest: float) -> _Faces:
     """Triangles of a mesh that are larger than a square of edge ``shortest`` [m]."""
-    corners = vertices[torch.tensor(triangles(faces), dtype=torch.long).reshape(-1, 3)]
-    normals = torch.linalg.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    numbers = torch.tensor(triangles(faces), dtype=torch.long).reshape(-1, 3)  # of the vertices
+    first, second, third = vertices[numbers].unbind(1)  # corners (f, 3) each
+    normals = torch.linalg.cross(second - first, third - first)
     areas = normals.norm(dim=1) / 2
     large = areas > shortest**2
-    return _Faces(normals[large], corners[large, 0], areas[large])
+    return _Faces(normals[large], first[large], areas[large])
 
 
 def _merged(
