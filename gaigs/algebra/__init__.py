@@ -102,8 +102,8 @@ class Algebra:
     ) -> Float[Tensor, "*batch k"]:
         """Regressive product x ∨ y: the dual of the wedge of both duals.
 
-        The join of two projective points is the line through both. A mirror u also changes its
-        sign: join(ux, uy) = -u join(x, y), as for every odd versor.
+        The join of two projective points is the line through both. A mirror u, like every odd
+        versor, also changes the sign of a join: join(ux, uy) = -u join(x, y).
         """
         return self._multiply("join", x, y)
 
@@ -137,15 +137,15 @@ class Algebra:
     ) -> Float[Tensor, "*batch k"]:
         """Motion of x by a versor u: u x u⁻¹ for an even u, u involute(x) u⁻¹ for an odd one.
 
-        A vector u reflects in the hyperplane orthogonal to it. Products of vectors rotate and
-        translate.
+        A versor is a product of vectors, even or odd by their number. A vector u reflects in the
+        hyperplane orthogonal to it. Products of vectors rotate and translate.
 
         Raises:
             ValueError: u has no inverse.
 
         Source: GAI-GS, eq. (6) and (7).
         """
-        square = self.inner(versor, versor)[..., None]
+        square = self.inner(versor, versor)[..., None]  # u reverse(u), so u⁻¹ = reverse(u) / square
         if not (square != 0).all():
             raise ValueError(
                 "a versor must be a product of vectors that are not null, "
@@ -175,9 +175,9 @@ class Algebra:
         # non-zero terms.
         x, y = torch.broadcast_tensors(x, y)
         batch = x.shape[:-1]
-        rows = x.movedim(-1, 0).reshape(self.size, batch.numel())  # (k, batch)
-        columns = y.movedim(-1, 0).reshape(self.size, batch.numel())
-        pairs = (rows[:, None] * columns).flatten(0, 1)  # (k k, batch)
+        left = x.movedim(-1, 0).reshape(self.size, batch.numel())  # (k, batch)
+        right = y.movedim(-1, 0).reshape(self.size, batch.numel())
+        pairs = (left[:, None] * right).flatten(0, 1)  # x_i y_j, (k k, batch)
         result = self.table(name, x).mT @ pairs  # (k or 2 k, batch)
         return result.reshape(len(result), *batch).movedim(0, -1)
 
@@ -212,7 +212,7 @@ def _tables(algebra: Algebra) -> dict[str, Tensor]:
     wedge = product * disjoint
     dual = wedge[:, :, -1]  # signed complement: blade i times blade j is the pseudoscalar
     join = torch.einsum("ia,jb,abc,kc->ijk", dual, dual, wedge, dual)
-    count = torch.tensor(algebra.grades)
+    count = torch.tensor(algebra.grades)  # vectors in each blade
     metric = [_square(algebra, blade) for blade in blades]
     # Points at infinity: the blades of a point's grade that hold the one null vector, with the
     # metric of the others.
@@ -246,7 +246,10 @@ def _square(algebra: Algebra, vectors: Iterable[int]) -> float:
 
 
 def _products(algebra: Algebra) -> tuple[Tensor, Tensor]:
-    """Products of all pairs of blades (k, k, k), and 1 for pairs that share no vector."""
+    """Products of all pairs of blades (k, k, k), and 1 for pairs that share no vector (k, k, 1).
+
+    Entry [i, j, l] of the products is the component of blade l in blade i times blade j.
+    """
     blades = _vectors(algebra.dimension)
     position = {frozenset(blade): index for index, blade in enumerate(blades)}
     size = algebra.size

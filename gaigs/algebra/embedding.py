@@ -38,8 +38,8 @@ def embed_point(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]
 def extract_point(multivectors: Float[Tensor, "*batch 16"]) -> Float[Tensor, "*batch 3"]:
     """Points [m] of trivectors; not finite for directions, whose e123 is zero."""
     indices = [PROJECTIVE.blades.index(blade) for blade in ("e023", "e013", "e012", "e123")]
-    x, y, z, h = (multivectors[..., index] for index in indices)
-    return torch.stack((-x, y, -z), -1) / h[..., None]
+    e023, e013, e012, e123 = (multivectors[..., index] for index in indices)
+    return torch.stack((-e023, e013, -e012), -1) / e123[..., None]
 
 
 def embed_plane(
@@ -60,4 +60,5 @@ def embed_event(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 16"]
 
     Motions of space-time are rotations, boosts and mirrors about the origin, without translations.
     """
+    # Components e1, e2 and e3 follow component 1, and 12 others follow them.
     return functional.pad(points, (1, 12))

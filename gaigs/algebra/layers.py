@@ -45,6 +45,7 @@ class EquivariantLinear(nn.Module):
         # Number of the basis map from each wedge with null vectors to each component.
         maps = algebra.table("linear_maps", torch.empty(0)).long()  # (2**r, k)
         self.register_buffer("maps", maps, persistent=False)
+        # A matrix over channels for each basis map (maps, in, out).
         self.weight = nn.Parameter(torch.empty(int(maps.max()) + 1, *multivectors))
         self.from_scalars = nn.Linear(scalars[0], multivectors[1])
         self.to_scalars = nn.Linear(multivectors[0] + scalars[0], scalars[1])
@@ -106,7 +107,7 @@ class GeometricBilinear(nn.Module):
         if not self.algebra.r:
             return self.output(self.algebra.product(left, right), scalars)
         products, joins = self.algebra.product_and_join(left, right)
-        # A mirror changes the signs of a join and of the reference's e123, so their product keeps.
+        # A mirror changes the signs of a join and of the reference's e123; their product stays.
         orientation = reference[..., self.algebra.homogeneous, None, None, None]
         return self.output(torch.cat((products, orientation * joins), -2), scalars)
 
@@ -154,29 +155,33 @@ class GeometricAttention(nn.Module):
         self.output = EquivariantLinear(algebra, (multivectors, multivectors), (scalars, scalars))
         metric = algebra.table("metric", torch.empty(0))  # (k,)
         ideal = algebra.table("ideal", torch.empty(0))  # (k,)
-        seen = metric.nonzero().flatten()
+        inner_blades = metric.nonzero().flatten()  # blades that the inner product sees
         ideal_blades = ideal.nonzero().flatten()
-        # Logits are a bilinear form of the features; the distance's is -g² y·y - h² x·x + 2 g h
-        # x·y.
-        form = torch.diag(metric[seen])
+        # The logit of ``features`` a and b is a' form b. The features of a distance are (x·x, h²,
+        # h x), and minus the squared distance is -g² y·y - h² x·x + 2 g h x·y.
+        form = torch.diag(metric[inner_blades])
         if len(ideal_blades):
             distance = torch.tensor([[0.0, -1.0], [-1.0, 0.0]])
             form = torch.block_diag(form, distance, torch.diag(2 * ideal[ideal_blades]))
-        self.parts = (len(seen), len(ideal_blades))
-        self.register_buffer("blades", torch.cat((seen, ideal_blades)), persistent=False)
+        self.parts = (len(inner_blades), len(ideal_blades))
+        self.register_buffer("blades", torch.cat((inner_blades, ideal_blades)), persistent=False)
         self.register_buffer("ideal", ideal[ideal_blades], persistent=False)
         self.register_buffer("form", form, persistent=False)
 
     def features(self, multivectors: Multivectors) -> Float[Tensor, "*batch c f"]:
-        """Factors of the logits: components of the inner product, and w(h) (x·x, h², h x)."""
-        seen, x = multivectors.index_select(-1, self.blades).split(self.parts, -1)
+        """Factors of the logits: components of the inner product, and w(h) (x·x, h², h x).
+
+        Algebras other than the projective one have no distances, and only the components.
+        """
+        components = multivectors.index_select(-1, self.blades)
+        inner, x = components.split(self.parts, -1)
         if not x.shape[-1]:
-            return seen
-        h = seen[..., -1:]  # the homogeneous coordinate is the last blade without e0
+            return inner
+        h = inner[..., -1:]  # the homogeneous coordinate is the last blade without e0
         weight = h / (h.square() + self.floor)  # w(h)
         size = (x.square() * self.ideal).sum(-1, keepdim=True)  # x·x
         distances = torch.cat((size, h.square(), h * x), -1)
-        return torch.cat((seen, weight * distances), -1)
+        return torch.cat((inner, weight * distances), -1)
 
     def forward(self, multivectors: Multivectors, scalars: Scalars) -> tuple[Multivectors, Scalars]:
         query, key, value = self._project(multivectors, scalars)  # (b, heads, tokens, f) each
@@ -195,13 +200,16 @@ class GeometricAttention(nn.Module):
         query, key, value = self._project(multivectors, scalars)  # (*batch, heads, tokens, f)
         # eq. (8): softmax of the logits over the root of their number of features.
         query = query[..., count, :, None] * query.shape[-1] ** -0.5  # (*batch, heads, f, 1)
-        sizes = (count, key.shape[-2] - count)
-        own, common = (key @ query).squeeze(-1).split(sizes, -1)  # (*batch, heads, tokens)
-        values, others = value.split(sizes, -2)
-        # exp a / (exp a + sum exp c) = sigmoid(a - log sum exp c): the share of one more token.
-        share = (own - common.logsumexp(-1, keepdim=True)).sigmoid()[..., None]
-        mean = common.softmax(-1)[..., None, :] @ others  # (*batch, heads, 1, f)
-        mixed = mean + share * (values - mean)
+        logits = (key @ query).squeeze(-1)  # (*batch, heads, tokens)
+        sizes = (count, key.shape[-2] - count)  # alternatives, and tokens that all results share
+        alternative_logits, common_logits = logits.split(sizes, -1)
+        alternatives, common = value.split(sizes, -2)  # (*batch, heads, tokens, f) each
+        # The weight of one alternative with logit a, beside common tokens with logits c:
+        # exp a / (exp a + sum exp c) = sigmoid(a - log sum exp c).
+        log_sums = common_logits.logsumexp(-1, keepdim=True)
+        weight = (alternative_logits - log_sums).sigmoid()[..., None]
+        mean = common_logits.softmax(-1)[..., None, :] @ common  # (*batch, heads, 1, f)
+        mixed = mean + weight * (alternatives - mean)
         return self._read(mixed.movedim(-3, -2))
 
     def _project(
@@ -215,17 +223,18 @@ class GeometricAttention(nn.Module):
         scalars = scalars.unflatten(-1, (3, self.heads, -1))
         scalars = scalars.movedim((-3, -2), (0, -3))  # (3, *batch, heads, tokens, s)
         query_key, value = multivectors.split((2, 1))
-        query, key = self.features(query_key)
+        query, key = self.features(query_key)  # (*batch, heads, tokens, c, features) each
         rows = []
-        for x, s in zip((query @ self.form, key, value[0]), scalars, strict=True):
-            rows.append(torch.cat((x.flatten(-2), s), -1))
+        for numbers, own_scalars in zip((query @ self.form, key, value[0]), scalars, strict=True):
+            rows.append(torch.cat((numbers.flatten(-2), own_scalars), -1))
         return rows
 
     def _read(self, mixed: Float[Tensor, "*tokens heads f"]) -> tuple[Multivectors, Scalars]:
         """Splits mixed values into multivectors and scalars of all heads; applies ``output``."""
         width = self.project.to_scalars.out_features // (3 * self.heads)  # scalars of a head
         multivectors, scalars = mixed.split((mixed.shape[-1] - width, width), -1)
-        multivectors = multivectors.unflatten(-1, (-1, self.algebra.size)).flatten(-3, -2)
+        multivectors = multivectors.unflatten(-1, (-1, self.algebra.size))  # (*tokens, heads, c, k)
+        multivectors = multivectors.flatten(-3, -2)  # (*tokens, heads c, k)
         return self.output(multivectors, scalars.flatten(-2))
 
 
@@ -240,8 +249,8 @@ def equivariant_norm(
     Args:
         algebra: The algebra.
         multivectors, scalars: Tokens.
-        floor: Number added to the squared size, which may be zero for large tokens with e0 and for
-            light-like tokens; GATr's value.
+        floor: Number added to the squared size; GATr's value. The size is zero for a token that has
+            only components with e0, and for light-like tokens.
 
     Source: GATr, "Layer normalization"; de Haan, Cohen & Brehmer, Euclidean, Projective, Conformal,
     2023.
@@ -290,27 +299,29 @@ class GATrBlock(nn.Module):
             reference: A multivector that moves with the tokens, such as the mean of the network's
                 inputs; see ``GeometricBilinear``.
         """
-        normal = equivariant_norm(self.algebra, multivectors, scalars)
-        attended, attended_scalars = self.attention(*normal)
+        normalised = equivariant_norm(self.algebra, multivectors, scalars)
+        attended, attended_scalars = self.attention(*normalised)
         return self.transform(multivectors + attended, scalars + attended_scalars, reference)
 
     def look(
         self, multivectors: Multivectors, scalars: Scalars, count: int
     ) -> tuple[Multivectors, Scalars]:
-        """The block's attention for one token, once for each of the first ``count`` tokens.
+        """The first half of the block for one token, once for each of ``count`` alternatives.
 
-        See ``GeometricAttention.look``; ``transform`` is the second half.
+        The first ``count`` tokens are the alternatives, and the next token attends, see
+        ``GeometricAttention.look``. ``transform`` is the second half.
         """
-        normal = equivariant_norm(self.algebra, multivectors, scalars)
-        attended, attended_scalars = self.attention.look(*normal, count)
-        multivectors = multivectors[..., count : count + 1, :, :] + attended
-        return multivectors, scalars[..., count : count + 1, :] + attended_scalars
+        normalised = equivariant_norm(self.algebra, multivectors, scalars)
+        attended, attended_scalars = self.attention.look(*normalised, count)
+        attending = slice(count, count + 1)
+        multivectors = multivectors[..., attending, :, :] + attended
+        return multivectors, scalars[..., attending, :] + attended_scalars
 
     def transform(
         self, multivectors: Multivectors, scalars: Scalars, reference: Float[Tensor, "... k"]
     ) -> tuple[Multivectors, Scalars]:
-        """The second half of the block, for each token separately."""
-        normal = equivariant_norm(self.algebra, multivectors, scalars)
-        products = self.bilinear(*normal, reference)
-        made, made_scalars = self.linear(*gated_gelu(*products))
-        return multivectors + made, scalars + made_scalars
+        """The second half of the block, for each token separately; arguments as for ``forward``."""
+        normalised = equivariant_norm(self.algebra, multivectors, scalars)
+        products = self.bilinear(*normalised, reference)
+        change, scalar_change = self.linear(*gated_gelu(*products))
+        return multivectors + change, scalars + scalar_change

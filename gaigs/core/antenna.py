@@ -14,7 +14,11 @@ from gaigs.core.geometry import Pose
 
 
 def differences(places: Float[Tensor, "e 3"]) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"]]:
-    """The distinct vectors between places, to nine decimals, and the number of each pair's."""
+    """The l distinct vectors between places, and the number of each pair's vector.
+
+    Vectors are rounded to nine decimals. A pair (i, j) has the vector place i minus place j. Pairs
+    are ordered by i, then by j.
+    """
     apart = (places[:, None] - places).flatten(0, 1).round(decimals=9)  # (e x e, 3)
     return torch.unique(apart, dim=0, return_inverse=True)
 
@@ -82,10 +86,13 @@ class Array:
 
     @functools.cached_property
     def lags(self) -> tuple[Float[Tensor, "l 3"], Int[Tensor, " pairs"], Float[Tensor, " l"]]:
-        """Lags, the distinct vectors between two elements [m]; each pair's lag; pairs at each lag.
+        """Lags, the distinct vectors between two elements, over which covariances are averaged.
 
-        The covariance of a field depends on lags alone. A 4 x 4 array has 49 lags. The second
-        tensor has the number of each pair's lag. Tensors are float64.
+        The covariance of a field depends on lags alone. A 4 x 4 array has 49 lags.
+
+        Returns:
+            The lags [m], float64; the number of each pair's lag; and the number of pairs at each
+            lag, float64.
         """
         # Cached tensors of inference mode could not be saved for a later backward pass.
         with torch.inference_mode(False):
@@ -94,11 +101,10 @@ class Array:
 
     def by_lag(self, covariances: Complex[Tensor, "b e e"]) -> Complex[Tensor, "b l"]:
         """Mean covariance of the pairs of elements at each of ``lags``."""
-        pairs, counts = (part.to(covariances.device) for part in self.lags[1:])
-        summed = covariances.new_zeros(len(covariances), len(counts)).index_add(
-            1, pairs, covariances.flatten(1)
-        )
-        return summed / counts.to(covariances.real)
+        _, pairs, counts = self.lags
+        sums = covariances.new_zeros(len(covariances), len(counts))  # (b, l)
+        sums = sums.index_add(1, pairs.to(covariances.device), covariances.flatten(1))
+        return sums / counts.to(covariances.real)
 
     def gain(self, directions: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Field gain of an element towards unit vectors in the array's frame."""
@@ -155,10 +161,13 @@ def lacking(
     count: int,
     frequencies: Float[Tensor, " s"],
 ) -> Bool[Tensor, "b e s"]:
-    """True where a link's receiver has no element or no subcarrier of a channel (b, e, s).
+    """True where a link's receiver lacks the element, or the subcarrier is outside its band.
 
-    A receiver's array may have fewer than ``count`` elements; the last ones are then missing. A
-    receiver's band may exclude subcarriers.
+    Args:
+        receivers: All receivers.
+        index: Number of each link's receiver.
+        count: Number e of elements of a channel. The last ones are missing in smaller arrays.
+        frequencies: Subcarriers [Hz].
     """
     sizes = torch.tensor([len(receiver.array) for receiver in receivers])
     hears = torch.stack([receiver.hears(frequencies.cpu()) for receiver in receivers])  # (r, s)

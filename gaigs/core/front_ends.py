@@ -28,16 +28,19 @@ class Shape(NamedTuple):
 class FrontEnd(NamedTuple):
     """The response of a receiver's front end."""
 
-    # Factor of each element and subcarrier, of mean power 1. Its common phase is free, and with
-    # links of unknown delay its delay.
+    # Factor of each element and subcarrier, of mean power 1. The common phase of all factors is
+    # arbitrary. If delays of links are unknown, the common delay is arbitrary, too.
     response: Complex[Tensor, "e s"]
-    # Standard deviation of its complex numbers, by the scatter of the links.
+    # Standard deviation of each complex factor, by the scatter of the links.
     errors: Float[Tensor, "e s"]
     explained: float  # mean share of a link's power that response and direct wave explain
 
 
 class Chosen(NamedTuple):
-    """A front end with its shape, and mean scores of free space at places left out of the fit."""
+    """A front end with its shape, and its effect on free space at places left out of the fit.
+
+    Scores are the task's monitored ones, averaged over places.
+    """
 
     front_end: FrontEnd
     shape: Shape
@@ -97,10 +100,14 @@ class FrontEndFit:
         return FrontEndFit(self.labels[index], self.waves[index], self.task, self.options)
 
     def start(self, shape: Shape) -> FrontEnd:
-        """The best of several fits: from the mean over links, or single links of unknown phase."""
+        """The front end that explains most of several fits with different starts.
+
+        With known phases the only start is the mean of the labels relative to direct waves. With
+        unknown phases such a mean vanishes, and the starts are 1 and four single links.
+        """
         strengths = self.waves.abs()
         relative = self.labels * self.waves.conj() / torch.where(strengths > 0, strengths, 1)
-        starts = [relative.mean(0)]
+        starts = [relative.mean(0)]  # (e, s)
         if self.task.phase != "known":
             single = evenly(torch.arange(len(relative)), 4)
             starts = [torch.ones_like(starts[0]), *relative[single]]
@@ -119,20 +126,21 @@ class FrontEndFit:
             residuals = aligned - gains[:, None, None] * model  # (n, e, s)
             errors = residuals.abs().square().sum((1, 2))  # (n,)
             weights = (gains / errors.clamp_min(self.options.floor))[:, None, None]
-            # R of least squares: sum weight h conj(w) / sum weight g |w|², with g in the weights.
+            # R of least squares: sum v h conj(w) / sum v g |w|², with the weights v = g / |error|².
             power = (weights * gains[:, None, None] * self.waves.abs().square()).sum(0)  # (e, s)
             scale = torch.where(power > 0, power, 1)
             ratio = (weights * aligned * self.waves.conj()).sum(0) / scale  # (e, s)
             ratio = torch.where(power > 0, ratio, 1)
             response = self._normal(self._smooth(ratio, shape))
-        # The sandwich estimator: each link's part in the mean, smoothed as the mean.
+        # The sandwich estimator: each link's residual as it enters R, smoothed like R.
         parts = weights * residuals * self.waves.conj() / scale  # (n, e, s)
         basis = self._basis(ratio, shape.count)
-        scatter = (parts @ basis.conj() @ basis.mT).abs().square().sum(0).sqrt()  # (e, s)
+        smooth_parts = parts @ basis.conj() @ basis.mT
+        scatter = smooth_parts.abs().square().sum(0).sqrt()  # (e, s)
         return FrontEnd(response, scatter, (1 - errors).mean().item())
 
     def likeness(self) -> float:
-        """Fraction of a few links' power that an unrestricted response explains."""
+        """Fraction of the power of at most 64 links that a response of many numbers explains."""
         thinned = self.at(evenly(torch.arange(len(self.labels)), 64))
         return thinned.start(Shape(max(self.options.counts), True)).explained
 
@@ -145,6 +153,7 @@ class FrontEndFit:
         options = self.options
         has_array = self.labels.shape[1] > 1
         subcarriers = self.labels.shape[2]
+        # No more numbers over the band than subcarriers.
         counts = sorted({min(count, subcarriers) for count in options.counts})
         shapes = [Shape(count, True) for count in counts]
         if has_array:
@@ -153,16 +162,17 @@ class FrontEndFit:
         chooser = self.at(choosing)
         places = places[choosing]
         start = chooser.start(Shape(counts[-1], True)).response
-        plain = chooser.left_out(places, None, start)
+        free_space = chooser.left_out(places, None, start)  # scores of the places
         best = None
-        # The largest shapes first: where none of them gains, the others need no look.
+        # The largest shapes first: where the first two (for an array three) do not gain, the others
+        # need no look.
         for number, shape in enumerate(sorted(shapes, key=lambda shape: -shape.count)):
-            score = chooser.left_out(places, shape, start)
-            gain = score - plain
-            error = gain.std() / math.sqrt(len(gain))
-            if gain.mean() > max(options.least_gain, options.deviations * error):
-                if best is None or score.mean() > best[0]:
-                    best = score.mean().item(), shape
+            scores = chooser.left_out(places, shape, start)
+            gains = scores - free_space
+            standard_error = gains.std() / math.sqrt(len(gains))
+            if gains.mean() > max(options.least_gain, options.deviations * standard_error):
+                if best is None or scores.mean() > best[0]:
+                    best = scores.mean().item(), shape
             elif number == 1 + has_array and best is None:
                 return None
         if best is None:
@@ -170,53 +180,62 @@ class FrontEndFit:
         after, shape = best
         fitting = evenly(torch.arange(len(self.labels)), self._most(options.most[1]))
         front_end = self.at(fitting).run(shape, start)
-        return Chosen(front_end, shape, plain.mean().item(), after)
+        return Chosen(front_end, shape, free_space.mean().item(), after)
 
     def left_out(
         self, places: Int[Tensor, " n"], shape: Shape | None, start: Complex[Tensor, "e s"]
     ) -> Float[Tensor, " p"]:
-        """Mean score at each place of free space times a response of this shape.
+        """Mean score at each of p places of free space times a response of this shape.
 
         The response is fitted to links in other folds of places. Without a shape the response is 1.
+
+        Args:
+            places: Number of each link's place.
+            shape: Shape of the response.
+            start: Response at the start of each fit.
         """
-        groups, number = places.unique(return_inverse=True)
-        order = torch.randperm(len(groups), generator=torch.Generator().manual_seed(0))
+        distinct, number = places.unique(return_inverse=True)
+        order = torch.randperm(len(distinct), generator=torch.Generator().manual_seed(0))
         fold = order[number] % self.options.folds  # (n,)
         scores = self.labels.new_zeros(len(places)).real
-        for part in range(self.options.folds):
-            asked = (fold == part).nonzero()[:, 0]
-            rest = self.at((fold != part).nonzero()[:, 0])
+        for tested_fold in range(self.options.folds):
+            tested = (fold == tested_fold).nonzero()[:, 0]
+            fitted = self.at((fold != tested_fold).nonzero()[:, 0])
             response = torch.ones_like(start)
             if shape is not None:
-                response = rest.run(shape, start).response
-            gain = fit_gain(rest.labels, response * rest.waves)
-            values = gain * response * self.waves[asked]
+                response = fitted.run(shape, start).response
+            gain = fit_gain(fitted.labels, response * fitted.waves)
+            values = gain * response * self.waves[tested]
             # The task has the elements of the largest array; smaller arrays have zeros.
             padding = (0, 0, 0, self.task.elements - values.shape[1])
-            labels = torch.nn.functional.pad(self.labels[asked], padding)
+            labels = torch.nn.functional.pad(self.labels[tested], padding)
             values = torch.nn.functional.pad(values, padding)
-            scores[asked] = self.task.scores(labels, values)[self.task.monitor]
-        totals = scores.new_zeros(len(groups)).index_add(0, number, scores)
+            scores[tested] = self.task.scores(labels, values)[self.task.monitor]
+        totals = scores.new_zeros(len(distinct)).index_add(0, number, scores)
         return totals / number.bincount()
 
     def _most(self, numbers: int) -> int:
-        """Number of links with ``numbers`` values together; at least 64."""
+        """Number of links that together have ``numbers`` channel values; at least 64."""
         return max(64, numbers // self.labels[0].numel())
 
     def _smooth(self, response: Complex[Tensor, "e s"], shape: Shape) -> Complex[Tensor, "e s"]:
         """The response of this shape that is nearest to ``response``."""
         basis = self._basis(response, shape.count)
-        smooth = response @ basis.conj() @ basis.mT
+        smooth = response @ basis.conj() @ basis.mT  # projection on the basis
         if shape.is_separable and len(response) > 1:
+            # The nearest product of a gain of each element and one function of frequency.
             left, sizes, right = torch.linalg.svd(smooth, full_matrices=False)
             smooth = sizes[0] * left[:, :1] * right[:1]
         return smooth
 
     def _basis(self, response: Complex[Tensor, "e s"], count: int) -> Complex[Tensor, "s k"]:
-        """Orthonormal polynomials over the band, times the common delay of a response."""
+        """``count`` orthonormal polynomials over the band, times the common delay of a response.
+
+        The polynomials describe a smooth response only after its delay is removed.
+        """
         frequencies = self.task.frequencies
         basis = _polynomials(frequencies, count).to(response)
-        if len(frequencies) > count:
+        if len(frequencies) > count:  # otherwise the basis is complete without the delay
             turns = alignment(response, torch.ones_like(response), frequencies)  # (1, s)
             basis = turns.conj().mT * basis
         return basis

@@ -72,7 +72,7 @@ class Frame:
             raise ValueError(f"a frame must be a projected system in metres, got {given}\n{remedy}")
 
     def _is_elsewhere(self) -> bool:
-        """True if the origin is in degrees or beyond all of UTM."""
+        """True if the origin looks like degrees, or is beyond all of UTM for a code of UTM."""
         is_small = abs(self.x) <= 180 and abs(self.y) <= 90
         if is_utm(self.epsg):
             # Norway has eastings of -80 to 1120 km in zone 33.
@@ -150,13 +150,15 @@ def quaternions_to_rotations(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, 
     quats = _of_moderate_length(quats)
     squares = (quats * quats).sum(-1, keepdim=True)  # (..., 1)
     s = 2 / torch.where(squares == 0, 1, squares)
-    # The column of each axis e is R e = e + s (w u x e + u x (u x e)), with u = (x, y, z). That
-    # takes few operations, each of which costs as much as hundreds of Gaussians.
-    w, u = quats[..., :1, None], quats[..., None, 1:]  # (..., 1, 1) and (..., 1, 3)
+    # The column of each axis e is R e = e + s (w u x e + u x (u x e)), with u = (x, y, z) and
+    # s = 2 / |quaternion|². That takes few operations, each of which costs as much as hundreds of
+    # Gaussians.
+    w = quats[..., :1, None]  # (..., 1, 1)
+    u = quats[..., None, 1:]  # (..., 1, 3)
     axes = torch.eye(3, dtype=quats.dtype, device=quats.device)
-    turned = torch.linalg.cross(u, axes.expand(*quats.shape[:-1], 3, 3))
-    turned = w * turned + torch.linalg.cross(u.expand_as(turned), turned)
-    return (axes + s[..., None] * turned).mT
+    crossed = torch.linalg.cross(u, axes.expand(*quats.shape[:-1], 3, 3))  # u x e, a row each
+    change = w * crossed + torch.linalg.cross(u.expand_as(crossed), crossed)
+    return (axes + s[..., None] * change).mT
 
 
 def unit_quaternions(quats: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 4"]:
@@ -180,8 +182,8 @@ def semi_axes(
 def to_spherical(points: Float[Tensor, "*batch 3"]) -> tuple[Tensor, Tensor, Tensor]:
     """Azimuth in [-pi, pi], elevation in [-pi/2, pi/2] [rad] and distance [m] of points.
 
-    At the zenith, where azimuth is undefined, it is 0. Gradients are finite everywhere but at the
-    origin.
+    On the z axis, where azimuth is undefined, the azimuth is 0. Gradients are finite everywhere but
+    at the origin.
     """
     x, y, z = points.unbind(-1)
     distances = points.norm(dim=-1)
@@ -223,7 +225,7 @@ class _Sinc(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, values):
-        # Added to 0 so that 0 / 0 is 1; to all other numbers it adds nothing.
+        # pi x plus a tiny number: at 0 the quotient is then 1, other numbers do not change.
         angles = torch.add(values.new_tensor(FAINTEST), values, alpha=math.pi)
         result = angles.sin().div_(angles)
         ctx.save_for_backward(angles, result)
@@ -248,9 +250,14 @@ def spherical_harmonics(
     """The k = (degree + 1)² real spherical harmonics up to ``degree``.
 
     Harmonic number n² + n + m, of degree n and order m, is sqrt(2) N P_n^|m|(z) cos(m az) for m >
-    0, sqrt(2) N P_n^|m|(z) sin(|m| az) for m < 0, and N P_n(z) for m = 0. P has the factor (-1)^m.
-    N makes the mean square over the sphere 1 / 4 pi, as in .ply viewers. The recurrence computes N
-    P_n^m / sin^m, a polynomial in z, so values and gradients are finite at the poles.
+    0, sqrt(2) N P_n^|m|(z) sin(|m| az) for m < 0, and N P_n(z) for m = 0. P are the associated
+    Legendre functions with the factor (-1)^m. N makes the mean square over the sphere 1 / 4 pi, as
+    in .ply viewers. The recurrence computes N P_n^m / sin^m of the polar angle, a polynomial in z,
+    so values and gradients are finite at the poles.
+
+    Args:
+        vectors: Unit vectors (x, y, z) with the azimuth az.
+        degree: Highest degree.
 
     Source: Holmes and Featherstone, A unified approach to the Clenshaw summation, 2002, section 3.
     """
@@ -258,12 +265,13 @@ def spherical_harmonics(
     # Cosine and sine of m az, times sin^m of the polar angle.
     cosines = torch.ones_like(z)
     sines = torch.zeros_like(z)
-    harmonics = [z] * (degree + 1) ** 2
-    first = 0.5 / math.sqrt(math.pi)
+    harmonics = [z] * (degree + 1) ** 2  # places, all of which are replaced
+    first = 0.5 / math.sqrt(math.pi)  # N P_m^m / sin^m
     for m in range(degree + 1):
         if m:
             first *= -math.sqrt((2 * m + 1) / (2 * m))
-            cosines, sines = x * cosines - y * sines, x * sines + y * cosines  # one angle on
+            # From m - 1 to m: the product of cosine + j sine and x + j y.
+            cosines, sines = x * cosines - y * sines, x * sines + y * cosines
         # The recurrence over n (equation 11) starts at P_m^m.
         last = torch.zeros_like(z)
         legendre = torch.full_like(z, first)
@@ -342,7 +350,8 @@ class Grid:
                 f"a grid over the sphere takes at least 2 rows and 3 columns, got {rows} x "
                 f"{columns}"
             )
-        # A zone's area is 2 pi times the difference of sines, so these are evenly spaced.
+        # The area of a zone is 2 pi times the difference of the sines of its elevations, so rows
+        # with evenly spaced sines have equal areas.
         sines = (2 * torch.arange(rows, dtype=torch.float64) + 1 - rows) / rows
         azimuths = 2 * math.pi / columns * (torch.arange(columns, dtype=torch.float64) + 0.5)
         return cls(sines.asin().float(), azimuths.float())
@@ -361,7 +370,8 @@ class Grid:
     def solid_angles(self) -> Float[Tensor, "rows columns"]:
         """Solid angle of each pixel as a fraction of the grid's solid angle.
 
-        Two rows meet at the mean of the sines of their elevations.
+        Two rows meet at the mean of the sines of their elevations. The first and last row reach as
+        far outwards as inwards, at most to a pole.
         """
         if len(self.elevations) < 2:
             raise ValueError(
@@ -413,16 +423,18 @@ def even_places(
     ``floors`` [m] places are at these heights only.
     """
     if len(floors):
-        each = max(1, count // len(floors))
+        count_on_floor = max(1, count // len(floors))
         places = []
         for floor in floors:
             height = lower.new_tensor([floor])
-            ends = torch.cat((lower[:2], height)), torch.cat((upper[:2], height))
-            places.append(even_places(*ends, each))
+            floor_lower = torch.cat((lower[:2], height))
+            floor_upper = torch.cat((upper[:2], height))
+            places.append(even_places(floor_lower, floor_upper, count_on_floor))
         return torch.cat(places)
-    lower, edges = torch.minimum(lower, upper), (upper - lower).abs()
+    edges = (upper - lower).abs()
+    lower = torch.minimum(lower, upper)
     longest = edges.double().sort(descending=True).values
-    pitch = 0.0
+    pitch = 0.0  # distance between places [m]; stays 0 if the box is a point
     # An edge below the pitch does not count: the box is then a rectangle or a line.
     for dimensions in (3, 2, 1):
         pitch = float(longest[:dimensions].prod() / count) ** (1 / dimensions)

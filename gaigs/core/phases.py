@@ -31,9 +31,10 @@ def phase_sign(
     """Sign with which the phases of channels follow the direct distance, -1 or 1; 0 for neither.
 
     A channel divided by free space of the right sign has a constant part: the direct path. The mean
-    over the links of a receiver keeps this part of the power. Random phases would keep about 1 /
-    links of the power. The sign that keeps more power wins if its fraction exceeds ``least_share``
-    plus four times the random fraction. Fewer than ``TELLING`` links a receiver always give 0.
+    over the links of a receiver keeps this part of the power. Random phases would keep a fraction
+    of about 1 / links of the power. The sign that keeps more power wins if its fraction exceeds
+    ``least_share`` plus four times the random fraction. Fewer than ``TELLING`` links a receiver
+    always give 0.
 
     Args:
         channels: Channels of the links.
@@ -42,7 +43,7 @@ def phase_sign(
         least_share: Smallest fraction of the power that the mean keeps.
     """
     received = max(1, int((channels.abs().amax((1, 2)) > 0).sum()))  # links with a signal
-    shares = {}
+    shares = {}  # fraction of the power that the means keep, by sign
     for sign in (-1, 1):
         powers = []
         for receiver, response in common_responses(channels, waves, receivers, sign).items():
@@ -50,7 +51,7 @@ def phase_sign(
             powers.append(links * response.abs().square().mean())
         shares[sign] = float(sum(powers)) / received
     best = max(shares, key=shares.__getitem__)
-    chance = len(receivers.unique()) / len(receivers)
+    chance = len(receivers.unique()) / len(receivers)  # the random fraction
     return best if shares[best] > least_share + 4 * chance else 0
 
 
@@ -65,10 +66,10 @@ def common_responses(
     The mean is the same at all elements and subcarriers if the given elements and frequencies are
     right. Arguments are as for ``phase_sign``.
     """
-    still = _without_phases_of(waves, _relative(channels, waves), sign)
+    relative = _without_phases_of(waves, _relative(channels, waves), sign)
     responses = {}
     for receiver in receivers.unique().tolist():
-        responses[receiver] = still[receivers == receiver].mean(0)  # (e, s)
+        responses[receiver] = relative[receivers == receiver].mean(0)  # (e, s)
     return responses
 
 
@@ -98,6 +99,7 @@ def strange_parts(
     for receiver, response in common_responses(channels, waves, receivers, sign).items():
         at_receiver = receivers == receiver
         links = int(at_receiver.sum())
+        # Fraction of the links' power in their mean; random phases keep 1 / links.
         share = response.abs().square().mean().item()
         if links < MANY or share < least_share + 4 / links:
             continue
@@ -105,7 +107,7 @@ def strange_parts(
         has_element = exists.any(1)
         in_band = exists.any(0)
         response = response[has_element][:, in_band]
-        turns = waves[at_receiver][:, has_element][..., in_band].sgn()  # (links, e, s)
+        directions = waves[at_receiver][:, has_element][..., in_band].sgn()  # (links, e, s)
         # The power of the mean response without the part that chance leaves in it.
         by_chance = (1 - share) / links / share
         power = response.abs().square().mean() * (1 - by_chance)
@@ -114,18 +116,19 @@ def strange_parts(
         over_subcarriers = response.mean(1).abs().square().mean()
         over_elements = response.mean(0).abs().square().mean()
         # Elements resolve directions if the waves' phases between them differ from link to link.
-        relative_turns = turns * turns.mean(1, keepdim=True).sgn().conj()
-        alike = relative_turns.mean(0).abs().square().mean()
+        # ``alike`` is 1 for one direction of all links.
+        between_elements = directions * directions.mean(1, keepdim=True).sgn().conj()
+        alike = between_elements.mean(0).abs().square().mean()
         elements = bool(over_elements < common_share * power and alike < 0.5)
         subcarriers = bool(over_subcarriers < common_share * power)
         delay = None
         if subcarriers:
             subset = frequencies[in_band]
-            rates = 2 * math.pi * (subset - subset.mean())
-            late = _best_delays(response.sum(0), rates)
-            aligned = response * torch.polar(torch.ones_like(rates), late * rates)
+            rates = 2 * math.pi * (subset - subset.mean())  # [rad/s]
+            advance = _best_delays(response.sum(0), rates)  # [s]
+            aligned = response * torch.polar(torch.ones_like(rates), advance * rates)
             if aligned.mean().abs().square() > common_share * power:
-                delay = -sign * late.item()
+                delay = -sign * advance.item()
         if elements or subcarriers:
             strange[receiver] = StrangeParts(elements, subcarriers, delay)
     return strange
@@ -146,8 +149,8 @@ def array_sign(
     relative = _relative(channels, waves)
     powers = []
     for sign in (-1, 1):
-        still = _without_phases_of(waves, relative, sign)
-        aligned = still * alignment(still, torch.ones_like(still), frequencies)
+        divided = _without_phases_of(waves, relative, sign)
+        aligned = divided * alignment(divided, torch.ones_like(divided), frequencies)
         powers.append(aligned.mean((1, 2)).abs().square().sum())
     return 1 if powers[1] > powers[0] else -1
 
@@ -164,17 +167,24 @@ def alignment(
     0. The result is complex128 and has no gradient.
     """
     with torch.no_grad():
-        cross = (channels.to(torch.complex128) * waves.to(torch.complex128).conj()).sum(-2)
+        products = channels.to(torch.complex128) * waves.to(torch.complex128).conj()
+        cross = products.sum(-2)  # over elements (*k, s)
         turns = torch.ones_like(cross)
         if frequencies is not None and len(frequencies) > 1:
-            rates = 2 * math.pi * (frequencies - frequencies.mean()).to(cross.real)
-            turns = torch.polar(turns.real, _best_delays(cross, rates)[..., None] * rates)
-        total = (cross * turns).sum(-1, keepdim=True)
-        return (turns * torch.where(total == 0, 1, total.conj().sgn()))[..., None, :]
+            rates = 2 * math.pi * (frequencies - frequencies.mean()).to(cross.real)  # [rad/s]
+            delays = _best_delays(cross, rates)  # (*k,) [s]
+            turns = torch.polar(turns.real, delays[..., None] * rates)
+        # The best common phase makes the sum over elements and subcarriers real and positive.
+        total = (cross * turns).sum(-1, keepdim=True)  # (*k, 1)
+        common = torch.where(total == 0, 1, total.conj().sgn())
+        return (turns * common)[..., None, :]
 
 
 def _best_delays(cross: Complex[Tensor, "*k s"], rates: Float[Tensor, " s"]) -> Float[Tensor, "*k"]:
-    """Delays t [s] with the largest |sum over s of cross exp(j rates t)|."""
+    """Delays t [s] with the largest |sum over s of cross exp(j rates t)|.
+
+    ``rates`` are angular frequencies [rad/s], ``cross`` products of channels and conjugate waves.
+    """
     ordered = rates.sort().values
     span = (ordered[-1] - ordered[0]).item()
     spacing = ordered.diff().median().item()
@@ -193,6 +203,7 @@ def _best_delays(cross: Complex[Tensor, "*k s"], rates: Float[Tensor, " s"]) -> 
         bend = ((1j * rates) ** 2 * turned).sum(-1)
         first = (value.conj() * slope).real
         second = slope.abs().square() + (value.conj() * bend).real
+        # At most a step of the grid, and only where the magnitude has a maximum nearby.
         delays = delays - torch.where(second < 0, first / second, 0).clamp(-step, step)
     return delays
 
@@ -229,21 +240,22 @@ def unknown_phase(
     normalised = _normalised(channels.to(torch.complex128))
     # A single reflection resembles the direct wave but for a delay, unless an array sees its
     # direction.
-    for phase, rates, is_telling in (
+    for phase, delayed_frequencies, is_telling in (
         ("per_link", None, numbers >= 8),
         ("per_link_and_delay", frequencies, numbers >= 16 and elements >= 4),
     ):
         if not is_telling:
             continue
-        likeness, agreement = [], []
-        for wave in (_normalised(waves), _normalised(waves.conj())):
-            turns = alignment(normalised, wave, rates)
+        likeness = []
+        agreement = []  # of the phases of a receiver's links: 1 if equal, about 0 if random
+        for wave in (_normalised(waves), _normalised(waves.conj())):  # for both signs of phases
+            turns = alignment(normalised, wave, delayed_frequencies)
             aligned = (wave.conj() * normalised * turns).mean((1, 2))  # (k,)
             likeness.append(aligned.abs().square().mean().item())
             plain = (wave.conj() * normalised).mean((1, 2))  # (k,)
             sums = [plain[receivers == receiver].sum().abs() for receiver in receivers.unique()]
             agreement.append((sum(sums) / plain.abs().sum()).item())
-        if max(agreement) > 3 * math.sqrt(chance):
+        if max(agreement) > 3 * math.sqrt(chance):  # more than random phases would agree
             return None
         if phase == declared:
             if max(likeness) >= 0.25:
@@ -260,6 +272,7 @@ def _without_phases_of(
 
     The waves have the sign -1, the channels' phases have ``sign``.
     """
+    # A wave has the phase -p, and a channel the phase sign p, with p = 2 pi distance / wavelength.
     phases = waves.angle()
     return channels * torch.polar(torch.ones_like(phases), sign * phases)
 
@@ -269,7 +282,8 @@ def _relative(
 ) -> Complex[Tensor, "k e s"]:
     """Channels over the waves' magnitudes, with a mean power of 1; 0 where a wave is 0."""
     strengths = waves.abs()
-    return _normalised(channels * (strengths > 0) / torch.where(strengths > 0, strengths, 1))
+    has_wave = strengths > 0
+    return _normalised(channels * has_wave / torch.where(has_wave, strengths, 1))
 
 
 def _normalised(channels: Complex[Tensor, "k e s"]) -> Complex[Tensor, "k e s"]:

@@ -74,7 +74,7 @@ def bartlett(
         )
     batch = responses.shape[:-2]
     responses = responses.flatten(0, -3) if responses.ndim > 2 else responses[None]  # (b, e, f)
-    covariances = responses @ responses.mH / responses.shape[-1]  # (b, e, e)
+    covariances = responses @ responses.mH / responses.shape[-1]  # mean over frequencies (b, e, e)
     places = array.elements.double() * (2 * frequency / speed_of_light)  # in half wavelengths
     steps, pair = differences(places)
     pair = pair.to(responses.device)
@@ -86,9 +86,11 @@ def bartlett(
     cosines = torch.cos(phases).to(lags.real)
     sines = torch.sin(phases).to(lags.real)
     power = lags.real @ cosines + lags.imag @ sines  # (b, k)
-    # In a null rounding may leave the power a little below zero.
-    power = torch.where(power > 0, power, 1).sqrt() * (power > 0)
-    return power.reshape(*batch, *grid.shape)
+    # In a null rounding may leave the power a little below zero. The root of 1 in its place has a
+    # finite gradient.
+    is_positive = power > 0
+    amplitudes = torch.where(is_positive, power, 1).sqrt() * is_positive
+    return amplitudes.reshape(*batch, *grid.shape)
 
 
 def min_max(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b rows columns"]:
@@ -129,7 +131,9 @@ def slab(
 
     Source: ITU-R P.2040-3, section 2.2.2.2.
     """
-    turns = torch.exp(-4j * math.pi * thickness * torch.sqrt(permittivity - (1 - cosines.square())))
+    # The wave through the slab and back, relative to the wave at the first face.
+    root = torch.sqrt(permittivity - (1 - cosines.square()))
+    turns = torch.exp(-4j * math.pi * thickness * root)
     te, tm = fresnel(permittivity, cosines)
     slab_te = te * (1 - turns) / (1 - te.square() * turns)
     slab_tm = tm * (1 - turns) / (1 - tm.square() * turns)
@@ -139,7 +143,7 @@ def slab(
 def fit_gain(
     channels: Complex[Tensor, " k *shape"], waves: Complex[Tensor, " k *shape"]
 ) -> Complex[Tensor, ""]:
-    """The complex gain, complex128, of measured channels h over waves w of gain 1.
+    """The complex gain, complex128, of measured channels h relative to computed waves w.
 
     Its magnitude is the median over links of |h| / |w|. Its phase is the phase of the sum of w* h /
     (|w| |h|), where weak links count as much as strong ones. Links with h = 0 or w = 0 do not
@@ -147,13 +151,14 @@ def fit_gain(
     """
     h = channels.to(torch.complex128).flatten(1)  # (k, numbers)
     w = waves.to(torch.complex128).flatten(1)
-    sizes = h.norm(dim=1)
-    strengths = w.norm(dim=1)
-    counts = (sizes > 0) & (strengths > 0)
+    h_sizes = h.norm(dim=1)
+    w_sizes = w.norm(dim=1)
+    counts = (h_sizes > 0) & (w_sizes > 0)
     if not counts.any():
         return torch.zeros((), dtype=torch.complex128, device=h.device)
-    alike = (w.conj() * h).sum(1)[counts] / (sizes * strengths)[counts]
-    return (sizes / strengths)[counts].quantile(0.5) * alike.sum().sgn()
+    correlations = (w.conj() * h).sum(1)[counts] / (h_sizes * w_sizes)[counts]
+    magnitude = (h_sizes / w_sizes)[counts].quantile(0.5)
+    return magnitude * correlations.sum().sgn()
 
 
 def common_gain(gains: Inexact[Tensor, " r *shape"]) -> Inexact[Tensor, " *shape"]:

@@ -22,7 +22,10 @@ ROUNDING = 1e-6
 
 
 def unit_hint(number: float) -> str:
-    """End of an error, such as ``; in MHz?``, if a number is a carrier in another unit."""
+    """Question for the end of an error message, such as ``; in MHz?``; empty if no unit fits.
+
+    A unit fits if ``number`` in this unit is within ``CARRIERS``.
+    """
     low, high = CARRIERS
     for unit, size in {"GHz": 1e9, "MHz": 1e6, "Hz": 1.0}.items():
         if low / size <= number <= high / size:
@@ -34,9 +37,11 @@ def check_carrier(name: str, frequencies: float | Tensor) -> None:
     """Raises a ``ValueError`` unless all values of the option ``name`` are carriers [Hz]."""
     low, high = CARRIERS
     values = torch.as_tensor(frequencies, dtype=torch.float64).flatten()
-    for wrong in values[~((values >= low) & (values <= high))][:1].tolist():
+    wrong = values[~((values >= low) & (values <= high))]  # NaN, too
+    if len(wrong):
+        first = wrong[0].item()
         expected = f"a carrier in Hz, from {low:g} to {high:g}"
-        raise ValueError(f"{name} must be {expected}, got {wrong:.7g}{unit_hint(wrong)}")
+        raise ValueError(f"{name} must be {expected}, got {first:.7g}{unit_hint(first)}")
 
 
 def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
@@ -47,10 +52,10 @@ def evenly(index: Int[Tensor, " k"], most: int) -> Int[Tensor, " j"]:
 
 
 def drawn(index: Int[Tensor, " k"], most: int = 10_000) -> Int[Tensor, " j"]:
-    """At most ``most`` of the links, drawn at random.
+    """At most ``most`` of the links in ``index``, drawn at random, in their order.
 
-    Every n-th link could belong to a few receivers only. The mean of 10,000 errors of 3 dB is known
-    to 0.02 dB.
+    Every n-th link could belong to a few receivers only. The default suffices for mean errors: the
+    mean of 10,000 errors of 3 dB is known to 0.02 dB.
     """
     if len(index) <= most:
         return index
@@ -63,7 +68,8 @@ def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped
     numbers = labels[..., None].flatten(1)  # (k, rows x columns)
     columns = labels.shape[-1] if labels.ndim > 1 else 1
     index = evenly(torch.arange(numbers.shape[1]), most)
-    # Numbers at a step that divides the number of columns would come from few columns.
+    # Numbers at a step that divides the number of columns would come from few columns. With one
+    # number less the step is another.
     while len((index % columns).unique()) < min(columns, most) / 8:
         most -= 1
         index = evenly(torch.arange(numbers.shape[1]), most)
@@ -71,7 +77,13 @@ def thin_labels(labels: Shaped[Tensor, " k *shape"], most: int = 1024) -> Shaped
 
 
 def as_tensor(name: str, values: object, expected: str) -> Tensor:
-    """An array-like as a tensor of the same dtype; a ``ValueError`` for anything else."""
+    """An array-like as a tensor of the same dtype; a ``ValueError`` for anything else.
+
+    Args:
+        name: Name of the option in errors.
+        values: Tensor, array, number, column of a table, or nested lists of these.
+        expected: What the option takes, for errors.
+    """
     if isinstance(values, Tensor):
         if values.is_meta or values.layout is not torch.strided:
             kind = "meta" if values.is_meta else str(values.layout).removeprefix("torch.")
@@ -88,10 +100,10 @@ def as_tensor(name: str, values: object, expected: str) -> Tensor:
         if np.ma.is_masked(values):
             raise TypeError("masked")
         array: Any = np.array(values)  # a copy, since torch warns of arrays that are read-only
-        if array.dtype == object and array.ndim:  # such as a column of pandas
+        if array.dtype == object and array.ndim:  # such as a column of pandas with missing values
             missing = [value is None or type(value).__name__ == "NAType" for value in array.flat]
             array[np.reshape(missing, array.shape)] = np.nan
-            array = np.array(array.tolist())
+            array = np.array(array.tolist())  # with a dtype of numbers, if all are numbers
         # Torch takes no negative strides and no other byte order.
         return torch.from_numpy(
             np.ascontiguousarray(array, array.dtype.newbyteorder("=")).reshape(array.shape)
@@ -127,7 +139,10 @@ def as_positions(name: str, values: object) -> Float[Tensor, "*points 3"]:
 
 
 def as_receivers(values: Any, names: Sequence[str]) -> Int[Tensor, "*points"]:
-    """Indices of receivers, from names or indices; a ``ValueError`` for an unknown one."""
+    """Indices of receivers, from names or indices; a ``ValueError`` for an unknown receiver.
+
+    ``names`` are the names of all receivers in the order of their indices.
+    """
     expected = f"one of {', '.join(f'{i} = {name}' for i, name in enumerate(names))}"
     if isinstance(values, KeysView | ValuesView) or hasattr(values, "to_numpy"):
         values = [*values]
@@ -159,7 +174,15 @@ def _is_text(values: object) -> bool:
 
 
 def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, "*points"] | None:
-    """Checked carriers of a request [Hz]; for None the only known carrier, if there is one."""
+    """Carriers of a user's request [Hz], checked; for None the training links' only carrier.
+
+    Args:
+        values: Requested carriers.
+        known: Distinct carriers of the training links, ascending [Hz]; empty if unknown.
+
+    Returns:
+        None if no carrier is requested and none is known.
+    """
     if values is None:
         if len(known) > 1:
             span = f"{known[0]:.7g} to {known[-1]:.7g} Hz"
@@ -183,7 +206,7 @@ def as_frequencies(values: object, known: Float[Tensor, " f"]) -> Float[Tensor, 
 def as_subcarriers(values: object) -> Float[Tensor, " s"]:
     """Distinct subcarriers of a request [Hz], one or several, checked, in float64."""
     expected = "different subcarriers (s,) in Hz"
-    as_numbers("frequencies", values, expected)
+    as_numbers("frequencies", values, expected)  # only the check: float32 would merge subcarriers
     exact = as_tensor("frequencies", values, expected).detach().cpu()
     subcarriers = exact.double().reshape(-1) if exact.ndim < 2 else exact
     if (
@@ -200,7 +223,13 @@ def as_subcarriers(values: object) -> Float[Tensor, " s"]:
 
 
 def as_directions(directions: Directions | None, own: Grid | None, task: str) -> Directions | None:
-    """Directions of a request, checked, in float32; for None the label's directions."""
+    """Directions of a user's request, checked, in float32; for None the label's directions.
+
+    Args:
+        directions: Requested directions.
+        own: The label's directions; None if labels of this task have none.
+        task: Name of the task, for errors.
+    """
     if directions is None:
         return own
     if own is None:
@@ -285,6 +314,7 @@ class Query:
         shape = points.shape[:-1]
 
         def spread(name: str, values: Tensor) -> Tensor:
+            """One value for each position, from one for all or one for each."""
             if values.ndim and values.shape != shape:
                 expected = f"one, or one for each of the {tuple(shape)} positions"
                 raise ValueError(f"{name} must be {expected}, got {tuple(values.shape)}")
@@ -299,6 +329,7 @@ class Query:
         query = cls(points, receivers, frequencies)
         if receiver is not None:
             return query, shape
+        # All receivers for each position in turn.
         query = query[torch.arange(len(points)).repeat_interleave(len(names))]
         query.receivers = torch.arange(len(names), device=points.device).repeat(len(points))
         return query, (*shape, len(names))
@@ -330,8 +361,9 @@ class Query:
     @property
     def votes(self) -> Float[Tensor, " b"]:
         """Weights such that repeated readings of a place, receiver and carrier count as one."""
-        _, which = self.unique(with_receivers=True)
-        return which.bincount().double().reciprocal()[which]
+        _, number = self.unique(with_receivers=True)
+        repetitions = number.bincount().double()
+        return repetitions.reciprocal()[number]
 
     def unique(self, with_receivers: bool) -> tuple["Query", Int[Tensor, " b"]]:
         """The distinct links, and the number of each link among them.
@@ -339,22 +371,23 @@ class Query:
         Distinct links are sorted by position, frequency and receiver. Without ``with_receivers``
         links that differ only in the receiver are equal.
         """
-        others = [self.frequencies] if self.frequencies is not None else []
-        others += [self.receivers] if with_receivers else []
+        tensors = [*self.transmitters.unbind(1)]
+        if self.frequencies is not None:
+            tensors.append(self.frequencies)
+        if with_receivers:
+            tensors.append(self.receivers)
         # Double holds float32, float64 and indices exactly. With a thousand links this takes a
         # tenth of the time of torch.unique.
-        columns = []
-        for part in (*self.transmitters.unbind(1), *others):
-            columns.append(part.detach().double().cpu().numpy())
-        order = np.lexsort(columns[::-1])
+        columns = [tensor.detach().double().cpu().numpy() for tensor in tensors]
+        order = np.lexsort(columns[::-1])  # the last column has the highest rank in numpy
+        # True for a link that differs from the one before it in this order.
         is_new = np.ones(len(order), dtype=bool)
         is_new[1:] = np.any([column[order[1:]] != column[order[:-1]] for column in columns], axis=0)
         numbers = np.empty_like(order)
         numbers[order] = is_new.cumsum() - 1
         device = self.transmitters.device
         first = torch.from_numpy(order[is_new]).to(device)
-        which = torch.from_numpy(numbers).to(device)
-        return self[first], which
+        return self[first], torch.from_numpy(numbers).to(device)
 
 
 @dataclass

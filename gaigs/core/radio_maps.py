@@ -207,7 +207,10 @@ def radio_map(
 
 
 def scalar_scene(model, owner: str) -> Scene:
-    """The scene of a model with scalar labels; ``owner`` names its use in errors."""
+    """The scene of a model with scalar labels; an error for any other object.
+
+    ``owner`` names the model's use in the error.
+    """
     if not hasattr(model, "scene"):
         raise TypeError(
             f"model must be one that gaigs.load gives, got {model!r:.200}; load the checkpoint "
@@ -223,7 +226,10 @@ def scalar_scene(model, owner: str) -> Scene:
 
 
 def _usual_height(scene: Scene) -> float:
-    """The scene's height [m]; a log line names the other floors."""
+    """Height of transmitters for a map without a given one [m].
+
+    If there are several floors, a line in the log names the other ones.
+    """
     if len(scene.floors):
         others = ", ".join(f"{floor:.2f}" for floor in sorted(scene.floors[1:].tolist()))
         log.info(
@@ -250,10 +256,10 @@ def _rectangle(scene: Scene, height: float, margin: float) -> tuple[ndarray, nda
 
 def _doubts(scene: Scene, height: float, margin: float) -> list[str]:
     """Warnings for options that put transmitters far outside the training box."""
-    beyond = max(scene.lower[2].item() - height, height - scene.upper[2].item())
+    below_or_above = max(scene.lower[2].item() - height, height - scene.upper[2].item())
     messages = []
     for name, distance, most in (
-        ("height", beyond, scene.extent),
+        ("height", below_or_above, scene.extent),
         ("margin", margin, 20 * scene.extent),
     ):
         if distance > most:
@@ -282,7 +288,10 @@ def _predict(
     frequency: float | None,
     points: Float[ndarray, "*points 3"],
 ) -> Float[ndarray, "m *points k"]:
-    """Values at places for some receivers, and deviations if the model has intervals."""
+    """Values at points [m] for receivers by number, and deviations if the model has intervals.
+
+    The first axis has the values, and then the deviations.
+    """
     shape = (*points.shape[:-1], len(receivers))
     places = np.broadcast_to(points[..., None, :], (*shape, 3))  # (..., k, 3)
     index = np.broadcast_to(receivers, shape)  # (..., k)
@@ -290,7 +299,7 @@ def _predict(
     has_intervals = model.calibration is not None and model.calibration.gives(0.5)
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", r"\d+ of \d+ positions are up to", ExtrapolationWarning)
-        # All receivers of a place are in one batch: its excitation is computed once.
+        # All receivers of a place are in one batch, so a model computes the place's features once.
         prediction = model.predict(
             torch.from_numpy(places.astype(np.float32)),
             torch.from_numpy(index.copy()),
@@ -317,8 +326,16 @@ def _affordable_pitch(
 
     The longer side has about ``points`` points, unless the model is slow or maps of all receivers
     would need more than ``predictions``.
+
+    Args:
+        predict: Function from places (..., 3) [m] to predictions for all receivers of the map.
+        receivers: Number of these receivers.
+        lower, upper: Corners of the map (2,) [m].
+        height: Height of the transmitters [m].
+        seconds, points, fewest, predictions: Limits, as described above.
     """
     pitch = max(0.1, float((upper - lower).max()) / points)
+    # Predictions along the diagonal are timed.
     line = np.linspace(lower, upper, points)
     places = np.column_stack((line, np.full(points, height)))
     # The whole map repeats the warnings.
@@ -339,5 +356,6 @@ def _axes(lower: ndarray, upper: ndarray, pitch: float) -> list[ndarray]:
     """Multiples of a pitch along x and along y that cover a rectangle."""
     axes = []
     for start, end in zip(lower, upper, strict=True):
+        # The last multiple is beyond the end; numpy's range leaves out its own end.
         axes.append(pitch * np.arange(np.floor(start / pitch), np.floor(end / pitch) + 2))
     return axes

@@ -40,15 +40,18 @@ class Roofs(NamedTuple):
     ground: Float[Tensor, "rows columns"] | None = None  # None: no terrain is known [m]
 
     def ground_at(self, points: Float[Tensor, "b 3"]) -> Float[Tensor, " b"]:
-        """Height of the ground below points, linear between cells; at the margin outside [m]."""
+        """Height of the ground below points [m], interpolated linearly between cells.
+
+        Outside the grid it is the height at the nearest margin; without a terrain it is 0.
+        """
         if self.ground is None:
             return torch.zeros_like(points[:, 0])
         sides = self.cell * torch.tensor(self.ground.shape[::-1]).to(points)
         corner = torch.tensor(self.lower).to(points)
         places = 2 * (points[:, :2] - corner) / sides - 1  # (b, 2), from -1 to 1 within the grid
         ground = self.ground.to(points)[None, None]  # (1, 1, rows, columns)
-        kinds = {"padding_mode": "border", "align_corners": False}
-        return functional.grid_sample(ground, places[None, None], **kinds)[0, 0, 0]
+        options = {"padding_mode": "border", "align_corners": False}
+        return functional.grid_sample(ground, places[None, None], **options)[0, 0, 0]
 
 
 def plan_grid(
@@ -60,7 +63,7 @@ def plan_grid(
     """A grid over a box [m]; cells are enlarged if there would be more than ``most``."""
     size = upper - lower
     cell = max(cell, math.sqrt(size.prod() / most))
-    columns, rows = np.ceil(size / cell).astype(int) + 1
+    columns, rows = np.ceil(size / cell).astype(int) + 1  # at least one
     return SiteGrid((float(lower[0]), float(lower[1])), cell, int(rows), int(columns))
 
 
@@ -70,25 +73,29 @@ def rasterize_roofs(
     ground: Float[ndarray, "rows columns"] | None = None,
     nothing: float = -1e4,  # [m], without a building; a checkpoint takes finite numbers alone
 ) -> Roofs:
-    """The roofs on a grid.
+    """The roofs on a grid; where buildings overlap, the highest one.
 
     Args:
+        buildings: Buildings, of which parts outside the grid are left out.
+        grid: Cells of the result.
         ground: Height of the ground in each cell [m]. A building whose ground is unknown stands on
             the mean below its footprint, or at 0 without ``ground``.
+        nothing: Height of a cell without a building.
     """
     heights = np.full((grid.rows, grid.columns), nothing, dtype=np.float32)
     for building in buildings:
         corners = (building.rings[0] - grid.lower) / grid.cell  # in cells
+        # Columns and rows of the cells that the outline may cover, the last ones excluded.
         first = np.floor(corners.min(0)).astype(int).clip(0)
         last = np.ceil(corners.max(0)).astype(int).clip(max=(grid.columns, grid.rows))
-        if (first >= last).any():
+        if (first >= last).any():  # outside the grid
             continue
         x, y = np.meshgrid(np.arange(first[0], last[0]), np.arange(first[1], last[1]))
         middles = np.stack((x.ravel(), y.ravel()), 1) + 0.5  # (k, 2)
         is_inside = Outline(corners).contains_points(middles)
         for hole in building.rings[1:]:
             is_inside &= ~Outline((hole - grid.lower) / grid.cell).contains_points(middles)
-        if not is_inside.any():
+        if not is_inside.any():  # smaller than a cell
             continue
         is_inside = is_inside.reshape(x.shape)
         area = slice(first[1], last[1]), slice(first[0], last[0])
@@ -121,17 +128,20 @@ def obstruct(
 
     Source: ITU-R P.526-15, sections 4.1 and 4.5.1.
     """
-    plan = (ends - starts)[:, :2].norm(dim=1, keepdim=True).clamp_min(1e-3)  # (b, 1)
-    count = max(2, math.ceil(plan.max().item() / roofs.cell)) if len(plan) else 2
+    # Horizontal lengths of the paths (b, 1) [m].
+    plan = (ends - starts)[:, :2].norm(dim=1, keepdim=True).clamp_min(1e-3)
+    count = max(2, math.ceil(plan.max().item() / roofs.cell)) if len(plan) else 2  # samples a path
     if len(plan) * count > most and len(plan) > 1:
         halves = zip(starts.tensor_split(2), ends.tensor_split(2), strict=True)
         return torch.cat([obstruct(roofs, *half, wavelength, most) for half in halves])
-    shares = (torch.arange(count).to(starts) + 0.5) / count  # (k,)
-    x, y, path = torch.lerp(starts.T[..., None], ends.T[..., None], shares)  # (b, k) each
-    before = plan * shares  # (b, k)
+    fractions = (torch.arange(count).to(starts) + 0.5) / count  # (k,)
+    # Coordinates and height of the samples (b, k) each.
+    x, y, path = torch.lerp(starts.T[..., None], ends.T[..., None], fractions)
+    before = plan * fractions  # horizontal distance from the start (b, k)
     rows, columns = roofs.heights.shape
     column = ((x - roofs.lower[0]) / roofs.cell).floor().long()
     row = ((y - roofs.lower[1]) / roofs.cell).floor().long()
+    # True for samples that count: on the grid, and away from the ends.
     counts = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
     counts &= torch.minimum(before, plan - before) > 1.5 * roofs.cell
     cells = row.clamp(0, rows - 1), column.clamp(0, columns - 1)
@@ -146,7 +156,8 @@ def obstruct(
     inside = is_blocked.sum(1) * (ends - starts).norm(dim=1) / count
     walls = (is_blocked[:, 1:] != is_blocked[:, :-1]).sum(1).to(path)
     loss = knife_edge(_bullington(surface, starts[:, 2:], ends[:, 2:], before, plan, wavelength))
-    loss += (1 - (-loss / 6).exp()) * (10 + 2e-5 * plan[:, 0])  # for the edges beside the highest
+    # The correction of Bullington's method for further edges.
+    loss += (1 - (-loss / 6).exp()) * (10 + 2e-5 * plan[:, 0])
     return torch.stack((is_blocked.any(1).to(path), inside, walls, loss), 1)
 
 
@@ -172,15 +183,18 @@ def _bullington(
 
     Source: ITU-R P.526-15, section 4.5.1.
     """
+    # Slopes of the steepest lines from the start and from the end to a sample (b, 1).
     up = ((surface - start) / before).amax(1, keepdim=True)
     down = ((surface - end) / (plan - before)).amax(1, keepdim=True)
     is_free = up <= (end - start) / plan
-    meeting = (end - start + down * plan) / (up + down)  # (b, 1)
-    meeting = torch.where(is_free, before, meeting)  # (b, k)
-    edge = torch.where(is_free, surface, start + up * meeting)
-    rest = plan - meeting  # distance from the edge to the end
-    above = edge - (start * rest + end * meeting) / plan
-    v = above * (2 * plan / (wavelength * meeting * rest)).sqrt()
+    # Distance from the start to the edge, and height of the edge: one for a blocked path, one for
+    # each sample of a free one.
+    to_edge = (end - start + down * plan) / (up + down)  # (b, 1)
+    to_edge = torch.where(is_free, before, to_edge)  # (b, k)
+    edge = torch.where(is_free, surface, start + up * to_edge)
+    from_edge = plan - to_edge
+    above = edge - (start * from_edge + end * to_edge) / plan  # above the direct path
+    v = above * (2 * plan / (wavelength * to_edge * from_edge)).sqrt()
     return v.amax(1).clamp_min(-1.0)
 
 

@@ -104,7 +104,7 @@ class Scene:
         return 1 if self.one_radio else len(self.receivers)
 
     def radio_of(self, receivers: Int[Tensor, " b"]) -> Int[Tensor, " b"]:
-        """Number of each receiver's radio, by which models store what they learn of receivers."""
+        """Number of each receiver's radio; models store what they learn of receivers by radio."""
         return torch.zeros_like(receivers) if self.one_radio else receivers
 
     def by_radio(self, query: Query) -> Query:
@@ -185,9 +185,9 @@ class Scene:
         responses = self.responses
         if responses is not None:
             known = self.task.frequencies.double().numpy()
-            order = np.argsort(known)
+            order = np.argsort(known)  # np.interp needs ascending frequencies
             asked = frequencies.double().numpy()
-            rows = responses.flatten(0, 1).numpy()[:, order]
+            rows = responses.flatten(0, 1).numpy()[:, order]  # (receivers x e, s)
             interpolated = [np.interp(asked, known[order], row) for row in rows]
             responses = torch.tensor(np.array(interpolated)).to(responses)
             responses = responses.unflatten(0, self.responses.shape[:2])  # (receivers, e, s)
@@ -220,7 +220,8 @@ class Scene:
                 "elements": receiver.array.elements,
                 "pattern": receiver.array.pattern,
             }
-            # Runs of one band go on that were begun before receivers had bands.
+            # Only if it is not the default, so that runs from before receivers had bands can go on:
+            # their scenes must be equal.
             if receiver.band != Receiver.band:
                 entry["band"] = receiver.band
             receivers.append(entry)
@@ -257,7 +258,11 @@ class Scene:
 
 
 def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
-    """Frequency of each link [Hz]: the query's, the only one, or its receiver's middle one."""
+    """Frequency of each link [Hz].
+
+    For channels it is the mean of the subcarriers in the receiver's band. For other labels it is
+    the query's frequency, or else the only carrier of the training links.
+    """
     if scene.task.is_channel:
         return scene.middles.to(query.transmitters)[query.receivers]
     if query.frequencies is not None:
@@ -271,10 +276,16 @@ def carriers(scene: Scene, query: Query) -> Float[Tensor, " b"]:
 
 
 def check_elements(owner: str, scene: Scene, pads: bool = False) -> Task:
-    """The scene's task; a ``ValueError`` unless it has channels with each array's elements.
+    """The scene's task, which must have channels with as many elements as each receiver's array.
 
-    ``owner`` names a component in errors. A component that ``pads`` takes smaller arrays too, and
-    predicts 0 at missing elements.
+    Args:
+        owner: Name of the component in errors.
+        scene: The scene.
+        pads: True if smaller arrays are allowed, because the component predicts 0 at missing
+            elements.
+
+    Raises:
+        ValueError: Labels are not channels, or an array has another number of elements.
     """
     task = scene.task
     if not task.is_channel:
@@ -307,12 +318,16 @@ def direct_waves(
     sign: int = -1,
     at_elements: bool = True,
 ) -> Complex[Tensor, "b e s"]:
-    """Fields in free space at the receiver's elements, or at its middle (e = 1).
+    """Fields in free space at the elements of each link's receiver.
 
-    The middle is used without ``at_elements``.
+    The field is 0 at elements that the receiver's array lacks, and outside the receiver's band.
 
-    It is 0 at elements that the receiver's array lacks, and outside the receiver's band.
-    ``sign`` is as for ``free_space``.
+    Args:
+        scene: Scene with the receivers.
+        query: The links.
+        frequencies: Subcarriers [Hz].
+        sign: As for ``free_space``.
+        at_elements: False for the field at the middle of the array (e = 1), at all subcarriers.
     """
     # Some metres from the origin float32 would round an element's place by 1e-6 m, at 6 GHz by
     # 1e-4 rad.

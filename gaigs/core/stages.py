@@ -27,6 +27,8 @@ class Timekeeper:
         shown: True if its stages have progress bars.
 
     Attributes:
+        stages: Open stages, the innermost one last.
+        left_out: Descriptions of parts that were skipped for lack of time.
         seconds: Time of each ``timed`` part [s], without nested parts.
         ends: Function that is True when the current part, such as a training, must end; or None.
     """
@@ -62,32 +64,34 @@ class Stage:
         self.owns_bars = False
 
     def advance(self) -> None:
-        """Counts a step as done."""
+        """Counts a step as done; the first one warns if a fixed stage will exceed the limit."""
         self.done += 1
         if self.row is not None and self.keeper.bars is not None:
             self.keeper.bars.update(
                 self.row, completed=self.done, count=f"{self.done}/{self.total}"
             )
-        more = (time.monotonic() - self.began) * (self.total - 1)
-        if self.is_fixed and self.done == 1 and more > max(2.0, self.keeper.left()):
+        # After the first step, the time that the others will take [s].
+        remaining = (time.monotonic() - self.began) * (self.total - 1)
+        if self.is_fixed and self.done == 1 and remaining > max(2.0, self.keeper.left()):
             words = "%s: %.0f s more, which cannot be shortened; max_time leaves %.0f s"
-            log.warning(words, self.name, more, max(0.0, self.keeper.left()))
+            log.warning(words, self.name, remaining, max(0.0, self.keeper.left()))
 
     def show(self) -> None:
         """Adds the bar to the run's bars."""
         with self.keeper.lock:
-            if self not in self.keeper.stages:  # it has ended
+            if self not in self.keeper.stages:  # the stage has ended before its timer
                 return
             if self.keeper.bars is None:
-                self.keeper.bars, self.owns_bars = make_bars(transient=True), True
+                self.keeper.bars = make_bars(transient=True)
                 self.keeper.bars.start()
+                self.owns_bars = True
             fields: dict[str, Any] = {"count": f"{self.done}/{self.total}", "scores": ""}
             self.row = self.keeper.bars.add_task(
                 self.name, total=self.total, completed=self.done, **fields
             )
 
     def close(self) -> None:
-        """Removes the bar."""
+        """Ends the stage, and removes the bar; the stage that started the run's bars stops them."""
         with self.keeper.lock:
             self.keeper.stages.remove(self)
             bars = self.keeper.bars
@@ -149,24 +153,25 @@ def stage(
 
 
 def portion(share: float) -> contextlib.AbstractContextManager[Stage]:
-    """A stage that has to end after a fraction of the time that is left."""
+    """A stage that has to end after the fraction ``share`` of the time that open stages leave."""
     keeper = current()
     if math.isinf(keeper.limit):
         return stage()
-    return stage(until=1 - (keeper.left() - share * left()) / keeper.limit)
+    after = keeper.left() - share * left()  # from the end of the stage to the run's limit [s]
+    return stage(until=1 - after / keeper.limit)
 
 
 @contextlib.contextmanager
 def timed(name: str) -> Iterator[None]:
     """A part of the current run whose time is recorded under a name, without nested parts."""
     seconds = current().seconds
-    inside = sum(seconds.values())
+    recorded_before = sum(seconds.values())
     began = time.monotonic()
     try:
         yield
     finally:
-        inside = sum(seconds.values()) - inside
-        seconds[name] = seconds.get(name, 0.0) + time.monotonic() - began - inside
+        nested = sum(seconds.values()) - recorded_before
+        seconds[name] = seconds.get(name, 0.0) + time.monotonic() - began - nested
 
 
 def track(

@@ -60,7 +60,8 @@ def clone(
     """
     copies = _append(gaussians, optimizer, chosen, follower)
     with torch.no_grad():
-        # logit a' = log(exp(softplus(logit a) / 2) - 1): accurate for opacities near 0 and 1.
+        # logit a' = log(a' / (1 - a')) = log(exp(softplus(logit a) / 2) - 1), since softplus(logit
+        # a) = -log(1 - a). This form is accurate for opacities near 0 and 1.
         logits = gaussians.opacity_logits[copies]
         gaussians.opacity_logits[copies] = nn.functional.softplus(logits).div(2).expm1().log()
 
@@ -74,6 +75,8 @@ def split(
 ) -> None:
     """Replaces each chosen Gaussian by two smaller ones, whose centres are drawn from it.
 
+    Arguments are as for ``prune``; ``generator`` draws the centres.
+
     Source: Kerbl et al., 2023, section 5.2.
     """
     shrinkage = 1.6  # as Kerbl et al. shrink them
@@ -81,7 +84,8 @@ def split(
     with torch.no_grad():
         scales = gaussians.scales[halves]  # (m, 3) [m]
         rotations = quaternions_to_rotations(gaussians.quats[halves])  # (m, 3, 3)
-        steps = torch.randn(scales.shape, generator=generator).to(scales) * scales  # own axes [m]
+        # Steps of both halves from the centre, along the Gaussian's axes (m, 3) [m].
+        steps = torch.randn(scales.shape, generator=generator).to(scales) * scales
         gaussians.means[halves] += (rotations @ steps[..., None]).squeeze(-1)
         gaussians.log_scales[halves] -= math.log(shrinkage)
 
@@ -92,7 +96,11 @@ def _append(
     chosen: Bool[Tensor, " n"],
     follower: Deformation | None,
 ) -> Bool[Tensor, " m"]:
-    """Appends copies of the chosen Gaussians; returns a mask of originals and copies."""
+    """Appends copies of the chosen Gaussians.
+
+    Returns:
+        True for the m Gaussians afterwards that were chosen, or are their copies.
+    """
 
     def with_copies(rows: Tensor) -> Tensor:
         return torch.cat((rows, rows[chosen]))
@@ -133,7 +141,8 @@ def _rearrange(
         if not state:
             continue
         for key, value in state.items():
-            # A tensor has a row for each Gaussian (Adafactor's lacks other axes), or is one number.
+            # State by Gaussian is selected like the parameter; single numbers, such as the count of
+            # steps, stay. Other axes may be missing, as in Adafactor's state.
             if torch.is_tensor(value) and value.shape[:1] == old.shape[:1]:
                 state[key] = select_state(value)
         optimizer.state[new] = state

@@ -102,12 +102,13 @@ class Gaussians(nn.Module):
         means = []
         scales = []
         for i, receiver in enumerate(scene.receivers):
-            share = count // receivers + (i < count % receivers)
-            directions = fibonacci_lattice(share, low, high)  # (share, 3)
-            distances = near + (far - near) * torch.rand(share)  # [m]
+            number = count // receivers + (i < count % receivers)  # equal to within one
+            directions = fibonacci_lattice(number, low, high)  # (number, 3)
+            distances = near + (far - near) * torch.rand(number)  # [m]
             means.append(receiver.pose.world(distances[:, None] * directions))
-            # Angle between neighbours: the root of each one's share of the zone's solid angle.
-            pitch = math.sqrt(2 * math.pi * (math.sin(high) - math.sin(low)) / share)  # [rad]
+            # Angle between neighbours: the root of the zone's solid angle divided by their number.
+            solid_angle = 2 * math.pi * (math.sin(high) - math.sin(low))
+            pitch = math.sqrt(solid_angle / number)  # [rad]
             scales.append(distances * pitch * spread)
         self.means = nn.Parameter(torch.cat(means))  # (n, 3)
         self.quats = nn.Parameter(torch.randn(count, 4))
@@ -178,10 +179,11 @@ def fibonacci_lattice(count: int, low: float, high: float) -> Float[Tensor, "cou
     Source: Swinbank and Purser, Fibonacci grids, 2006.
     """
     i = torch.arange(count, dtype=torch.float64) + 0.5
-    # Equal steps in height are equal areas on the sphere; the golden angle separates neighbours.
+    # Equal steps in height are equal areas on the sphere. Azimuths in steps of the golden angle
+    # keep neighbours apart.
     heights = math.sin(low) + (math.sin(high) - math.sin(low)) * i / count
-    golden = math.pi * (1 + math.sqrt(5))
-    azimuths = torch.remainder(golden * i, 2 * math.pi)
+    golden_angle = math.pi * (1 + math.sqrt(5))
+    azimuths = torch.remainder(golden_angle * i, 2 * math.pi)
     return from_spherical(azimuths, torch.asin(heights)).float()
 
 
@@ -201,7 +203,7 @@ def write_ply(path: str | Path, values: Mapping[str, Tensor], comment: str) -> N
     harmonics = signal[:, :3, 1:].flatten(1)
     others = signal[:, 3:].flatten(1)
     parameters["signal"] = torch.cat((colours, harmonics, others), 1)
-    parameters["normals"] = torch.zeros(n, 3)
+    parameters["normals"] = torch.zeros(n, 3)  # viewers expect them, and ignore the values
     rest = parameters["signal"].shape[1] - 3
     properties = {  # in the order that viewers expect
         "means": ["x", "y", "z"],
@@ -212,10 +214,11 @@ def write_ply(path: str | Path, values: Mapping[str, Tensor], comment: str) -> N
         "quats": [f"rot_{i}" for i in range(4)],
     }
     columns = torch.cat([parameters[name].reshape(n, -1) for name in properties], 1)
-    names = [*itertools.chain.from_iterable(properties.values())]
+    names = [*itertools.chain.from_iterable(properties.values())]  # of the columns
     vertices = unstructured_to_structured(columns.numpy(), names=names)
+    element = PlyElement.describe(vertices, "vertex")
     with atomic_write(path) as part:
-        PlyData([PlyElement.describe(vertices, "vertex")], comments=[comment]).write(str(part))
+        PlyData([element], comments=[comment]).write(str(part))
 
 
 class Placed(NamedTuple):

@@ -20,7 +20,7 @@ def require(holds: object, rule: str) -> None:
 
 
 def require_empty(got: Sequence[int], shapes: Collection[Sequence[int]], rule: str) -> None:
-    """Requires that the result for a batch without links has one of some shapes."""
+    """Requires that the shape ``got`` of a result for no links is one of ``shapes``."""
     remedy = "with b = 0, flatten(1) works and reshape(b, -1) does not"
     require(tuple(got) in shapes, f"{rule}, got {tuple(got)}; {remedy}")
 
@@ -37,14 +37,17 @@ def require_refusal(call: Callable[[], object], rule: str) -> None:
 
 
 def require_close(actual: Tensor, expected: Tensor, tolerance: float, rule: str) -> None:
-    """Requires equality to within a fraction of the largest expected value, at least 1."""
+    """Requires errors of at most ``tolerance`` times the largest expected magnitude, or times 1.
+
+    ``rule`` is the message of the error.
+    """
     largest = max(1.0, _largest(expected))
     wide = torch.complex128 if expected.is_complex() else torch.float64
     _require_within(actual.to(wide), expected.to(wide), tolerance * largest, rule)
 
 
 def require_same(actual: Tensor, expected: Tensor, rule: str) -> None:
-    """Requires equal tensors, on a GPU up to rounding, as the order of its sums varies."""
+    """Requires equal tensors; on a GPU equal up to rounding, as the order of its sums varies."""
     rounds = actual.is_floating_point() or actual.is_complex()
     if actual.device.type == "cpu" or not rounds:
         require(torch.equal(actual, expected), rule)
@@ -75,8 +78,9 @@ def require_tensor(
     device: torch.device | str | None = None,
 ) -> None:
     """Requires a finite tensor of this shape, dtype and type of device."""
-    shapes = tuple(shape), tuple(tensor.shape)
-    require(shapes[0] == shapes[1], f"{name} must be of shape {shapes[0]}, got {shapes[1]}")
+    expected = tuple(shape)
+    got = tuple(tensor.shape)
+    require(expected == got, f"{name} must be of shape {expected}, got {got}")
     rule = f"{name} must be {dtype}, got {tensor.dtype}; convert it by .to({dtype})"
     require(tensor.dtype == dtype, rule)
     stays = device is None or tensor.device.type == torch.device(device).type

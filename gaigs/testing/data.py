@@ -33,7 +33,7 @@ def example_links(task: str = "spectrum", carrier: float | None = None) -> Links
     generator = torch.Generator().manual_seed(0)
     places = torch.rand(24, 3, generator=generator) * torch.tensor([6.0, 4.0, 2.0])  # (24, 3) [m]
     receivers = torch.arange(24) % 2
-    rows: Tensor | None = torch.arange(24) // 2
+    rows: Tensor | None = torch.arange(24) // 2  # of a table with both receivers in a row
     array = Array.single()
     poses = (
         Pose.from_xyzw((0.2, 0.2, 2.5), (-0.6, 0, 0, 0.8)),
@@ -165,10 +165,10 @@ def _check_rows(links: Links) -> None:
     is_index = tuple(rows.shape) == (len(links),) and rows.dtype == torch.long
     require(is_index, "rows must hold an integer for each link")
     require(rows.ge(0).all(), "rows must count from 0")
-    _, which = rows.unique(return_inverse=True)
-    members = torch.zeros(int(which.max()) + 1, dtype=torch.long)
-    members.scatter_(0, which, torch.arange(len(rows)))  # one link of each row
-    at_one_place = torch.equal(places[members[which]], places)
+    _, number = rows.unique(return_inverse=True)
+    members = torch.zeros(int(number.max()) + 1, dtype=torch.long)
+    members.scatter_(0, number, torch.arange(len(rows)))  # one link of each row
+    at_one_place = torch.equal(places[members[number]], places)
     rule = "links of one row must have one transmitter position; number rows by place"
     require(at_one_place, rule)
 
@@ -176,7 +176,7 @@ def _check_rows(links: Links) -> None:
 def _check_labels(links: Links) -> None:
     """Checks that labels can be read twice, singly and as a batch, and that each has a score."""
     task = links.task
-    index = torch.linspace(0, len(links) - 1, 9).long().flip(0)
+    index = torch.linspace(0, len(links) - 1, 9).long().flip(0)  # in descending order
     labels = links.labels[index]
     require_tensor("labels", labels, (len(index), *task.shape), task.dtype)
     rule = "labels read twice must be the same; draw random numbers once, with a seed"

@@ -127,7 +127,10 @@ def _check_arguments(model: Model, links: Links, query: Query) -> None:
 
 
 def _check_evaluation(model: Model, batch: Batch, mixed: Batch) -> None:
-    """Checks that ``evaluate`` and ``forward`` agree, for links to one receiver and to several."""
+    """Checks that ``evaluate`` and ``forward`` agree, and that links do not affect each other.
+
+    Links of ``batch`` are to one receiver, links of ``mixed`` to several.
+    """
     model.eval()
     values = model.evaluate(batch)
     labels = batch.labels
@@ -148,7 +151,7 @@ def _check_evaluation(model: Model, batch: Batch, mixed: Batch) -> None:
 
 
 def _check_directions(model: Model, batch: Batch) -> None:
-    """Checks that values depend neither on the other directions nor on ``chunk``."""
+    """Checks that values depend neither on other directions nor on the model's ``chunk``."""
     values = model.evaluate(batch)
     if isinstance(batch.directions, Grid):
         rows, columns = slice(1, None, 3), slice(2, None, 4)

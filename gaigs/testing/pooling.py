@@ -144,17 +144,20 @@ def _check_values(pooling: Pooling, task: Task, inputs: _PoolingInputs, query: Q
 def _check_directions(
     pooling: Pooling, task: Task, received: Tensor | ReceivedPaths, query: Query, value: Tensor
 ) -> None:
-    """Checks values for a list of the label's directions."""
+    """Checks the values for a part of the label's directions, given as a list of rays.
+
+    ``value`` has the values for all directions.
+    """
     tolerance = PRECISION[_real_dtype(received)]
     if isinstance(received, Tensor) and pooling.grid is None:
-        row = received.flatten(2)[:, :, None, ::3]  # (b, c, 1, k)
+        row = received.flatten(2)[:, :, None, ::3]  # every third pixel, as rays (b, c, 1, k)
         values = pooling(row, query)
         shape = (len(query), *row.shape[2:])
         require_tensor("the value of a list of rays", values, shape, value.dtype, value.device)
         rule = "a list of rays must have the values of their pixels"
         require_close(values[:, 0], value.flatten(1)[:, ::3], tolerance, rule)
     elif task.directions is not None:
-        rays = task.directions.flatten()[1::3].to(value.device)
+        rays = task.directions.flatten()[1::3].to(value.device)  # every third direction
         values = pooling(received, query, rays)
         rule = "fewer directions must get the same values"
         require_close(values, value.flatten(1)[:, 1::3], tolerance, rule)

@@ -145,7 +145,7 @@ def _check_thinning(task: Task, options: dict) -> None:
     """Checks that a task's thinning keeps the same pixels of labels and of directions."""
     thin = task.thinning(**options)
     count = max(1, int(np.prod(task.shape)))
-    # Each label has the number of its pixel as value, which shows where a kept value is from.
+    # The value of a label's pixel is the pixel's number, which shows where a kept value is from.
     numbers = torch.arange(count, dtype=torch.float64).reshape(task.shape).expand(2, *task.shape)
     query = Query(torch.tensor([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]), torch.tensor([0, 1]))
     batch = Batch(query, task.directions, numbers, (0.5, 0.25))

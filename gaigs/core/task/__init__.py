@@ -147,13 +147,16 @@ class Task(ABC):
         return means
 
     def averaged(self, scores: dict[str, Tensor]) -> dict[str, Tensor] | None:
-        """Scores if the mean of many labels at a place predicts each of them; by default None.
+        """Scores of the mean of many labels at a place as the prediction of each of them.
 
         Two labels with independent noise of variance s² have a mean square difference of 2 s²; a
         label and the mean of many labels have s².
 
         Args:
             scores: Scores of one label as the prediction of another at the same place.
+
+        Returns:
+            The scores; by default None, for a task without such a rule.
         """
         return None
 
@@ -198,7 +201,10 @@ class Task(ABC):
         return labels
 
     def phase_sign(self, labels: Tensor, waves: Tensor, receivers: Tensor) -> int:
-        """The sign with which phases follow path lengths, see ``Csi``; 0 without phases."""
+        """The sign with which phases of labels follow path lengths, see ``Csi.phase_sign``.
+
+        It is 0 for labels without phases, as by default.
+        """
         return 0
 
     def fingerprint(self, values: Tensor) -> Tensor:
@@ -236,14 +242,17 @@ def need_samples(scores: Tensor) -> None:
 
 
 def check_range(task: Task, labels: Tensor, name: str) -> None:
-    """Raises a ``ValueError`` unless real labels are NaN or within the task's limits."""
+    """Raises a ``ValueError`` unless real labels are NaN or within the task's limits.
+
+    ``name`` is the labels' name in the error. Complex labels have no limits.
+    """
     if task.dtype.is_complex:
         return
     lowest, highest = task.limits
     flat = labels.reshape(len(labels), -1)  # (k, numbers)
-    wrong = ((flat < lowest) | (flat > highest + 1e-6)).any(1)
+    wrong = ((flat < lowest) | (flat > highest + 1e-6)).any(1)  # 1e-6 for rounding
     if wrong.any():
-        row = int(wrong.int().argmax())
+        row = int(wrong.int().argmax())  # the first wrong one
         low, high = flat[row][~flat[row].isnan()].aminmax()
         bounds = f"from {lowest:g} to {highest:g} {task.unit}".rstrip()
         raise ValueError(
@@ -253,12 +262,15 @@ def check_range(task: Task, labels: Tensor, name: str) -> None:
 
 
 def check_values(labels: Tensor, values: Tensor, shape: tuple[int, ...], samples: str) -> None:
-    """Raises a ``ValueError`` unless labels and values are (k, *shape) and finite."""
+    """Raises a ``ValueError`` unless labels and values are (k, *shape) and finite.
+
+    ``samples`` is the noun for k samples in errors, such as ``spectra``.
+    """
     if labels.shape != values.shape or labels.ndim < 1 or tuple(labels.shape[1:]) != tuple(shape):
         given = f"{tuple(labels.shape)} and {tuple(values.shape)}"
         raise ValueError(f"labels and predictions must both be {('k', *shape)}, got {given}")
     for name, tensor in (("labels", labels), ("predictions", values)):
-        broken = ~tensor.isfinite()[..., None].flatten(1).all(1)
+        broken = ~tensor.isfinite()[..., None].flatten(1).all(1)  # (k,); scalars get an axis
         if broken.any():
             count = f"{int(broken.sum())} of {len(tensor)} {samples}"
             raise ValueError(

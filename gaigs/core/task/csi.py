@@ -120,10 +120,12 @@ class Csi(Task):
         turned = labels * self._turns(labels, values).to(labels)
         if self.phase == "per_link":
             return turned
-        sizes = turned.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
-        predicted = values.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
-        is_received = (sizes > 0) & (predicted > 0)
-        gains = torch.where(is_received, predicted, 1) / torch.where(is_received, sizes, 1)  # (k,)
+        label_sizes = turned.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
+        value_sizes = values.to(torch.complex128).flatten(1).norm(dim=1)  # (k,)
+        # Links without a label or prediction keep their scale, with a gain of 1.
+        is_received = (label_sizes > 0) & (value_sizes > 0)
+        wanted = torch.where(is_received, value_sizes, 1)
+        gains = wanted / torch.where(is_received, label_sizes, 1)  # (k,)
         return turned * gains[:, None, None].to(turned.real)
 
     def fingerprint(self, values: Complex[Tensor, "k e s"]) -> Float[Tensor, "k m"]:
@@ -196,17 +198,20 @@ class Csi(Task):
         """
         check_values(labels, values, self.shape, "channels")
         h = labels.detach().cpu().to(torch.complex128)  # (k, e, s)
-        guess = values.detach().cpu().to(torch.complex128)
+        guess = values.detach().cpu().to(torch.complex128)  # h'
         power = h.abs().square().sum((1, 2))  # (k,)
-        if silent := int((power == 0).sum()):
+        silent = int((power == 0).sum())
+        if silent:
             raise ValueError(
                 f"labels must not be zero throughout, got {silent} such channels; leave them out"
             )
+        # The prediction is turned onto the label: the inverse of the label's turn.
         aligned = self._turns(h, guess).conj() * guess
         if self.phase == "per_link_and_delay":
             # The gain of the least squared error; a prediction of zeros keeps its scale.
-            sizes = guess.abs().square().sum((1, 2))  # (k,)
-            gains = (aligned.conj() * h).sum((1, 2)).real / torch.where(sizes > 0, sizes, 1)
+            guess_power = guess.abs().square().sum((1, 2))  # (k,)
+            products = (aligned.conj() * h).sum((1, 2)).real
+            gains = products / torch.where(guess_power > 0, guess_power, 1)
             aligned = gains[:, None, None] * aligned
         plain_error = (h - guess).abs().square().sum((1, 2))  # (k,)
         aligned_error = (h - aligned).abs().square().sum((1, 2))

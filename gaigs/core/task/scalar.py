@@ -37,7 +37,7 @@ class Scalar(Task):
         }
 
     def scores(self, labels: Tensor, values: Tensor) -> dict[str, Tensor]:
-        """The absolute error of each prediction."""
+        """The absolute error of each prediction, by the name of ``monitor``."""
         check_values(labels, values, (), "readings")
         errors = values.detach().cpu().double() - labels.detach().cpu().double()
         return {self.monitor: errors.abs()}

@@ -73,10 +73,11 @@ class Basis(Deformation):
         nn.init.zeros_(self.weights[:, -1])
 
     def forward(self, tokens: Tokens, placed: Placed, query: Query) -> Residuals:
+        # One empty token in place of the Gaussians' tokens: one row of features a transmitter.
         no_gaussians = tokens._replace(gaussians=tokens.transmitters.new_zeros(1, 0))
         first = functional.gelu(self.first(no_gaussians)).squeeze(1)  # (b, width)
-        features = self.rest(first)
-        residuals = functional.linear(features, self.weights.flatten(0, 1))
+        features = self.rest(first)  # h, (b, width)
+        residuals = functional.linear(features, self.weights.flatten(0, 1))  # w_n h
         residuals = residuals.unflatten(1, self.weights.shape[:2])  # (b, n, channels + 1)
         return Residuals(delta_signal=residuals[..., :-1, None], delta_opacities=residuals[..., -1])
 

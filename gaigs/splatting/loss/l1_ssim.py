@@ -65,12 +65,12 @@ def find_window(loss: str, directions: Directions | None, pitch: float, pixels: 
         raise ValueError(
             f"loss {loss!r} needs rows and columns; with training.thinning.rays set loss=absolute"
         )
-    smallest = min(directions.shape)
+    smallest = min(directions.shape)  # edge of the thinned grid [pixels]
     if smallest < 3:
         raise ValueError(f"loss {loss!r} needs at least 3 x 3 directions, got {directions.shape}")
-    step = max(1, round(directions.pitch / pitch))
-    same_angle = max(3, round((pixels - 1) / step / 2) * 2 + 1)
-    largest = (smallest - 1) // 2 * 2 + 1  # odd too
+    step = max(1, round(directions.pitch / pitch))  # pixels of the full grid in one of this
+    same_angle = max(3, round((pixels - 1) / step / 2) * 2 + 1)  # the nearest odd number
+    largest = (smallest - 1) // 2 * 2 + 1  # the largest odd number in the grid
     return min(same_angle, largest)
 
 
@@ -95,14 +95,16 @@ def structural_similarity(
         >>> structural_similarity(spectra, spectra, window=7)
         tensor(1.)
     """
-    # The labels' means are separate, as they need no gradient.
+    # Window means of values x, labels y, and their products. The means of labels alone need no
+    # gradient.
     x, xx, xy = window_means(torch.stack((values, values.square(), values * labels)), window)
     y, yy = window_means(torch.stack((labels, labels.square())), window)
     unbiased = window**2 / (window**2 - 1)  # of a sample's covariance
-    variances = unbiased * (xx - x.square() + yy - y.square())
+    variances = unbiased * (xx - x.square() + yy - y.square())  # of values plus of labels
     covariance = unbiased * (xy - x * y)
     numerator = (2 * x * y + 0.01**2) * (2 * covariance + 0.03**2)
-    return (numerator / ((x.square() + y.square() + 0.01**2) * (variances + 0.03**2))).mean()
+    denominator = (x.square() + y.square() + 0.01**2) * (variances + 0.03**2)
+    return (numerator / denominator).mean()
 
 
 def window_means(
@@ -123,7 +125,7 @@ class _WindowMeans(torch.autograd.Function):
     def forward(ctx, images, window):
         ctx.window = window
         for axis in (-1, -2):
-            count = images.shape[axis] - window + 1
+            count = images.shape[axis] - window + 1  # windows along the axis
             total = images.narrow(axis, 0, count).clone()
             for first in range(1, window):
                 total += images.narrow(axis, first, count)
@@ -133,6 +135,7 @@ class _WindowMeans(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx, means_gradient):
+        # Each pixel gets the sum of the gradients of the windows that contain it.
         gradient = means_gradient / ctx.window**2
         for axis in (-2, -1):
             count = gradient.shape[axis]

@@ -12,9 +12,9 @@ from gaigs.splatting.loss.relative_error import RelativeError
 class LogRelativeError(RelativeError):
     """The mean over the links of ln((1 + r / floor) / (1 + r floor)), r = |h - h'|² / |h|².
 
-    The SNR of a link is -10 log10 r [dB]. Between the bounds -10 log10(floor) and 10 log10(floor)
-    dB the loss is linear in the SNR, so all links have equal weight. Outside the bounds the weight
-    of a link falls.
+    r is the relative error of a link with the label h and the prediction h'. The SNR of a link is
+    -10 log10 r [dB]. Between the bounds -10 log10(floor) and 10 log10(floor) dB the loss is linear
+    in the SNR, so all links have equal weight. Outside the bounds the weight of a link falls.
 
     Args:
         task: Task of the labels, which are complex.

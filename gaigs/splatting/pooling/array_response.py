@@ -52,9 +52,10 @@ class ArrayResponsePooling(Pooling):
         vectors = self.grid.flatten().vectors().to(image)  # (p, 3)
         weights = self.grid.solid_angles.flatten().to(image) * array.gain(vectors)  # (p,)
         positions = array.elements.to(image)  # (e, 3) [m]
-        lags = waves.new_zeros(len(query), len(array.lags[2]))  # (b, l)
+        steps, _, _ = array.lags
+        lags = waves.new_zeros(len(query), len(steps))  # (b, l)
         for carrier, links in self.beamformer.by_carrier(query):
-            # A wave from u leads at x by 2 pi x . u / lambda [rad].
+            # A wave from the direction u leads at an element x by 2 pi x . u / lambda [rad].
             phases = 2 * math.pi * carrier / speed_of_light * (vectors @ positions.T)  # (p, e)
             steering = torch.polar(weights[:, None].expand_as(phases), phases)  # (p, e)
             fields = waves[links] @ steering  # (b, e)

@@ -93,6 +93,8 @@ class Beamformer:
         # 0.
         relative = lags[:, middle:] / torch.where(power < FAINTEST, 1, power)[:, None]
         parts = torch.cat((relative.real, relative.imag), 1)  # (b, m)
+        # Spectra and the numbers of their links, carrier by carrier; the empty ones serve a query
+        # without links.
         spectra = [parts.new_zeros(0, math.prod(asked.shape))]
         order = [torch.zeros(0).long().to(parts.device)]
         for carrier, links in self.by_carrier(query):
@@ -103,21 +105,21 @@ class Beamformer:
                 reference = torch.cat((amplitudes, coarse), 1)
             spectra.append(_scaled(amplitudes, reference))
             order.append(links)
-        if len(spectra) == 2:  # a single carrier
+        if len(spectra) == 2:  # a single carrier, whose links are in order
             values = spectra[1]
         else:
             values = torch.cat(spectra)[torch.cat(order).argsort()]
         return values.unflatten(1, asked.shape)
 
     def lags(self, labels: Float[Tensor, "b rows columns"], query: Query) -> LagFit:
-        """Fits covariances to labels by least squares, in float64; it inverts ``__call__``.
+        """Fits covariances to labels by least squares, in float64; the inverse of ``__call__``.
 
         The scale of a label is unknown. A label of zeros has covariances of 0.
 
-        Up to a factor a label is y = s - m, with m the lowest amplitude. So s² = y² + 2 m y + m² is
-        linear in the covariances and m, which are fitted together. Combinations of lags with hardly
-        any effect on the spectrum are set to 0 (``rtol``). Closely spaced elements have many such
-        combinations, and a fit would fill them with noise.
+        Up to a factor a label is y = s - m, with m the lowest amplitude. The power s² = y² + 2 m y
+        + m² is linear in the covariances, which are fitted together with m. Combinations of lags
+        with hardly any effect on the spectrum are set to 0 (``rtol``). Closely spaced elements have
+        many such combinations, and a fit would fill them with noise.
         """
         grid = self.scene.task.directions
         # At least 40 x 40 pixels.
@@ -132,19 +134,20 @@ class Beamformer:
             half = len(basis) // 2
             basis = torch.cat((basis[:half], basis[half + 1 :]))  # the lag 0 is real
             inverse = torch.linalg.pinv(basis, rtol=1e-3)  # (k, m)
-            squares = labels[links].square()
-            doubles = 2 * labels[links]
+            squares = labels[links].square()  # y²
+            doubles = 2 * labels[links]  # 2 y
             # The residual of y² + 2 m y after the fit of covariances is linear in m. Its norm is
             # least at this m, which cannot be negative.
-            square_rest = squares - squares @ inverse @ basis
-            double_rest = doubles - doubles @ inverse @ basis
-            product = (square_rest * double_rest).sum(1)  # (b,)
-            least = -product / double_rest.square().sum(1).clamp_min(1e-30)
-            least = least.clamp_min(0)[:, None]
-            powers = squares + least * doubles + least.square()  # (b, k)
+            square_residual = squares - squares @ inverse @ basis
+            double_residual = doubles - doubles @ inverse @ basis
+            product = (square_residual * double_residual).sum(1)  # (b,)
+            lowest = -product / double_residual.square().sum(1).clamp_min(1e-30)
+            lowest = lowest.clamp_min(0)[:, None]  # m, (b, 1)
+            powers = squares + lowest * doubles + lowest.square()  # s², (b, k)
             parts = powers @ inverse  # (b, m)
-            rest = (powers - parts @ basis).square().sum(1)
-            unexplained[links] = rest / powers.square().sum(1).clamp_min(1e-30)
+            residual = (powers - parts @ basis).square().sum(1)
+            unexplained[links] = residual / powers.square().sum(1).clamp_min(1e-30)
+            # Complex covariances of the second half of the lags; the first half is their conjugate.
             imaginary = torch.cat((0 * parts[:, :1], parts[:, half:]), 1)
             later = torch.complex(parts[:, :half], imaginary)  # (b, half)
             lags[links] = torch.cat((later[:, 1:].conj().flip(1), later), 1)
@@ -165,7 +168,7 @@ class Beamformer:
     ) -> Float[Tensor, "b k"]:
         """Amplitudes of the beamformer in k directions.
 
-        ``parts`` are covariances as real numbers, in the order of the rows of ``_basis``.
+        ``parts`` are covariances as m real numbers, in the order of the rows of ``_basis``.
         """
         power = parts @ self._stored_basis(parts, carrier, query, directions)  # (b, k)
         least = 1e-6  # of the mean power: sums of tens of float32 terms round at this
@@ -176,7 +179,7 @@ class Beamformer:
     def _stored_basis(
         self, parts: Tensor, carrier: float, query: Query, directions: Directions
     ) -> Float[Tensor, "m k"]:
-        """``_basis`` in the dtype and on the device of ``parts``, cached for grids.
+        """The matrix ``_basis`` in the dtype and on the device of ``parts``, cached for grids.
 
         A training uses the same few thinned grids repeatedly. Lists of rays rarely repeat.
         """
@@ -199,27 +202,31 @@ class Beamformer:
         is their conjugate.
         """
         array = self.array(query)
-        steps, _, counts = array.lags
+        steps, _, counts = array.lags  # D [m], and n_D
         middle = len(steps) // 2
         # Opposite lags are conjugates of each other, so one of them counts twice.
-        pairs = torch.where(torch.arange(len(steps) - middle) > 0, 2, 1)
-        weights = (counts[middle:] / len(array) * pairs)[:, None]  # (half, 1)
+        twice = torch.where(torch.arange(len(steps) - middle) > 0, 2, 1)
+        weights = (counts[middle:] / len(array) * twice)[:, None]  # (half, 1)
         vectors = directions.to(steps).flatten().vectors()  # (k, 3)
         phases = 2 * math.pi * carrier / speed_of_light * (steps[middle:] @ vectors.T)  # (half, k)
         return torch.cat((phases.cos() * weights, phases.sin() * weights))
 
 
-def _scaled(amplitudes: Float[Tensor, "b k"], shown: Float[Tensor, "b j"]) -> Float[Tensor, "b k"]:
-    """Amplitudes scaled so that the range of ``shown`` becomes [0, 1].
+def _scaled(
+    amplitudes: Float[Tensor, "b k"], reference: Float[Tensor, "b j"]
+) -> Float[Tensor, "b k"]:
+    """Amplitudes scaled so that the range of ``reference`` becomes [0, 1].
+
+    Without gradients the result overwrites ``amplitudes``.
 
     One read of all pixels takes as long as the beamformer. The gradients of ``amin`` and ``amax``
-    read them four times, so training uses ``min`` and ``max``. Without gradients ``amin`` and
+    read all pixels four times, so training uses ``min`` and ``max``. Without gradients ``amin`` and
     ``amax`` are faster.
     """
-    if shown.requires_grad:
-        low = shown.min(1, keepdim=True).values  # (b, 1)
-        high = shown.max(1, keepdim=True).values
+    if reference.requires_grad:
+        low = reference.min(1, keepdim=True).values  # (b, 1)
+        high = reference.max(1, keepdim=True).values
         return (amplitudes - low) / torch.where(high > low, high - low, 1)
-    low = shown.amin(1, keepdim=True)
-    high = shown.amax(1, keepdim=True)
+    low = reference.amin(1, keepdim=True)
+    high = reference.amax(1, keepdim=True)
     return amplitudes.sub_(low).div_(torch.where(high > low, high - low, 1))

@@ -52,8 +52,8 @@ class ChannelPooling(Pooling):
         """
         missing = self.task.elements - channels.shape[1]
         channels = torch.nn.functional.pad(channels, (0, 0, 0, missing))
-        hears = [receiver.hears(self.frequencies) for receiver in self.scene.receivers]
-        in_band = torch.stack(hears).to(query.receivers.device)[query.receivers, None]  # (b, 1, s)
+        hears = torch.stack([receiver.hears(self.frequencies) for receiver in self.scene.receivers])
+        in_band = hears.to(query.receivers.device)[query.receivers, None]  # (b, 1, s)
         return self.scene.received(query, channels * in_band)
 
     @torch.no_grad()
@@ -66,5 +66,5 @@ class ChannelPooling(Pooling):
         self.strength.fill_(strength(labels, waves, query.receivers))
         self.sign.fill_(self.task.phase_sign(labels, waves, query.receivers))
         # Without a common clock the phases within a link still show the convention.
-        relative = torch.tensor(array_sign(labels, waves)) if self.sign == 0 else self.sign
-        self.array_sign.copy_(relative)
+        within_link = torch.tensor(array_sign(labels, waves)) if self.sign == 0 else self.sign
+        self.array_sign.copy_(within_link)

@@ -55,19 +55,24 @@ class ElementSum(ChannelPooling):
         if not len(query):
             shape = (0, *self.scene.task.shape)
             return torch.zeros(shape, dtype=image.dtype.to_complex(), device=image.device)
-        nearest = (self.learnt - self.frequencies[:, None]).abs().argmin(1)  # (s,)
-        real, imaginary = image.flatten(2).unflatten(1, (2, -1)).unbind(1)  # (b, s, p) each
-        waves = torch.complex(real, imaginary)[:, nearest]
+        # Number of the learnt subcarrier nearest to each requested one (s,).
+        nearest = (self.learnt - self.frequencies[:, None]).abs().argmin(1)
+        pixels = image.flatten(2)  # (b, c, p)
+        real, imaginary = pixels.unflatten(1, (2, -1)).unbind(1)  # (b, learnt, p) each
+        waves = torch.complex(real, imaginary)[:, nearest]  # m_f, (b, s, p)
         steering = self._steering(int(query.receivers[0]), int(self.array_sign)).to(waves)
         channels = waves.permute(1, 0, 2) @ steering  # (s, b, e)
         channels = channels.permute(1, 2, 0)  # (b, e, s)
         direct = direct_waves(
             self.scene, query, self.frequencies, int(self.sign), at_elements=False
-        )  # (b, 1, s)
+        )  # F, (b, 1, s)
         return self.received(query, channels * (self.strength.double() * direct).to(waves))
 
     def _steering(self, receiver: int, sign: int) -> Complex[Tensor, "s p e"]:
-        """Field at e elements of a unit wave from p directions, at s subcarriers; float64."""
+        """Field at e elements of a unit wave from p directions, at s subcarriers; complex128.
+
+        Weights w(u) and patterns a(u) of the directions are included.
+        """
         array = self.scene.receivers[receiver].array
         directions = self.grid.flatten().vectors().double()  # (p, 3)
         # A wave from the direction u reaches an element at x earlier by x . u / c than the middle.

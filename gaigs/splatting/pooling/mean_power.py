@@ -56,11 +56,12 @@ class MeanPower(Pooling):
         if pixels != tuple(self.weights.shape):
             raise ValueError(f"maps must have {tuple(self.weights.shape)} pixels, got {pixels}")
         image = image.to(torch.promote_types(image.dtype, torch.float32))
-        # Scaled by the largest, squares neither overflow nor underflow.
+        # Scaled by the largest amplitude, squares neither overflow nor underflow.
         largest = image.detach().abs().amax((1, 2, 3)).clamp(min=self.floor)  # (b,)
         powers = (image / largest[:, None, None, None]).square().sum(1)  # (b, rows, columns)
         power = powers.mul(self.weights).sum((1, 2))  # (b,)
-        return 20 * largest.log10() + 10 * (power + (self.floor / largest).square()).log10()
+        noise = (self.floor / largest).square()
+        return 20 * largest.log10() + 10 * (power + noise).log10()
 
 
 def noise_amplitude(floor_db: float) -> float:

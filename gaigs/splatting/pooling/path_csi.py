@@ -32,11 +32,13 @@ class PathCsi(ChannelPooling, PathPooling):
     def read(
         self, received: Complex[Tensor, "b e s"], query: Query, directions: Directions | None = None
     ) -> Complex[Tensor, "b most s"]:
+        """Channels from the paths' fields ``received`` [1/m], padded to the largest array."""
         frequencies = self.frequencies.to(received.real)
-        # Free space: the amplitude at 1 m is lambda / (4 pi).
+        # g lambda / (4 pi): free space at 1 m has the amplitude lambda / (4 pi).
         gains = self.strength.to(frequencies) * speed_of_light / (4 * math.pi * frequencies)  # (s,)
         value = received * gains
         if self.sign == 0:  # no common clock: the phase of the direct path is taken off
             direct = direct_waves(self.scene, query, frequencies, 1, at_elements=False)  # (b, 1, s)
             value = value * direct.sgn().to(value)
+        # Paths have the sign -1; the data may have the other one.
         return self.received(query, value.conj() if self.array_sign > 0 else value)

@@ -110,33 +110,35 @@ class LagPooling(PathPooling):
 
             sum |A|² exp(-(2 pi)² D' S D / 2 + j 2 pi D . u)
 
-        u are a path's direction cosines, which shrink to 0 within ``NEAREST`` of the array's
-        middle. S is the covariance of direction cosines, from the Gaussian and from
-        ``least_spread``. The interference of two paths has the product of their coherences as a
-        factor, and over a band also sinc(bandwidth (t - t')), with their delays t and t': the mean
-        over the band of cos(2 pi f (t - t')).
+        The sum is over paths, with amplitudes A. u are a path's direction cosines, which shrink to
+        0 within ``NEAREST`` of the array's middle. S is the covariance of direction cosines, from
+        the Gaussian and from ``least_spread``. The interference of two paths has the product of
+        their coherences as a factor, and over a band also sinc(bandwidth (t - t')), with their
+        delays t and t'. The sinc is the mean over the band of cos(2 pi f (t - t')).
         """
         array = paths.receiver.array
         amplitudes = paths.amplitudes  # (b, n)
         coherences = paths.coherences  # (n,)
         steering = _Steering(paths, self.least_spread)
         steps = array.lags[0].to(paths.lengths)  # (l, 3) [m]
-        # Powers add of the share of each path whose phase is unknown. Half of the lags are the
-        # conjugates of the others.
+        # The part of a path's power with an unknown phase adds without interference. Half of the
+        # lags are the conjugates of the others.
         powers = torch.view_as_real(amplitudes).square().sum(-1) * (1 - coherences.square())
-        later = (powers[..., None] * steering.at(steps[len(steps) // 2 :])).sum(1)
+        later_steps = steps[len(steps) // 2 :]
+        later = (powers[..., None] * steering.at(later_steps)).sum(1)  # (b, l / 2 + 1)
         lags = torch.cat((later[:, 1:].conj().flip(1), later), 1)  # (b, l)
         coherent = coherences.nonzero()[:, 0]
         if not len(coherent):
             return lags
-        # The others interfere: eq. (2) at each element, and the products of two elements.
+        # The parts with a known phase interfere: eq. (2) at each element, and the products of two
+        # elements. From here n counts paths with such a part.
         response = steering.at(array.elements.to(steps))  # (b, n, e)
         waves = ((amplitudes * coherences)[..., None] * response)[:, coherent]
         if paths.bandwidth is None:
             field = waves.sum(1)[..., None]  # (b, e, 1)
             return lags + array.by_lag(field @ field.mH)
         turns = paths.bandwidth / speed_of_light * paths.lengths[:, coherent]  # (b, n)
-        likeness = sinc(turns[:, :, None] - turns[:, None])  # (b, n, n)
+        likeness = sinc(turns[:, :, None] - turns[:, None])  # mean over the band (b, n, n)
         # Real products take half the time of complex ones.
         parts = torch.view_as_real(waves).flatten(2)  # (b, n, 2 e)
         alike = (likeness @ parts).unflatten(2, (-1, 2))  # (b, n, e, 2)
@@ -155,20 +157,20 @@ class _Steering:
     def __init__(self, paths: ReceivedPaths, least_spread: float):
         self.amplitudes = paths.amplitudes
         self.is_point = paths.receiver.array.is_point
-        if self.is_point:  # a power has no directions
+        if self.is_point:  # its response is 1 for all directions
             return
         points, wavenumbers, self.across = _see(paths)
         distances = points.norm(dim=-1, keepdim=True).clamp_min(NEAREST)  # (b, n, 1)
-        self.angles = wavenumbers * points / distances  # (b, n, 3) [rad/m]
+        self.wave_vectors = wavenumbers * points / distances  # (b, n, 3) [rad/m]
         self.least = (least_spread * wavenumbers).square()  # (b, 1, 1) [rad²/m²]
 
     def at(self, steps: Float[Tensor, "k 3"]) -> Complex[Tensor, "*b n k"]:
-        """exp(-(2 pi)² D' S D / 2 + j 2 pi D . u) of each path at steps [m]."""
+        """Response exp(-(2 pi)² D' S D / 2 + j 2 pi D . u) to each path at k points D [m]."""
         if self.is_point:
             return self.amplitudes.new_ones(1, 1, len(steps))
         spreads = _spreads(self.across, steps)  # (b, n, k)
         least = self.least * steps.square().sum(-1)  # (b, 1, k)
-        return polar(((spreads + least) / -2).exp(), self.angles @ steps.T)
+        return polar(((spreads + least) / -2).exp(), self.wave_vectors @ steps.T)
 
 
 class _Seen(NamedTuple):
@@ -176,7 +178,8 @@ class _Seen(NamedTuple):
 
     points: Float[Tensor, "b n 3"]  # centres in the array's frame [m]
     wavenumbers: Float[Tensor, "b 1 1"]  # 2 pi / lambda of each query [rad/m]
-    # Semi-axes across the way, as angles at the middle of the array times the wavenumber [rad/m].
+    # Parts of the semi-axes across the line of sight, as angles at the middle of the array, times
+    # the wavenumber [rad/m].
     across: Float[Tensor, "b n 3 3"]
 
 
@@ -187,15 +190,20 @@ def _see(paths: ReceivedPaths) -> _Seen:
     semi_axes = pose.rotation.mT @ paths.semi_axes  # (1 or b, n, 3, 3)
     wavenumbers = 2 * math.pi / speed_of_light * paths.carriers.to(points)[:, None, None]
     distances = points.norm(dim=-1, keepdim=True).clamp_min(NEAREST)  # (b, n, 1)
-    units = (points / distances)[..., None]  # (b, n, 3, 1)
-    across = semi_axes - units * (units * semi_axes).sum(-2, keepdim=True)
+    units = (points / distances)[..., None]  # towards the Gaussians (b, n, 3, 1)
+    along = (units * semi_axes).sum(-2, keepdim=True)  # (b, n, 1, 3)
+    across = semi_axes - units * along
     return _Seen(points, wavenumbers, across * (wavenumbers / distances)[..., None])
 
 
 def _spreads(
     across: Float[Tensor, "b n 3 3"], steps: Float[Tensor, "k 3"]
 ) -> Float[Tensor, "b n k"]:
-    """(2 pi)² D' S D of each path at each step D [m]."""
+    """(2 pi)² D' S D of each path at each step D [m], with S the covariance of direction cosines.
+
+    ``across`` is as in ``_Seen``: its product with its transpose is (2 pi)² S.
+    """
+    # One matrix product for all paths.
     rows = across.movedim(-2, 0).flatten(1)  # (3, b n 3)
     turns = (steps @ rows).view(len(steps), *across.shape[:2], 3)  # (k, b, n, 3)
     return turns.square().sum(-1).movedim(0, -1)
@@ -225,11 +233,11 @@ def element_fields(paths: ReceivedPaths, offsets: Float[Tensor, "b s"]) -> Compl
     spreads = _spreads(across, elements)  # (b, n, e)
     decays = (spreads / -2).exp() * longer.ratios
     waves = paths.amplitudes[..., None] * polar(decays, -wavenumbers * longer.differences)
-    reach = float(elements.norm(dim=-1).amax()) / speed_of_light  # [s]
+    reach = float(elements.norm(dim=-1).amax()) / speed_of_light  # largest delay over the array [s]
     rates = -2 * math.pi * offsets.to(paths.lengths)  # (b, s) [rad/s]
-    # Phase of the band over the array [rad].
+    # Largest phase of the band over the array [rad].
     widest = reach * float(rates.abs().amax()) if rates.numel() else 0.0
-    if widest > 3:
+    if widest > 3:  # the series would need many terms
         delays = (paths.lengths[..., None] + longer.differences) / speed_of_light  # (b, n, e)
         turns = _unit_waves(delays[..., None] * rates[:, None, None])  # (b, n, e, s)
         return (waves[..., None] * turns).sum(1)
@@ -246,7 +254,10 @@ class _PathDifferences(NamedTuple):
 def _path_differences(
     points: Float[Tensor, "b n 3"], elements: Float[Tensor, "e 3"]
 ) -> _PathDifferences:
-    """Distances from points to elements minus distances to the middle, without cancellation."""
+    """Distances from points p to elements x minus distances to the middle, without cancellation.
+
+    ``NEAREST`` is the least distance in differences and ratios.
+    """
     to_middle = points.norm(dim=-1, keepdim=True)  # |p|, (b, n, 1)
     # Plain differences: by the matrix product an element far from a near point would lose its
     # digits.
@@ -257,6 +268,7 @@ def _path_differences(
     total = to_elements + to_middle
     squares = elements.square().sum(-1) - 2 * points @ elements.T  # (b, n, e)
     longer = squares / torch.where(total > 0, total, 1)
+    # The changes by the least distance, which are mostly 0.
     longer = longer + (far_elements - to_elements) - (far_middle - to_middle)
     return _PathDifferences(longer, far_middle / far_elements)
 
@@ -273,8 +285,10 @@ def _sum_by_series(
 
         exp(j rate (t + dt)) = exp(j rate t) sum_k (j rate dt)^k / k!
 
+    t is the delay of a path to the middle of the array, and dt its further delay to an element.
     |dt| is at most ``reach``. Terms of the series are small while rate dt is at most 3 rad.
     """
+    # waves (j dt / reach)^k / k!, until the largest term (rate reach)^k / k! is below rounding.
     terms = [waves]
     size = widest
     while size > torch.finfo(lengths.dtype).eps:
@@ -283,7 +297,7 @@ def _sum_by_series(
         size *= widest / len(terms)
     middle = _unit_waves(lengths[..., None] / speed_of_light * rates[:, None])  # (b, n, s)
     sums = torch.stack(terms, 2).flatten(2).mT @ middle  # (b, terms x e, s)
-    exponents = torch.arange(len(terms), device=rates.device)[:, None]
+    exponents = torch.arange(len(terms), device=rates.device)[:, None]  # k
     powers = (reach * rates)[:, None] ** exponents  # (b, terms, s)
     return (sums.unflatten(1, (len(terms), -1)) * powers[:, :, None]).sum(1)
 

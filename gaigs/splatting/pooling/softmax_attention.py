@@ -82,10 +82,10 @@ class SoftmaxAttention(Pooling):
     ) -> Float[Tensor, " b"]:
         """Level relative to the model's trend [dB]; float32 for a map of half precision."""
         bels = image.to(torch.promote_types(image.dtype, torch.float32)).flatten(1)  # (b, pixels)
-        # The paper subtracts the mean, and later the maximum, in which the mean cancels.
-        # Subtracting the maximum alone is the same, and exact for the pixels that count, where one
-        # huge value makes the mean swallow the others.
+        # The paper subtracts the mean m, but a softmax does not change with a common constant. The
+        # maximum in its place is exact for the brightest pixels, even if one value is huge.
         below = bels - bels.amax(1, keepdim=True).detach()
         attention = (below / self.temperature).softmax(1)  # (b, pixels)
         # "Attention weights blended with a uniform prior to ensure coverage."
-        return 10 * ((1 - self.prior) * (attention * bels).sum(1) + self.prior * bels.mean(1))
+        attended = (attention * bels).sum(1)  # (b,)
+        return 10 * ((1 - self.prior) * attended + self.prior * bels.mean(1))

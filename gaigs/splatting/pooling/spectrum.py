@@ -12,7 +12,9 @@ from gaigs.splatting.pooling import Pooling
 
 @register("pooling", "spectrum")
 class SpectrumPooling(Pooling):
-    """|C_0|, or |C_0 + j C_1|: channels are signed, so that paths can cancel.
+    """The magnitude of a map, |C_0| for one channel C_0 or |C_0 + j C_1| for two.
+
+    Channels are signed, so that paths can cancel.
 
     Args:
         channels: 1 (real) or 2 (complex).

@@ -23,8 +23,8 @@ class Splats:
 
     Attributes:
         means2d: Centres (u, v), (n, 2), or (b, n, 2) if they depend on the query.
-        factors: p, q and r of the lower triangular factor [[p, 0], [q, r]] of each covariance, with
-            p and r above 0 (1 or b, n, 3).
+        factors: p, q and r of the lower triangular (Cholesky) factor [[p, 0], [q, r]] of each
+            covariance, with p and r above 0 (1 or b, n, 3).
         depths: Distances to the receiver [m].
         visible: False for a Gaussian at the receiver, which has no direction.
     """
@@ -210,7 +210,7 @@ def project(
 
 
 def _pitch_of_row(grid: Grid) -> float:
-    """Mean step of azimuth of a grid of one row [rad]; 0 for a single pixel."""
+    """Mean azimuth step over the columns of a grid of one row [rad]; 0 for a single pixel."""
     steps = grid.thin(slice(1), slice(None)).azimuths.diff().abs()
     return steps.sum().item() / grid.shape[1]
 
@@ -226,8 +226,8 @@ def factor(
     All roots are of sums of squares, so no difference cancels, even for a long, thin ellipse.
     """
     p = (across.square().sum(-1) + variance).sqrt()  # (...)
-    unit = across / p[..., None]  # e, (..., k)
-    area = torch.linalg.cross(unit, along).square().sum(-1)  # |e x along|²
-    beside = area + (variance / p.square()) * along.square().sum(-1)
-    q = (unit * along).sum(-1)
+    e = across / p[..., None]  # (..., k)
+    squared_area = torch.linalg.cross(e, along).square().sum(-1)  # |e x along|²
+    beside = squared_area + (variance / p.square()) * along.square().sum(-1)  # r² - variance
+    q = (e * along).sum(-1)
     return torch.stack((p, q, (beside + variance).sqrt()), -1)  # (..., 3)

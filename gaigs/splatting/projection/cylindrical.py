@@ -40,12 +40,12 @@ class Cylindrical(Projection):
         azimuths, elevations, distances = to_spherical(points)  # (...) each
         clamped = elevations.clamp(-self.limit, self.limit)
         _, slope = self.stretch(clamped)
-        # Unit vectors of growing azimuth and of growing elevation.
+        # Unit vectors of growing azimuth (east) and of growing elevation (north).
         sin, cos = torch.sin(azimuths), torch.cos(azimuths)
         east = torch.stack((-sin, cos, torch.zeros_like(sin)), -1)  # (..., 3)
         height, horizontal = torch.sin(elevations), torch.cos(elevations)
         north = torch.stack((-height * cos, -height * sin, horizontal), -1)  # (..., 3)
-        # Changes of u and v along these [1/m]: du = east / (r cos el), dv = f'(el) north / r.
+        # Gradients of u and v [1/m]: east / (r cos el) and f'(el) north / r, at the distance r.
         rates = torch.stack((1 / torch.cos(clamped), slope), -1) / distances[..., None]  # (..., 2)
         return rates[..., None] * torch.stack((east, north), -2)  # (..., 2, 3)
 

@@ -29,6 +29,7 @@ class DirectionCosine(Projection):
     def jacobian(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 2 3"]:
         distances = points.norm(dim=-1)[..., None, None]  # (..., 1, 1) [m]
         unit = points[..., None, :] / distances  # (..., 1, 3)
-        # A direction changes only by the part of a step that is across it: (I - e e') / r.
+        # A unit vector e at the distance r changes only by the part of a step that is across e:
+        # its derivative is (I - e e') / r.
         identity = torch.eye(3, dtype=points.dtype, device=points.device)
         return (identity - unit.mT @ unit)[..., :2, :] / distances  # (..., 2, 3)

@@ -66,7 +66,10 @@ class Rasterizer(Protocol):
         attenuations: Float[Tensor, "b n"] | None,
         plane: Plane,
     ) -> tuple[Float[Tensor, "b c rows columns"], Float[Tensor, "b rows columns"]]:
-        """Draws the map, and the transmittance behind the last splat."""
+        """Draws the map, and the transmittance behind the last splat.
+
+        Splats have c channels of ``signal``, opacities a_i, and attenuations d_i; None: d_i = 1.
+        """
         ...
 
 
@@ -152,19 +155,24 @@ def rasterize(
     opacities = opacities.expand(b, n)
     if attenuations is not None:
         attenuations = attenuations.expand(b, n)
-    # Gaussians that do not move are drawn for all transmitters at once, others one by one.
+    # Gaussians that do not move with the transmitter are drawn for all transmitters at once, others
+    # for one transmitter after the other.
     moves = means.ndim == 3
     maps = []
     transmittances = []
     rows = [slice(k, k + 1) for k in range(b)] if moves else [slice(None)]
     for row in rows:
-        places = _rows(means, row)[0] if moves else means  # (n, 3)
-        shape = [_rows(values, row) for values in (quats, scales)]
         splats, plane = project(
-            places, *shape, receiver=receiver, grid=grid, projection=projection, pixel=pixel
+            _rows(means, row)[0] if moves else means,  # (n, 3)
+            _rows(quats, row),
+            _rows(scales, row),
+            receiver=receiver,
+            grid=grid,
+            projection=projection,
+            pixel=pixel,
         )
-        passing = None if attenuations is None else attenuations[row]
-        image, transmittance = chosen(splats, signal[row], opacities[row], passing, plane)
+        transmitted = None if attenuations is None else attenuations[row]
+        image, transmittance = chosen(splats, signal[row], opacities[row], transmitted, plane)
         maps.append(image)
         transmittances.append(transmittance)
     image = cat(maps)  # (b, c, rows, columns)
@@ -176,15 +184,19 @@ def rasterize(
 
 
 def _rows(values: Tensor, row: slice) -> Tensor:
-    """The rows of a slice of transmitters, or the single row that all share."""
+    """Values of the transmitters in a slice; all values if transmitters share them.
+
+    Values have a leading axis of transmitters, of length 1 if they are shared, or no such axis.
+    """
     return values[row] if values.ndim == 3 and len(values) > 1 else values
 
 
 def _check_shapes(tensors: Mapping[str, Tensor]) -> set[int]:
-    """Checks types and shapes of the inputs by name.
+    """Checks types and shapes of the inputs of ``rasterize``, given by name.
 
     Returns:
-        Numbers of transmitters in leading axes; empty if no input has such an axis.
+        The different lengths of leading axes, which count transmitters; empty if no input has such
+        an axis.
     """
     if not all(isinstance(values, Tensor) and values.ndim for values in tensors.values()):
         raise TypeError(
@@ -196,6 +208,7 @@ def _check_shapes(tensors: Mapping[str, Tensor]) -> set[int]:
     columns = {"means": 3, "quats": 4, "scales": 3, "signal": tensors["signal"].shape[-1]}
     leading: set[int] = set()
     for name, values in tensors.items():
+        # Opacities and attenuations have one number a Gaussian.
         rows = values if name in columns else values[..., None]  # (n, k) or (b, n, k)
         size = columns.get(name, 1)
         if rows.ndim not in (2, 3) or tuple(rows.shape[-2:]) != (n, size):

@@ -18,7 +18,7 @@ def default_device() -> str:
 
 @functools.cache
 def _process() -> int:
-    """Number of the process that first used OpenCL."""
+    """Number of the process that first used OpenCL, which is the first one to call this."""
     return os.getpid()
 
 
@@ -29,7 +29,7 @@ def is_forked() -> bool:
 
 def _devices() -> list:
     """The devices of all drivers; a broken driver is an error only if no other has a device."""
-    _process()  # drivers start threads here, too
+    _process()  # records the process, since drivers start threads here
     devices = []
     causes = []
     try:
@@ -84,7 +84,7 @@ def _open(name: str | None) -> cl.CommandQueue:
 
 
 def _choose(name: str | None):
-    """The first device with this part of a name; for None the first CPU, or the first device."""
+    """The first device with ``name`` in its name; for None the first CPU, or the first device."""
     devices = _devices()
     if name:
         chosen = [device for device in devices if name.lower() in name_of(device).lower()]
@@ -112,7 +112,7 @@ def find_fault(queue: cl.CommandQueue) -> str | None:
 
 
 def cause_of(error: cl.Error) -> str:
-    """The first error in a build's log, or its last line."""
+    """The first error in a kernel build's log, or the log's last line."""
     lines = [line.strip() for line in str(error).splitlines()]
     # Lines in brackets are pyopencl's notes on options and source.
     lines = [line for line in lines if line and not line.startswith("(")]

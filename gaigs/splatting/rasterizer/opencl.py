@@ -5,6 +5,7 @@ The kernels are in kernels/*.cl.
 
 import ctypes
 import functools
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,8 +96,8 @@ class OpenCLRasterizer:
         if attenuations is not None:
             floats.append(attenuations)
         suit = all(x.dtype == torch.float32 and x.device.type == "cpu" for x in floats)
-        _, n, c = signal.shape
-        return not is_forked() and suit and c >= 1 and n < self.too_many
+        _, n, channels = signal.shape
+        return not is_forked() and suit and channels >= 1 and n < self.too_many
 
     def __call__(
         self,
@@ -109,8 +110,8 @@ class OpenCLRasterizer:
         self._check(splats, signal, opacities, attenuations, plane)
         queue = open_queue(self.device)
         images = []
-        transmittances = []
-        for part in signal.split(LAYOUT.channels, 2):
+        transmittances = []  # equal for all channels
+        for some_channels in signal.split(LAYOUT.channels, 2):
             image, transmittance = _CompositeByKernels.apply(
                 queue,
                 splats,
@@ -118,7 +119,7 @@ class OpenCLRasterizer:
                 torch.is_grad_enabled(),
                 splats.means2d,
                 splats.factors,
-                part,
+                some_channels,
                 opacities,
                 attenuations,
             )
@@ -137,6 +138,7 @@ class OpenCLRasterizer:
         """Raises an error for wrong tensors, since kernels check nothing."""
         b, n, c = signal.shape
         height, width = plane.shape
+        # Each tensor with its allowed shapes.
         tensors: dict[str, tuple[Tensor, list[tuple[int, ...]]]] = {
             "means2d": (splats.means2d, [(n, 2)]),
             "factors": (splats.factors, [(1, n, 3), (b, n, 3)]),
@@ -250,20 +252,24 @@ class _Render:
         self.sizes = _measure(splats, signal, plane)
         sizes = self.sizes
         self.tiles = sizes.down * sizes.across
-        self.lists = sizes.sets * self.tiles
+        self.lists = sizes.sets * self.tiles  # one for each tile and set
         self.groups_per_list = sizes.groups if sizes.sets == 1 else 1
+        # Transmitters that a work-item has room for, a constant of the kernels.
         self.group_capacity = 1 if sizes.group == 1 else LAYOUT.group
         # Opacity, attenuation and signal of one transmitter.
         self.appearance_size = 1 + self.attenuates + self.channels
+        # Numbers that an entry of a list adds to the gradients.
         self.partials = LAYOUT.moments + self.group_capacity * self.appearance_size
         self.is_separable = plane.u.shape[0] == plane.v.shape[1] == 1
         self.kernels = _kernels(queue, **self._macros(plane.period))
         self.order = self._share(_front_to_back(splats.depths))
         self._list_splats(splats, signal, opacities, attenuations, plane)
+        # Largest magnitude of each transmitter's signal: where the rest of a list cannot change a
+        # pixel, the kernel ends early.
         self.loudest = self._share(np.abs(signal.detach().numpy()).max((1, 2), initial=0))
 
     def _macros(self, period: float | None) -> dict[str, str | int]:
-        """Macros for building the kernels."""
+        """Constants of the kernels for the compiler; ``period`` is as in ``Plane``."""
         macros: dict[str, str | int] = {
             "CHANNELS": self.channels,
             "ATTENUATION": int(self.attenuates),
@@ -275,38 +281,40 @@ class _Render:
             "STEEPEST": _literal(STEEPEST),
         }
         if period is not None:
-            rest = period - float(np.float32(period))
-            macros |= {"PERIOD": _literal(period), "PERIOD_REST": _literal(rest)}
+            rounding = period - float(np.float32(period))
+            macros |= {"PERIOD": _literal(period), "PERIOD_REST": _literal(rounding)}
         return macros
 
     def _list_splats(self, splats, signal, opacities, attenuations, plane):
-        """Lists the splats that reach each tile, front to back."""
+        """Lists the splats that reach each tile, front to back.
+
+        Sets ``scene``, buffers that ``forward`` and ``backward`` read, and ``bounds``, where the
+        entries of each block of splats begin in each list.
+        """
         sizes = self.sizes
         u, v, spans, edges = _tiling(self.queue, _content(plane.u), _content(plane.v), plane.period)
+        # Splats fill whole words. A splat has a row of geometry in each set, and of appearance
+        # for each transmitter.
         rows = sizes.words * LAYOUT.word
         geometry = self._empty(sizes.sets * rows * LAYOUT.geometry)
         appearance = self._empty(rows * sizes.transmitters * self.appearance_size)
         spans_of_tiles = sizes.across + sizes.down if self.is_separable else 2 * self.tiles
+        # A bit for each splat and span of tiles: 1 if the splat's bounding box meets the span.
         hits = self._empty(sizes.sets * sizes.words * spans_of_tiles)
-        tensors = (
-            splats.means2d,
-            splats.factors,
-            splats.visible,
-            signal,
-            opacities,
-            attenuations,
-        )
+        shapes = splats.means2d, splats.factors, splats.visible
+        tensors = *shapes, signal, opacities, attenuations
         inputs = [self._share(tensor) for tensor in tensors]  # they outlive the kernels
         outputs = (geometry, appearance, hits)
         self._run("prepare", sizes.sets * sizes.words, self.order, *inputs, spans, *outputs)
 
+        # Upper bounds of the lists' lengths place the lists in one buffer.
         counts = np.empty(self.lists, np.int32)
         shared_counts = self._share(counts)
         self._run("count", self.lists, hits, shared_counts)
         self._finish(shared_counts)
         offsets = self._share(np.cumsum(counts, dtype=np.int32) - counts)
         sizes.entries = counts.sum()
-        self.blocks = -(-sizes.words // LAYOUT.block)
+        self.blocks = math.ceil(sizes.words / LAYOUT.block)
         blocks = self._empty(self.lists * (self.blocks + 1))
         entries = self._empty(sizes.entries)
         tests = (hits, spans, edges, geometry)
@@ -325,10 +333,12 @@ class _Render:
         image = torch.empty(shape, dtype=torch.float32)
         transmittance = torch.empty(shape[:1] + shape[2:], dtype=torch.float32)
         outputs = self._share(image), self._share(transmittance)
-        items = sizes.groups * self.tiles
-        ends = self._empty(items)
+        items = sizes.groups * self.tiles  # work-items
+        ends = self._empty(items)  # entries of its list that each work-item has drawn
         checkpoints, bounds = None, None
         if differentiate:
+            # A checkpoint for each chunk of a list, whose last chunk may be incomplete. It has the
+            # transmittances of the tile's pixels, and the first and last row still drawn.
             count = self.groups_per_list * (sizes.entries // LAYOUT.chunk + self.lists)
             pixels = LAYOUT.rows * LAYOUT.columns
             checkpoints = self._empty(count * self.group_capacity * pixels)
@@ -388,18 +398,19 @@ def _measure(splats: Splats, signal: Tensor, plane: Plane) -> _Sizes:
     b, n, _ = signal.shape
     height, width = plane.shape
     sets = len(splats.factors)
-    groups = b if sets > 1 else max(1, -(-b // LAYOUT.group))
+    # Transmitters with lists of their own have a work-item of their own.
+    groups = b if sets > 1 else max(1, math.ceil(b / LAYOUT.group))
     return _Sizes(
         transmitters=b,
         sets=sets,
         groups=groups,
-        group=-(-b // groups),
+        group=math.ceil(b / groups),
         splats=n,
-        words=-(-n // LAYOUT.word),
+        words=math.ceil(n / LAYOUT.word),
         height=height,
         width=width,
-        down=-(-height // LAYOUT.rows),
-        across=-(-width // LAYOUT.columns),
+        down=math.ceil(height / LAYOUT.rows),
+        across=math.ceil(width / LAYOUT.columns),
     )
 
 
@@ -414,10 +425,12 @@ def _content(tensor: Tensor) -> tuple[bytes, tuple[int, ...]]:
 
 
 def _front_to_back(depths: Tensor) -> np.ndarray:
-    """Indices sorted by depth, ties by index, through integers whose low half is the index."""
+    """Indices sorted by depth, ties by index."""
     bits = np.ascontiguousarray(depths.detach().numpy()).view(np.int32)
-    # Integers in the order of the floats, negative ones too.
+    # The bits of floats, read as integers, have the order of the floats. For negative floats all
+    # bits but the sign are inverted.
     bits = bits ^ (bits >> 31 & 0x7FFFFFFF)
+    # Sorting integers of depth (high half) and index (low half) is faster than an argsort.
     keys = (bits.astype(np.int64) << 32) + np.arange(len(bits))
     keys.sort()
     return (keys & 0xFFFFFFFF).astype(np.int32)
@@ -433,6 +446,10 @@ def _tiling(
 ) -> list[cl.Buffer | None]:
     """The pixels of a plane in whole tiles, as buffers for the kernels.
 
+    A span is the range of u, or of v, within a tile. On a separable plane u depends on the column
+    only, and v on the row only, so tiles above each other share the span of u, and tiles side by
+    side share the span of v.
+
     Args:
         queue: Command queue of the device.
         u_content, v_content: Bytes and shapes of u and v.
@@ -441,13 +458,15 @@ def _tiling(
     Returns:
         Buffers of u and v, filled up by repetition; a separable plane has one u for each column and
         one v for each row. Then spans (centre, half size) of u and of v. Then the lowest and
-        highest v of the rows in each span of v.
+        highest v of the rows in each span of v. An empty buffer is None.
     """
     u, v = (
         np.frombuffer(data, np.float32).reshape(shape) for data, shape in (u_content, v_content)
     )
     height, width = len(v), u.shape[1]
-    down, across = -(-height // LAYOUT.rows), -(-width // LAYOUT.columns)
+    down = math.ceil(height / LAYOUT.rows)
+    across = math.ceil(width / LAYOUT.columns)
+    # Rows and columns of the pixels; the last one repeats.
     y = np.minimum(np.arange(down * LAYOUT.rows), height - 1)
     x = np.minimum(np.arange(across * LAYOUT.columns), width - 1)
     # Axes of the tiles: (down, rows of a tile, across, columns of a tile).
@@ -461,7 +480,7 @@ def _tiling(
         v = np.broadcast_to(v, (height, width))[np.ix_(y, x)]
         u_tiles = u.reshape(down, LAYOUT.rows, across, LAYOUT.columns)
         v_tiles = v.reshape(down, LAYOUT.rows, across, LAYOUT.columns)
-    # For rounding.
+    # Spans are enlarged, so that rounding drops no splat.
     slack = 1e-6 * (np.abs(u).max(initial=0) + np.abs(v).max(initial=0) + (period or 0))
     row_low = v_tiles.min(3)  # (down, rows, spans in a row of tiles)
     row_high = v_tiles.max(3)

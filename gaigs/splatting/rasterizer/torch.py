@@ -1,5 +1,6 @@
 """The rasterizer in eager torch: any device, float32 and float64."""
 
+import math
 import operator
 from bisect import bisect_right
 from typing import NamedTuple
@@ -52,8 +53,8 @@ class TorchRasterizer:
         triples = self.chunk if means.device.type == "cpu" else self.large_chunk
         with torch.no_grad():
             tiles = _Tiles(plane, means, factors, opacities, triples)
-        passing = None if attenuations is None else attenuations[:, order]
-        return _Composite.apply(tiles, means, factors, signal[:, order], opacities, passing)
+        transmitted = None if attenuations is None else attenuations[:, order]
+        return _Composite.apply(tiles, means, factors, signal[:, order], opacities, transmitted)
 
 
 class _Period(NamedTuple):
@@ -76,7 +77,8 @@ class _Tiles:
     Attributes:
         edge: Edge of a tile [pixels].
         u, v: Coordinates of the tiles' pixels (t, y or 1, x or 1).
-        chunks: Numbers of tiles (t,), and of their splats (t, k), padded with n, a null splat.
+        chunks: For each chunk the numbers of its tiles (t,), and of their splats (t, k). Shorter
+            lists of splats are padded with n, the number of a splat without effect.
     """
 
     edge = 16
@@ -89,7 +91,7 @@ class _Tiles:
         if plane.period is not None:
             rounded = torch.tensor(plane.period, dtype=plane.u.dtype).item()
             self.period = _Period(rounded, plane.period - rounded)
-        self.down, self.across = (-(-size // self.edge) for size in self.shape)
+        self.down, self.across = (math.ceil(size / self.edge) for size in self.shape)
         self.u = self._cut(plane.u)
         self.v = self._cut(plane.v)
         self.chunks: list[tuple[Tensor, Tensor]] = []
@@ -111,7 +113,7 @@ class _Tiles:
         touches = ~(opacities.amax(0) < ALPHA_MIN).expand(self.down * self.across, -1)
         axes = ((self.u, self.period), (self.v, None))
         for axis, (coordinate, period) in enumerate(axes):
-            coordinate = coordinate.flatten(1)
+            coordinate = coordinate.flatten(1)  # (tiles, pixels)
             low = coordinate.amin(1, keepdim=True)  # (tiles, 1)
             high = coordinate.amax(1, keepdim=True)
             offset = _nearest(means[:, axis], (low + high) / 2, period).abs()  # (tiles, n)
@@ -130,16 +132,20 @@ class _Tiles:
             if coordinate.shape[axis] == size:
                 pixels = torch.arange(tiles * self.edge, device=coordinate.device)
                 coordinate = coordinate.index_select(axis, pixels.clamp_max(size - 1))
+        # An axis of length 1 stays so, since the coordinate does not depend on it.
         y, x = (self.edge if size > 1 else 1 for size in coordinate.shape)
         cut = coordinate.unflatten(1, (-1, x)).unflatten(0, (-1, y))  # (down, y, across, x)
         cut = cut.transpose(1, 2)  # (down, across, y, x)
         return cut.expand(self.down, self.across, y, x).reshape(-1, y, x)
 
     def _chunks(self, touches: Tensor, pairs: int) -> list[tuple[Tensor, Tensor]]:
-        """Tiles with their splats in chunks of ``pairs`` pairs, longest lists first."""
+        """``chunks``, each of about ``pairs`` (tile, splat) pairs, longest lists first.
+
+        ``touches`` is True where a splat reaches a tile (tiles, n).
+        """
         counts = touches.sum(1)  # (tiles,)
         n = touches.shape[1]
-        # Sorting the indices with "not touched" pushed behind keeps the depth order in front.
+        # The numbers of the splats that touch a tile, front to back, followed by n for the others.
         splats = torch.where(touches, torch.arange(n, device=counts.device), n).sort(1).values
         sorted_counts, tiles = counts.sort(descending=True)
         lengths = sorted_counts.tolist()
@@ -147,7 +153,8 @@ class _Tiles:
         start = 0
         while start < len(lengths) and lengths[start]:
             longest = lengths[start]
-            # Lists down to half the longest: fillings at most double the work.
+            # Lists down to half the longest: fillings at most double the work. Lengths descend,
+            # so bisection sees their negatives.
             end = bisect_right(lengths, -longest / 2, key=operator.neg)
             size = min(max(1, pairs // longest), end - start)
             chosen = tiles[start : start + size]
@@ -183,8 +190,8 @@ def _nearest(a: Tensor, b: Tensor, period: _Period | None) -> Tensor:
     offset = a - b
     if period is None:
         return offset
-    back = offset - a
-    rest = (a - (offset - back)) - (b + back)
+    minus_b = offset - a  # -b as far as the rounded offset has it
+    rest = (a - (offset - minus_b)) - (b + minus_b)  # errors of a and of b by this rounding
     turns = (offset / period.rounded).round_()
     return (offset - turns * period.rounded) + (rest - turns * period.rest)
 
@@ -217,7 +224,8 @@ class _SplatParts(NamedTuple):
 class _Weights(NamedTuple):
     """Weights of splats in a chunk: b transmitters, t tiles, k splats and y x pixels a tile."""
 
-    # (du, dv) of the pixels, in units of the splat's factor (1 or b, t, k, y or 1, x or 1).
+    # (s, y) = L^-1 (du, dv), with (du, dv) from the splat's centre to the pixel and the splat's
+    # factor L = [[p, 0], [q, r]] (1 or b, t, k, y or 1, x or 1).
     s: Tensor
     y: Tensor
     footprint: Tensor  # G (b, t, k, y x)
@@ -236,24 +244,26 @@ def _weigh(tiles: _Tiles, chosen: Tensor, k: Tensor, inputs: _SplatParts) -> _We
         k: Splats of each tile (t, k).
         inputs: All splats.
     """
-    u, v = inputs.means[k][..., None, None].unbind(-3)  # (t, k, 1, 1) each
+    centres = inputs.means[k][..., None, None]  # (t, k, 2, 1, 1)
+    u, v = centres.unbind(-3)
     du = _nearest(tiles.u[chosen][:, None], u, tiles.period)  # (t, k, y or 1, x)
     dv = tiles.v[chosen][:, None] - v
-    p, q, r = (part[..., None, None] for part in inputs.factors[:, k].unbind(-1))
+    factors = inputs.factors[:, k, :, None, None]  # (1 or b, t, k, 3, 1, 1)
+    p, q, r = factors.unbind(-3)
     # With (s, y) = L^-1 (du, dv) the exponent loses the fewest digits where a splat is long and
     # thin.
     s = du / p
     y = dv / r - (q / r) * s
-    exponent = torch.addcmul(-0.5 * s * s, y, y, value=-0.5)
+    exponent = torch.addcmul(-0.5 * s * s, y, y, value=-0.5)  # -(s² + y²) / 2
     footprint = exponent.exp_().flatten(-2)  # G
     alpha = footprint * inputs.opacities[:, k, None]
     live = alpha >= ALPHA_MIN
     alpha = alpha.clamp_max(ALPHA_MAX).mul_(live)
     # eq. (13) and (14): log T_i = sum_{j<i} log(1 - A_j) + G_j log d_j.
-    passed = torch.log1p(-alpha)
+    log_passed = torch.log1p(-alpha)  # of each splat
     if inputs.logs is not None:
-        passed.addcmul_(footprint * live, inputs.logs[:, k, None])
-    total = passed.cumsum(-2)  # up to and with each splat
+        log_passed.addcmul_(footprint * live, inputs.logs[:, k, None])
+    total = log_passed.cumsum(-2)  # up to and with each splat
     remaining = total[..., -1, :].exp()
     before = torch.nn.functional.pad(total[..., :-1, :], (0, 0, 1, 0))
     return _Weights(s, y, footprint, alpha, live, before.exp_(), remaining)
@@ -263,8 +273,8 @@ class _Composite(torch.autograd.Function):
     """Composites sorted splats, with a gradient written by hand.
 
     Let R be the transmittance behind all splats, D_i = signal_i . image gradient and S_i =
-    sum_{j>i} D_j A_j T_j + R (gradient of R). The derivative by A_i is T_i D_i - S_i / (1 - A_i).
-    The derivative by log T behind splat i is S_i.
+    sum_{j>i} D_j A_j T_j + R (gradient of R). A_i and T_i are as in ``Rasterizer``. The derivative
+    of the loss by A_i is T_i D_i - S_i / (1 - A_i). The derivative by log T behind splat i is S_i.
     """
 
     @staticmethod
@@ -299,6 +309,7 @@ class _Composite(torch.autograd.Function):
             w = _weigh(tiles, chosen, k, inputs)
             towards = image_gradient[:, :, chosen].transpose(1, 2)  # (b, t, c, y x)
             parts = _differentiate(w, k, inputs, towards, remaining_gradient[:, chosen], tiles.edge)
+            # A splat may be in several tiles. Centres have no axis of transmitters.
             for gradient, part, axis in zip(gradients, parts, (0, 1, 1, 1, 1), strict=True):
                 if gradient is not None:
                     gradient.index_add_(axis, k.flatten(), part.flatten(axis, axis + 1))
@@ -327,8 +338,8 @@ def _differentiate(
     blend = w.alpha * w.transmittance  # A T
     d_signal = blend @ towards.mT  # (b, t, k, c)
     d = inputs.signal[:, k] @ towards  # D, (b, t, k, y x)
-    flow = blend.mul_(d)
-    behind = flow.flip(-2).cumsum(-2).flip(-2).sub_(flow)
+    drawn = blend.mul_(d)  # D A T
+    behind = drawn.flip(-2).cumsum(-2).flip(-2).sub_(drawn)  # sums over the splats behind
     behind += (w.remaining * remaining_gradient)[..., None, :]  # S
     # Gradient by the opacity itself, 0 where the splat does nothing or is clamped.
     d_alpha = d.mul_(w.transmittance) - behind / (1 - w.alpha)
@@ -337,9 +348,10 @@ def _differentiate(
     d_exponent = d_alpha.mul_(w.alpha)
     d_logs = None
     if inputs.logs is not None:
-        covered = behind.mul_(w.footprint).mul_(w.live)
-        d_logs = covered.sum(-1)  # (b, t, k)
-        d_exponent = d_exponent + covered * inputs.logs[:, k][..., None]
+        # log T behind a splat has the term G log d.
+        d_log = behind.mul_(w.footprint).mul_(w.live)  # S G
+        d_logs = d_log.sum(-1)  # (b, t, k)
+        d_exponent = d_exponent + d_log * inputs.logs[:, k][..., None]
     factors = inputs.factors[:, k]
     d_exponent = d_exponent.unflatten(-1, (edge, edge))  # (b, t, k, y, x)
     d_means, d_factors = _moments(d_exponent, w.s, w.y, factors)
@@ -350,7 +362,8 @@ def _differentiate(
 def _moments(d_exponent: Tensor, s: Tensor, y: Tensor, factors: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of centres (b, t, k, 2) and factors (b, t, k, 3) from the exponents' gradients.
 
-    Sums run over s and y. Sums over du and dv would cancel for a long, thin splat.
+    Sums over pixels run over s and y, as the exponent is -(s² + y²) / 2. Sums over du and dv would
+    cancel for a long, thin splat.
 
     Args:
         d_exponent: Gradients of the exponents (b, t, k, y, x).
@@ -359,6 +372,7 @@ def _moments(d_exponent: Tensor, s: Tensor, y: Tensor, factors: Tensor) -> tuple
     """
     d_y = d_exponent * y
     yy = (d_y * y).sum((-2, -1))  # (b, t, k)
+    # Sums over the pixels of g s, g s², g y s and g y, with g the gradients (b, t, k).
     if s.shape[-2] == 1:  # the same in all rows: contract the columns first
         powers = torch.cat((s, s * s), -2).mT  # (1 or b, t, k, x, 2)
         d_s, ss = (d_exponent @ powers).sum(-2).unbind(-1)

@@ -105,13 +105,14 @@ class EuclideanTokenizer(nn.Module):
 def learnable_octaves(scene: Scene) -> tuple[int, int]:
     """Lowest and highest octave of the transmitter's features that suit the training transmitters.
 
-    Periods range from twice the box's longest edge to 16 distances between neighbouring
-    transmitters. The output of the network has multiples of its input frequencies, so input
-    frequencies must be well below the sampling limit. Periods for noisy labels are at least 16 m,
-    since shorter ones would fit noise; the network's multiples can still form a sharp shadow.
+    An octave k has 2^k cycles a metre. Periods range from twice the box's longest edge to 16
+    distances between neighbouring transmitters. The output of the network has multiples of its
+    input frequencies, so input frequencies must be well below the sampling limit. Periods for noisy
+    labels are at least 16 m, since shorter ones would fit noise; the network's multiples can still
+    form a sharp shadow.
     """
-    neighbours = 16  # chosen on validation parts of rfid-s23-200 and the built-in room
-    highest = min(round(-math.log2(neighbours * scene.spacing)), MAX_OCTAVE)
+    shortest_period = 16  # in distances; chosen on validation parts of rfid-s23-200 and the room
+    highest = min(round(-math.log2(shortest_period * scene.spacing)), MAX_OCTAVE)
     if scene.task.is_noisy:
         # 2^4 m: chosen by leaving out one of the robot's training runs in ble-flat.
         highest = min(highest, -4)

@@ -113,11 +113,11 @@ class GATokenizer(nn.Module):
         # With a single block CLS and anchors are equal for all queries until the block's attention.
         is_shared = len(anchors) == 1 and not blocks and not self.scene.has_band
         points, types = self._tokens(query, transmitters, anchors, is_shared)
-        count = b if is_shared else 1  # of the transmitters, which come first
+        count = b if is_shared else 1  # transmitters in a set of tokens, which come first
 
         points = self.embed(points)  # (b + 1 + m, k), or (b, 2 + m, k)
         multivectors, scalars = self.first(points[..., None, :], types)
-        # The transmitter moves with the room, as the reference of joins has to.
+        # The transmitter moves with the room, as the reference of ``GeometricBilinear`` has to.
         reference = points[:b] if is_shared else points[:, 0]  # (b, k)
         for block in blocks:
             multivectors, scalars = block(multivectors, scalars, reference)

@@ -1,6 +1,7 @@
 """Planes whose positions a placement learns, and the sequences of planes of its paths."""
 
 import logging
+import math
 from pathlib import Path
 
 import torch
@@ -112,9 +113,10 @@ class MovablePlanes(Placement):
         """
         further = planes - self.faces
         axes = torch.eye(3)
-        normals = torch.cat((axes, -axes, axes.repeat(-(-further // 3), 1)))[:planes]
-        beyond = half + self.margin * self.diagonal
-        offsets = torch.cat((beyond, beyond, torch.zeros(further)))
+        repeated_axes = axes.repeat(math.ceil(further / 3), 1)
+        normals = torch.cat((axes, -axes, repeated_axes))[:planes]
+        face_offsets = half + self.margin * self.diagonal  # (3,)
+        offsets = torch.cat((face_offsets, face_offsets, torch.zeros(further)))
         # A random tilt: parallel planes would have equal gradients.
         normals = normals + 0.05 * torch.randn(planes, 3)
         return torch.cat((normals, offsets[:, None]), 1)
@@ -127,28 +129,37 @@ class MovablePlanes(Placement):
         """
         axes = [flat.axis for flat in self.scene.flat_axes if flat.is_common]
         # Planes 0 to 5 are the faces +x, +y, +z, -x, -y, -z.
-        unseen = torch.tensor(axes, dtype=torch.long)
-        blind = torch.isin(torch.arange(self.faces) % 3, unseen).nonzero()[:, 0]
-        is_face = (self.sequences < self.faces).all(1)
-        return is_face & ~torch.isin(self.sequences, blind).any(1)
+        face_axes = torch.arange(self.faces) % 3
+        is_unseen = torch.isin(face_axes, torch.tensor(axes, dtype=torch.long))
+        unseen_faces = is_unseen.nonzero()[:, 0]
+        has_faces_only = (self.sequences < self.faces).all(1)  # (n,); -1 is no plane
+        return has_faces_only & ~torch.isin(self.sequences, unseen_faces).any(1)
 
     def fit(self, links: Links) -> None:
-        """Sets the first planes: the user's walls, or the box's faces turned to the places."""
+        """Sets the first planes: the user's walls, or the faces of the places' smallest box.
+
+        Planes that have been trained are not changed. ``is_new`` and ``turn`` are set, too, unless
+        there are walls.
+        """
         if self.walls is not None:
             self._place_walls(Path(self.walls))
             return
         self.is_new = torch.equal(self.origin, self.first) and not self.shifts.any()
         places = links.query.transmitters[links.split.train]
         self.turn = upright_turn(places).to(self.origin)
-        if self.is_new and not torch.equal(self.turn, torch.eye(3).to(self.turn)):
-            faces = torch.cat((self.turn.mT, -self.turn.mT))
+        is_turned = not torch.equal(self.turn, torch.eye(3).to(self.turn))
+        if self.is_new and is_turned:
+            faces = torch.cat((self.turn.mT, -self.turn.mT))  # outward normals (6, 3)
             points = torch.cat((places, self.scene.positions(places))).to(self.origin)
-            farthest = ((points - self.middle) @ faces.mT).amax(0)
+            farthest = ((points - self.middle) @ faces.mT).amax(0)  # (6,) [m]
             self.origin[: self.faces, :3] = self.first[: self.faces, :3] @ self.turn.mT
             self.origin[: self.faces, 3] = farthest + self.margin * self.diagonal
 
     def _place_walls(self, file: Path) -> None:
-        """Sets the first planes to the largest of a file; only paths at these are in use."""
+        """Sets the first planes to the largest planes of a file of walls.
+
+        Paths at other planes are not in use.
+        """
         planes = read_planes(file, *self.box).to(self.origin)
         most = len(self.origin)
         if len(planes) > most:
@@ -187,8 +198,8 @@ class MovablePlanes(Placement):
 
     def sequences_of(self, planes: Int[Tensor, " k"]) -> Bool[Tensor, " n"]:
         """True for sequences without other planes than these; also for the direct path."""
-        planes = torch.cat((planes, planes.new_tensor([-1]))).to(self.sequences.device)
-        return torch.isin(self.sequences, planes).all(1)
+        allowed = torch.cat((planes, planes.new_tensor([-1])))  # -1 is no plane
+        return torch.isin(self.sequences, allowed.to(self.sequences.device)).all(1)
 
     @torch.no_grad()
     def place(self, number: int, plane: Float[Tensor, "4"]) -> None:
@@ -198,9 +209,13 @@ class MovablePlanes(Placement):
 
     @property
     def room_axes(self) -> Float[Tensor, "3 3"]:
-        """Axes of an upright room in columns; the first is normal to the first vertical plane."""
+        """Axes of an upright room in columns; the third is the z axis.
+
+        The first axis is the normal of the first vertical plane in use, or the world's x axis if
+        there is none.
+        """
         normals = self.normals[self.used]
-        upright = normals[normals[:, 2].abs() < 0.1]
+        upright = normals[normals[:, 2].abs() < 0.1]  # normals of vertical planes
         first = upright[0] if len(upright) else normals.new_tensor([1.0, 0.0, 0.0])
         up = first.new_tensor([0.0, 0.0, 1.0])
         across = functional.normalize(torch.linalg.cross(up, first), dim=0)
@@ -208,7 +223,10 @@ class MovablePlanes(Placement):
 
     @torch.no_grad()
     def move_by_wavelengths(self, wavelength: float) -> None:
-        """Sets ``step`` to a fraction of the wavelength [m]; moves so far go into ``origin``."""
+        """Sets ``step`` in proportion to the wavelength [m], and restarts ``shifts`` at 0.
+
+        The planes stay where they are: moves so far go into ``origin``.
+        """
         self.origin.copy_(torch.cat((self.normals, self.offsets[:, None]), 1))
         self.shifts.zero_()
         # 2.2 wavelengths: a usual step of 0.01 then turns a phase by a tenth of a radian.
@@ -234,10 +252,10 @@ def upright_turn(
         return turn.to(places)
     angles = torch.arange(0, 90, dtype=torch.float64).deg2rad()
     cos, sin = angles.cos(), angles.sin()
-    columns = torch.stack((cos, -sin), 1), torch.stack((sin, cos), 1)
-    axes = torch.stack(columns, 1)  # (angles, 2, 2)
+    rows = torch.stack((cos, -sin), 1), torch.stack((sin, cos), 1)  # of the rotation matrices
+    axes = torch.stack(rows, 1)  # (angles, 2, 2)
     along = places[:, :2].double() @ axes  # (angles, n, 2)
-    edges = along.amax(1) - along.amin(1)
+    edges = along.amax(1) - along.amin(1)  # of the box at each angle (angles, 2) [m]
     areas = edges.prod(1)
     best = int(areas.argmin())
     if areas[best] < smaller * areas[0] and edges[best].min() > width * edges[best].max():

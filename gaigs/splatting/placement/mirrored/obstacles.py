@@ -115,35 +115,40 @@ class Obstacles(nn.Module):
     ) -> Inexact[Tensor, "*batch"]:
         """Optical depth along segments [Np]; with phases the imaginary part is the phase lag [rad].
 
-        A used box attenuates only segments for which ``counts`` is True; None: all segments.
+        Args:
+            start, end: Ends of the segments [m].
+            counts: True where a used box attenuates a segment; None: all boxes attenuate all.
         """
         starts = start.reshape(-1, 3)
         ends = end.reshape(-1, 3)
-        size = len(starts) or 1
+        size = len(starts) or 1  # segments at a time
         if start.device.type == "cpu":
             size = max(1, self.pairs // len(self))
         columns = [self.densities]
         if self.turns is not None:
             columns = [self.densities, self.densities * self.turns]
-        shapes = (self.centres, self.log_widths, torch.stack(columns, 1))
-        parts = [
-            _Depth.apply(*legs, *shapes)
-            for legs in zip(starts.split(size), ends.split(size), strict=True)
-        ]
+        densities = torch.stack(columns, 1)  # (obstacles, 1 or 2)
+        parts = []
+        for some_starts, some_ends in zip(starts.split(size), ends.split(size), strict=True):
+            parts.append(
+                _Depth.apply(some_starts, some_ends, self.centres, self.log_widths, densities)
+            )
         depths = torch.cat(parts)  # (segments, 1 or 2)
-        solid = self._box_depths(starts, ends, counts)  # (segments, 1)
-        depths = torch.cat((depths[:, :1] + solid, depths[:, 1:]), 1)
+        attenuation = depths[:, :1] + self._box_depths(starts, ends, counts)  # boxes turn no phase
+        depths = torch.cat((attenuation, depths[:, 1:]), 1)
         depths = depths[:, 0] if self.turns is None else torch.view_as_complex(depths)
         return depths.view(start.shape[:-1])
 
     def are_outside(self, sites: Float[Tensor, "b e 3"]) -> Bool[Tensor, "b k"]:
         """True for links (b) and used boxes (k) if no end of the link is inside the box.
 
-        Transmitters and receivers are in the open, so a box that holds one is wrong for its links.
+        ``sites`` are the e ends of each link [m]. Transmitters and receivers are in the open, so a
+        box that holds one is wrong for its links.
         """
         along = (sites @ self.box_axes)[:, :, None]  # (b, e, 1, 3)
-        low, high = self.boxes[self.used].unbind(1)
-        return ~((along > low) & (along < high)).all(-1).any(1)
+        low, high = self.boxes[self.used].unbind(1)  # (k, 3) each
+        is_inside = ((along > low) & (along < high)).all(-1)  # (b, e, k)
+        return ~is_inside.any(1)
 
     def _box_depths(
         self,
@@ -151,11 +156,11 @@ class Obstacles(nn.Module):
         end: Float[Tensor, "s 3"],
         counts: Bool[Tensor, "*batch k"] | None,
     ) -> Float[Tensor, "s 1"]:
-        """Depths of segments through boxes [Np]."""
+        """Depths of segments through boxes [Np]; arguments are as for ``forward``."""
         start = start @ self.box_axes
         end = end @ self.box_axes
-        depths = self.box_depths[self.used].clamp_min(0)
-        hits = depths.new_zeros(len(start), len(depths))
+        depths = self.box_depths[self.used].clamp_min(0)  # boxes never amplify
+        hits = depths.new_zeros(len(start), len(depths))  # 1 where a segment meets a box (s, k)
         for number, box in enumerate(self.boxes[self.used]):
             hits[:, number] = passes_box(start, end, box)
         if counts is not None:
@@ -166,13 +171,19 @@ class Obstacles(nn.Module):
 def passes_box(
     start: Float[Tensor, "s 3"], end: Float[Tensor, "s 3"], corners: Float[Tensor, "2 3"]
 ) -> Bool[Tensor, " s"]:
-    """True for segments through a box with edges along the axes, by the slab method."""
+    """True for segments through a box with edges along the axes, by the slab method.
+
+    A box is where three slabs between opposite faces overlap. ``corners`` are its lowest and its
+    highest corner [m].
+    """
     ray = end - start
-    inverse = 1 / torch.where(ray.abs() < 1e-9, 1e-9, ray)
-    first = (corners[0] - start) * inverse  # (s, 3)
-    second = (corners[1] - start) * inverse
-    entry = torch.minimum(first, second).amax(1).clamp_min(0)
-    return entry < torch.maximum(first, second).amin(1).clamp_max(1)
+    inverse = 1 / torch.where(ray.abs() < 1e-9, 1e-9, ray)  # no division by 0 along a face
+    # Fractions of the segment at which it crosses both faces across each axis (s, 3).
+    low_faces = (corners[0] - start) * inverse
+    high_faces = (corners[1] - start) * inverse
+    entry = torch.minimum(low_faces, high_faces).amax(1).clamp_min(0)
+    exit_ = torch.maximum(low_faces, high_faces).amin(1).clamp_max(1)
+    return entry < exit_
 
 
 _FAINTEST = -80.0
@@ -182,7 +193,8 @@ _FAINTEST = -80.0
 class _Depth(torch.autograd.Function):
     """Optical depth (segments, columns of densities), with a hand-written, faster gradient.
 
-    With A, B, C and rho of ``Obstacles``, l the length of a segment, and
+    A, B and C are the products of ``Obstacles`` for a segment and an obstacle, l is the length of
+    the segment, and rho the density of the obstacle. With
 
         r = sqrt(1 / (2 A)), g = exp(-(C - B²/A) / 2), E = erf((A + B) r) - erf(B r)
 
@@ -194,24 +206,25 @@ class _Depth(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx, start, end, centres, log_widths, densities):
-        parts = _measure_legs(start, end, centres, log_widths)
-        each = parts.near * parts.inside * parts.r  # (segments, obstacles)
-        ctx.save_for_backward(start, end, centres, log_widths, densities, *parts)
-        return (each @ densities) * (math.sqrt(math.pi) * parts.length)[:, None]
+        legs = _measure_legs(start, end, centres, log_widths)
+        each = legs.near * legs.inside * legs.r  # r g E (segments, obstacles)
+        ctx.save_for_backward(start, end, centres, log_widths, densities, *legs)
+        return (each @ densities) * (math.sqrt(math.pi) * legs.length)[:, None]
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx, gradient):
-        start, end, centres, log_widths, densities, *parts = ctx.saved_tensors
-        a, b, r, near, inside, length = parts
+        start, end, centres, log_widths, densities, *legs = ctx.saved_tensors
+        a, b, r, near, inside, length = legs  # A, B, r, g and E (segments, obstacles); l
         gradient = gradient * (math.sqrt(math.pi) * length)[:, None]
         # In place where it can be: fresh memory costs more than the sums.
-        rate = near * r  # factor of E in the depth
-        each = rate * inside
+        rate = near * r  # r g
+        each = rate * inside  # r g E
         d_densities = each.T @ gradient
-        weights = gradient @ densities.T
+        weights = gradient @ densities.T  # gradients of r g E
         rate.mul_(weights)
         each.mul_(weights)
+        # e1 and e0 with their factor in the gradient.
         slope = rate.mul_(r).mul_(2 / math.sqrt(math.pi))
         e1 = (a + b).mul_(r).square_().neg_().clamp_min_(_FAINTEST).exp_().mul_(slope)
         e0 = (b * r).square_().neg_().clamp_min_(_FAINTEST).exp_().mul_(slope)
@@ -221,11 +234,12 @@ class _Depth(torch.autograd.Function):
         d_b = (e1 - e0).addcmul_(each, ratio)
         d_a = e1.addcmul_(ratio, d_b, value=-1).addcdiv_(each, a, value=-1).mul_(0.5)
         d_c = -0.5 * each
-        widths = (-2 * log_widths).exp()  # inverse squares
+        inverse_squares = (-2 * log_widths).exp()  # w, of the widths
         ray = end - start
-        # A = sum ray² w, B = sum ray (start - c) w, C = sum (start - c)² w: sums are products of
-        # matrices. With the narrow one on the left they take a CPU a third to a sixth of the time.
-        narrow = torch.cat((widths, centres * widths), 1).T
+        # Over the axes A = sum ray² w, B = sum ray (start - c) w, C = sum (start - c)² w. Sums over
+        # obstacles, then over segments, are products of matrices. With the narrow one on the left
+        # they take a CPU a third to a sixth of the time.
+        narrow = torch.cat((inverse_squares, centres * inverse_squares), 1).T
         row_a, _ = (narrow @ d_a.T).T.split(3, 1)
         row_b, column_b = (narrow @ d_b.T).T.split(3, 1)
         row_c, column_c = (narrow @ d_c.T).T.split(3, 1)
@@ -238,11 +252,11 @@ class _Depth(torch.autograd.Function):
         by_ray = (ray.T @ d_b).T
         by_start = (start.T @ d_c).T
         ones = d_c.sum(0)[:, None]
-        d_centres = -(by_ray + 2 * (by_start - centres * ones)) * widths
+        d_centres = -(by_ray + 2 * (by_start - centres * ones)) * inverse_squares
         # d log width: -2 (A's, B's and C's share of the axis).
         squares = (ray.square().T @ d_a + (ray * start).T @ d_b + start.square().T @ d_c).T
         squares = squares - by_ray * centres - 2 * centres * by_start + centres.square() * ones
-        return d_start, d_end, d_centres, -2 * squares * widths, d_densities
+        return d_start, d_end, d_centres, -2 * squares * inverse_squares, d_densities
 
 
 class _Legs(NamedTuple):
@@ -263,13 +277,15 @@ class _Legs(NamedTuple):
 def _measure_legs(start: Tensor, end: Tensor, centres: Tensor, log_widths: Tensor) -> _Legs:
     """The terms of ``_Depth`` for segments (s, 3) and obstacles (k, 3)."""
     ray = end - start
-    # Contiguous columns: an outer product of others takes a CPU four times as long.
+    # One row for each axis. Contiguous rows: an outer product of others takes a CPU four times as
+    # long.
     inverse = (-log_widths).exp().T.contiguous()
     places = centres.T.contiguous()
     starts = start.T.contiguous()
     ways = ray.T.contiguous()
     # C - B²/A is the squared distance of a line from a centre. Differences of places come first:
     # products of the places themselves would be large numbers with a small difference.
+    # Offsets and rays in units of the widths (s, k), by axis.
     offsets = [(starts[axis, :, None] - places[axis]).mul_(inverse[axis]) for axis in range(3)]
     rays = [ways[axis, :, None] * inverse[axis] for axis in range(3)]
     # The least squared length [squared widths]: within 1e-4 of a width nothing changes.

@@ -181,9 +181,11 @@ class PathFields(MovablePlanes):
     ) -> Complex[Tensor, "b n"]:
         """Field of each kept path, relative to free space over the same length.
 
-        It is 0 for a path that does not exist. With ``blocked`` False obstacles are left out.
+        Phases of paths and receivers are not included. The field of a path that does not exist is
+        0. With ``blocked`` False obstacles are left out.
         """
         path_gains = self.of_bands(self.path_gains, query)
+        # g_k + g_r, logarithms of gains (b, n).
         gains = path_gains[..., self.kept] + self.gains_at(query.receivers).real[:, None]
         fields = torch.complex(gains.exp() * folded.exists, torch.zeros_like(gains))
         fields = folded.reflected(fields, self.coefficients(query, folded))
@@ -196,13 +198,15 @@ class PathFields(MovablePlanes):
         planes = folded.planes
         cosines = folded.cosines
         real = 1 + self.log_permittivities.exp()
-        permittivities = torch.complex(real, -self.log_conductivities.exp())[planes]
+        imaginary = -self.log_conductivities.exp()
+        permittivities = torch.complex(real, imaginary)[planes]  # (w,)
         if self.log_thicknesses is None:
             te, tm = fresnel(permittivities, cosines)
         else:
             wavelengths = speed_of_light / carriers(self.scene, query).to(cosines)[:, None]
-            te, tm = slab(permittivities, cosines, self.log_thicknesses[planes].exp() / wavelengths)
-        # A plane's gain falls off as a Gaussian about its middle.
+            thicknesses = self.log_thicknesses[planes].exp() / wavelengths  # (b, w)
+            te, tm = slab(permittivities, cosines, thicknesses)
+        # A plane's gain falls off as a Gaussian about its middle; (b, w, 3), in extents.
         aside = (folded.bounces - self.middles[planes]) * (-self.log_extents[planes]).exp()
         gains = (self.plane_gains[planes] - aside.square().sum(-1) / 2).exp()
         return polarised(folded.normals, te, tm) * gains
@@ -212,59 +216,66 @@ class PathFields(MovablePlanes):
     ) -> Inexact[Tensor, "b n"]:
         """Depth of each path through the obstacles [Np]; 0 for a path that does not exist.
 
-        With ``skips_faint`` the depth is 0 for faint paths, too.
+        With ``skips_faint`` the depth is 0 for faint paths, too. ``strengths`` are fields without
+        obstacles, relative to free space.
         """
         depths = torch.zeros_like(strengths.real if obstacles.turns is None else strengths)
         with torch.no_grad():
-            is_blocked = strengths != 0
+            is_computed = strengths != 0  # (b, n)
             if self.skips_faint:
-                spans = (folded.end - folded.start).norm(dim=-1)
+                spans = (folded.end - folded.start).norm(dim=-1)  # of the legs (b, s) [m]
                 lengths = depths.real.index_add(1, folded.path, spans).clamp_min(NEAREST)
                 powers = (strengths.abs() / lengths).square()
-                is_blocked = powers > self.faint * powers.sum(1, keepdim=True)
-            legs = is_blocked[:, folded.path].flatten().nonzero()[:, 0]
+                is_computed = powers > self.faint * powers.sum(1, keepdim=True)
+            # Numbers of the legs of these paths, among the legs of all links in a row (b s).
+            legs = is_computed[:, folded.path].flatten().nonzero()[:, 0]
         starts = folded.start.flatten(0, 1).index_select(0, legs)
         ends = folded.end.flatten(0, 1).index_select(0, legs)
         count, n = strengths.shape
-        # Number of each leg's path among the paths of all links, (b n) in a row.
+        # Number of each leg's path among the paths of all links in a row (b n).
         paths = folded.path + n * torch.arange(count, device=legs.device)[:, None]
         paths = paths.flatten()[legs]
         # The first leg ends at the receiver, the last one starts at the transmitter.
         sites = torch.stack((folded.end[:, 0], folded.start[:, -1]), 1)  # (b, 2, 3)
         links = legs // folded.start.shape[1]
-        blocked = obstacles(starts, ends, obstacles.are_outside(sites)[links])
-        return depths.flatten().index_add(0, paths, blocked).view(count, n)
+        leg_depths = obstacles(starts, ends, obstacles.are_outside(sites)[links])
+        return depths.flatten().index_add(0, paths, leg_depths).view(count, n)
 
     def passing(self, query: Query) -> Float[Tensor, "b v"]:
-        """Fields of the direct path and of the single reflection at each plane, in this order.
+        """Amplitudes of the direct path and of the single reflection at each plane, in this order.
 
-        They are relative to free space, with obstacles and without receiver gains. The field of a
-        path that does not exist is 0.
+        They are relative to free space, with obstacles and without receiver gains. The amplitude of
+        a path that does not exist is 0.
         """
-        sequences = self.sequences[self.kept]
-        strengths = self.strengths(query, self.folded(query).paths).abs()
+        sequences = self.sequences[self.kept]  # (n, order)
+        strengths = self.strengths(query, self.folded(query).paths).abs()  # (b, n)
         is_short = (sequences >= 0).sum(1) <= 1
         planes = sequences[is_short].amax(1)  # -1 for the direct path
-        fields = strengths.new_zeros(len(query), len(self.origin) + 1)
-        fields[:, planes + 1] = strengths[:, is_short]
-        return fields / self.gains_at(query.receivers).real[:, None].exp()
+        amplitudes = strengths.new_zeros(len(query), len(self.origin) + 1)
+        amplitudes[:, planes + 1] = strengths[:, is_short]
+        return amplitudes / self.gains_at(query.receivers).real[:, None].exp()
 
     def margins(self, query: Query) -> Complex[Tensor, "b n"]:
         """Prior standard deviation of the field of each of n kept paths, relative to free space.
 
-        It is the path's field times the share that obstacles block, plus a tenth of the field
-        without obstacles. Its phase is the phase of the path's field.
+        The deviation is the path's field times the share that obstacles block, plus a tenth of the
+        field without obstacles. Its phase is the phase of the path's field.
         """
         links = self.folded(query)
         field = self.strengths(query, links.paths)
-        free = self.strengths(query, links.paths, blocked=False)
-        share = 1 - field.abs() / free.abs().clamp_min(torch.finfo(field.real.dtype).tiny)
-        return (share * field + 0.1 * free) * self.patterns(query, links.ways)
+        unblocked = self.strengths(query, links.paths, blocked=False)
+        least = torch.finfo(field.real.dtype).tiny
+        blocked_share = 1 - field.abs() / unblocked.abs().clamp_min(least)
+        return (blocked_share * field + 0.1 * unblocked) * self.patterns(query, links.ways)
 
     # --- bands ---
 
     def _number_bands(self) -> None:
-        """Sets the number of each receiver's band; new receivers must have one of the bands."""
+        """Sets ``band_numbers``, the number of each receiver's band in ``bands``.
+
+        Raises:
+            ValueError: A new receiver has none of the bands of the training.
+        """
         for receiver in self.scene.receivers:
             if receiver.band not in self.bands:
                 raise ValueError(
@@ -308,7 +319,11 @@ class PathFields(MovablePlanes):
 
     @torch.no_grad()
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
-        """Replaces the scene; new receivers get the mean gain of the ``known`` receivers."""
+        """Adapts parameters to the receivers of ``scene``, each of which gets the same mean gain.
+
+        The mean is over the former receivers for which ``known`` is True. None: receivers with
+        training links.
+        """
         is_known = self.is_heard if known is None or scene.one_radio else known
         gains = self._common_gain(is_known)
         gains = gains.repeat(scene.radios)
@@ -320,7 +335,11 @@ class PathFields(MovablePlanes):
         self._number_bands()
 
     def pattern(self, receiver: int, directions: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
-        """Field gain of a receiver's elements in its frame, for arrays times the learnt cos^q."""
+        """Field gain of a receiver's elements towards unit vectors in its frame.
+
+        For an array with a ``boresight`` the gain includes the learnt power of the cosine of the
+        angle to this direction. ``receiver`` is the receiver's number.
+        """
         array = self.scene.receivers[receiver].array
         gain = array.gain(directions)
         normal = self.boresights[receiver]
@@ -335,10 +354,10 @@ class PathFields(MovablePlanes):
         gains = torch.ones_like(ways[..., 0])
         for number in query.receivers.unique().tolist():
             receiver = self.scene.receivers[number]
-            if receiver.array.is_point:
+            if receiver.array.is_point:  # its gain is 1
                 continue
             rows = query.receivers == number
-            directions = ways[rows] @ receiver.pose.rotation.to(ways)
+            directions = ways[rows] @ receiver.pose.rotation.to(ways)  # receiver's frame
             gains[rows] = self.pattern(number, functional.normalize(directions, dim=-1))
         return gains
 
@@ -349,12 +368,16 @@ def _filled(value: float, *shape: int) -> nn.Parameter:
 
 
 def boresight(receiver: Receiver, middle: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
-    """Normal of a planar array in its frame, towards a world point [m]; 0 for other arrays."""
+    """Normal of a planar array in the array's frame; 0 if the elements do not span a plane.
+
+    The normal is on the side of ``middle``, a point in the world frame [m].
+    """
     elements = receiver.array.elements.double()
-    # Elements of a plane scatter along two axes; that of the least singular value is the normal.
-    _, values, axes = torch.linalg.svd(elements - elements.mean(0), full_matrices=True)
-    flat = 1e-6 * values[0]  # float32 places elements no better
-    if len(values) < 3 or values[2] > flat or values[1] <= flat:
+    # Elements of a plane scatter along two axes; the axis without scatter is the normal.
+    _, scatters, axes = torch.linalg.svd(elements - elements.mean(0), full_matrices=True)
+    flat = 1e-6 * scatters[0]  # float32 places elements no better
+    if len(scatters) < 3 or scatters[2] > flat or scatters[1] <= flat:
         return torch.zeros(3)
     normal = axes[2].float()
-    return normal if normal @ receiver.pose.to(middle).local(middle) >= 0 else -normal
+    towards_middle = receiver.pose.to(middle).local(middle)
+    return normal if normal @ towards_middle >= 0 else -normal

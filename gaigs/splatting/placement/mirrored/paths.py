@@ -103,24 +103,25 @@ class Mirrored(PathFields):
 
     @property
     def located(self) -> Bool[Tensor, " w"]:
-        """True for planes at which paths interfere."""
-        is_known = ((self.sequences >= 0).sum(1) <= 1) & ~self._is_blurred
-        numbers = torch.arange(len(self.origin), device=is_known.device)
-        return torch.isin(numbers, self.sequences[is_known])
+        """True for planes whose single reflection interferes with other paths."""
+        is_single = (self.sequences >= 0).sum(1) <= 1  # or the direct path
+        interferes = is_single & ~self._is_blurred
+        numbers = torch.arange(len(self.origin), device=interferes.device)
+        return torch.isin(numbers, self.sequences[interferes])
 
     @torch.no_grad()
     def locate(self, *planes: int) -> None:
-        """Marks ``planes`` as located, so that paths at located planes only interfere.
+        """Marks planes as located, in addition to those that are, by their numbers.
 
-        Powers of all other paths add. Without an argument no plane is located any longer, and only
-        the direct path has a phase.
+        Paths without other planes than located ones interfere. Powers of all other paths add.
+        Without an argument no plane is located any longer, and only the direct path has a phase.
         """
-        located = self.located if planes else self.located & False
+        located = self.located if planes else torch.zeros_like(self.located)
         located[list(planes)] = True
-        phased = self.sequences_of(located.nonzero()[:, 0])  # (n,)
-        self.path_phases[phased & self._is_blurred] = 0
+        interferes = self.sequences_of(located.nonzero()[:, 0])  # (n,)
+        self.path_phases[interferes & self._is_blurred] = 0  # no phase was learnt so far
         known = self.log_blurs.clamp_max(self.known_blur)
-        self.log_blurs.copy_(torch.where(phased, known, self.unknown_blur))
+        self.log_blurs.copy_(torch.where(interferes, known, self.unknown_blur))
 
     @torch.no_grad()
     def start_from_free_space(self, gains: Complex[Tensor, " receivers"]) -> None:
@@ -130,7 +131,8 @@ class Mirrored(PathFields):
         receivers, in the pooling's unit; all differ from 0.
         """
         self.planned.copy_(self.kept)
-        self.kept.copy_(self.sequences_of(self.used[:0]))
+        no_planes = self.used[:0]
+        self.kept.copy_(self.sequences_of(no_planes))
         self.is_bare.fill_(True)
         self.receiver_gains.copy_(gains.abs().log())
         self.receiver_phases.copy_(gains.angle())
@@ -142,17 +144,19 @@ class Mirrored(PathFields):
         receivers: Int[Tensor, " r"],
         receiver_gains: Complex[Tensor, " r"],
     ) -> None:
-        """Sets the paths' strengths to products of the gains of the first planes.
+        """Sets gain and phase of each path to the product of the gains of the path's planes.
 
         Args:
-            gains: Complex gains of the first planes in each of ``bands``. They multiply the
-                reflection coefficients of the planes' slabs.
+            gains: Complex gains of the first w planes in each of ``bands``. They multiply the
+                reflection coefficients of the planes' slabs. Further planes have a gain of 1.
             receivers: Numbers of the receivers.
             receiver_gains: Gains of these receivers, in the pooling's unit.
         """
         least = 1e-3  # a logarithm needs some gain
+        # The last column is for -1, which stands for no plane in a sequence.
         ones = gains.new_ones(len(gains), len(self.origin) + 1 - gains.shape[1])
-        factors = torch.cat((gains, ones), 1)[:, self.sequences]  # (bands, n, order); 1: no plane
+        plane_gains = torch.cat((gains, ones), 1)  # (bands, planes + 1)
+        factors = plane_gains[:, self.sequences]  # (bands, n, order)
         strengths = factors.abs().clamp_min(least).log().sum(2)  # (bands, n)
         self.path_gains.copy_(strengths.view_as(self.path_gains))
         if self.path_phases is not None:
@@ -186,16 +190,17 @@ class Mirrored(PathFields):
 
     def forward(self, gaussians: Gaussians | None, query: Query) -> Placed:
         """Gaussians at the images of each transmitter, followed by the trainable ``gaussians``."""
-        sequences = self.sequences[self.kept]
+        sequences = self.sequences[self.kept]  # (n, order)
         normals = self.normals
         offsets = self.offsets if self.tried is None else self.tried
         seen = images(query.transmitters - self.middle, sequences, normals, offsets)
         receivers = (self.scene.positions(query.transmitters) - self.middle)[query.receivers]
-        lengths = (seen[-1] - receivers[:, None]).norm(dim=-1).clamp_min(NEAREST)
+        ways = seen[-1] - receivers[:, None]  # from receivers to the last images (b, n, 3) [m]
+        lengths = ways.norm(dim=-1).clamp_min(NEAREST)
         strengths = self.held
         if strengths is None:
-            strengths = self.strengths(query, fold(seen, receivers, sequences, normals, offsets))
-            strengths = strengths * self.patterns(query, seen[-1] - receivers[:, None])
+            folded = fold(seen, receivers, sequences, normals, offsets)
+            strengths = self.strengths(query, folded) * self.patterns(query, ways)
             if self.holds:
                 self.held = strengths
         gains = strengths / lengths
@@ -214,7 +219,9 @@ class Mirrored(PathFields):
 
     def _phasors(self, query: Query, lengths: Float[Tensor, "b n"]) -> Complex[Tensor, "b n"]:
         """Phase factors of paths by their lengths [m], learnt phases, and the receivers' phases."""
-        turns = lengths / (speed_of_light / carriers(self.scene, query).to(lengths))[:, None]
+        wavelengths = speed_of_light / carriers(self.scene, query).to(lengths)  # (b,)
+        turns = lengths / wavelengths[:, None]
+        # Whole turns are removed, since float32 rounds large phases.
         phases = -2 * math.pi * (turns - turns.detach().round())
         if self.path_phases is not None:
             phases = phases + self.of_bands(self.path_phases, query)[..., self.kept]
@@ -229,10 +236,13 @@ class Mirrored(PathFields):
         gains: Complex[Tensor, "b n"],
         coherences: Float[Tensor, " n"],
     ) -> Placed:
-        """Round Gaussians at the images; their widths are angular spread times path length."""
+        """Round Gaussians at the images ``means``, with widths of angular spread times path length.
+
+        ``gains`` are the complex fields of the paths, ``coherences`` the shares with a known phase.
+        """
         count = lengths.shape[1]
         signal = lengths.new_zeros(count, self.channels, 1)
-        signal[:, 0] = 1
+        signal[:, 0] = 1  # real 1, which the complex gain multiplies
         widths = lengths * (self.log_spreads[self.kept].exp() * ~self.is_bare)
         return Placed(
             means=means,
@@ -249,12 +259,15 @@ class Mirrored(PathFields):
     # --- training ---
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
-        """Groups: positions of planes, parameters of planes, paths and receivers, and obstacles."""
+        """Parameters by groups.
+
+        Groups are positions of planes; parameters of planes, paths and receivers; and obstacles.
+        """
         obstacles = [] if self.obstacles is None else [*self.obstacles.parameters()]
-        others = {id(parameter) for parameter in (self.shifts, *obstacles)}
+        in_other_groups = {id(parameter) for parameter in (self.shifts, *obstacles)}
         groups = {} if self.fixed else {"planes": [self.shifts]}
         groups["paths"] = [
-            parameter for parameter in self.parameters() if id(parameter) not in others
+            parameter for parameter in self.parameters() if id(parameter) not in in_other_groups
         ]
         if obstacles:
             groups["obstacles"] = obstacles
@@ -269,7 +282,8 @@ class Mirrored(PathFields):
 
 def _beside(placed: Placed, gaussians: Gaussians) -> Placed:
     """Mirrored Gaussians followed by trainable ones, of unknown path lengths and phases."""
-    b, free = len(placed.lengths), len(gaussians)
+    b = len(placed.lengths)
+    free = len(gaussians)
     ones = placed.lengths.new_ones(b, free)
     return Placed(
         means=torch.cat((placed.means, gaussians.means.expand(b, -1, -1)), 1),
@@ -278,6 +292,7 @@ def _beside(placed: Placed, gaussians: Gaussians) -> Placed:
         scales=torch.cat((placed.scales, gaussians.scales.expand(b, -1, -1)), 1),
         opacities=torch.cat((placed.opacities, gaussians.opacities)),
         signal=torch.cat((placed.signal, gaussians.signal)),
+        # The signal of trainable Gaussians is a coefficient of the constant harmonic.
         gains=torch.cat((placed.gains, torch.complex(SH_DC * ones, 0 * ones)), 1),
         coherences=torch.cat((placed.coherences, ones.new_zeros(free))),
         bandwidth=placed.bandwidth,
