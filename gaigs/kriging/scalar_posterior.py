@@ -21,8 +21,9 @@ from gaigs.kriging.scalar import ScalarProcess
 class ScalarPosterior(Posterior):
     """Kriged residuals of scalar labels, with a ``ScalarProcess``.
 
-    The weight of the trend is a mean of the candidates. Each counts by its likelihood on the
-    validation links, or equally without such links. All readings of a place count as one.
+    The weight of the trend is the mean of the candidate weights. Each candidate counts by its
+    likelihood on the validation links, or equally without such links. All readings of a place count
+    as one.
     """
 
     def __init__(self, scene: Scene):
