@@ -166,7 +166,7 @@ class Calibration:
         at_known = self._estimates(value, deviations, replace(query, receivers=receivers), levels)
 
         def choose(new: Tensor | None, known: Tensor | None) -> Tensor | None:
-            """A field of the estimate, from the receivers' own kind; None stays None."""
+            """Values ``new`` at new receivers, ``known`` at the others; None stays None."""
             if new is None or known is None:
                 return None
             mask = is_new.reshape(-1, *[1] * (new.ndim - 1))

@@ -74,15 +74,15 @@ def read(path: str | Path) -> dict:
             f"{path} cannot be read: it is damaged, or another program wrote it\n"
             "copy the file again from where it was trained, or train again"
         ) from None
-    part = content.get(KEY) if isinstance(content, dict) else None
-    if not isinstance(part, dict):
+    entries = content.get(KEY) if isinstance(content, dict) else None
+    if not isinstance(entries, dict):
         raise ValueError(f"{path} is no checkpoint of gaigs: it lacks the entry {KEY!r}")
-    if (version := part.get("version")) != VERSION:
+    if (version := entries.get("version")) != VERSION:
         raise ValueError(
             f"{path} has checkpoint format {version!r}, not {VERSION}; use the gaigs that wrote it"
         )
-    needed = {"state_dict": content, "model": part, "scene": part}
-    lacking = [name for name, there in needed.items() if not isinstance(there.get(name), dict)]
+    parents = {"state_dict": content, "model": entries, "scene": entries}
+    lacking = [name for name, parent in parents.items() if not isinstance(parent.get(name), dict)]
     if lacking:
         raise ValueError(
             f"{path} is no complete checkpoint: it lacks {', '.join(lacking)}\ntrain again"
