@@ -74,8 +74,9 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises:
             ValueError: Shapes or numbers are wrong, or the model does not fit the task.
         """
-        of_levels = {"ensure_all_finite": "allow-nan", "ensure_2d": False, "dtype": np.float64}
-        X, y = validate_data(self, X, y, validate_separately=({"ensure_min_samples": 2}, of_levels))
+        checks_of_y = {"ensure_all_finite": "allow-nan", "ensure_2d": False, "dtype": np.float64}
+        checks = ({"ensure_min_samples": 2}, checks_of_y)
+        X, y = validate_data(self, X, y, validate_separately=checks)
         if X.shape[1] not in (2, 3):
             count = f"{X.shape[1]} feature(s)"
             raise ValueError(f"X must be positions (n, 2) or (n, 3) [m], got {count}")
@@ -89,7 +90,7 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         )
         quiet = {"enable_progress_bar": False, "enable_model_summary": False}
         self.model_ = train(self.model, known, seed=self.seed, **{**quiet, **self.options})
-        # The model leaves receivers without training links out; in answers they stay as NaN.
+        # The model lacks receivers without training links; their predictions are NaN.
         names = _names_of(self.receivers) or [f"rx{number}" for number in range(y[0].size)]
         self.columns_ = [names.index(receiver.name) for receiver in self.model_.scene.receivers]
         self.shape_ = y.shape[1:]
@@ -105,9 +106,11 @@ class Regressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self)
         X = validate_data(self, X, reset=False)
         places = np.column_stack((X, np.full(len(X), self.height))) if X.shape[1] == 2 else X
-        estimate = self.model_.predict(places, interval=0.9 if return_std else None)
-        levels = self._arranged(estimate[0] if return_std else estimate)
-        return (levels, self._arranged(estimate[1])) if return_std else levels
+        if not return_std:
+            return self._arranged(self.model_.predict(places))
+        # Any interval comes with standard deviations.
+        levels, deviations, *_ = self.model_.predict(places, interval=0.9)
+        return self._arranged(levels), self._arranged(deviations)
 
     def _arranged(self, values: Any) -> np.ndarray:
         """Values in the shape of the training levels; NaN for receivers that the model lacks."""
@@ -140,5 +143,7 @@ def _names_of(receivers: Any) -> list[str]:
     if isinstance(receivers, Mapping):
         return [*receivers]
     entries = [receivers] if isinstance(receivers, Receiver) else receivers
-    is_named = isinstance(entries, Sequence) and all(isinstance(it, Receiver) for it in entries)
+    if not isinstance(entries, Sequence):
+        return []
+    is_named = all(isinstance(entry, Receiver) for entry in entries)
     return [entry.name for entry in entries] if is_named else []

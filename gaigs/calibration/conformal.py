@@ -83,11 +83,11 @@ class Calibration:
         labels, values, deviations = thinned(task, labels, values, deviations)
         scale = _shaped(deviations, values)  # (n, m)
         errors = (labels - values).abs() / scale  # (n, m)
-        exists = ~scale.isnan()
+        exists = ~scale.isnan()  # False at elements that an array lacks
         groups = group_links(query, known, near, errors)
         bins = bin_numbers(values)
         levels = torch.linspace(0, 1, steps + 1, dtype=torch.float64)
-        shape = len(groups.counts), len(bins.amplitudes) + 1
+        shape = len(groups.counts), len(bins.amplitudes) + 1  # (groups, bins)
         quantiles = errors.new_zeros(*shape, steps + 1, dtype=torch.float64)
         sizes = errors.new_zeros(shape, dtype=torch.float64)
         for group in range(shape[0]):
@@ -154,25 +154,25 @@ class Calibration:
                 "no intervals at receivers without links: three receivers with held-out links "
                 "calibrate them"
             )
-        shape = -1, *[1] * (value.ndim - 1)
         # Deviations that the model states hold for receivers with links only. Their NaN marks
         # elements that an array lacks.
         usual = _shaped(usual_deviations(value) * widths, value)
         usual = usual.masked_fill(_shaped(deviations, value).isnan(), math.nan)
-        new = self.elsewhere._estimates(value, usual, query, levels)
+        at_new = self.elsewhere._estimates(value, usual, query, levels)
         if is_new.all():
-            return new
-        # Only receivers with links have groups. The others borrow one; its result is not used.
+            return at_new
+        # Only receivers with links have groups. New ones borrow a group; its result is not used.
         receivers = torch.where(is_new, query.receivers[~is_new][0], query.receivers)
-        old = self._estimates(value, deviations, replace(query, receivers=receivers), levels)
+        at_known = self._estimates(value, deviations, replace(query, receivers=receivers), levels)
 
-        def choose(at_new: Tensor | None, at_old: Tensor | None) -> Tensor | None:
-            if at_new is None or at_old is None:
+        def choose(new: Tensor | None, known: Tensor | None) -> Tensor | None:
+            """Values ``new`` at new receivers, ``known`` at the others; None stays None."""
+            if new is None or known is None:
                 return None
-            mask = is_new if at_new.ndim == 1 else is_new.reshape(shape)
-            return torch.where(mask, at_new, at_old)
+            mask = is_new.reshape(-1, *[1] * (new.ndim - 1))
+            return torch.where(mask, new, known)
 
-        return [Estimate(*map(choose, *pair)) for pair in zip(new, old, strict=True)]
+        return [Estimate(*map(choose, *pair)) for pair in zip(at_new, at_known, strict=True)]
 
     def _estimates(
         self, value: Tensor, deviations: Tensor, query: Query, levels: Sequence[float]
@@ -186,43 +186,45 @@ class Calibration:
     ) -> Estimate:
         """The interval of predictions; ``groups`` has the number of each link's group."""
         self._check_counts(groups, level)
-        # Numbers of the cells of group and amplitude bin, as in the flattened quantiles.
+        # Number of each value's cell (group and amplitude bin) in the flattened quantiles.
         cells = groups.reshape(-1, *[1] * (value.ndim - 1))
         amplitudes = self.amplitudes.to(value.real)
         if len(amplitudes):
             cells = cells * (len(amplitudes) + 1) + torch.bucketize(value.contiguous(), amplitudes)
         scale = _shaped(deviations, value)
-        rank = math.ceil(level * self.steps - 1e-9)  # of the next stored level
-        half = scale * self.quantiles[..., rank].flatten().to(scale).take(cells)
+        step = math.ceil(level * self.steps - 1e-9)  # of the next stored level
+        half_width = scale * self.quantiles[..., step].flatten().to(scale).take(cells)
         std = scale * self.sizes.flatten().to(scale).take(cells)
         if not value.is_complex():
-            lower = (value - half).clamp_min(self.lowest.item())
+            lower = (value - half_width).clamp_min(self.lowest.item())
             # A model may predict less than the least possible label.
-            return Estimate(value, std, torch.minimum(lower, value), value + half)
-        absent = std.isnan()  # elements that an array lacks
-        power = value.masked_fill(absent, 0).abs().square().flatten(1).sum(1)  # (b,)
-        error = std.masked_fill(absent, 0).abs().square().flatten(1).sum(1)  # (b,)
-        return Estimate(value, std, None, None, half, 10 * (power / error).log10())
+            return Estimate(value, std, torch.minimum(lower, value), value + half_width)
+        is_absent = std.isnan()  # elements that an array lacks
+        power = value.masked_fill(is_absent, 0).abs().square().flatten(1).sum(1)  # (b,)
+        error_power = std.masked_fill(is_absent, 0).abs().square().flatten(1).sum(1)  # (b,)
+        snr_db = 10 * (power / error_power).log10()
+        return Estimate(value, std, None, None, half_width, snr_db)
 
     def _groups_of(self, query: Query) -> Int[Tensor, " b"]:
-        """Group of each link, by receiver and distance."""
+        """Number of each link's group, by receiver and distance."""
         receivers = query.receivers
         rows = receivers if len(self.edges) > 1 else torch.zeros_like(receivers)
-        groups = rows * (self.edges.shape[1] + 1)
-        if self.edges.shape[1]:
+        edge_count = self.edges.shape[1]
+        groups = rows * (edge_count + 1)
+        if edge_count:
             places = self.places.to(query.transmitters)
-            near = nearest(query, places, self.receivers.to(receivers))
+            near = nearest(query, places, self.receivers.to(receivers))  # (b,) [m]
             groups = groups + torch.searchsorted(self.edges.to(near)[rows], near[:, None])[:, 0]
         return groups
 
     def _check_counts(self, groups: Int[Tensor, " b"], level: float) -> None:
         """Raises a ``ValueError`` if a link's group is too small for intervals of a level."""
         counts = self.counts.to(groups)[groups]
-        need = fewest(level)
-        if len(counts) and (few := int(counts.min())) < need:
+        needed = fewest(level)
+        if len(counts) and (available := int(counts.min())) < needed:
             raise ValueError(
-                f"an interval of {100 * level:g} % needs {need} links to calibrate it, "
-                f"the model has {few}\n"
+                f"an interval of {100 * level:g} % needs {needed} links to calibrate it, "
+                f"the model has {available}\n"
                 "ask for a narrower interval, or give more links: to a look-up known ones, "
                 "else by split.validation"
             )
@@ -290,27 +292,28 @@ def group_links(
     receivers = query.receivers
     count = int(torch.cat((receivers, known.receivers)).max()) + 1
     links = receivers.bincount(minlength=count)  # (r,)
+    # Each receiver is a row of groups, or all receivers together are one row.
     has_rows = links.min() >= enough and count > 1
     rows = receivers if has_rows else torch.zeros_like(receivers)
-    apart = torch.zeros(len(rows), dtype=torch.float64)
+    apart = torch.zeros(len(rows), dtype=torch.float64)  # distance to the nearest place
     groups = 1
     if near is not None:
         apart = near.clamp_max(FAR)
         groups = max(1, min(most, int(rows.bincount().min()) // enough))
     while True:  # equal distances may leave a group with few links
         levels = torch.arange(1, groups, dtype=torch.float64) / groups
-        edges = torch.stack(
-            [apart[rows == row].quantile(levels) for row in range(int(rows.max()) + 1)]
-        )  # (r, groups - 1)
+        row_numbers = range(int(rows.max()) + 1)
+        row_edges = [apart[rows == row].quantile(levels) for row in row_numbers]
+        edges = torch.stack(row_edges)  # (r, groups - 1)
         numbers = rows * groups + torch.searchsorted(edges[rows], apart[:, None])[:, 0]  # (n,)
         counts = numbers.bincount(minlength=len(edges) * groups)
         if groups == 1:
             return Groups(edges, numbers, counts)
-        squares = torch.stack(
-            [errors[numbers == group].square().nanmean() for group in range(len(counts))]
-        )
+        squares = []
+        for group in range(len(counts)):
+            squares.append(errors[numbers == group].square().nanmean())
         # Distances are useful only if errors rise with them.
-        rises = (squares.view(-1, groups).diff() > 0).all()
+        rises = (torch.stack(squares).view(-1, groups).diff() > 0).all()
         if counts.min() >= enough // 2 and rises:
             return Groups(edges, numbers, counts)
         groups -= 1
@@ -329,15 +332,16 @@ def bin_numbers(values: Inexact[Tensor, "n m"], most: int = 8) -> Bins:
     Scalar labels and channels have one bin. Spectra have ``most`` bins with equal numbers of
     pixels. The number of bins is halved until at least ``fewest(0.9)`` links have pixels in each.
     """
-    numbers = (values.abs() if values.is_complex() else values).double()
-    sample = numbers.flatten()[evenly(torch.arange(numbers.numel()), 10**6)]
-    count = most if numbers.shape[1] > 1 and not values.is_complex() else 1
+    amplitudes = (values.abs() if values.is_complex() else values).double()  # (n, m)
+    sample = amplitudes.flatten()[evenly(torch.arange(amplitudes.numel()), 10**6)]
+    is_spectrum = amplitudes.shape[1] > 1 and not values.is_complex()
+    count = most if is_spectrum else 1
     while True:
-        amplitudes = sample.quantile(torch.arange(1, count, dtype=torch.float64) / count)
-        bins = torch.bucketize(numbers, amplitudes)
+        edges = sample.quantile(torch.arange(1, count, dtype=torch.float64) / count)
+        bins = torch.bucketize(amplitudes, edges)  # (n, m)
         links = torch.stack([(bins == number).any(1).sum() for number in range(count)])
         if count == 1 or links.min() >= fewest(0.9):
-            return Bins(amplitudes, bins)
+            return Bins(edges, bins)
         count //= 2
 
 
@@ -348,19 +352,18 @@ def link_quantiles(
     levels: Float[Tensor, " q"],
     level: float = 0.9,
 ) -> Float[Tensor, " q"]:
-    """Quantiles of a group's errors, by which new links are within intervals of each level.
+    """Bounds of a group's errors for intervals of each level, the quantiles p (n + 1) / n.
 
     Args:
         ordered: Errors of the group's label values, ascending.
         errors: Errors of all label values.
         inside: True for the label values of the group.
-        levels: Levels of the intervals.
-        level: Level at which ``effective_count`` is taken, for all levels.
+        levels: Levels p of the intervals.
+        level: Level at which n, the ``effective_count``, is taken for all levels.
     """
-    held = (errors <= quantile(ordered, levels.new_tensor(level))) & inside
-    both = torch.stack((held.sum(1), inside.sum(1)))  # (2, n)
-    count = effective_count(*both)
-    # Quantile p (n + 1) / n: the new link is one of n + 1 exchangeable ones.
+    is_held = (errors <= quantile(ordered, levels.new_tensor(level))) & inside
+    count = effective_count(is_held.sum(1), inside.sum(1))
+    # A new link is one of n + 1 exchangeable ones.
     return quantile(ordered, levels * (1 + 1 / count))
 
 
@@ -375,15 +378,15 @@ def effective_count(held: Int[Tensor, " n"], counts: Int[Tensor, " n"]) -> float
         counts: Number of each link's values.
     """
     total = counts.sum().double()
-    weights = counts / total
-    parts = held / total
-    share = parts.sum().item()
-    effective_links = 1 / weights.square().sum().item()
-    scatter = (parts - share * weights).square().sum().item()
+    weights = counts / total  # (n,)
+    held_shares = held / total  # (n,)
+    share = held_shares.sum().item()
+    effective_links = 1 / weights.square().sum().item()  # n if all links have equal counts
+    scatter = (held_shares - share * weights).square().sum().item()
     # A share p of n independent numbers has the variance p (1 - p) / n, which is solved for n. The
     # estimate of this variance is the scatter with Bessel's correction, 1 / (1 - 1 / links).
-    unbiased = 1 - 1 / effective_links
-    return max(effective_links, share * (1 - share) * unbiased / max(scatter, 1e-12))
+    bessel = 1 - 1 / effective_links
+    return max(effective_links, share * (1 - share) * bessel / max(scatter, 1e-12))
 
 
 def fewest(level: float) -> int:
@@ -439,7 +442,8 @@ def thinned(
     """
     if deviations.ndim > 1:
         deviations = thin_labels(deviations)
-    # An alignment takes several times the memory of the labels.
-    pairs = zip(labels.split(64), values.split(64), strict=True)
-    aligned = [thin_labels(task.align(*pair)) for pair in pairs]
+    # In parts, since an alignment takes several times the memory of the labels.
+    aligned = []
+    for some_labels, some_values in zip(labels.split(64), values.split(64), strict=True):
+        aligned.append(thin_labels(task.align(some_labels, some_values)))
     return Thinned(torch.cat(aligned), thin_labels(values), deviations)

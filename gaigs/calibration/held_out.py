@@ -57,8 +57,8 @@ def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -
         is_known = folds != fold
         # If all links of a receiver are in this fold, they are not held out.
         is_known |= torch.isin(receivers[index], receivers[index[is_known]], invert=True)
-        part = index[~is_known & torch.isin(index, asked)]
-        if not len(part):
+        asked_of_fold = index[~is_known & torch.isin(index, asked)]
+        if not len(asked_of_fold):
             continue
         rest = replace(links, split=links.split.only(index[is_known]))
         # Estimated places of receivers are estimated again, without the fold.
@@ -66,7 +66,7 @@ def held_out_folds(links: Links, count: int = LOOK_UP_FOLDS, most: int = 1000) -
             is_estimated = links.uncertainties > 0
             unknown = torch.where(is_estimated, math.inf, 0.0)
             rest = with_places(replace(rest, uncertainties=unknown))
-        yield Fold(rest, part)
+        yield Fold(rest, asked_of_fold)
 
 
 def validation_halves(links: Links) -> list[tuple[Int[Tensor, " k"], Int[Tensor, " j"]]]:

@@ -46,8 +46,9 @@ class NewReceivers(NamedTuple):
             p = mean over t of F(log b - c - s (1 + 1/k)^½ t)
 
         F is the distribution of log errors relative to their receiver's quantile. Errors are
-        smaller at receivers from which the room was learnt. If they are larger at the others, c and
-        k are those of the others alone. s is relative to the mean of each of these two kinds.
+        smaller at receivers from which the room was learnt. If errors at the other receivers are
+        larger, c and k are those of the other receivers alone. s is relative to the mean of each of
+        these two kinds of receivers.
 
         Args:
             errors: Errors of all label values.
@@ -57,26 +58,27 @@ class NewReceivers(NamedTuple):
         """
         middles = (torch.arange(parts, dtype=torch.float64) + 0.5) / parts
         # Log errors of each receiver: points of their distribution, and quantiles of the levels.
-        points, receiver_bounds, kinds = [], [], []
+        points, receiver_quantiles, kinds = [], [], []
         for receiver in self.receivers.unique():
             rows = self.receivers == receiver
             logs = errors[rows][inside[rows]].double().clamp_min(FAINTEST).log().sort().values
             if len(logs):
                 points.append(quantile(logs, middles))
-                receiver_bounds.append(quantile(logs, levels))
+                receiver_quantiles.append(quantile(logs, levels))
                 kinds.append(self.are_taught[rows][0])
-        offsets, taught = torch.stack(receiver_bounds), torch.stack(kinds)  # (k, q), (k,)
-        relative = torch.stack(points)[:, None] - offsets[..., None]  # (k, q, parts)
-        within = relative.movedim(0, 1).flatten(1).sort().values  # (q, k parts), F of each level
+        quantiles, taught = torch.stack(receiver_quantiles), torch.stack(kinds)  # (k, q), (k,)
+        relative = torch.stack(points)[:, None] - quantiles[..., None]  # (k, q, parts)
+        distributions = relative.movedim(0, 1).flatten(1).sort().values  # F (q, k parts)
         chances = (torch.arange(draws, dtype=torch.float64) + 0.5) / draws
-        freedom = max(len(taught) - len(taught.unique()), 1)
+        freedom = max(len(taught) - len(taught.unique()), 1)  # a mean of each kind is fitted
         t = torch.from_numpy(stdtrit(freedom, chances.numpy()))  # (draws,)
         bounds = []
-        for level, offset, logs in zip(levels, offsets.T, within, strict=True):
-            centre, scale = _predictive(offset, taught, freedom)
+        for level, at_level, logs in zip(levels, quantiles.T, distributions, strict=True):
+            centre, scale = _predictive(at_level, taught, freedom)
+            # Log errors at a new receiver: all sums of its quantile and a relative error.
             sums = (centre + scale * t)[:, None] + quantile(logs, middles)  # (draws, parts)
             rank = (level * sums.numel() - 1e-9).ceil().clamp(1, sums.numel())
-            bounds.append(sums.flatten().kthvalue(int(rank)).values)  # quicker than to sort them
+            bounds.append(sums.flatten().kthvalue(int(rank)).values)  # faster than a sort
         # A higher level may have a lower bound if receivers differ less there; bounds must rise.
         logarithms = torch.stack(bounds).cummax(0).values
         return logarithms.clamp_max(-math.log(FAINTEST)).exp()
@@ -95,7 +97,8 @@ def _predictive(
     # that is by chance, and all receivers count.
     others = values[~are_taught]
     used = others if len(others) and others.mean() > values.mean() else values
-    return used.mean(), (squares.sum() / freedom * (1 + 1 / len(used))).sqrt()
+    variance = squares.sum() / freedom * (1 + 1 / len(used))  # of a new value about the mean
+    return used.mean(), variance.sqrt()
 
 
 def quantile(numbers: Float[Tensor, " n"], levels: Float[Tensor, "*q"]) -> Float[Tensor, "*q"]:
@@ -117,32 +120,36 @@ def fit_law(
         places: Transmitters of these links (k, 3) [m].
         most: Largest number of links that are used at a receiver.
     """
-    rows = [evenly(torch.arange(len(part)), most) for part in errors]
-    parts = [part[row].double() for part, row in zip(errors, rows, strict=True)]
-    spots = [part[row].double() for part, row in zip(places, rows, strict=True)]
-    mean = torch.cat(parts).square().mean().clamp_min(1e-9)
+    used_errors, used_places = [], []
+    for receiver_errors, receiver_places in zip(errors, places, strict=True):
+        rows = evenly(torch.arange(len(receiver_errors)), most)
+        used_errors.append(receiver_errors[rows].double())
+        used_places.append(receiver_places[rows].double())
+    mean_square = torch.cat(used_errors).square().mean().clamp_min(1e-9)
     # Receivers with fewer links are padded with errors of 0 that correlate with nothing.
-    exists = pad_sequence([torch.ones(len(part)) for part in parts], batch_first=True)  # (r, k)
-    padded = pad_sequence(parts, batch_first=True)[..., None]  # (r, k, 1)
-    there = pad_sequence(spots, batch_first=True)  # (r, k, 3)
-    apart = torch.cdist(there, there)  # (r, k, k)
-    pairs = exists[:, :, None] * exists[:, None]
-    size = (pairs * apart).amax((1, 2)).median().clamp_min(1e-6)
-    units = torch.stack((mean, mean, mean, size))
+    ones = [torch.ones(len(part)) for part in used_errors]
+    exists = pad_sequence(ones, batch_first=True)  # (r, k)
+    padded = pad_sequence(used_errors, batch_first=True)[..., None]  # (r, k, 1)
+    positions = pad_sequence(used_places, batch_first=True)  # (r, k, 3)
+    apart = torch.cdist(positions, positions)  # (r, k, k)
+    pairs = exists[:, :, None] * exists[:, None]  # (r, k, k)
+    size = (pairs * apart).amax((1, 2)).median().clamp_min(1e-6)  # of the site [m]
+    units = torch.stack((mean_square, mean_square, mean_square, size))
+    start = np.log([0.25, 0.3, 0.3, 0.05])  # level, noise, field, length over ``units``
 
     def cost(logarithms: np.ndarray) -> float:
-        """Mean negative log posterior, without constant terms."""
+        """Mean negative log posterior of parameters over ``units``, without constant terms."""
         prior = (logarithms[1] - start[1]) ** 2 / 2
         level, noise, field, length = torch.from_numpy(logarithms).exp() * units
         covariances = pairs * (level + field * (-apart / length).exp())
         variances = torch.where(exists > 0, noise, 1.0)
-        factor = torch.linalg.cholesky(covariances + variances.diag_embed())  # (r, k, k)
+        # -log p(e) = |L^-1 e|² / 2 + log det L, with the covariance matrix L L'.
+        factor = torch.linalg.cholesky(covariances + variances.diag_embed())  # L (r, k, k)
         white = torch.linalg.solve_triangular(factor, padded, upper=False)  # (r, k, 1)
-        spread = factor.diagonal(dim1=1, dim2=2).log().sum()  # padding adds 0
-        return ((white.square().sum() / 2 + spread + prior) / exists.sum()).item()
+        log_det = factor.diagonal(dim1=1, dim2=2).log().sum()  # padding adds 0
+        return ((white.square().sum() / 2 + log_det + prior) / exists.sum()).item()
 
     # Variances from 1e-4 to 20 mean squares, lengths from 0.1 % to 3 sizes of the site.
     bounds = [(-9.0, 3.0)] * 3 + [(-7.0, 1.0)]
-    start = np.log([0.25, 0.3, 0.3, 0.05])
     result = minimize(cost, start, method="L-BFGS-B", bounds=bounds)
     return torch.from_numpy(np.exp(result.x)) * units

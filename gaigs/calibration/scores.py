@@ -83,7 +83,8 @@ def scores_of_links(
     for name in parts[0]:
         scores[name] = torch.cat([part[name] for part in parts])
     scores["calibration_links"] = torch.full((len(query),), float(calibration.counts.sum()))
-    scores["places"] = query.place_keys.unique(return_inverse=True)[1].double()
+    _, place_numbers = query.place_keys.unique(return_inverse=True)
+    scores["places"] = place_numbers.double()
     return scores
 
 
@@ -127,11 +128,17 @@ def summarise_intervals(scores: dict[str, Tensor]) -> dict[str, float]:
 def coverage_error(
     score: Float[Tensor, " k"], level: float, places: Tensor, calibration_links: float
 ) -> float:
-    """Standard error of the mean share of links within intervals; NaN with one place.
+    """Standard error of a mean coverage of intervals; NaN with one place.
 
     Links at one place depend on each other; different places count as independent. The calibrating
     links are a sample, too, so a small number of them adds to the error. If all links have the same
-    share, the variance is taken as level (1 - level).
+    score, the variance is taken as level (1 - level).
+
+    Args:
+        score: Share of each link's values that its interval holds.
+        level: Probability of the interval.
+        places: Number of each link's place.
+        calibration_links: Number of links that calibrated the interval.
 
     Source: Cameron and Miller, A practitioner's guide to cluster-robust inference, 2015.
     """
@@ -139,9 +146,9 @@ def coverage_error(
     sums = places.bincount(score - score.mean())  # (places,), of deviations from the mean
     if len(sums) <= 1:
         return math.nan
-    links = 1 / count + 1 / calibration_links
-    # Variance of a link's share, from independent errors of the places.
-    spread = sums.square().sum().item() / count * len(sums) / max(len(sums) - 1, 1)
+    # Variance of a link's share, from independent errors of the places, with Bessel's correction.
+    variance = sums.square().sum().item() / count * len(sums) / max(len(sums) - 1, 1)
     if score.min() == score.max():
-        spread = level * (1 - level) * count / len(sums)
-    return math.sqrt(spread * links)
+        variance = level * (1 - level) * count / len(sums)
+    # Both the scored and the calibrating links are samples.
+    return math.sqrt(variance * (1 / count + 1 / calibration_links))

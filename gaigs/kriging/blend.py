@@ -30,7 +30,8 @@ def blend(task: Task, one: Tensor | None, other: Tensor | None, weight: float) -
     of 0 is not read, so it may be None or NaN.
     """
     if weight in (0, 1):
-        return (one if weight else other).clone()
+        only = one if weight else other
+        return only.clone()
     return torch.add(weight * task.align(one, other), other, alpha=1 - weight)
 
 
@@ -39,8 +40,8 @@ def is_surely_better(
 ) -> bool:
     """True if the mean score ``one`` exceeds the mean ``other`` by ``errors`` standard errors.
 
-    Both have the scores of the same k links, and the standard error is that of the links'
-    differences. The result is False for fewer than two links.
+    Both have scores of the same k links. The standard error is that of the mean difference between
+    both scores of a link. The result is False for fewer than two links.
     """
-    gain = one - other
-    return len(gain) > 1 and bool(gain.mean() > errors * gain.std() / math.sqrt(len(gain)))
+    gains = one - other
+    return len(gains) > 1 and bool(gains.mean() > errors * gains.std() / math.sqrt(len(gains)))

@@ -152,11 +152,13 @@ class FieldPosterior(Posterior):
         features: Float[Tensor, "k c"] | None = None,
     ) -> float:
         index = links.split.known
+        # Row of each link among the known links, as in ``candidates`` and ``features``.
         rows = index.new_zeros(len(links)).index_copy(0, index, torch.arange(len(index)))
 
         def fitted(
             weight: float, most: int = 300, has_features: bool = False, length: float | None = None
         ) -> tuple[Hyperparameters, float]:
+            """Hyperparameters for a weight of the trend, and their negative log likelihood."""
             residuals = candidates[weight]
             if residuals.is_complex():
                 labels = thin_labels(links.labels[index])
@@ -180,10 +182,11 @@ class FieldPosterior(Posterior):
         if features is not None:
             lengths = {weight: fit.length for weight, (fit, _) in fits.items()}
             fits = {weight: fitted(weight, 300, True, lengths[weight]) for weight in candidates}
-            weight = min(candidates, key=lambda weight: fits[weight][1])
-            # A hyperparameter more has to make up for itself (Akaike, 1974).
-            if fits[weight][1] + 2 < fitted(best, length=lengths[best])[1]:
-                best = weight
+            with_features = min(candidates, key=lambda weight: fits[weight][1])
+            # A further hyperparameter must lower the cost by 2 (Akaike, 1974).
+            _, cost_without = fitted(best, length=lengths[best])
+            if fits[with_features][1] + 2 < cost_without:
+                best = with_features
                 process, _ = fitted(best, 1000, True, lengths[best])
         self.hyperparameters.copy_(torch.tensor(process, dtype=torch.float64))
         return best
@@ -234,7 +237,7 @@ class FieldPosterior(Posterior):
 
     def process_at(self, receiver: int) -> Process:
         field, process = self.fields[receiver], self.process
-        # Over places and carriers alone: callers have no predicted spectra.
+        # Without features, since callers have no predicted spectra.
         known = field.places if not self.has_features else field.places[:, :3]
         places = scaled(known, 1 / process.scale)  # of scale 1
         of_labels = process.at(places, field.size(process).item() ** 2)
@@ -254,7 +257,10 @@ class FieldPosterior(Posterior):
 
 
 def _like_loaded(buffer: Tensor, values: Tensor) -> Tensor:
-    """A copy of ``values`` with the strides of a loaded buffer, which affect rounding."""
+    """A copy of ``values`` with the memory layout of a buffer, which affects rounding.
+
+    A solved and a loaded model then give the same predictions to the last digit.
+    """
     return buffer.new_empty(values.shape).copy_(values)
 
 
@@ -278,10 +284,11 @@ def principal_components(
         is_flat = len(residuals) <= residuals.shape[1]
         gram = residuals @ residuals.mH if is_flat else residuals.mH @ residuals
         wide = torch.promote_types(gram.dtype, torch.float64)
-        squares, vectors = torch.linalg.eigh(gram.to(wide))
-        squares = squares.flip(0).clamp_min(0)
+        squares, vectors = torch.linalg.eigh(gram.to(wide))  # ascending
+        squares = squares.flip(0).clamp_min(0)  # energy of each component, largest first
         vectors = vectors.flip(1).mH.to(residuals)[:most]
-        components = vectors @ residuals if is_flat else vectors
+        # Vectors of the smaller side: links (k), or values of a label (m).
+        components = vectors @ residuals if is_flat else vectors  # (q, m)
     else:
         # The random state stays: a resumed run must continue as an uninterrupted one.
         with torch.random.fork_rng(devices=[]):

@@ -76,12 +76,13 @@ def damping(
     channels. Residuals within decimetres of a receiver exceed the limit, and so do gross errors.
     Without the limit, one of them would spoil the predictions of the whole room.
     """
-    sizes, levels = norms(residuals), norms(labels)
-    factors = torch.ones_like(sizes)
+    residual_norms, label_norms = norms(residuals), norms(labels)
+    factors = torch.ones_like(residual_norms)
     for receiver in receivers.unique():
         rows = receivers == receiver
-        limit = most * levels[rows].quantile(0.5)
-        factors[rows] = torch.where(sizes[rows] > limit, limit / sizes[rows], 1)
+        limit = most * label_norms[rows].quantile(0.5)
+        sizes = residual_norms[rows]
+        factors[rows] = torch.where(sizes > limit, limit / sizes, 1)
     return factors.float()
 
 
@@ -103,8 +104,8 @@ def fit_hyperparameters(
 ) -> tuple[Hyperparameters, float]:
     """Hyperparameters with the largest likelihood, and the ``negative_log_likelihood``.
 
-    The likelihood is that of held-out links of all receivers; -inf is returned if all residuals are
-    0.
+    The likelihood is that of held-out links of all receivers. If all residuals are 0, the result is
+    the middle of the bounds, and -inf.
 
     Args:
         scene: Receivers and task.
@@ -132,37 +133,37 @@ def fit_hyperparameters(
     scale = math.exp(middle[2]) if scene.has_band else math.nan
     if links.split.by_receivers:  # no known link is near those that validate
         links = replace(links, split=links.split.only(links.split.train))
-    known = [*filter(len, known_links(links, any_receiver=True))]
-    each = max(1, most // len(known))
+    known = [index for index in known_links(links, any_receiver=True) if len(index)]
+    most_per_receiver = max(1, most // len(known))
     held_out = []
     for index in known:
-        held = hold_out(scene, links, index, scale, residuals, each, features=features)
-        held_out += [] if held is None else [held]
+        held = hold_out(scene, links, index, scale, residuals, most_per_receiver, features=features)
+        if held is not None:
+            held_out.append(held)
     if not held_out:
         return Hyperparameters(*np.exp(middle).tolist()), -math.inf
 
-    def value(logarithms: Tensor) -> Tensor:
-        hyperparameters = logarithms.exp()
-        by_errors = length is not None
-        parts = (
-            negative_log_likelihood(scene, held, *hyperparameters, by_errors=by_errors)
-            for held in held_out
-        )
-        return sum(parts, torch.zeros(()))
+    def cost(logarithms: Tensor) -> Tensor:
+        total = torch.zeros(())
+        for held in held_out:
+            total = total + negative_log_likelihood(
+                scene, held, *logarithms.exp(), by_errors=length is not None
+            )
+        return total
 
-    def cost(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
+    def cost_and_gradient(logarithms: np.ndarray) -> tuple[float, np.ndarray]:
         with torch.enable_grad():
             leaf = torch.tensor(logarithms, requires_grad=True)
-            total = value(leaf)
+            total = cost(leaf)
             (gradient,) = torch.autograd.grad(total, leaf)
         return total.item(), gradient.numpy()
 
     # From the best point of a coarse grid: the likelihood may have several maxima.
     axes = [low + (high - low) * np.array([1, 3, 5]) / 6 for low, high in bounds]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(bounds))
-    start = min(grid, key=lambda point: value(torch.from_numpy(point)).item())
+    start = min(grid, key=lambda point: cost(torch.from_numpy(point)).item())
     result = minimize(
-        cost,
+        cost_and_gradient,
         start,
         jac=True,
         method="L-BFGS-B",
@@ -195,33 +196,34 @@ def hold_out(
     radio = radios[known[0]]
     train = split.train[radios[split.train] == radio]
     train = train if len(train) else known
-    held = split.validation[radios[split.validation] == radio]
+    validation = split.validation[radios[split.validation] == radio]
     if len(single_readings(links, split.validation)) < FEWEST:
-        held = held[:0]
-    asked = evenly(held if len(held) else train, most)
+        validation = validation[:0]
+    asked = evenly(validation if len(validation) else train, most)
     apart = distances(
         coordinates(scene, query[asked], scale), coordinates(scene, query[train], scale)
     )
-    if not len(held):
-        here = (query.transmitters[asked][:, None] == query.transmitters[train]).all(-1)
-        apart = apart.masked_fill(here, math.inf)
+    if not len(validation):
+        is_same_place = (query.transmitters[asked][:, None] == query.transmitters[train]).all(-1)
+        apart = apart.masked_fill(is_same_place, math.inf)
     count = min(neighbours, int(apart.isfinite().sum(1).min()))
     if not count:
         return None
     around = train[apart.topk(count, largest=False).indices]  # (b, j)
     groups = torch.cat((asked[:, None], around), 1)  # (b, j + 1)
-    used, place = groups.unique(return_inverse=True)
+    # Residuals of each link are computed once, although it may be around several others.
+    used, used_rows = groups.unique(return_inverse=True)
     values = residuals(used)  # (u, m)
     values = values.to(torch.promote_types(values.dtype, torch.float64))
     products = []
-    for rows in place:
+    for rows in used_rows:
         group = values[rows]  # (j + 1, m)
         products.append((group @ group.mH).real)
-    means = torch.stack(products) / values.shape[1]  # (b, j + 1, j + 1)
-    if not means.any():
+    mean_products = torch.stack(products) / values.shape[1]  # (b, j + 1, j + 1)
+    if not mean_products.any():
         return None
-    of_groups = None if features is None else features(used)[place]
-    return HeldOut(query[asked], query[around.flatten()], means, of_groups)
+    features_of_groups = None if features is None else features(used)[used_rows]
+    return HeldOut(query[asked], query[around.flatten()], mean_products, features_of_groups)
 
 
 def negative_log_likelihood(
@@ -235,8 +237,9 @@ def negative_log_likelihood(
 ) -> Float[Tensor, ""]:
     """-2 log p(held-out labels | labels around them), without constants.
 
-    It is an average over the values of a label. The signal's variance is the maximum-likelihood
-    value at the receiver. With ``by_errors`` all held-out labels have one variance.
+    The likelihood is that of one value of a label, with errors averaged over the values. The
+    signal's variance is the maximum-likelihood value at the receiver. With ``by_errors`` all
+    held-out labels have one variance, so the cost is the log of their squared error.
 
     Source: Rasmussen and Williams, Gaussian Processes for Machine Learning, 2006, section 5.4.2.
     """

@@ -46,11 +46,10 @@ def without_gross_errors(links: Links, size: float = 6.0) -> Links:
         rows = (radios == radio).nonzero()[:, 0]
         threshold = size * torch.maximum(common, robust_deviation(errors[rows]))
         is_kept[rows] = ~are_alone(places[rows], errors[rows], threshold)
-    parts = links.split.parts()
-    train, validation = (
-        parts[name][torch.isin(parts[name], index[is_kept])] for name in ("train", "validation")
-    )
     split: Any = links.split
+    kept = index[is_kept]
+    train = split.train[torch.isin(split.train, kept)]
+    validation = split.validation[torch.isin(split.validation, kept)]
     return replace(links, split=replace(split, train=train, validation=validation))
 
 
@@ -69,14 +68,16 @@ def are_alone(
     large = (errors.abs() > threshold).nonzero()[:, 0]
     if len(errors) <= neighbours or not len(large):
         return is_alone
-    near = []
-    for part in large.split(256):  # for memory's sake
-        apart = distances(places[part], places)  # (f, k)
-        itself = part[:, None] == torch.arange(len(errors))
-        near.append(apart.masked_fill(itself, math.inf).topk(neighbours, largest=False).indices)
-    differs = (errors[large, None] - errors[torch.cat(near)]).abs().amin(1) > threshold
-    is_few = differs.sum() <= max(1, len(errors) // 20)
-    is_alone[large] = differs & is_few
+    nearest = []
+    for rows in large.split(256):  # limits memory
+        apart = distances(places[rows], places)  # (rows, k)
+        is_itself = rows[:, None] == torch.arange(len(errors))
+        apart = apart.masked_fill(is_itself, math.inf)
+        nearest.append(apart.topk(neighbours, largest=False).indices)
+    differences = (errors[large, None] - errors[torch.cat(nearest)]).abs()  # (large, neighbours)
+    differs = differences.amin(1) > threshold  # from all neighbours
+    are_few = differs.sum() <= max(1, len(errors) // 20)
+    is_alone[large] = differs & are_few
     return is_alone
 
 
@@ -87,11 +88,12 @@ def errors_of_law(decades: Float[Tensor, " k"], levels: Float[Tensor, " k"]) -> 
     """
     weights = torch.ones_like(levels)
     for _ in range(20):
+        # Weighted least squares of y = slope x, with x and y relative to their means.
         shares = weights / weights.sum()
-        steps = decades - shares @ decades
-        errors = levels - shares @ levels
-        slope = shares @ (steps * errors) / (shares @ steps.square()).clamp_min(1e-6)
-        errors = errors - slope * steps
+        x = decades - shares @ decades
+        y = levels - shares @ levels
+        slope = shares @ (x * y) / (shares @ x.square()).clamp_min(1e-6)
+        errors = y - slope * x
         # Cauchy's weight at twice the deviation is a half.
         weights = 1 / (1 + (errors / (2 * robust_deviation(errors))).square())
     return errors

@@ -32,7 +32,8 @@ class Process:
         """Whitened covariances L^-1 C, and the Cholesky factor L.
 
         C has the covariances of readings with places; L L' is the covariance matrix of the noisy
-        readings. They lower the variance at a place by the sum of squares of its column in L^-1 C.
+        readings. Readings lower the variance at a place by the sum of squares of the place's column
+        in L^-1 C.
 
         Args:
             asked: Places, ``coordinates`` of scale 1 [m].
@@ -47,10 +48,14 @@ class Process:
 
 
 def resize(module: nn.Module, state: Mapping[str, Tensor], prefix: str, *names: str) -> None:
-    """Gives the buffers ``names`` the shapes in a ``state`` before it is loaded."""
+    """Gives buffers of a module the shapes that they have in a ``state``, before it is loaded.
+
+    ``names`` are names of the buffers, whose keys in the state begin with ``prefix``.
+    """
     for name in names:
-        if f"{prefix}{name}" in state:
-            setattr(module, name, getattr(module, name).new_empty(state[f"{prefix}{name}"].shape))
+        stored = state.get(f"{prefix}{name}")
+        if stored is not None:
+            setattr(module, name, getattr(module, name).new_empty(stored.shape))
 
 
 LIMIT = 6000

@@ -32,14 +32,15 @@ def known_links(links: Links, any_receiver: bool = False) -> list[Int[Tensor, " 
         return [links.split.known]
     known = [links.known(receiver) for receiver in range(len(links.receivers))]
     pairs = zip(links.receivers, known, strict=True)
-    without = [receiver.name for receiver, index in pairs if not len(index)]
-    if without and not (any_receiver and links.split.by_receivers):
+    without_links = [receiver.name for receiver, index in pairs if not len(index)]
+    if without_links and not (any_receiver and links.split.by_receivers):
         kind = "known" if len(links.split.validation) else "training"
-        mend = "choose another split"
+        remedy = "choose another split"
         if links.split.by_receivers:
-            mend += ", or a model for receivers without links"
+            remedy += ", or a model for receivers without links"
         raise ValueError(
-            f"split {links.split.name!r} has no {kind} links of {', '.join(without)}; {mend}"
+            f"split {links.split.name!r} has no {kind} links of {', '.join(without_links)}; "
+            f"{remedy}"
         )
     return known
 
@@ -54,7 +55,8 @@ def limit_known(links: Links, most: int) -> Links:
     """The same links with at most ``most`` known links of each receiver, evenly spread."""
     chosen = torch.cat([evenly(index, most) for index in known_links(links, any_receiver=True)])
     split: Any = links.split
-    train, validation = (part[torch.isin(part, chosen)] for part in (split.train, split.validation))
+    train = split.train[torch.isin(split.train, chosen)]
+    validation = split.validation[torch.isin(split.validation, chosen)]
     return replace(links, split=replace(split, train=train, validation=validation))
 
 
@@ -65,31 +67,34 @@ def folds_of(links: Links, index: Int[Tensor, " k"], count: int = 10) -> Int[Ten
         groups = place_numbers(links.query.transmitters[index])
     else:
         groups = groups[index]
-    numbers, group = groups.unique(return_inverse=True)
+    numbers, group_of_link = groups.unique(return_inverse=True)
     order = torch.randperm(len(numbers), generator=torch.Generator().manual_seed(0))
-    return (order % count)[group]
+    fold_of_group = order % count
+    return fold_of_group[group_of_link]
 
 
 def place_numbers(places: Float[Tensor, "k 3"]) -> Int[Tensor, " k"]:
     """Number of each place, in the order of coordinates; equal places have equal numbers."""
-    which = torch.zeros(len(places), dtype=torch.long)
-    return Query(places, which).unique(with_receivers=False)[1]
+    any_receiver = torch.zeros(len(places), dtype=torch.long)
+    _, numbers = Query(places, any_receiver).unique(with_receivers=False)
+    return numbers
 
 
 def single_readings(links: Links, index: Int[Tensor, " k"]) -> Int[Tensor, " j"]:
     """One random link for each place, receiver and carrier, since repeated readings err alike."""
     if not len(index):
         return index
-    _, which = links.query[index].unique(with_receivers=True)
+    _, numbers = links.query[index].unique(with_receivers=True)  # equal for repeated readings (k,)
     order = torch.randperm(len(index), generator=torch.Generator().manual_seed(0))
-    last = order.new_zeros(int(which.max()) + 1).index_copy(0, which[order], order)
-    return index[last.sort().values]
+    # Of several copies to a number the last one in the random order stays.
+    chosen = order.new_zeros(int(numbers.max()) + 1).index_copy(0, numbers[order], order)
+    return index[chosen.sort().values]
 
 
 def coordinates(
     scene: Scene, query: Query, scale: float | Tensor, features: Float[Tensor, "b c"] | None = None
 ) -> Float[Tensor, "b d"]:
-    """Coordinates of links (float64): the distance of two links is the Euclidean distance D.
+    """Coordinates of links (float64) whose Euclidean distance D is the distance of two links.
 
     With a difference dx of the transmitters [m] and df of ln(carrier), D² = |dx|² + (scale df)².
     With ``one_radio`` |dx|² includes both ends. With ``features`` df is their difference instead.
@@ -103,9 +108,9 @@ def coordinates(
         return torch.cat((positions, scale * features), 1)
     if not scene.has_band:
         return positions
-    half = (scene.frequencies[-1] / scene.frequencies[0]).double().log() / 2
+    half_band = (scene.frequencies[-1] / scene.frequencies[0]).double().log() / 2
     carriers = scene.band_positions(query).double()[:, None]  # (b, 1), from -1 to 1
-    return torch.cat((positions, scale * half * carriers), 1)
+    return torch.cat((positions, scale * half_band * carriers), 1)
 
 
 def coarse(spectra: Float[Tensor, "b rows columns"]) -> Float[Tensor, "b c"]:
@@ -141,9 +146,9 @@ def nearest_places(asked: Float[Tensor, "m d"], known: Float[Tensor, "k d"], cou
     count = min(count, len(known))
     # A k-d tree split at the middles of boxes stays fast if a place is measured often.
     tree = cKDTree(known.double().cpu().numpy(), balanced_tree=False)
-    apart, rows = tree.query(
-        asked.double().cpu().numpy().reshape(-1, known.shape[1]), k=[*range(1, count + 1)]
-    )
+    points = asked.double().cpu().numpy().reshape(-1, known.shape[1])
+    ranks = [*range(1, count + 1)]  # a list keeps the axis of neighbours if count is 1
+    apart, rows = tree.query(points, k=ranks)
     return Near(torch.from_numpy(apart).to(known.device), torch.from_numpy(rows).to(known.device))
 
 
@@ -164,11 +169,11 @@ def reception_probability(
         neighbours: Number of nearest known places to average.
     """
     count = min(neighbours, len(known))
-    parts = []
-    for part in asked.split(16 * PART):
-        near = nearest_places(part[:, :3], known, count).rows
-        parts.append((receives[near].sum(1) + prior) / (count + 1))
-    return torch.cat(parts)
+    probabilities = []
+    for places in asked.split(16 * PART):  # limits memory
+        near = nearest_places(places[:, :3], known, count).rows
+        probabilities.append((receives[near].sum(1) + prior) / (count + 1))
+    return torch.cat(probabilities)
 
 
 def scale_bounds(scene: Scene) -> tuple[float, float]:
@@ -187,7 +192,10 @@ def scale_bounds(scene: Scene) -> tuple[float, float]:
 
 
 def at_directions(values: Tensor, batch: Batch, scene: Scene) -> Tensor:
-    """Labels (b, rows, columns) in the directions of a batch, from the nearest row and column."""
+    """Labels (b, rows, columns) in the directions of a batch, from the nearest row and column.
+
+    Labels without directions are unchanged.
+    """
     grid, asked = scene.task.directions, batch.directions
     if grid is None or asked is None or grid.matches(asked):  # the usual case, recognised at once
         return values

@@ -82,7 +82,7 @@ class Readings(NamedTuple):
         scale = math.nan
         if self.scene.has_band:
             scale = math.sqrt(math.prod(scale_bounds(self.scene)))
-        last: tuple[Tensor, Tensor, Near] | None = None
+        last_search: tuple[Tensor, Tensor, Near] | None = None
         for receiver in receivers.unique().tolist():
             known = (self.receivers == receiver).nonzero()[:, 0]
             if not len(known):
@@ -91,9 +91,9 @@ class Readings(NamedTuple):
             if own is None or folds is None:
                 ends = scaled(places[asked_rows], scale), scaled(self.places[known], scale)
                 # One search for all receivers with readings at the same places.
-                if last is None or not all(map(torch.equal, ends, last)):
-                    last = (*ends, nearest_places(*ends, self.count))
-                nearest_rows = last[2].rows  # (a, j)
+                if last_search is None or not all(map(torch.equal, ends, last_search)):
+                    last_search = (*ends, nearest_places(*ends, self.count))
+                nearest_rows = last_search[2].rows  # (a, j)
                 rows[asked_rows, : nearest_rows.shape[1]] = known[nearest_rows]
                 exists[asked_rows, : nearest_rows.shape[1]] = True
                 continue
@@ -101,10 +101,10 @@ class Readings(NamedTuple):
             known_places = scaled(self.places[known], scale)
             count = min(self.count, len(known))
             for asked in asked_rows.split(size):
-                apart = distances(scaled(places[asked], scale), known_places)
+                apart = distances(scaled(places[asked], scale), known_places)  # (asked, known)
                 is_own = own[asked, None] == folds[known]
                 apart = apart.masked_fill(is_own, math.inf)
-                farthest = int(apart.isfinite().sum(1).min())
+                farthest = int(apart.isfinite().sum(1).min())  # rank that all places have
                 if reach and farthest > self.count:
                     ranks = self._far_ranks(farthest)
                     rows[asked] = known[apart.argsort(1)[:, ranks]]
@@ -144,9 +144,11 @@ class Readings(NamedTuple):
         the sum would then exceed four times ``most``.
         """
         receivers = self.receivers[rows].unique()
-        each = max(1, most // len(receivers), min(16, 4 * most // len(receivers)))
-        parts = [rows[self.receivers[rows] == receiver] for receiver in receivers]
-        asked = torch.cat([evenly(part, each) for part in parts])
-        places, of_asked = self.places[asked], self.receivers[asked]
-        nearest = self.nearest(places, of_asked, folds[asked], folds, reach=True)
-        return HeldOutReadings(asked, self.around(places, of_asked, nearest))
+        per_receiver = max(1, most // len(receivers), min(16, 4 * most // len(receivers)))
+        parts = []
+        for receiver in receivers:
+            parts.append(evenly(rows[self.receivers[rows] == receiver], per_receiver))
+        asked = torch.cat(parts)
+        places, asked_receivers = self.places[asked], self.receivers[asked]
+        nearest = self.nearest(places, asked_receivers, folds[asked], folds, reach=True)
+        return HeldOutReadings(asked, self.around(places, asked_receivers, nearest))

@@ -106,25 +106,26 @@ class PathTerms(nn.Module):
             self.regions.copy_(links.uncertainties)
         index = links.split.known
         query = links.query[index]
-        known = query.transmitters, query.receivers, errors
+        transmitters, receivers = query.transmitters, query.receivers
         if chooses:
-            self._choose(*known, folds_of(links, index))
+            self._choose(transmitters, receivers, errors, folds_of(links, index))
             self.unseen = errors.new_zeros(len(links)).index_copy(0, index, self.unseen)
-        radios = self.scene.radio_of(query.receivers)
+        radios = self.scene.radio_of(receivers)
         for radio in radios.unique().tolist():
             rows = radios == radio
-            columns, candidates = self._candidates(*(part[rows] for part in known[:2]))
-            solution = self._solve(columns, errors[rows], 0 * radios[rows], self.used)
+            columns, candidates = self._candidates(transmitters[rows], receivers[rows])
+            single_fold = 0 * radios[rows]
+            solution = self._solve(columns, errors[rows], single_fold, self.used)
             self.breaks[radio] = candidates[solution.numbers[0]]
             self.coefficients[radio] = solution.coefficients[0] * self.used.any()
             variances = solution.variances[0] * errors[rows].square().mean()
             self.deviations[radio] = variances.sqrt()
-        is_new = radios.bincount(minlength=len(self.breaks)) == 0
+        has_no_links = radios.bincount(minlength=len(self.breaks)) == 0
         for values in (self.breaks, self.coefficients, self.deviations):
-            values[is_new] = values[~is_new].mean(0)
+            values[has_no_links] = values[~has_no_links].mean(0)
 
     def take_receivers(self, scene: Scene, known: Tensor | None = None) -> None:
-        """New receivers stand at known places."""
+        """Replaces the receivers by new ones, whose places are known exactly."""
         self.regions = self.regions.new_zeros(len(scene.receivers))
 
     def facts(self) -> Mapping[str, object]:
@@ -155,9 +156,9 @@ class PathTerms(nn.Module):
             held_out, used = min(trials, key=lambda trial: trial[0].abs().mean().item())
             falls = self.unseen.abs() - held_out.abs()
             # Errors of readings at one place are similar, so each place counts by its mean.
-            of_places = falls.new_zeros(len(counts)).index_add(0, places, falls) / counts
-            chance = of_places.std() / len(counts) ** 0.5
-            is_clear = of_places.mean() > self.options.errors * chance
+            place_falls = falls.new_zeros(len(counts)).index_add(0, places, falls) / counts
+            standard_error = place_falls.std() / len(counts) ** 0.5
+            is_clear = place_falls.mean() > self.options.errors * standard_error
             if not is_clear or falls.mean() < self.options.least * self.unseen.abs().mean():
                 return
             self.used.copy_(used)
@@ -178,13 +179,14 @@ class PathTerms(nn.Module):
         radios = self.scene.radio_of(receivers)
         for radio in radios.unique().tolist():
             rows = radios == radio
-            columns, _ = self._candidates(transmitters[rows], receivers[rows])
-            _, fold = folds[rows].unique(return_inverse=True)
+            columns, _ = self._candidates(transmitters[rows], receivers[rows])  # (k, m)
+            _, fold = folds[rows].unique(return_inverse=True)  # numbered from 0 (k,)
             if not fold.any():
-                continue  # no other fold
+                continue  # a single fold has no other readings
             solution = self._solve(columns, errors[rows], fold, used)
             chosen = self._columns_with_break(solution.numbers[fold])  # (k, n)
-            corrected[rows] -= (columns.gather(1, chosen) * solution.coefficients[fold]).sum(1)
+            corrections = columns.gather(1, chosen) * solution.coefficients[fold]  # (k, n)
+            corrected[rows] -= corrections.sum(1)
         return corrected
 
     def _solve(
@@ -197,49 +199,66 @@ class PathTerms(nn.Module):
         """Coefficients fitted to the readings outside of each fold, at the best break point.
 
         A single fold is fitted to its own readings.
+
+        Args:
+            columns: Factors of the coefficients, with all candidate break points.
+            levels: Levels to which terms are fitted.
+            folds: Fold of each reading, from 0.
+            used: True for the terms in use.
         """
-        both = torch.cat((columns, levels[:, None]), 1)
+        # Normal equations of ridge regression: (X'X + P) c = X'y, from sums over readings.
+        both = torch.cat((columns, levels[:, None]), 1)  # X and y (k, m + 1)
         parts = [both[folds == fold] for fold in range(int(folds.max()) + 1)]
         grams = torch.stack([part.T @ part for part in parts])  # (f, m + 1, m + 1), of each fold
         sums = grams.sum(0) - grams if len(grams) > 1 else grams  # of all other folds
         options = self.options
         orders = torch.arange(1, options.harmonics + 1).double().repeat_interleave(2)
-        # Precisions of the prior, in units of a reading's; level and slope are nearly free.
-        free, one = orders.new_full((2,), 1e-3), orders.new_full((3,), options.alike)
-        prior = torch.cat((free, options.alike * orders.square(), one, one[:1] / options.slope**2))
+        # Precisions P of the prior, in units of a reading's; level and slope are nearly free.
+        free = orders.new_full((2,), 1e-3)
+        of_lobes = options.alike * orders.square()
+        of_heights = orders.new_full((3,), options.alike)
+        of_break = of_heights[:1] / options.slope**2
+        prior = torch.cat((free, of_lobes, of_heights, of_break))  # (n,)
+        # ``used`` has the break point first, the columns have it last.
         widths = torch.tensor([len(orders), 3, 1])
         is_used = torch.cat((used.new_ones(2), used[[1, 2, 0]].repeat_interleave(widths)))
-        kept = is_used.nonzero()[:, 0]
+        kept = is_used.nonzero()[:, 0]  # (p,)
         trials = []
         for number in range(options.breaks if used[0] else 1):
             chosen = self._columns_with_break(torch.tensor([number]))[0, kept]
-            products = sums[:, chosen, -1]  # (f, p)
+            products = sums[:, chosen, -1]  # X'y (f, p)
             gram = sums[:, chosen][:, :, chosen] + prior[kept].diag()  # (f, p, p)
             inverse = torch.linalg.inv(gram)
-            solved = (inverse @ products[..., None])[..., 0]  # (f, p)
-            trials.append(((solved * products).sum(1), solved, inverse.diagonal(dim1=1, dim2=2)))
+            solved = (inverse @ products[..., None])[..., 0]  # c (f, p)
+            explained = (solved * products).sum(1)  # fall of the squared errors (f,)
+            trials.append((explained, solved, inverse.diagonal(dim1=1, dim2=2)))
         explained, solved, variances = (torch.stack(part) for part in zip(*trials, strict=True))
-        numbers = explained.argmax(0)  # (f,)
-        folds = torch.arange(len(numbers))
+        numbers = explained.argmax(0)  # of the best break point for each fold (f,)
+        each_fold = torch.arange(len(numbers))
         zeros = solved.new_zeros(len(numbers), len(prior))
-        coefficients = zeros.index_copy(1, kept, solved[numbers, folds])
-        errors = zeros.index_copy(1, kept, options.alike * variances[numbers, folds])
+        coefficients = zeros.index_copy(1, kept, solved[numbers, each_fold])
+        errors = zeros.index_copy(1, kept, options.alike * variances[numbers, each_fold])
         return Solution(coefficients, errors, numbers)
 
     def _columns_with_break(self, numbers: Int[Tensor, " f"]) -> Int[Tensor, "f n"]:
-        """Indices of the columns of ``_candidates`` that remain with break point ``numbers``."""
-        first = torch.arange(self.coefficients.shape[1] - 1).expand(len(numbers), -1)
-        return torch.cat((first, first[:, -1:] + 1 + numbers[:, None]), 1)
+        """Indices of the columns of ``_candidates`` that remain with each of some break points.
+
+        Columns of the break points follow all others, and one of them remains.
+        """
+        others = torch.arange(self.coefficients.shape[1] - 1).expand(len(numbers), -1)  # (f, n - 1)
+        of_break = others[:, -1:] + 1 + numbers[:, None]
+        return torch.cat((others, of_break), 1)
 
     def _candidates(
         self, transmitters: Float[Tensor, "k 3"], receivers: Int[Tensor, " k"]
     ) -> tuple[Float[Tensor, "k m"], Float[Tensor, " j"]]:
         """``_columns`` with all break points tried at one receiver, and these break points."""
-        none = self.breaks.new_zeros(len(receivers), 0)
+        no_breaks = self.breaks.new_zeros(len(receivers), 0)
+        decades = self._columns(transmitters, receivers, no_breaks)[:, 1]
         shares = torch.linspace(0.05, 0.95, self.options.breaks).double()
-        candidates = self._columns(transmitters, receivers, none)[:, 1].quantile(shares)
-        beyond = candidates.expand(len(receivers), -1)
-        return self._columns(transmitters, receivers, beyond), candidates
+        candidates = decades.quantile(shares)
+        breaks = candidates.expand(len(receivers), -1)  # (k, j)
+        return self._columns(transmitters, receivers, breaks), candidates
 
     def _columns(
         self,
@@ -247,23 +266,26 @@ class PathTerms(nn.Module):
         receivers: Int[Tensor, " b"],
         breaks: Float[Tensor, "b j"],
     ) -> Float[Tensor, "b m"]:
-        """Factors of coefficients: 1, decades, lobes, heights, decades beyond each break point."""
+        """Factors of coefficients: 1, decades, lobes, heights, decades beyond each break point.
+
+        ``breaks`` has the break points of each link [log10 of a distance in m].
+        """
         positions = self.scene.positions(transmitters)[receivers]
-        steps = (transmitters - positions).double()  # (b, 3)
-        # As of the law, distances below 0.1 m count as 0.1 m.
+        ways = (transmitters - positions).double()  # (b, 3)
+        # As in ``path_loss``: the region of an estimated position, and at least 0.1 m.
         regions = 0.56 * self.regions[receivers].square()
-        lengths = (steps.square().sum(1) + regions).sqrt().clamp_min(0.1)
+        lengths = (ways.square().sum(1) + regions).sqrt().clamp_min(0.1)
         decades = lengths.log10()[:, None]
-        orders = torch.arange(1, self.options.harmonics + 1).to(steps)
-        turns = torch.atan2(steps[:, 1], steps[:, 0])[:, None] * orders  # (b, harmonics)
-        lobes = torch.stack((turns.cos(), turns.sin()), 2).flatten(1)
+        orders = torch.arange(1, self.options.harmonics + 1).to(ways)
+        turns = torch.atan2(ways[:, 1], ways[:, 0])[:, None] * orders  # (b, harmonics)
+        lobes = torch.stack((turns.cos(), turns.sin()), 2).flatten(1)  # (b, 2 harmonics)
         # Heights are limited to the box of the links, where they were fitted.
-        low, high = self.scene.lower[2].to(steps), self.scene.upper[2].to(steps)
-        height = transmitters[:, 2].to(steps).clamp(low, high) - (low + high) / 2
+        low, high = self.scene.lower[2].to(ways), self.scene.upper[2].to(ways)
+        height = transmitters[:, 2].to(ways).clamp(low, high) - (low + high) / 2
         height = height / ((high - low) / 2).clamp_min(1e-3)
-        sine = steps[:, 2] / lengths
+        sine = ways[:, 2] / lengths
         heights = torch.stack((height, sine, (3 * sine.square() - 1) / 2), 1)
-        beyond = (decades - breaks).clamp_min(0)
+        beyond = (decades - breaks).clamp_min(0)  # (b, j)
         return torch.cat((torch.ones_like(decades), decades, lobes, heights, beyond), 1)
 
 

@@ -78,12 +78,12 @@ class Equations:
         for start in track(range(0, len(places), size), "kriging"):
             part = slice(start, start + size)
             fields = margins(part).flatten(2).to(torch.complex128)  # (b, n, m)
-            noise = residuals[part].abs().double().square().mean((1, 2))  # (b,)
-            power = labels[part].abs().double().square().mean((1, 2))  # (b,)
-            powers = (noise + least * power)[:, None, None]
-            grams.append(fields.conj() @ fields.mT / powers)  # (b, n, n)
-            numbers = residuals[part].flatten(1)[..., None].to(fields)  # (b, m, 1)
-            sides.append((fields.conj() @ numbers / powers)[..., 0])
+            residual_power = residuals[part].abs().double().square().mean((1, 2))  # (b,)
+            label_power = labels[part].abs().double().square().mean((1, 2))  # (b,)
+            noise_power = (residual_power + least * label_power)[:, None, None]  # p
+            grams.append(fields.conj() @ fields.mT / noise_power)  # (b, n, n)
+            r = residuals[part].flatten(1)[..., None].to(fields)  # (b, m, 1)
+            sides.append((fields.conj() @ r / noise_power)[..., 0])
         return cls(places.double(), torch.cat(grams), torch.cat(sides))
 
     def __getitem__(self, index: object) -> "Equations":
@@ -115,18 +115,20 @@ class PathField(nn.Module):
         inverse = torch.cholesky_inverse(torch.linalg.cholesky(between))
         grams = equations.grams * (process.deviation**2 / process.nugget)  # (k, n, n)
         sides = equations.sides / process.nugget  # (k, n)
-        # With u the strengths over their deviation: (K^-1 + G) u = s. The (n, n) blocks of single
-        # places are the preconditioner.
-        of_places = torch.eye(grams.shape[1], dtype=torch.float64)
-        blocks = grams + inverse.diagonal()[:, None, None] * of_places
-        precondition = torch.linalg.inv(blocks)
-        inverse = inverse.to(sides.dtype)
+        # The most probable strengths u solve (K^-1 + G) u = deviation² s, with the kernel K between
+        # places, G = ``grams`` and s = ``sides``. The (n, n) blocks of single places are the
+        # preconditioner.
+        of_paths = torch.eye(grams.shape[1], dtype=torch.float64)
+        blocks = grams + inverse.diagonal()[:, None, None] * of_paths  # (k, n, n)
+        inverse_blocks = torch.linalg.inv(blocks)
+        inverse = inverse.to(sides.dtype)  # K^-1
 
         def times(strengths: Tensor) -> Tensor:
+            """(K^-1 + G) times strengths (k, n)."""
             return inverse @ strengths + (grams @ strengths[..., None])[..., 0]
 
         def preconditioned(residual: Tensor) -> Tensor:
-            return (precondition @ residual[..., None])[..., 0]
+            return (inverse_blocks @ residual[..., None])[..., 0]
 
         solution = conjugate_gradients(times, preconditioned, sides * process.deviation**2)
         self.places = equations.places.clone()
@@ -212,6 +214,7 @@ class PathPosterior(Posterior):
             rows = (query.receivers == receiver).nonzero()[:, 0]
 
             def margins(part: slice, rows: Tensor = rows) -> Tensor:
+                """Margins of a part of this receiver's links; a default binds its ``rows``."""
                 return self.margins(query[rows[part]].to(device)).cpu()
 
             places = query.transmitters[rows]
@@ -292,7 +295,7 @@ def conjugate_gradients(
         x = x + step * direction
         residual = residual - step * change
         conditioned = precondition(residual)
-        before, slope = slope, dot(residual, conditioned)
-        # Directions are conjugate: times(one) is orthogonal to all others.
-        direction = conditioned + slope / before * direction
+        last_slope, slope = slope, dot(residual, conditioned)
+        # Directions are conjugate: ``times`` of each is orthogonal to all others.
+        direction = conditioned + slope / last_slope * direction
     return x

@@ -51,7 +51,12 @@ class Posterior(nn.Module):
         raise NotImplementedError
 
     def solve(self, links: Links, residuals: Callable[[Int[Tensor, " j"]], Tensor]) -> None:
-        """Computes weights of the known links; ``residuals`` maps j rows to values (j, *shape)."""
+        """Computes everything that ``mean`` needs from the residuals of the known links.
+
+        Args:
+            links: Links with a split.
+            residuals: Function from rows of the known links (j,) to residuals (j, *shape).
+        """
         raise NotImplementedError
 
     def start_from(self, other: Any) -> None:

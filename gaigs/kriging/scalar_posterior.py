@@ -21,8 +21,9 @@ from gaigs.kriging.scalar import ScalarProcess
 class ScalarPosterior(Posterior):
     """Kriged residuals of scalar labels, with a ``ScalarProcess``.
 
-    The weight of the trend is a mean of the candidates. Each counts by its likelihood on the
-    validation links, or equally without such links. All readings of a place count as one.
+    The weight of the trend is the mean of the candidate weights. Each candidate counts by its
+    likelihood on the validation links, or equally without such links. All readings of a place count
+    as one.
     """
 
     def __init__(self, scene: Scene):
@@ -47,7 +48,8 @@ class ScalarPosterior(Posterior):
         count = len(links.split.train)
         held = torch.arange(count, len(index)) if len(links.split.validation) else None
         process = self.process.cpu()
-        # A refit has two maximisations, or one without validation links.
+        # Numbers of maximisations, for the progress bar. A refit has two, or one without validation
+        # links; there is one refit for each candidate, and one for their mean.
         refits = 1 if held is None else 2 * (len(weights) + (len(weights) > 1))
         fits = process.fit_count(1) if self.start is None else 0
         with stages.stage("kriging", fits + refits):
@@ -61,6 +63,7 @@ class ScalarPosterior(Posterior):
             self.seen = index[torch.cat(rows).unique()]
 
             def refit(values: Tensor) -> float:
+                """Fits again from step 1; returns the negative log likelihood."""
                 process.logarithms, process.choice = logarithms, choice
                 return process.refit(values, groups)
 
@@ -68,10 +71,11 @@ class ScalarPosterior(Posterior):
             if held is not None and len(weights) > 1:
                 # Errors of readings at one place are similar, so they count as one reading.
                 places = links.query[index[held]].place_keys.unique()
-                each = len(held) / len(places)
+                readings_per_place = len(held) / len(places)
                 costs = torch.tensor([refit(values) for values in residuals], dtype=torch.float64)
                 # A cost is -inf if a trend explains all labels.
-                shares = torch.softmax(-costs.clamp_min(-1e300) / each, 0)
+                log_likelihoods = -costs.clamp_min(-1e300) / readings_per_place
+                shares = torch.softmax(log_likelihoods, 0)
             refit(shares @ torch.stack(residuals))
         return (shares @ weights).item()
 

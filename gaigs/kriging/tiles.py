@@ -69,17 +69,19 @@ class Tiles(nn.Module):
 
     def add(self, places: Float[Tensor, "m d"], readings: Merged) -> None:
         """Divides the readings of one more receiver, at ``places``, into tiles."""
-        parts = halves(places, self.core)
-        centres = torch.stack([places[part].mean(0) for part in parts])
+        members = halves(places, self.core)  # rows that belong to each tile
+        centres = torch.stack([places[rows].mean(0) for rows in members])
         near = nearest_places(centres, places, self.size).rows  # (t, j)
         around = nearest_places(places, places, self.neighbours).rows  # (m, n)
         tiles = []
-        for part, nearest in zip(parts, near, strict=True):
-            order = torch.cat((part, around[part].mT.flatten(), nearest))  # nearest ranks first
-            tiles.append([*dict.fromkeys(order.tolist())][: near.shape[1]])  # without repetition
+        for own, nearest in zip(members, near, strict=True):
+            neighbours = around[own].mT.flatten()  # nearest neighbours of all first
+            order = torch.cat((own, neighbours, nearest)).tolist()
+            without_repetition = [*dict.fromkeys(order)]
+            tiles.append(without_repetition[: near.shape[1]])
         owners = torch.empty_like(readings.rows)
-        for number, part in enumerate(parts, len(self)):
-            owners[part] = number
+        for number, own in enumerate(members, len(self)):
+            owners[own] = number
         rows = near.new_tensor(tiles) + len(self.readings)
         for name, added in zip(self.stored, (*readings, owners, rows), strict=True):
             old = getattr(self, name)
@@ -141,7 +143,7 @@ def merged(
     places: Float[Tensor, "k d"], values: Float[Tensor, " k"], variances: Float[Tensor, " k"]
 ) -> Merged:
     """Readings merged to one for each place, with the same posterior of the process."""
-    unique, numbers = places.unique(dim=0, return_inverse=True)
+    unique, numbers = places.unique(dim=0, return_inverse=True)  # place of each reading (k,)
     rows = torch.arange(len(places), device=places.device)
     first = rows.new_full((len(unique),), len(rows)).scatter_reduce(0, numbers, rows, "amin")
     precisions = values.new_zeros(len(unique)).index_add(0, numbers, 1 / variances)
@@ -154,16 +156,16 @@ def halves(places: Float[Tensor, "k d"], most: int) -> list[Int[Tensor, " _"]]:
 
     Halving ends when no box has more than ``most`` places.
     """
-    parts = [torch.arange(len(places), device=places.device)]
-    done = []
-    while parts:
-        part = parts.pop()
-        if len(part) <= most:
-            done.append(part)
+    pending = [torch.arange(len(places), device=places.device)]
+    small = []
+    while pending:
+        rows = pending.pop()
+        if len(rows) <= most:
+            small.append(rows)
             continue
-        inside = places[part]
-        axis = int((inside.amax(0) - inside.amin(0)).argmax())
+        inside = places[rows]
+        axis = int((inside.amax(0) - inside.amin(0)).argmax())  # the longest edge
         order = inside[:, axis].argsort()
-        middle = len(part) // 2
-        parts += [part[order[:middle]], part[order[middle:]]]
-    return done
+        middle = len(rows) // 2
+        pending += [rows[order[:middle]], rows[order[middle:]]]
+    return small

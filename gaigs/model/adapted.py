@@ -29,9 +29,9 @@ from gaigs.registry import register, registry
 class Adapted(Wrapper):
     """A model whose errors at a receiver are predicted from a few readings there, and removed.
 
-    The prediction at x is y(x) + c(x)' (C + N)^-1 e, the best linear one. y is the model at
-    receivers without links, and e has its errors at the readings. C and c are error covariances
-    among readings and with x. N is the noise, which repeated readings of a place share.
+    The prediction at x is y(x) + c(x)' (C + N)^-1 e, the best linear one. y is the prediction of
+    ``base``. e has the ``errors`` of ``base`` at the readings. C and c are error covariances among
+    readings and with x. N is the diagonal matrix of ``noises``.
 
     Args:
         base: The model at these receivers, or its configuration if a state is to be loaded.
@@ -39,15 +39,16 @@ class Adapted(Wrapper):
     Source: Robinson, That BLUP is a good thing: the estimation of random effects, 1991.
     """
 
-    law: Tensor  # (4,)
+    law: Tensor  # level, noise, field, length (4,), see the module
     places: Tensor  # transmitters of the readings [m], and numbers of their receivers (k, 4)
-    noises: Tensor  # variances (k,)
-    errors: Tensor  # (k,)
+    noises: Tensor  # noise over the number of averaged readings (k,)
+    errors: Tensor  # reading minus prediction of ``base`` (k,)
 
     def __init__(self, scene: Scene, base: dict | Model):
         super().__init__(scene)
-        is_built = isinstance(base, Model)
-        self.base: Model = base if is_built else registry("model").build(base, scene=scene)
+        if not isinstance(base, Model):
+            base = registry("model").build(base, scene=scene)
+        self.base: Model = base
         self.chunk = self.base.chunk
         shapes = {"law": (4,), "places": (0, 4), "noises": (0,), "errors": (0,)}
         for name, shape in shapes.items():
@@ -61,29 +62,33 @@ class Adapted(Wrapper):
         rows = evenly(torch.arange(len(links)), most)
         query = links.query[rows]
         self.places = _coordinates(query)
-        self.noises = self.law[1] / links.query.votes[rows]
+        _, noise, _, _ = self.law
+        self.noises = noise / links.query.votes[rows]
         self.errors = (links.labels[rows] - self.base.predict(query).cpu()).double()
         self.to(self.base.device)
 
     def forward(self, batch: Batch) -> Prediction:
-        towards, factor = self._process.whitened(_coordinates(batch.query))  # (k, b), (k, k)
-        white = torch.linalg.solve_triangular(factor, self.errors[:, None], upper=False)
+        # With C + N = L L', the correction is (L^-1 c)' (L^-1 e).
+        white_covariances, factor = self._process.whitened(_coordinates(batch.query))  # (k, b), L
+        white_errors = torch.linalg.solve_triangular(factor, self.errors[:, None], upper=False)
+        corrections = (white_covariances.T @ white_errors)[:, 0]  # (b,)
         value = self.base(batch).value
-        return Prediction(value + (towards.T @ white)[:, 0].to(value), {})
+        return Prediction(value + corrections.to(value), {})
 
     def deviations(self, batch: Batch) -> Float[Tensor, " b"]:
         """Standard deviations of the errors, relative to those without readings."""
-        towards, _ = self._process.whitened(_coordinates(batch.query))
-        total = self.law[:3].sum()
-        return (1 - towards.square().sum(0) / total).sqrt().float()
+        white_covariances, _ = self._process.whitened(_coordinates(batch.query))  # (k, b)
+        variance = self.law[:3].sum()  # level + noise + field, without readings
+        return (1 - white_covariances.square().sum(0) / variance).sqrt().float()
 
     @property
     def _process(self) -> Process:
+        """The Gaussian process of the errors; receivers are independent of each other."""
         level, noise, field, length = self.law
 
         def covariances(a: Float[Tensor, "m 4"], b: Float[Tensor, "n 4"]) -> Float[Tensor, "m n"]:
-            is_same = a[:, None, 3] == b[:, 3]
-            return is_same * (level + field * kernel(a[:, :3], b[:, :3], length))
+            is_same_receiver = a[:, None, 3] == b[:, 3]
+            return is_same_receiver * (level + field * kernel(a[:, :3], b[:, :3], length))
 
         return Process(covariances, self.places, self.noises, noise.item())
 
@@ -94,7 +99,7 @@ class Adapted(Wrapper):
     def at_receivers(
         self, receivers: Sequence[Receiver], known: Int[Tensor, " k"] | None = None
     ) -> Model:
-        return self.base.at_receivers(receivers, known)  # readings say nothing of others
+        return self.base.at_receivers(receivers, known)  # the readings are of other receivers
 
     def adapt(self, links: Links) -> Any:
         raise ValueError(

@@ -25,7 +25,7 @@ from gaigs.registry import name_of
 
 
 def batch_size(links: Links, model: Model | None = None) -> int:
-    """Number of links to predict at a time.
+    """Number of links to predict at a time; without a ``model`` as for a trained one.
 
     Scalar labels have larger batches, since they take little memory. Look-ups have the largest,
     since each batch takes time for every receiver.
@@ -53,25 +53,28 @@ def predicted(
 def weighed_residuals(
     links: Links, fallback: Model, values: Tensor, weights: Sequence[float]
 ) -> dict[float, Tensor]:
-    """Residuals (k, m) of the known links for each weight of a trend, thinned by ``thin_labels``.
+    """Residuals (k, m) of the known links from means of two models, for each weight of the first.
+
+    Residuals are thinned to m numbers by ``thin_labels``.
 
     Args:
         links: Links with a split.
-        fallback: Model whose weight is 1 minus the trend's.
+        fallback: The second model, whose weight is 1 minus that of the first, the trend.
         values: The trend's predictions of the known links.
         weights: Weights of the trend.
     """
     index, task = links.split.known, links.task
-    # Without an alignment each number stands alone, so labels may be thinned first.
-    is_turned = type(task).align is not Task.align
+    # Without an alignment each number stands alone, so labels may be thinned first, to save time.
+    aligns = type(task).align is not Task.align
     parts: dict[float, list[Tensor]] = {weight: [] for weight in weights}
     for rows in torch.arange(len(index)).split(PART):
-        labels, trend = links.labels[index[rows]], values[rows]
-        other = predicted(fallback, links, index[rows])
-        if not is_turned:
-            labels, trend, other = map(thin_labels, (labels, trend, other))
+        labels, of_trend = links.labels[index[rows]], values[rows]
+        of_fallback = predicted(fallback, links, index[rows])
+        if not aligns:
+            labels, of_trend = thin_labels(labels), thin_labels(of_trend)
+            of_fallback = thin_labels(of_fallback)
         for weight, residuals in parts.items():
-            mean = blend(task, trend, other, weight)
+            mean = blend(task, of_trend, of_fallback, weight)
             residuals.append(thin_labels(task.align(labels, mean) - mean))
     return {weight: torch.cat(residuals) for weight, residuals in parts.items()}
 
@@ -96,25 +99,29 @@ def share_at_new(links: Links, held: Int[Tensor, " k"], one: Tensor, other: Mode
     """
     receivers = links.query.receivers[held]
     _, numbers, counts = receivers.unique(return_inverse=True, return_counts=True)
-    votes = 1.0 / counts[numbers].double() / len(counts)  # (k,)
+    votes = 1.0 / counts[numbers].double() / len(counts)  # (k,), equal sums for all receivers
     both = torch.stack((one, predicted(other, links, held))).double()  # (2, k)
     errors = both - links.labels[held]
     (a, c), (_, b) = ((votes * errors) @ errors.T).tolist()
-    draw = (a + b) / 2 / len(counts)
-    curvature = a + b - 2 * c + 2 * draw
-    # Without an error any share is right.
-    return min(1.0, max(0.0, (b - c + draw) / curvature)) if curvature > 0 else 0.5
+    prior = (a + b) / 2 / len(counts)  # m / n
+    curvature = a + b - 2 * c + 2 * prior  # half the second derivative over w
+    if curvature <= 0:  # no errors: any weight is right
+        return 0.5
+    return min(1.0, max(0.0, (b - c + prior) / curvature))
 
 
 def spreads(model: Model, links: Links, index: Int[Tensor, " k"], values: Tensor) -> Tensor:
-    """``Model.spread`` for the links of ``index``, on the CPU; ``values`` are their predictions."""
-    directions, device = links.task.directions, model.device
+    """Standard deviations of labels for the links of ``index``, by ``Model.spread``, on the CPU.
+
+    ``values`` are the model's predictions of these links.
+    """
     size = batch_size(links, model)
-    parts = []
-    for query, part in zip(links.query[index].parts(size), values.split(size), strict=True):
-        batch = Batch(query, directions).to(device)
-        parts.append(model.spread(batch, part.to(device)).cpu())
-    return torch.cat(parts)
+    queries = links.query[index].parts(size)
+    deviations = []
+    for query, value in zip(queries, values.split(size), strict=True):
+        batch = Batch(query, links.task.directions).to(model.device)
+        deviations.append(model.spread(batch, value.to(model.device)).cpu())
+    return torch.cat(deviations)
 
 
 def calibrated(model: Model, links: Links) -> Calibration | None:
@@ -126,12 +133,14 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
         return None
 
     def answer(fold: Model, index: Int[Tensor, " k"]) -> Answers:
+        """Predictions and deviations of links that the model of a fold has not seen."""
         values = predicted(fold, links, index)
-        # Hyperparameters of a fold may state larger or smaller deviations everywhere.
+        # Other hyperparameters of a fold would scale all its deviations.
         fold.take_hyperparameters(model)
         deviations = spreads(fold, links, index, values)
-        batch = Batch(links.query[index[:1]], links.task.directions).to(fold.device)
-        return Answers(values, deviations, fold.deviations(batch) is not None)
+        first_link = Batch(links.query[index[:1]], links.task.directions).to(fold.device)
+        states_deviations = fold.deviations(first_link) is not None
+        return Answers(values, deviations, states_deviations)
 
     with stages.timed("intervals"):
         unseen = model.unseen(links)
@@ -140,7 +149,8 @@ def calibrated(model: Model, links: Links) -> Calibration | None:
             return calibration
         known = links.query.receivers[links.split.known].bincount(minlength=len(links.receivers))
         elsewhere = at_new_receivers(model, links)
-        return replace(calibration, widths=(known == 0).double(), elsewhere=elsewhere)
+        widths = (known == 0).double()  # receivers without links have intervals of ``elsewhere``
+        return replace(calibration, widths=widths, elsewhere=elsewhere)
 
 
 def at_new_receivers(
@@ -159,59 +169,63 @@ def at_new_receivers(
     split: Any = links.split
     of_links = links.query.receivers
     has_links = of_links[split.train if model.is_trained else split.known].unique()
-    # A look-up is asked without the receiver: it has learnt of none.
+    # A trained model has learnt from a receiver that is predicted as new; a look-up leaves it out.
     taught = has_links if model.is_trained else has_links[:0]
     asked = split.known
-    # The room has learnt from the training links: validation links show its errors.
+    # A trained model has seen the training links, so only validation links show its errors.
     if model.is_trained and not split.by_receivers:
         asked = split.validation
     asked = single_readings(links, asked)
     chosen = evenly(of_links[asked].unique(), receivers)
-    rows, values = [], []
+    indices, values = [], []
     for receiver in chosen.tolist():
         others = has_links[has_links != receiver]
         if len(others) < 2:
             return None
         index = evenly(asked[of_links[asked] == receiver], most // len(chosen))
         moved = model.at_receivers([links.receivers[receiver]], others)
-        first = replace(links.query, receivers=torch.zeros_like(of_links))
-        rows.append(index)
-        values.append(predicted(moved, replace(links, query=first), index))
-    if len(rows) < 3:
+        # The moved model has this receiver alone, with the number 0.
+        query = replace(links.query, receivers=torch.zeros_like(of_links))
+        indices.append(index)
+        values.append(predicted(moved, replace(links, query=query), index))
+    if len(indices) < 3:
         return None
-    index, answers = torch.cat(rows), torch.cat(values)
+    index, answers = torch.cat(indices), torch.cat(values)
     query = links.query[index]
-    alike = replace(query, receivers=torch.zeros_like(query.receivers))
+    # All new receivers share the quantiles, so they have one number.
+    as_one = replace(query, receivers=torch.zeros_like(query.receivers))
     calibration = Calibration.of(
         links.task,
         links.labels[index],
         answers,
         usual_deviations(answers),
-        alike,
+        as_one,
         None,
-        alike,
+        as_one,
         new=NewReceivers(query.receivers, torch.isin(query.receivers, taught)),
     )
     if not links.task.is_scalar:
         return calibration
-    errors = [
-        (links.labels[part] - value).double() for part, value in zip(rows, values, strict=True)
-    ]
-    places = [links.query.transmitters[part] for part in rows]
+    errors = []
+    places = []
+    for index, value in zip(indices, values, strict=True):
+        errors.append((links.labels[index] - value).double())
+        places.append(links.query.transmitters[index])
     return replace(calibration, scatter=fit_law(errors, places))
 
 
 def count_in_time(model: Model, links: Links, most: int) -> int:
-    """The number of a receiver's known links, at most ``most``, that can be kriged in time.
+    """The number of a receiver's known links, from 100 to ``most``, that can be kriged in time.
 
     The trained model predicts the links once, and once more for each half of the validation links.
-    These three predictions may take a third of the time that is left.
+    These three predictions may take a third of the run's time that is left.
     """
-    if math.isinf(stages.left()):
+    if math.isinf(stages.left()):  # the run has no time limit
         return most
     sample = evenly(links.split.known, 64)
     predicted(model, links, sample[:1])  # the first prediction compiles and loads
     began = time.monotonic()
     predicted(model, links, sample)
     link_time = max(time.monotonic() - began, 1e-9) / len(sample)  # [s]
-    return int(min(most, max(100, stages.left() / 9 / link_time / links.scene.radios)))
+    count = stages.left() / 9 / link_time / links.scene.radios  # 3 predictions, a third of the time
+    return int(min(most, max(100, count)))

@@ -160,16 +160,19 @@ class Model(Movable):
 
     @torch.no_grad()
     def evaluate(self, batch: Batch) -> Tensor:
-        """Values (b, *shape) of a batch in all its directions, ``chunk`` pairs at a time."""
+        """Predicted labels (b, *shape), with ``chunk`` (link, direction) pairs at a time."""
         if self.chunk is None or batch.directions is None:
             return self(batch).value
         rays = batch.directions.flatten()
         (count,) = rays.shape
         values = []
         for query in batch.query.parts(max(1, self.chunk // count)):
-            parts = (rays[start : start + self.chunk] for start in range(0, count, self.chunk))
-            chunks = [replace(batch, query=query, directions=part, labels=None) for part in parts]
-            value = torch.cat([self(part).value for part in chunks], 1)
+            chunks = []
+            for start in range(0, count, self.chunk):
+                some_rays = rays[start : start + self.chunk]
+                chunk = replace(batch, query=query, directions=some_rays, labels=None)
+                chunks.append(self(chunk).value)
+            value = torch.cat(chunks, 1)  # (links, rays)
             values.append(value.unflatten(1, batch.directions.shape))
         return torch.cat(values)
 
@@ -265,9 +268,9 @@ class Model(Movable):
         return request.estimates(fields, scene)
 
     def to_xarray(self, transmitters: object, interval: float | None = None, **named: Any) -> Any:
-        """``predict`` as an ``xarray.Dataset``, with arguments by name.
+        """The result of ``predict``, with the same arguments, as an ``xarray.Dataset``.
 
-        If numbers of elements differ, the result is a dictionary by receiver.
+        If arrays have different numbers of elements, the result is a dictionary by receiver.
         """
         model, receiver = self._located(named.pop("receiver", None), transmitters)
         options = (named.get(name) for name in ("frequency", "directions", "frequencies"))
@@ -292,14 +295,12 @@ class Model(Movable):
         model, receiver = self._located(receiver, transmitters)
         request = model._request(transmitters, receiver, frequency, directions, frequencies)
         values = model._values(request, batch_size)
-        receivers = request.axes[-1:] if request.receiver is None else ()
-        count = math.prod(receivers)
-        return (
-            request.arranged(part, model.scene, (len(part) // count, *receivers)) for part in values
-        )
+        last = request.axes[-1:] if request.receiver is None else ()  # axis of the receivers
+        count = math.prod(last)
+        return (request.arranged(part, model.scene, (len(part) // count, *last)) for part in values)
 
     def _located(self, receiver: object, transmitters: object) -> tuple[Any, object]:
-        """This model and ``receiver``; for a new receiver a copy of the model for it, and 0."""
+        """Returns the model for a receiver, a copy if it is new, and its name or index there."""
         new = as_new_receiver(receiver, self.scene, transmitters)
         if new is None:
             return self, receiver
@@ -351,7 +352,7 @@ class Model(Movable):
             batch_size = usual_batch_size(self.scene.task.shape)
         if batch_size < 1:
             raise ValueError(f"batch_size must be at least 1 link, got {batch_size}")
-        size = max(1, batch_size // request.each) * request.each
+        size = max(1, batch_size // request.links_per_position) * request.links_per_position
         query = request.query.to(self.device)
         directions = request.directions
         if directions is not None:
@@ -394,12 +395,11 @@ class Model(Movable):
         task = self.scene.task
         receivers = batch.query.receivers
         absent = lacking(self.scene.receivers, receivers, task.elements, task.frequencies)
-        if deviations.ndim == 1:  # over all numbers, of which those that are absent are 0
-            present = 1 - absent.to(deviations).mean((1, 2))  # (b,)
+        if deviations.ndim == 1:
+            # Root mean squares over all numbers of a label, where absent numbers count as 0.
+            present = 1 - absent.to(deviations).mean((1, 2))  # share of the numbers (b,)
             deviations = (deviations / present.sqrt())[:, None, None]
         return deviations.expand(value.shape).masked_fill(absent, math.nan)
-
-    # --- what a run asks a model for, beside values ---
 
     def facts(self) -> dict[str, Any]:
         """Entries of ``metrics.json`` besides the model's sizes; plain values by name."""
@@ -421,7 +421,7 @@ class Model(Movable):
         return []
 
     def export(self, folder: Path) -> None:
-        """Writes files for other programs into a run's folder; by default none."""
+        """Writes files for other programs into a run's folder; by default writes nothing."""
 
     def revise(
         self, number: int, train: Batch, validation: Batch | None, loss: Callable[[Batch], float]
@@ -440,8 +440,6 @@ class Model(Movable):
             A sentence for the log.
         """
         return "nothing is revised"
-
-    # --- what a model knows of its errors ---
 
     def deviations(self, batch: Batch) -> Tensor | None:
         """Standard deviations (b, *shape) of the labels up to a common factor; None if unknown.

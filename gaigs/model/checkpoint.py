@@ -74,15 +74,15 @@ def read(path: str | Path) -> dict:
             f"{path} cannot be read: it is damaged, or another program wrote it\n"
             "copy the file again from where it was trained, or train again"
         ) from None
-    part = content.get(KEY) if isinstance(content, dict) else None
-    if not isinstance(part, dict):
+    entries = content.get(KEY) if isinstance(content, dict) else None
+    if not isinstance(entries, dict):
         raise ValueError(f"{path} is no checkpoint of gaigs: it lacks the entry {KEY!r}")
-    if (version := part.get("version")) != VERSION:
+    if (version := entries.get("version")) != VERSION:
         raise ValueError(
             f"{path} has checkpoint format {version!r}, not {VERSION}; use the gaigs that wrote it"
         )
-    needed = {"state_dict": content, "model": part, "scene": part}
-    lacking = [name for name, there in needed.items() if not isinstance(there.get(name), dict)]
+    parents = {"state_dict": content, "model": entries, "scene": entries}
+    lacking = [name for name, parent in parents.items() if not isinstance(parent.get(name), dict)]
     if lacking:
         raise ValueError(
             f"{path} is no complete checkpoint: it lacks {', '.join(lacking)}\ntrain again"
@@ -98,13 +98,13 @@ def save(model: nn.Module, path: str | Path) -> None:
             f"model {name_of(model)!r} has no state: "
             "keep what it learns in buffers, or use model.LookUp"
         )
-    part = {"version": VERSION, "scene": model.scene.state(), **described(model)}
-    part["plugins"] = digests(part["model"], part["scene"]["task"])
-    weights = {
-        f"model.{key}": value.cpu() if isinstance(value, Tensor) else value
-        for key, value in state.items()
-    }
-    write({KEY: part, "state_dict": weights}, Path(path))
+    entries = {"version": VERSION, "scene": model.scene.state(), **described(model)}
+    entries["plugins"] = digests(entries["model"], entries["scene"]["task"])
+    weights = {}
+    for key, value in state.items():
+        # The prefix "model." as in a checkpoint of a training.
+        weights[f"model.{key}"] = value.cpu() if isinstance(value, Tensor) else value
+    write({KEY: entries, "state_dict": weights}, Path(path))
 
 
 def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Module:
@@ -123,7 +123,7 @@ def load(path: str | Path, trust: bool, recorded: Mapping[str, str]) -> nn.Modul
         fresh = {**dict(model.named_parameters()), **dict(model.named_buffers())}
         unset = {name for name, value in fresh.items() if not value.isfinite().all()}
         model.load_state_dict(weights)
-        # By the model's names: an older checkpoint may have others.
+        # The model's own state: an older checkpoint may have other names.
         state = model.state_dict()
         _check_finite("weights", {name: state[name] for name in state if name not in unset})
         model.calibrate(content[KEY].get("calibration"))
@@ -152,12 +152,12 @@ def trained_weights(content: dict) -> dict:
     weights = content["state_dict"]
     if "trained" not in content[KEY]:
         return weights
-    part = f"model.{content[KEY]['trained']}."
-    return {
-        f"model.{key.removeprefix(part)}": value
-        for key, value in weights.items()
-        if key.startswith(part)
-    }
+    prefix = f"model.{content[KEY]['trained']}."
+    of_trained = {}
+    for key, value in weights.items():
+        if key.startswith(prefix):
+            of_trained[f"model.{key.removeprefix(prefix)}"] = value
+    return of_trained
 
 
 def described(model: nn.Module) -> dict:
@@ -195,18 +195,18 @@ def _tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
     Raises:
         ValueError: Nesting is too deep or endless.
     """
-    parts = [(name, value, 0)]
+    pending = [(name, value, 0)]
     for count in itertools.count():
-        if not parts:
+        if not pending:
             return
-        name, value, depth = parts.pop()
-        if depth > 50 or count > 1_000_000:
+        name, value, depth = pending.pop()
+        if depth > 50 or count > 1_000_000:  # a list in a file may contain itself
             raise ValueError(f"{name:.80} is nested too deeply")
         if isinstance(value, Tensor):
             yield name, value
         elif isinstance(value, dict | list | tuple):
             entries = value.items() if isinstance(value, dict) else enumerate(value)
-            parts += [(f"{name} {key}", item, depth + 1) for key, item in entries]
+            pending += [(f"{name} {key}", item, depth + 1) for key, item in entries]
 
 
 def _check_finite(name: str, value: object) -> None:

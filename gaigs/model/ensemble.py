@@ -29,7 +29,7 @@ class Ensemble(Wrapper):
             differ only in their seed.
 
     Attributes:
-        typical: Mean square difference of the members, over all links.
+        typical: Variance of the members' predictions, averaged over links and values.
 
     Raises:
         ValueError: The weights do not match the members, or their sum is not 1.
@@ -49,17 +49,18 @@ class Ensemble(Wrapper):
 
     def __init__(self, scene: Scene, members: list, weights: list | None = None):
         super().__init__(scene)
-        built = [
-            one if isinstance(one, Model) else registry("model").build(one, scene=scene)
-            for one in members
-        ]
+        built = []
+        for member in members:
+            is_built = isinstance(member, Model)
+            built.append(member if is_built else registry("model").build(member, scene=scene))
         self.members = nn.ModuleList(built)
         self.is_blend = weights is not None
         self.weights = [1 / len(built)] * len(built) if weights is None else weights
-        is_share = len(self.weights) == len(built) and min(self.weights) >= 0
-        if not is_share or abs(sum(self.weights) - 1) > 1e-6:
+        are_shares = len(self.weights) == len(built) and min(self.weights) >= 0
+        if not are_shares or abs(sum(self.weights) - 1) > 1e-6:
             raise ValueError(f"weights must be {len(built)} shares that sum to 1, got {weights}")
-        self.chunk = min((one.chunk for one in built if one.chunk is not None), default=None)
+        chunks = [member.chunk for member in built if member.chunk is not None]
+        self.chunk = min(chunks, default=None)
         self.register_buffer("typical", torch.tensor(0.0))
 
     @property
@@ -87,34 +88,36 @@ class Ensemble(Wrapper):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Computes the mean square difference of the members at training links."""
+        """Computes ``typical`` from training links."""
         index = evenly(links.split.train, 256)
-        parts = [self._squares(links.batch(part).to(self.device)) for part in index.split(32)]
+        parts = [self._variances(links.batch(part).to(self.device)) for part in index.split(32)]
         self.typical = torch.cat(parts).mean()
 
     def forward(self, batch: Batch) -> Prediction:
-        values = self._each(batch)  # (members, b, *shape)
+        values = self._values_of_members(batch)  # (members, b, *shape)
         return Prediction(torch.tensordot(values.new_tensor(self.weights), values, 1), {})
 
     def deviations(self, batch: Batch) -> Tensor | None:
-        """Deviations of labels: root mean square differences of the members over a label's values.
+        """Standard deviations (b,) of the members' predictions, averaged over a label's values.
 
-        Few members may agree by chance, so the ``typical`` mean square counts as four more members.
-        A blend of different models returns the weighted root mean square of its members'
-        deviations.
+        Few members may agree by chance, so the ``typical`` variance counts as four more members. A
+        blend of different models returns the weighted root mean square of its members' deviations,
+        which may be (b, *shape); None if no member states any.
         """
         if not self.is_blend:
-            count = len(self._members) - 1
-            return ((count * self._squares(batch) + 4 * self.typical) / (count + 4)).sqrt()
+            freedom = len(self._members) - 1
+            variances = (freedom * self._variances(batch) + 4 * self.typical) / (freedom + 4)
+            return variances.sqrt()
         total: Any = 0.0
         weights = 0.0
         for weight, member in zip(self.weights, self._members, strict=True):
-            stated = member.deviations(batch.to(member.device))
-            if stated is not None:
-                # (b,) and (b, *shape) add up with the links behind.
-                squares = stated.square().to(batch.query.transmitters.device).movedim(0, -1)
-                total = total + weight * squares
-                weights += weight
+            stated = member.deviations(batch.to(member.device))  # (b,) or (b, *shape)
+            if stated is None:
+                continue
+            # With the links as the last axis both shapes can be added.
+            variances = stated.square().to(batch.query.transmitters.device).movedim(0, -1)
+            total = total + weight * variances
+            weights += weight
         return (total / weights).sqrt().movedim(-1, 0) if weights else None
 
     def process_at(self, receiver: int) -> Process | None:
@@ -136,7 +139,7 @@ class Ensemble(Wrapper):
         return moved
 
     def unseen(self, links: Links) -> Iterator[Unseen]:
-        """Models like this one with links that no member was trained on.
+        """Yields models like this one, each with links that no member was trained on.
 
         If a member is trained, these are validation links, and look-ups are fitted without them.
         """
@@ -144,19 +147,20 @@ class Ensemble(Wrapper):
             yield from super().unseen(links)
             return
         training = replace(links, split=links.split.validating())
-        of_members = []
+        of_members = []  # for each member a list of ``Unseen``
         for member in self._members:
             if member.is_trained:
                 of_members.append([*member.unseen(links)])
             else:
                 refitted = member.refitted(training)
                 of_members.append([Unseen(refitted, links.split.validation, links.split.train)])
-        for parts in itertools.product(*of_members):
-            asked = parts[0].asked
-            for part in parts[1:]:
-                asked = asked[torch.isin(asked, part.asked)]
+        for combination in itertools.product(*of_members):
+            asked = combination[0].asked
+            for unseen in combination[1:]:
+                asked = asked[torch.isin(asked, unseen.asked)]  # links that all members lack
             if len(asked):
-                yield Unseen(self._of([part.model for part in parts]), asked, links.split.train)
+                blend = self._of([unseen.model for unseen in combination])
+                yield Unseen(blend, asked, links.split.train)
 
     def take_hyperparameters(self, other: Model) -> None:
         assert isinstance(other, Ensemble)
@@ -172,12 +176,17 @@ class Ensemble(Wrapper):
         other.typical = self.typical
         return other.train(self.training)
 
-    def _squares(self, batch: Batch) -> Tensor:
-        """Variances of the members' predictions, averaged over a label's values (b,)."""
-        batch = replace(batch, directions=self.scene.task.directions)  # whichever are asked
-        return self._each(batch.to(self.device))[..., None].flatten(2).var(0).mean(1)
+    def _variances(self, batch: Batch) -> Tensor:
+        """Variances of the members' predictions, averaged over a label's values (b,).
 
-    def _each(self, batch: Batch) -> Tensor:
+        They are those of the label's directions, even if the batch has others.
+        """
+        batch = replace(batch, directions=self.scene.task.directions)
+        values = self._values_of_members(batch.to(self.device))  # (members, b, *shape)
+        values = values[..., None].flatten(2)  # (members, b, numbers), also of scalar labels
+        return values.var(0).mean(1)
+
+    def _values_of_members(self, batch: Batch) -> Tensor:
         """Values of all members (members, b, *shape); look-ups run on the CPU."""
         device = batch.query.transmitters.device
         values = [member(batch.to(member.device)).value.to(device) for member in self._members]

@@ -56,14 +56,15 @@ class Friis(Model):
         waves = direct_waves(self.scene, query, self.frequencies)
         labels = self.scene.equalised(query, labels)
         sign = self.task.phase_sign(labels, waves, self.scene.radio_of(query.receivers))
-        self.sign.fill_(sign or -1)
+        self.sign.fill_(sign or -1)  # 0: unknown
         self.gains.zero_()
-        has_gain = sign != 0 or len(index) < TELLING * len(known)
-        for receiver, rows in enumerate(known if has_gain else ()):
-            gain = fit_gain(links.labels[rows], self._waves(links.query[rows]))
-            self.gains[receiver] = gain.to(self.gains)
-        is_known = torch.tensor([*map(len, known)]) > 0
-        self.gains[~is_known] = common_gain(self.gains[is_known])
+        has_few_links = len(index) < TELLING * len(known)
+        if sign != 0 or has_few_links:
+            for receiver, rows in enumerate(known):
+                gain = fit_gain(links.labels[rows], self._waves(links.query[rows]))
+                self.gains[receiver] = gain.to(self.gains)
+        has_links = torch.tensor([len(rows) for rows in known]) > 0
+        self.gains[~has_links] = common_gain(self.gains[has_links])
 
     def forward(self, batch: Batch) -> Prediction:
         waves = self._waves(batch.query).to(self.gains)

@@ -94,7 +94,7 @@ class GaussianSplatting(Model):
         trend: str | Mapping | Model | None = None,
     ):
         super().__init__(scene)
-        # In this order: a part draws its parameters when it is built.
+        # In this order: each part draws random numbers when it is built.
         self.trend = None if trend is None else self._built_trend(trend)
         pooling = self.own_pooling(scene) if pooling is None else pooling
         self.pooling = registry("pooling").build(pooling, scene=scene)
@@ -111,15 +111,15 @@ class GaussianSplatting(Model):
         self.placement = registry("placement").build(placement, scene=scene, channels=channels)
         self._check_placement()
         self.gaussians = self._built_gaussians(gaussians, zone)
-        component: Any = deformation
+        deforms: Any = deformation  # the object or its class, either of which has reads_tokens
         if not is_built(deformation):
             name = deformation if isinstance(deformation, str) else deformation["name"]
-            component = registry("deformation").get(name)
-        self.tokenizer = None
-        is_fixed = self.gaussians is not None and not self.placement.has_own
-        count = len(self.gaussians) if is_fixed else None
+            deforms = registry("deformation").get(name)
+        is_constant = self.gaussians is not None and not self.placement.has_own
+        count = len(self.gaussians) if is_constant else None
         context: dict[str, Any] = {"scene": scene, "channels": channels, "count": count}
-        if component.reads_tokens:
+        self.tokenizer = None
+        if deforms.reads_tokens:
             built = self.tokenizer = registry("tokenizer").build(tokenizer, scene=scene)
             widths = built.scene_width, built.gaussian_width, built.transmitter_width
             context["tokenizer_widths"] = widths
@@ -195,10 +195,10 @@ class GaussianSplatting(Model):
             )
 
     def _built_gaussians(self, options: Mapping | None, zone: Any) -> Gaussians | None:
-        """Trainable Gaussians beside the placement's, at elevations in ``zone`` [rad]; or None.
+        """Trainable Gaussians, which are not the placement's own; None without ``options``.
 
-        Together with Gaussians of a placement their signal must not depend on the direction (degree
-        0).
+        ``zone`` has their lowest and highest elevation [rad]. Beside Gaussians of a placement they
+        must have a signal that is the same in all directions (degree 0).
         """
         name = name_of(self.placement)
         if options is None:
@@ -246,10 +246,10 @@ class GaussianSplatting(Model):
         self.pooling.fit(links)
         if self.trend is None:
             return
-        trained = links
-        if links.split.by_receivers:  # receivers that validate stay unknown
-            trained = replace(links, split=links.split.only(links.split.train))
-        self.trend.fit(trained)
+        of_trend = links
+        if links.split.by_receivers:  # the trend must not know the validation receivers
+            of_trend = replace(links, split=links.split.only(links.split.train))
+        self.trend.fit(of_trend)
         if self.scene.task.dtype.is_complex:
             return  # waves have no level: their phases differ from link to link
         count = len(links.split.train)
@@ -275,31 +275,32 @@ class GaussianSplatting(Model):
         # Receivers share what a place excites, unless a part looks at the receiver.
         parts = self.placement, self.tokenizer, self.deformation
         sees_receivers = any(getattr(part, "sees_receivers", False) for part in parts)
-        places, which = query.unique(with_receivers=sees_receivers)
+        places, which = query.unique(with_receivers=sees_receivers)  # which (b,): link to place
         return self.respond(self.excite(places), which, batch)
 
     def respond(self, excited: Excited, which: Int[Tensor, " b"], batch: Batch) -> Prediction:
         """Values of a batch; ``which`` is the row of ``excited`` for each link."""
         query = batch.query
-        links, values = [], []
-        together = self.takes_paths and self.pooling.is_same_for_all
-        group = torch.zeros_like(query.receivers) if together else query.receivers
-        for receiver in group.unique().tolist() or [0]:  # an empty batch needs the label's shape
-            index = (group == receiver).nonzero()[:, 0]
-            part = query[index]
+        indices, values = [], []
+        # One receiver at a time, unless the pooling sums paths in the same way for all receivers.
+        is_one_group = self.takes_paths and self.pooling.is_same_for_all
+        groups = torch.zeros_like(query.receivers) if is_one_group else query.receivers
+        for receiver in groups.unique().tolist() or [0]:  # an empty batch needs the label's shape
+            index = (groups == receiver).nonzero()[:, 0]
+            links = query[index]
             rows = which[index]
             if self.takes_paths:
-                received = self.paths(excited, rows, receiver, part)
+                received = self.paths(excited, rows, receiver, links)
             else:
                 calls = self._splats(excited, rows, receiver, batch.directions)
                 received = torch.cat([self.rasterizer(*arguments)[0] for arguments in calls])
-            value = self.pooling(received, part, batch.directions)
+            value = self.pooling(received, links, batch.directions)
             if not self.takes_paths and self.pooling.grid is None and batch.directions is not None:
                 # A list of rays was rendered as one row.
-                value = value.reshape(len(part), *batch.directions.shape)
-            links.append(index)
+                value = value.reshape(len(links), *batch.directions.shape)
+            indices.append(index)
             values.append(value)
-        value = torch.cat(values)[torch.cat(links).argsort()]
+        value = torch.cat(values)[torch.cat(indices).argsort()]  # in the order of the batch
         if self.trend is not None:
             value = self.trend(batch).value + value - self.level
         penalties = {}
@@ -317,20 +318,20 @@ class GaussianSplatting(Model):
     def any_receiver(self) -> bool:  # type: ignore[override]
         """True if all parts that depend on receivers have ``take_receivers``."""
         parts = self.placement, self.tokenizer, self.deformation
-        seeing = [part for part in parts if getattr(part, "sees_receivers", False)]
-        knows_all = all(hasattr(part, "take_receivers") for part in seeing)
-        return knows_all and (self.trend is None or self.trend.any_receiver)
+        dependent = [part for part in parts if getattr(part, "sees_receivers", False)]
+        is_movable = all(hasattr(part, "take_receivers") for part in dependent)
+        return is_movable and (self.trend is None or self.trend.any_receiver)
 
     def parameter_groups(self) -> dict[str, list[nn.Parameter]]:
         """A group for each parameter of the Gaussians, the placement's groups, and all networks."""
         groups = {}
         if self.gaussians is not None:
             groups = {name: [parameter] for name, parameter in self.gaussians.named_parameters()}
-        placing = self.placement.parameter_groups()
-        network = placing.pop("network", [])
+        groups |= self.placement.parameter_groups()
+        network = groups.pop("network", [])
         for part in (self.tokenizer, self.deformation, self.pooling):
             network += [] if part is None else list(part.parameters())
-        return groups | placing | ({"network": network} if network else {})
+        return groups | ({"network": network} if network else {})
 
     @property
     def primitives(self) -> Gaussians | None:  # type: ignore[override]
@@ -361,18 +362,19 @@ class GaussianSplatting(Model):
         """The Gaussians for the transmitter in each row of a query."""
         placed = self.placement(self.gaussians, query)
         if placed.opacities is None:
-            free = self.gaussians
+            trained = self.gaussians  # the placement gave only their centres
             placed = placed._replace(
-                quats=free.unit_quats,
-                scales=free.scales[None],
-                opacities=free.opacities,
-                signal=_towards(free.bands, query.transmitters[:, None] - placed.means),
+                quats=trained.unit_quats,
+                scales=trained.scales[None],
+                opacities=trained.opacities,
+                signal=_towards(trained.bands, query.transmitters[:, None] - placed.means),
             )
-        # The network learns how a place responds to a transmitter. No gradient of it moves the
-        # Gaussians.
-        seen = Placed(*(None if part is None else part.detach() for part in placed))
-        tokens = None if self.tokenizer is None else self.tokenizer(seen, seen.opacities, query)
-        residuals = self.deformation(tokens, seen, query)
+        # Gradients of the networks must not move the Gaussians.
+        constant = Placed(*(None if part is None else part.detach() for part in placed))
+        tokens = None
+        if self.tokenizer is not None:
+            tokens = self.tokenizer(constant, constant.opacities, query)
+        residuals = self.deformation(tokens, constant, query)
         quats, scales = placed.quats[None], placed.scales
         if residuals.delta_quats is not None:
             quats = quats + residuals.delta_quats
@@ -425,43 +427,43 @@ class GaussianSplatting(Model):
     ) -> list[tuple]:
         """Arguments of each call of the rasterizer, for links to one receiver.
 
-        If the Gaussians do not move between links, one call draws all links; otherwise one link.
+        A call draws one link, or all links if they share the centres of the Gaussians.
         """
         placed, axes = excited.placed, excited.semi_axes
         if self.pooling.grid is not None or directions is None:
             directions = self.pooling.grid or self.scene.task.directions
         plane = self.projection.plane(directions.to(placed.means.device).to(placed.means.dtype))
         means = placed.means
-        if not len(means):  # no query: Gaussians that depend on it may be anywhere
+        if not len(means):  # no links: any Gaussians give a map of the right shape
             axes = means.new_ones(1, means.shape[1], 3, 3)
             means = means.new_zeros(1, means.shape[1], 3)
         pose = self.scene.receivers[receiver].pose
         calls = []
-        for row in [which] if len(means) == 1 else which.split(1):
-            centres = means[0] if len(means) == 1 else means[row][0]  # (n, 3)
-            axes_of_row = axes if len(axes) == 1 else axes[row]
-            splats = self.projection.project(centres, axes_of_row, pose)
-            calls.append((splats, *self._strengths(excited, row), plane))
+        for rows in [which] if len(means) == 1 else which.split(1):
+            centres = means[0] if len(means) == 1 else means[rows][0]  # (n, 3)
+            axes_of_rows = axes if len(axes) == 1 else axes[rows]  # (1 or rows, n, 3, 3)
+            splats = self.projection.project(centres, axes_of_rows, pose)
+            calls.append((splats, *self._strengths(excited, rows), plane))
         return calls
 
     def _strengths(self, excited: Excited, which: Int[Tensor, " b"]) -> Strengths:
         """Strengths of the Gaussians for each row ``which`` of ``excited``."""
         placed, residuals = excited.placed, excited.residuals
         signal, opacities = placed.signal, placed.opacities
-        if signal.ndim == 4:  # another for each query
+        if signal.ndim == 4:  # (places, n, c, 1): it depends on the transmitter
             signal = signal[which]
         if residuals.delta_signal is not None:
             signal = signal + residuals.delta_signal[which]
         if residuals.delta_opacities is not None:
             opacities = (opacities + residuals.delta_opacities[which]).clamp(0, 1)
         attenuations = None if residuals.attenuations is None else residuals.attenuations[which]
-        signal = signal.squeeze(-1)
+        signal = signal.squeeze(-1)  # (n, c) or (b, n, c)
         count = len(which)
         if placed.gains is None:
             signal = SH_DC * signal
-        elif signal.shape[-1] == 1:
+        elif signal.shape[-1] == 1:  # a power map has no phase
             signal = signal * magnitudes(placed.gains[which])[..., None]
-        else:  # two channels are a complex number
+        else:  # the two channels are the real and imaginary part of a wave
             numbers = torch.complex(*signal.expand(count, -1, -1).unbind(-1))  # (b, n)
             signal = torch.view_as_real(numbers * placed.gains[which])
         return Strengths(signal.expand(count, -1, -1), opacities.expand(count, -1), attenuations)
@@ -481,14 +483,15 @@ class GaussianSplatting(Model):
 def _towards(
     bands: Float[Tensor, "n c k"], offsets: Float[Tensor, "b n 3"]
 ) -> Float[Tensor, "*b n c 1"]:
-    """Signal of Gaussians towards transmitters, relative to the constant harmonic.
+    """Signal of Gaussians for transmitters, in units of the constant harmonic ``SH_DC``.
 
-    ``offsets`` lead from the Gaussians to the transmitters [m].
+    Args:
+        bands: Coefficients of k spherical harmonics for each channel.
+        offsets: Vectors from the Gaussians to the transmitters [m].
     """
     if bands.shape[-1] == 1:
         return bands
-    # On a centre there is no direction. Nearer than 0.05 m the harmonics fade: gradients stay
-    # moderate.
-    seen = -offsets / offsets.norm(dim=-1, keepdim=True).clamp(min=0.05)
-    harmonics = spherical_harmonics(seen, math.isqrt(bands.shape[-1]) - 1)
+    # The direction is undefined at a centre. Nearer than 0.05 m it fades, to bound its gradients.
+    incident = -offsets / offsets.norm(dim=-1, keepdim=True).clamp(min=0.05)  # (b, n, 3)
+    harmonics = spherical_harmonics(incident, math.isqrt(bands.shape[-1]) - 1)  # (b, n, k)
     return (bands * harmonics[:, :, None]).sum(-1, keepdim=True) / SH_DC

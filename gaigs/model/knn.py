@@ -96,8 +96,8 @@ class KNearestNeighbours(LookUp):
             self.scale = min(scales, key=self._squared_error)
         if self.k is None:
             folds = [folds_of(links, index) for index in self.known]
-            held = [*self._held_out(folds)]
-            self.chosen = min(COUNTS, key=lambda count: self._rank(count, held))
+            held_out = [*self._held_out(folds)]
+            self.chosen = min(COUNTS, key=lambda count: self._cost(count, held_out))
 
     def get_extra_state(self) -> dict:
         state = super().get_extra_state()
@@ -118,13 +118,13 @@ class KNearestNeighbours(LookUp):
         labels = torch.empty(len(query), *self.scene.task.shape, dtype=self.scene.task.dtype)
         radios = self.scene.radio_of(query.receivers)
         for radio in radios.unique():
-            is_asked = radios == radio
+            is_here = radios == radio
             index = self.known[radio]
-            if not self.scene.task.shape:
-                labels[is_asked] = self._levels(query[is_asked], index, self.chosen + 1)
+            if not self.scene.task.shape:  # links may be too many for a matrix of all distances
+                labels[is_here] = self._levels(query[is_here], index, self.chosen + 1)
                 continue
-            apart = self._distances(query[is_asked], index, self.scale)
-            labels[is_asked] = self._look_up(apart, index)
+            apart = self._distances(query[is_here], index, self.scale)
+            labels[is_here] = self._look_up(apart, index)
         return Prediction(at_directions(labels, batch, self.scene), {})
 
     def _distances(
@@ -138,33 +138,35 @@ class KNearestNeighbours(LookUp):
     def _levels(
         self, query: Query, index: Int[Tensor, " k"], count: int, size: int = 2**20
     ) -> Float[Tensor, " b"]:
-        """Predictions of scalar labels, for a receiver with known links ``index``.
+        """Predictions of scalar labels for a receiver with known links ``index``.
 
-        The ``count`` nearest known links are searched. If the last of them is at the distance of
-        the last neighbour in use, further links may be at this distance. Then four times as many
-        are searched, with at most ``size`` distances in memory.
+        The function averages the ``count`` nearest known links by ``_weights``. Where links beyond
+        these may be as near as the last neighbour in use, it calls itself with four times
+        ``count``. At most ``size`` distances are in memory.
         """
         asked = coordinates(self.scene, query, self.scale)
         known = coordinates(self.home, self.links.query[index], self.scale)
         near = nearest_places(asked, known, count)
         labels = self._mean(near, index)
         if count < len(index):
-            # More links may be as near, such as several at one place.
+            # Several links at one place are equally near: all must count.
             is_tied = near.apart[:, -1] <= near.apart[:, self.chosen - 1]
-            for rows in is_tied.nonzero()[:, 0].split(max(1, size // (4 * count))):
+            tied_rows = is_tied.nonzero()[:, 0]
+            for rows in tied_rows.split(max(1, size // (4 * count))):
                 labels[rows] = self._levels(query[rows], index, 4 * count, size)
         return labels
 
     def _weights(self, apart: Float[Tensor, "b j"]) -> Float[Tensor, "b j"]:
-        """Weights of known links by their distances, with a sum of 1.
+        """Weights of known links in a mean, by their distances [m]; each row has the sum 1.
 
         Weights are 0 beyond the last neighbour, and at an infinite distance.
         """
-        farthest = apart.topk(min(self.chosen, apart.shape[1]), largest=False).values[:, -1:]
-        near = (apart <= farthest) & apart.isfinite()
+        nearest = apart.topk(min(self.chosen, apart.shape[1]), largest=False).values
+        is_near = (apart <= nearest[:, -1:]) & apart.isfinite()
         # A transmitter within a micrometre of a measured one gets that label.
         apart = apart.clamp_min(1e-6)
-        weights = near * (apart.amin(1, keepdim=True) / apart) ** self.power  # ratios stay finite
+        # 1 / apart^power would overflow, so distances are relative to the least.
+        weights = is_near * (apart.amin(1, keepdim=True) / apart) ** self.power
         return weights / weights.sum(1, keepdim=True)
 
     def _mean(self, near: Near, index: Int[Tensor, " k"]) -> Float[Tensor, " b"]:
@@ -173,59 +175,72 @@ class KNearestNeighbours(LookUp):
         return (self._weights(near.apart).to(labels) * labels[near.rows]).sum(1)
 
     def _look_up(self, apart: Float[Tensor, "b k"], index: Int[Tensor, " k"]) -> Tensor:
-        """Weighted means of the labels of known links by their distances, for other labels."""
+        """Weighted means (b, *shape) of the labels of known links, for labels with a shape."""
         weights = self._weights(apart)
-        used = weights.any(0)
-        labels, align = self.links.labels[index[used]], self.scene.task.align
-        rows = []
-        for row, first in zip(weights[:, used], apart[:, used].argmin(1).tolist(), strict=True):
-            near = row.nonzero()[:, 0]
-            aligned = align(labels[near], labels[first : first + 1])  # to the nearest
-            rows.append(torch.tensordot(row[near].to(labels), aligned, 1))
-        return torch.stack(rows)
+        is_used = weights.any(0)  # by any of the b links
+        labels = self.links.labels[index[is_used]]
+        nearest = apart[:, is_used].argmin(1).tolist()
+        means = []
+        for link_weights, first in zip(weights[:, is_used], nearest, strict=True):
+            rows = link_weights.nonzero()[:, 0]
+            # Unknown phases would cancel in a mean: all are aligned to the nearest link's.
+            aligned = self.scene.task.align(labels[rows], labels[first : first + 1])
+            means.append(torch.tensordot(link_weights[rows].to(labels), aligned, 1))
+        return torch.stack(means)
 
     def _held_out(self, folds: Sequence[Int[Tensor, " _"]] | None = None) -> Iterator[HeldOutLinks]:
-        """Holds out at most about 256 known links of all receivers together, in groups of 32.
+        """Yields groups of at most 32 held-out links of a receiver; about 256 links in all.
 
         All known links at the place of a held-out link are held out, too. ``folds`` holds the fold
         of each known link of each receiver; with it the whole fold of a held-out link is held out.
         """
+        links_per_receiver = max(1, 256 // len(self.known))
         for receiver, index in enumerate(self.known):
-            for rows in evenly(torch.arange(len(index)), max(1, 256 // len(self.known))).split(32):
+            sample = evenly(torch.arange(len(index)), links_per_receiver)
+            for rows in sample.split(32):
                 asked, known = self.links.query[index[rows]], self.links.query[index]
-                here = (asked.transmitters[:, None] == known.transmitters).all(-1)
+                is_hidden = (asked.transmitters[:, None] == known.transmitters).all(-1)  # (h, k)
                 if folds is not None:
-                    here |= folds[receiver][rows][:, None] == folds[receiver]
-                apart = self._distances(asked, index, self.scale).masked_fill(here, math.inf)
+                    is_hidden |= folds[receiver][rows][:, None] == folds[receiver]
+                apart = self._distances(asked, index, self.scale).masked_fill(is_hidden, math.inf)
                 has_others = apart.isfinite().any(1)  # a place may be the only one
                 if has_others.any():
                     yield HeldOutLinks(rows[has_others], apart[has_others], index)
 
-    def _predicted(self, held: HeldOutLinks) -> tuple[Tensor, Tensor]:
+    def _predicted(self, held_out: HeldOutLinks) -> tuple[Tensor, Tensor]:
         """Labels of held-out links, aligned to the predictions, and their predictions."""
         if self.scene.task.shape:
-            values = self._look_up(held.apart, held.index)
+            values = self._look_up(held_out.apart, held_out.index)
         else:
-            # Far more than the largest number of neighbours, for those that are as near.
-            count = min(4 * max(COUNTS), len(held.index))
-            values = self._mean(Near(*held.apart.topk(count, largest=False)), held.index)
-        labels = self.links.labels[held.index[held.rows]]
+            # More than the largest number of neighbours, since several links may be equally near.
+            count = min(4 * max(COUNTS), len(held_out.index))
+            near = Near(*held_out.apart.topk(count, largest=False))
+            values = self._mean(near, held_out.index)
+        labels = self.links.labels[held_out.index[held_out.rows]]
         return self.scene.task.align(labels, values), values
 
     def _squared_error(self, scale: float) -> float:
-        """Mean squared error of held-out links with a scale of frequencies [m]."""
+        """Mean squared error of held-out links with a scale of frequencies [m].
+
+        Sets ``scale``.
+        """
         self.scale = scale
         errors = []
-        for held in self._held_out():
-            labels, values = self._predicted(held)
+        for held_out in self._held_out():
+            labels, values = self._predicted(held_out)
             errors.append((values - labels).abs().double().square().flatten())
         return torch.cat(errors).mean().item() if errors else 0.0
 
-    def _rank(self, count: int, held: Sequence[HeldOutLinks]) -> float:
-        """Mean monitored score of held-out links with ``count`` neighbours, as a cost."""
+    def _cost(self, count: int, groups: Sequence[HeldOutLinks]) -> float:
+        """Mean monitored score of held-out links with ``count`` neighbours; lower is better.
+
+        Sets ``chosen`` to ``count``.
+        """
         self.chosen = count
         task = self.scene.task
-        pairs = map(self._predicted, held)
-        scores = [task.scores(labels, values)[task.monitor] for labels, values in pairs]
+        scores = []
+        for held_out in groups:
+            labels, values = self._predicted(held_out)
+            scores.append(task.scores(labels, values)[task.monitor])
         mean = torch.cat(scores).mean().item() if scores else 0.0
         return -mean if task.higher_is_better else mean

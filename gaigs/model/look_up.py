@@ -38,11 +38,11 @@ class LookUp(Model):
             raise ValueError(f"model {name_of(self)!r} has no links to save; fit it first")
         index = torch.cat([*self.known])
         labels = []
-        for part in index.split(PART):
-            values = self.links.labels[part]
-            levels = (255 * values.real).round().clamp(0, 255).to(torch.uint8)
-            is_exact = (levels / 255 == values).all()
-            labels.append(levels if is_exact else values)
+        for rows in index.split(PART):
+            values = self.links.labels[rows]
+            pixels = (255 * values.real).round().clamp(0, 255).to(torch.uint8)
+            is_image = (pixels / 255 == values).all()  # bytes lose nothing
+            labels.append(pixels if is_image else values)
         learnt = {name: getattr(self, name) for name in self.learnt}
         return {"query": vars(self.links.query[index]), "labels": labels, **learnt}
 

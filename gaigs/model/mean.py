@@ -29,17 +29,18 @@ class Mean(Model):
     def fit(self, links: Links) -> None:
         """Computes the means; a receiver without links gets ``common_gain`` of the other means."""
         known = known_links(links, any_receiver=True)
+        wide = torch.promote_types(self.scene.task.dtype, torch.float64)  # sums without rounding
         for receiver, index in enumerate(known):
             if not len(index):
                 continue
-            wide = torch.promote_types(self.scene.task.dtype, torch.float64)
-            first, align = links.labels[index[:1]], self.scene.task.align
-            total = sum(
-                align(links.labels[part], first).sum(0).to(wide) for part in index.split(256)
-            )
+            first = links.labels[index[:1]]
+            total = torch.zeros_like(first[0], dtype=wide)
+            for rows in index.split(256):  # labels may be too large for memory
+                aligned = self.scene.task.align(links.labels[rows], first)
+                total += aligned.sum(0).to(wide)
             self.means[receiver] = (total / len(index)).to(self.means)
-        is_known = torch.tensor([*map(len, known)]) > 0
-        self.means[~is_known] = common_gain(self.means[is_known])
+        has_links = torch.tensor([len(index) for index in known]) > 0
+        self.means[~has_links] = common_gain(self.means[has_links])
 
     def forward(self, batch: Batch) -> Prediction:
         means = self.means[self.scene.radio_of(batch.query.receivers)]

@@ -94,8 +94,8 @@ class MirroredSplatting(GaussianSplatting):
     ):
         self.search = search
         self.boxes = boxes
-        image = projection, rasterizer, pooling
-        super().__init__(scene, placement, tokenizer, deformation, *image, gaussians, trend)
+        parts = placement, tokenizer, deformation, projection, rasterizer, pooling
+        super().__init__(scene, *parts, gaussians, trend)
 
     @staticmethod
     def own_pooling(scene: Scene) -> str:
@@ -105,7 +105,7 @@ class MirroredSplatting(GaussianSplatting):
 
     @torch.no_grad()
     def fit(self, links: Links) -> None:
-        """Fits the pipeline; searches planes in spectra and channels, or prepares it in levels."""
+        """Fits the pipeline, and searches planes; in levels ``revise`` does, with obstacles."""
         super().fit(links)
         self.places = thin_links(links.query[links.split.train])
         is_known = links.query.frequencies is not None or len(self.scene.frequencies) == 1
@@ -118,11 +118,11 @@ class MirroredSplatting(GaussianSplatting):
             # A search by phases needs 20 links of each receiver; places of one radio have fewer.
             if searches and not self.is_wide and not self.scene.one_radio:
                 self._prepare_levels(links)
-        # Levels at known receivers are learnt as well without boxes. Without a carrier, as of
-        # Bluetooth beacons, boxes explained what single receivers have of their own.
+        # Boxes lower errors at new receivers, but not at known ones. Without a known carrier (such
+        # as Bluetooth beacons), boxes fitted errors of single receivers.
         wants_boxes = links.split.by_receivers if self.boxes is None else self.boxes
-        is_shared = wants_boxes and not self.scene.one_radio
-        if is_known and is_shared and not self.is_wide and isinstance(self.pooling, PathRssi):
+        wants_boxes = wants_boxes and not self.scene.one_radio
+        if is_known and wants_boxes and not self.is_wide and isinstance(self.pooling, PathRssi):
             self._prepare_boxes(links)
         if self.boxes and self.shadowed is not None:
             # Gains of single paths learn the shadows at the known receivers in place of boxes.
@@ -184,12 +184,12 @@ class MirroredSplatting(GaussianSplatting):
 
     def _prepare_boxes(self, links: Links) -> None:
         """Draws links for the search of boxes in ``revise``, and links that test its boxes."""
-        # With so many a search takes a minute; with 600 it finds a third of the furniture.
-        rows, held = drawn(links.split.train, 1500), drawn(links.split.validation, 1500)
-        # One receiver or two do not tell where along a path an obstacle stands.
-        if len(links.query.receivers[rows].unique()) >= 3 and len(held):
-            self.shadowed = Batch(links.query[rows], labels=links.labels[rows])
-            self.proof = Batch(links.query[held], labels=links.labels[held])
+        # With 1500 links a search takes a minute; with 600 it finds a third of the furniture.
+        searched, tested = drawn(links.split.train, 1500), drawn(links.split.validation, 1500)
+        # Only paths to three receivers or more show where along a path an obstacle stands.
+        if len(links.query.receivers[searched].unique()) >= 3 and len(tested):
+            self.shadowed = Batch(links.query[searched], labels=links.labels[searched])
+            self.proof = Batch(links.query[tested], labels=links.labels[tested])
 
     def _fit_channels(self, links: Links, task: Task, pooling: ChannelPooling) -> None:
         """Starts the training from free space, and searches the planes for its first revision.
@@ -201,36 +201,37 @@ class MirroredSplatting(GaussianSplatting):
         received = links.labels
         links = replace(links, labels=self.scene.equalised(links.query, links.labels))
         train = links.split.train
-        sign = int(pooling.sign)
+        sign = int(pooling.sign)  # of the phase, 2 pi f delay; 0: unknown
         query = links.query[train]
-        waves = direct_waves(self.scene, query, task.frequencies, sign)
+        waves = direct_waves(self.scene, query, task.frequencies, sign)  # (b, e, s)
         waves = direct_gains(self.scene, query)[:, None, None] * waves
-        start = placement.planes[placement.used if placement.walls else placement.used[:0]].cpu()
         gains = self._receiver_gains(links.labels[train], query, waves, pooling)
         placement.start_from_free_space(gains.conj() if sign > 0 else gains)
         placement.enable_phases(speed_of_light / self.scene.middles.max().item())
-        if placement.fixed or not placement.order:
+        if placement.fixed or not placement.order:  # no planes to search
             return
-        is_known = task.phase == "known" and sign != 0
+        walls = placement.used if placement.walls else placement.used[:0]  # given by the user
+        start = placement.planes[walls].cpu()
+        has_phase = task.phase == "known" and sign != 0
         if placement.has_few_numbers:
-            if is_known:
+            if has_phase:
                 self._search_field(links, sign, start, pooling)
             return
         labels = links.labels.clone()
-        # Unknown delays of links are none of their paths'.
+        # An unknown delay of a link shifts all its paths; the search must see them unshifted.
         labels[train] = task.align(labels[train], waves)
         planes, slabs = ChannelSearch(
             replace(links, labels=labels),
             int(pooling.array_sign),
-            is_known,
+            has_phase,
             placement.order,
             len(placement.origin),
             start,
         ).run()
         self._plan(planes, slabs)
-        # One receiver or two do not tell how far behind a box its shadow began.
-        if is_known and self.scene.radios >= 3:
-            rows = drawn(train, 1200)  # with which a search takes some seconds
+        # Only three receivers or more show where along a path a box stands.
+        if has_phase and self.scene.radios >= 3:
+            rows = drawn(train, 1200)  # a search with 1200 links takes some seconds
             self.shadowed = Batch(links.query[rows], labels=received[rows])
         placement.step.mul_(0.1)  # the search is exact to millimetres
 
@@ -244,26 +245,27 @@ class MirroredSplatting(GaussianSplatting):
         planes = search.frame.to_world(room.planes)
         self._plan(planes, room.slabs, search.data.order)
         if placement.obstacles is not None and search.score.fit.count < search.fewest:
-            placement.obstacles.requires_grad_(False)  # a few numbers tell no shadows, either
+            placement.obstacles.requires_grad_(False)  # too few numbers to learn shadows
         if not len(planes):
             return
-        # The search has waves exp(-j k L) / L; the pooling's are ``strength`` lambda / (4 pi) times
-        # as large.
+        # The search has waves exp(-j k L) / L over a path of length L. Those of the pooling are
+        # ``strength`` lambda / (4 pi) times as large, so the gains are as much smaller.
         wavelengths = torch.tensor([receiver.wavelength for receiver in search.data.receivers])
         unit = pooling.strength.item() * wavelengths / (4 * math.pi)  # (r,)
-        numbers = torch.tensor(search.data.numbers)
-        gains = room.gains.new_ones(len(placement.bands), len(planes))
-        gains[placement.band_numbers[numbers]] = room.gains[search.score.fit.band_numbers]
         receiver_gains = room.receivers / unit
         if self.scene.one_radio:
             receiver_gains = receiver_gains.mean().expand_as(receiver_gains)
-        placement.start_strengths(gains, self.scene.radio_of(numbers), receiver_gains)
-        placement.step.mul_(0.1)
+        receivers = torch.tensor(search.data.numbers)  # r indices of the scene's receivers
+        plane_gains = room.gains.new_ones(len(placement.bands), len(planes))
+        searched_bands = placement.band_numbers[receivers]
+        plane_gains[searched_bands] = room.gains[search.score.fit.band_numbers]
+        placement.start_strengths(plane_gains, self.scene.radio_of(receivers), receiver_gains)
+        placement.step.mul_(0.1)  # the search is exact to fractions of a wavelength
 
     def _plan(self, planes: Tensor, slabs: Tensor, order: int | float = math.inf) -> None:
-        """Places planes and their slabs; the first revision begins to use paths at them.
+        """Places planes with their slabs, and plans paths of at most ``order`` reflections.
 
-        These paths have at most ``order`` reflections.
+        The first revision begins to use these paths.
         """
         placement = self.placement
         for number, (plane, slab) in enumerate(zip(planes, slabs, strict=True)):
@@ -285,13 +287,13 @@ class MirroredSplatting(GaussianSplatting):
         The gain is 0.1 where phases follow neither sign convention: a strong start with wrong
         phases would be worse than no signal.
         """
-        gains = []
+        fitted = []
         radios = self.scene.radio_of(query.receivers)
         for radio in range(self.scene.radios):
             rows = radios == radio
-            gains.append(fit_gain(labels[rows], waves[rows]))
-        relative = torch.stack(gains) / pooling.strength.cpu()
-        return torch.where((relative != 0) & (int(pooling.sign) != 0), relative, 0.1)
+            fitted.append(fit_gain(labels[rows], waves[rows]))
+        gains = torch.stack(fitted) / pooling.strength.cpu()
+        return torch.where((gains != 0) & (int(pooling.sign) != 0), gains, 0.1)
 
     @property
     def predicts_untrained(self) -> bool:  # type: ignore[override]
@@ -302,26 +304,28 @@ class MirroredSplatting(GaussianSplatting):
 
         Planes that a search has found do not move.
         """
-        boxes = ""
-        # Boxes need the strengths of the planes, which levels teach before phases count.
+        about_boxes = ""
+        # The search of boxes needs strengths of the planes, which powers have taught by now.
         if number == 2 and isinstance(self.pooling, PathRssi):
-            boxes = self._place_boxes()
-        return self._revise_planes(number, train, validation, loss) + boxes
+            about_boxes = self._place_boxes()
+        return self._revise_planes(number, train, validation, loss) + about_boxes
 
     def _revise_planes(
         self, number: int, train: Batch, validation: Batch | None, loss: Loss
     ) -> str:
         """The changes of ``revise`` to planes and paths, without the search of boxes in levels."""
         placement = self.placement
-        # Channels are sums of waves: powers alone say nothing, and phases count from the start.
+        # Channels are sums of waves, so their phases count from the start.
         adds_waves = not isinstance(self.pooling, LagPooling)
         if placement.is_bare:
             placement.enable_reflections()
-        # Early, too, if a search has found the planes: each path costs time in every step.
+        # The last revision drops weak paths. If a search has found the planes, the second does so,
+        # too: each path costs time in every step.
         if number == len(self.revisions) - 1 or (number == 1 and placement.found):
             batches = [train] if validation is None else [train, validation]
-            dropped = prune(placement, batches, loss)
-            return dropped + (self._place_boxes() if placement.is_complex and number == 1 else "")
+            about_paths = prune(placement, batches, loss)
+            is_time_for_boxes = placement.is_complex and number == 1
+            return about_paths + (self._place_boxes() if is_time_for_boxes else "")
         if number < 2 and not adds_waves:
             return "planes stay where they are"
         if self.is_wide or (self.scene.one_radio and not adds_waves):
@@ -341,13 +345,18 @@ class MirroredSplatting(GaussianSplatting):
         if placement.fixed or placement.found:
             return "phases count"
         before = loss(train)
-        # Powers locate distant planes to some decimetres: the first search reaches farther.
-        least = 0.03 * placement.diagonal if number == (0 if adds_waves else 2) else 0.0
-        moves = ", ".join(f"{move:+.3f}" for move in move_planes(self, train, wavelength, least))
+        # Powers locate distant planes to some decimetres, so the first search has a wider range.
+        is_first = number == (0 if adds_waves else 2)
+        least_range = 0.03 * placement.diagonal if is_first else 0.0  # [m]
+        offsets = move_planes(self, train, wavelength, least_range)
+        moves = ", ".join(f"{offset:+.3f}" for offset in offsets)
         return f"phases count; planes moved by {moves} m; loss {before:.4f} -> {loss(train):.4f}"
 
     def _place_boxes(self) -> str:
-        """Replaces learnt obstacles by boxes, if they explain the shadows at all receivers."""
+        """Replaces learnt obstacles by boxes, if boxes explain the shadows at all receivers.
+
+        Returns a clause for the log, empty if boxes are not searched.
+        """
         obstacles = self.placement.obstacles
         if self.shadowed is None or obstacles is None:
             return ""
@@ -355,7 +364,7 @@ class MirroredSplatting(GaussianSplatting):
         boxes = search.run()
         if stages.is_up():
             return "; no time for boxes"
-        # Boxes may explain what single receivers have of their own: others must gain, too.
+        # Boxes may fit errors of single receivers: held-out receivers must gain, too.
         if boxes and self.proof is not None and self._box_search(self.proof).gain(boxes) <= 0:
             return f"; {len(boxes)} boxes found, which held-out receivers do not confirm"
         if boxes:
@@ -368,47 +377,51 @@ class MirroredSplatting(GaussianSplatting):
         """The search for boxes in some links, along the axes of the room."""
         query = batch.query.to(self.device)
         errors = self._shadow_errors(query, batch.labels.to(self.device))
-        axes = self.placement.room_axes
+        axes = self.placement.room_axes  # (3, 3), a column for each axis of the room
         links = self.placement.folded(query)
         paths = links.paths._replace(start=links.paths.start @ axes, end=links.paths.end @ axes)
-        ends = torch.cat((links.seen[0][:, 0], links.receivers)).unique(dim=0) @ axes
+        transmitters = links.seen[0][:, 0]  # the direct path starts at the transmitter (b, 3)
+        ends = torch.cat((transmitters, links.receivers)).unique(dim=0) @ axes
         return BoxSearch(paths, errors, ends)
 
     def _shadow_errors(self, query: Query, labels: Tensor) -> ChannelErrors | LevelErrors:
-        """The function from the depths of paths to the errors of links, for ``BoxSearch``."""
+        """The function from losses of paths in obstacles to errors of links, for ``BoxSearch``."""
         placement = self.placement
         if not placement.is_complex:
             links = placement.folded(query)
-            fields = placement.strengths(query, links.paths, blocked=False).abs()
-            fields = fields * placement.patterns(query, links.ways)
-            powers = (fields / links.ways.norm(dim=-1).clamp_min(NEAREST)).square()
+            amplitudes = placement.strengths(query, links.paths, blocked=False).abs()  # (b, n)
+            amplitudes = amplitudes * placement.patterns(query, links.ways)
+            lengths = links.ways.norm(dim=-1).clamp_min(NEAREST)  # (b, n) [m]
+            powers = (amplitudes / lengths).square()
             if self.trend is not None:
                 labels = labels - self.trend(Batch(query)).value
             return LevelErrors(powers, labels, query.receivers)
         products, matches = [], []
         rows = torch.arange(len(query), device=self.device)
-        for link, channel in zip(rows.split(1), labels.split(1), strict=True):
-            asked = query[link]
-            folded = placement.folded(asked)
-            strengths = placement.strengths(asked, folded.paths, blocked=False)
-            fields = self._separate(asked, strengths * placement.patterns(asked, folded.ways))
+        # One link at a time: channels of all its paths take much memory.
+        for row, channel in zip(rows.split(1), labels.split(1), strict=True):
+            link = query[row]
+            folded = placement.folded(link)
+            strengths = placement.strengths(link, folded.paths, blocked=False)
+            fields = self._separate(link, strengths * placement.patterns(link, folded.ways))
             errors = ChannelErrors.of(fields, channel.to(fields))
             products.append(errors.products)
             matches.append(errors.matches)
         return ChannelErrors(torch.cat(products), torch.cat(matches))
 
     def _start(self) -> Float[Tensor, "w 4"]:
-        """Planes from which a search starts, in the world's frame.
+        """Planes (normal and offset [m]) from which a search starts, in the world's frame.
 
-        They are the user's walls, or learnt planes, or the faces of the box without their tilt.
+        They are the user's walls, or learnt planes, or the faces of the box.
         """
         placement = self.placement
         used = placement.used
         if placement.walls or not placement.is_new:
             return placement.planes[used].cpu()
+        # Normals of new planes have a small random tilt; rounded in the box's frame they are axes.
         normals = (placement.normals[used] @ placement.turn).round() @ placement.turn.mT
-        straight = torch.cat((normals, placement.offsets[used, None]), 1)
-        return seen_from(straight.double(), -placement.middle).cpu()
+        faces = torch.cat((normals, placement.offsets[used, None]), 1)  # from the box's middle
+        return seen_from(faces.double(), -placement.middle).cpu()
 
     @property
     def has_margins(self) -> bool:
@@ -425,7 +438,10 @@ class MirroredSplatting(GaussianSplatting):
         return self._separate(query, self.placement.margins(query))
 
     def _separate(self, query: Query, strengths: Complex[Tensor, "b n"]) -> Tensor:
-        """Channel of each path alone (b, n, e, s), with given strengths, at one receiver."""
+        """Channel of each path alone (b, n, e, s), if the paths have ``strengths``.
+
+        All links are to one receiver.
+        """
         with self.placement.holding():
             self.placement.held = strengths
             which = torch.arange(len(query), device=query.transmitters.device)
@@ -433,7 +449,7 @@ class MirroredSplatting(GaussianSplatting):
         count, n = paths.amplitudes.shape
 
         def separate(values: Tensor) -> Tensor:
-            """``values`` (b, n, ...) with one link for each path (b n, 1, ...)."""
+            """Reshapes values of paths (b, n, ...) to links of one path each (b n, 1, ...)."""
             return values.expand(count, *values.shape[1:]).flatten(0, 1)[:, None]
 
         single_paths = replace(
@@ -451,12 +467,13 @@ class MirroredSplatting(GaussianSplatting):
     def facts(self) -> dict[str, object]:
         """Facts of the pipeline, numbers of planes and paths, and tables by ``summarize``."""
         placement = self.placement
+        path_count = int(placement.kept.sum())
+        free_count = 0 if self.gaussians is None else len(self.gaussians)
         facts = super().facts() | {
-            "num_gaussians": int(placement.kept.sum())
-            + (0 if self.gaussians is None else len(self.gaussians)),
+            "num_gaussians": path_count + free_count,
             "num_gaussians_start": int(placement.most),
             "planes_kept": len(placement.used),
-            "paths_kept": int(placement.kept.sum()),
+            "paths_kept": path_count,
             "paths_most": int(placement.most),
         }
         return facts if self.places is None else facts | summarize(placement, self.places)
@@ -475,7 +492,7 @@ class MirroredSplatting(GaussianSplatting):
         return spread_links(self.scene) if self.places is None else self.places
 
     def learnt_room(self, links: Links | None = None) -> LearntRoom:
-        """Planes, obstacles and paths for figures."""
+        """The learnt room: planes, obstacles and paths."""
         return build_room(self.placement, links)
 
     def learnt_paths(self, query: Query) -> list[LearntPath]:

@@ -24,7 +24,7 @@ class Movable(nn.Module):
             ``scene.task.frequencies``.
         any_receiver: True if the model predicts for receivers without links. In ``of_receivers`` a
             module names its buffers with a row for each receiver; a new receiver gets the mean row.
-            ``take_receivers`` makes all other changes.
+            A module's method ``take_receivers`` makes all other changes.
     """
 
     scene: Scene
@@ -88,10 +88,13 @@ class Movable(nn.Module):
         for part in other.modules():
             if hasattr(part, "scene"):
                 part.scene = scene
-            for name in () if scene.one_radio else getattr(part, "of_receivers", ()):
-                values = getattr(part, name)
-                general = common_gain(values if known is None else values[known])
-                setattr(part, name, general.repeat(len(receivers), *[1] * general.ndim))
+            # With one radio at all places, the radio's only row stays.
+            buffers = () if scene.one_radio else getattr(part, "of_receivers", ())
+            for name in buffers:
+                values = getattr(part, name)  # (receivers, ...)
+                mean = common_gain(values if known is None else values[known])
+                repeats = (len(receivers), *[1] * mean.ndim)
+                setattr(part, name, mean.repeat(repeats))
             if hasattr(part, "take_receivers"):
                 part.take_receivers(scene, known)
         other.take_calibration(self)
@@ -150,7 +153,7 @@ class Movable(nn.Module):
             )
         adapted = registry("model").get("adapted")(moved.scene, moved).eval()
         adapted.take(links, new.scatter)
-        # Its deviations are over those without readings.
+        # ``Adapted.deviations`` scale the intervals of the model without readings.
         adapted.calibration = replace(new, widths=None, elsewhere=None)
         return adapted
 

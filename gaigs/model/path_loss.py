@@ -53,33 +53,35 @@ class PathLoss(Model):
 
         A receiver without links gets the means of levels and exponents.
         """
-        lines = []
         if links.uncertainties is not None:
             self.regions.copy_(links.uncertainties)
         links = without_gross_errors(links)
         known = known_links(links, any_receiver=True)
+        laws = []  # results of the fit at each receiver with links
         for index in filter(len, known):
             query, labels = links.query[index], links.labels[index].double()
             decades = self._decades(query.transmitters.double(), query.receivers)
+            # Least squares of y - mean(y) = gamma x, with x = -10 (decades - mean(decades)).
             level, centre = labels.mean(), decades.mean()
             labels = labels - level
-            steps = -10 * (decades - centre)
-            # Below a ratio of 1.01 one unit of the exponent changes the labels by less than 0.05
-            # dB.
+            x = -10 * (decades - centre)
+            # With lengths in a ratio below 1.01, an exponent larger by 1 changes labels by less
+            # than 0.05 dB.
             is_spread = 10 ** (decades.max() - decades.min()) >= 1.01
-            weight = steps.square().sum() * is_spread
-            exponent = steps @ labels / weight if is_spread else weight
-            errors = (labels - exponent * steps).square().sum()
-            freedom = len(index) - 1 - is_spread.to(weight)
-            lines.append(torch.stack((level, centre, exponent, weight, errors, freedom)))
-        levels, centres, exponents, weights, errors, freedom = torch.stack(lines, 1)
+            weight = x.square().sum() * is_spread
+            exponent = x @ labels / weight if is_spread else weight  # 0 without a spread
+            errors = (labels - exponent * x).square().sum()
+            freedom = len(index) - 1 - is_spread.to(weight)  # degrees of freedom of the errors
+            laws.append(torch.stack((level, centre, exponent, weight, errors, freedom)))
+        levels, centres, exponents, weights, errors, freedom = torch.stack(laws, 1)
+        # Variance of the labels about their laws, common to all receivers.
         noise = errors.sum() / freedom.sum() if freedom.sum() else errors.new_tensor(torch.nan)
         exponents = shrunk(exponents, weights, noise)
-        levels = levels + 10 * exponents * centres
-        is_known = torch.tensor([*map(len, known)]) > 0
+        levels = levels + 10 * exponents * centres  # T: the level at decades of 0, 1 m
+        has_links = torch.tensor([len(index) for index in known]) > 0
         for buffer, fitted in ((self.levels, levels), (self.exponents, exponents)):
-            buffer[is_known] = fitted.to(buffer)
-            buffer[~is_known] = fitted.mean().to(buffer)
+            buffer[has_links] = fitted.to(buffer)
+            buffer[~has_links] = fitted.mean().to(buffer)
 
     def forward(self, batch: Batch) -> Prediction:
         decades = self._decades(batch.query.transmitters, batch.query.receivers)
@@ -93,11 +95,11 @@ class PathLoss(Model):
     def _decades(
         self, transmitters: Float[Tensor, "b 3"], receivers: Int[Tensor, " b"]
     ) -> Float[Tensor, " b"]:
-        """log10 of the distances in [m]."""
+        """log10(distance / 1 m), averaged over the region in which the receiver may stand."""
         positions = self.scene.positions(transmitters)[receivers]  # (b, 3)
         lengths = (transmitters - positions).norm(dim=-1).clamp_min(0.1)
-        # The mean of ln r² over a normal region is ln(0.56 deviation²) in its middle, where 0.56 is
-        # exp(-Euler's constant), and ln d² far away.
+        # The mean of ln r² over a normal region is ln(0.56 deviation²) at its middle, where 0.56 is
+        # exp(-Euler's constant), and ln d² far away. The logarithm of the sum has both limits.
         regions = self.regions[receivers].to(lengths)
         return (lengths.square() + 0.56 * regions.square()).log10() / 2
 
@@ -117,19 +119,25 @@ def shrunk(
         weights: Inverse variances of their errors, for noise of variance 1; 0 without an exponent.
         noise: Variance of the labels about the law; NaN if too few labels show it. All exponents
             then become their weighted mean.
+
+    Returns:
+        Exponents; 2 (free space) if no receiver has one.
     """
     total = weights.sum()
     if not total:
         return torch.full_like(exponents, 2)
+    mean = weights @ exponents / total
     if noise.isnan():
-        return torch.full_like(exponents, (weights @ exponents / total).item())
+        return torch.full_like(exponents, mean.item())
     noise = noise.clamp_min(1e-12)
-    # Scatter beyond chance (DerSimonian and Laird, 1986): Q - (r - 1) over the sum of weights less
-    # their squares over it.
-    squares = weights @ (exponents - weights @ exponents / total).square()
-    chance = ((weights > 0).sum() - 1) * noise
-    scatter = (squares - chance) / (total - weights.square().sum() / total)
-    scatter = scatter.nan_to_num(0, posinf=0).clamp_min(0)
-    precisions = weights / (scatter * weights + noise)  # of the exponents about the mean
-    shares = scatter * precisions
-    return shares * exponents + (1 - shares) * (precisions @ exponents / precisions.sum())
+    # Variance of the true exponents (DerSimonian and Laird, 1986), with the squares Q of fitted
+    # ones about their mean and the weights w: (Q - (r - 1) noise) / (sum w - sum w² / sum w).
+    squares = weights @ (exponents - mean).square()
+    expected_squares = ((weights > 0).sum() - 1) * noise  # if all true exponents are equal
+    variance = (squares - expected_squares) / (total - weights.square().sum() / total)
+    variance = variance.nan_to_num(0, posinf=0).clamp_min(0)
+    # A fitted exponent has the variance of the true ones plus noise / w about their mean.
+    precisions = weights / (variance * weights + noise)
+    shares = variance * precisions  # of the variance that is not noise, 0 to 1
+    common = precisions @ exponents / precisions.sum()
+    return shares * exponents + (1 - shares) * common

@@ -29,9 +29,9 @@ from gaigs.core.task import Axis
 class Subcarriers(NamedTuple):
     """Requested subcarriers of a prediction."""
 
-    # Frequencies [Hz] that the model computes in place of the labels' own; None: the labels' own.
+    # New frequencies [Hz], which the model computes; None: frequencies of the labels.
     exchanged: Float[Tensor, " s"] | None = None
-    # The labels' own subcarriers that are taken; None: all.
+    # Numbers of the requested subcarriers among those of the labels; None: all.
     columns: Int[Tensor, " s"] | None = None
     warning: str = ""  # sentence on the values, empty if there is nothing to say
 
@@ -39,10 +39,10 @@ class Subcarriers(NamedTuple):
 class Request(NamedTuple):
     """A checked request of ``Model.predict``: links to predict, and axes of the result."""
 
-    query: Query  # links, the receivers of a position one after the other
-    axes: tuple[int, ...]  # axes of the links in the answer, see ``Query.from_positions``
-    receiver: object  # receivers as they were asked for; None: all
-    each: int  # number of links at a position
+    query: Query  # links; all receivers of the first position, then of the second, ...
+    axes: tuple[int, ...]  # shape of the links in the answer, see ``Query.from_positions``
+    receiver: object  # argument ``receiver`` of ``predict``; None: all receivers
+    links_per_position: int
     directions: Directions | None  # directions to predict; None: the label's own
     subcarriers: Subcarriers  # subcarriers to predict
     # Sentences on positions, carriers and subcarriers far from the training links.
@@ -60,23 +60,25 @@ class Request(NamedTuple):
     ) -> "Request":
         """Checks the arguments of ``Model.predict``, whose docstring lists the errors."""
         directions = as_directions(directions, scene.task.directions, scene.task.name)
-        names = [one.name for one in scene.receivers]
+        names = [known.name for known in scene.receivers]
         query, axes = Query.from_positions(
             transmitters, receiver, frequency, names, scene.frequencies
         )
-        if isinstance(transmitters, Query):
+        if isinstance(transmitters, Query):  # one link a row, and no warnings
             return cls(query, axes, transmitters.receivers, 1, directions, subcarriers, [])
-        each = axes[-1] if receiver is None else 1
+        links_per_position = axes[-1] if receiver is None else 1
         warnings = [subcarriers.warning] if subcarriers.warning else []
-        warnings += extrapolations(query[::each], scene)
-        return cls(query, axes, receiver, each, directions, subcarriers, warnings)
+        one_link_each = query[::links_per_position]
+        warnings += extrapolations(one_link_each, scene)
+        return cls(query, axes, receiver, links_per_position, directions, subcarriers, warnings)
 
     def asked(self, scene: Scene, name: str | None = None) -> Asked:
         """Names and coordinates of the result's axes, or of its part at receiver ``name``."""
         task = self._task(scene)
         known = [receiver.name for receiver in scene.receivers]
         receiver = self.receiver if name is None else name
-        if task.is_channel and receiver is not None and not np.ndim(receiver):
+        is_single = receiver is not None and not np.ndim(receiver)
+        if task.is_channel and is_single:  # the result has only subcarriers in the receiver's band
             in_band = scene.receivers[int(as_receivers(receiver, known))].hears(task.frequencies)
             task = task if in_band.all() else task.at_frequencies(task.frequencies[in_band])
         if isinstance(self.directions, Grid):
@@ -86,15 +88,16 @@ class Request(NamedTuple):
         if isinstance(self.directions, Rays):
             shape = self.directions.shape
             axes = {f"direction_{k}": Axis(np.arange(size)) for k, size in enumerate(shape)}
-        names = np.array(known)
-        places = self.axes[:-1] if self.receiver is None else self.axes
-        positions = self.query.transmitters[:: self.each].reshape(*places, 3)
-        has_axis = self.receiver is None and name is None
-        if name is not None:
-            names = np.full(places, name)
-        elif not has_axis:
-            names = names[self.query.receivers.cpu()].reshape(places)
-        return Asked(positions, names, has_axis, axes, task.quantity, task.unit)
+        grid = self.axes[:-1] if self.receiver is None else self.axes  # shape of the positions
+        positions = self.query.transmitters[:: self.links_per_position].reshape(*grid, 3)
+        has_receiver_axis = self.receiver is None and name is None
+        if has_receiver_axis:
+            names = np.array(known)
+        elif name is not None:
+            names = np.full(grid, name)
+        else:
+            names = np.array(known)[self.query.receivers.cpu()].reshape(grid)
+        return Asked(positions, names, has_receiver_axis, axes, task.quantity, task.unit)
 
     def _task(self, scene: Scene) -> Any:
         """The task at the requested subcarriers."""
@@ -106,13 +109,18 @@ class Request(NamedTuple):
         return task
 
     def estimates(self, fields: Sequence, scene: Scene) -> Any:
-        """The ``Estimate`` of its fields, or a dictionary if they are dictionaries by receiver."""
+        """An ``Estimate``, or a dictionary of estimates by the names of the receivers.
+
+        Args:
+            fields: Fields of the estimate, as results of ``arranged``; None: unknown.
+            scene: Scene of the model.
+        """
         if not isinstance(fields[0], dict):
             return Estimate(*fields).about(self.asked(scene))
         estimates = {}
         for name in fields[0]:
-            parts = Estimate(*(part and part[name] for part in fields))
-            estimates[name] = parts.about(self.asked(scene, name))
+            at_receiver = [None if field is None else field[name] for field in fields]
+            estimates[name] = Estimate(*at_receiver).about(self.asked(scene, name))
         return estimates
 
     def to_xarray(self, answer: Any, scene: Scene) -> Any:
@@ -142,25 +150,27 @@ class Request(NamedTuple):
         is_channel = values.ndim > len(axes)
         task = self._task(scene)
 
-        def of_array(part: Tensor, receiver: Receiver) -> Tensor:
+        def unpadded(part: Tensor, receiver: Receiver) -> Tensor:
+            """Values (..., elements, subcarriers) that the receiver measures."""
             if not is_channel:
                 return part
-            return part[..., : len(receiver.array), :][..., receiver.hears(task.frequencies)]
+            of_elements = part[..., : len(receiver.array), :]
+            return of_elements[..., receiver.hears(task.frequencies)]
 
         if self.receiver is None:
             parts = values.unbind(len(axes) - 1)
             pairs = zip(receivers, parts, strict=True)
-            return {receiver.name: of_array(part, receiver) for receiver, part in pairs}
+            return {receiver.name: unpadded(part, receiver) for receiver, part in pairs}
         number = as_receivers(self.receiver, [receiver.name for receiver in receivers])
-        return values if number.ndim else of_array(values, receivers[int(number)])
+        return values if number.ndim else unpadded(values, receivers[int(number)])
 
 
 def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver | None:
     """The new receiver in an argument of ``Model.predict``; None for names and indices.
 
-    The argument may be a ``Receiver``, a ``Pose``, or a position [m]. A pose or position gets the
-    array of the scene's receivers. A position requires an array without orientation. With three
-    transmitters, three whole numbers are indices of receivers.
+    A new receiver is given by a ``Receiver``, a ``Pose``, or a position [m]. A pose or position
+    gets the array of the scene's receivers. A position requires an array without orientation. Three
+    whole numbers are a position, but with three transmitters they are an index for each.
     """
     if isinstance(receiver, Receiver) or receiver is None:
         return receiver
@@ -173,9 +183,9 @@ def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver 
             return None
         pose = Pose.at(as_positions("receiver", receiver).cpu())
     array = scene.receivers[0].array
-    for other in scene.receivers:
-        is_alike = other.array.pattern == array.pattern
-        if not is_alike or not torch.equal(other.array.elements, array.elements):
+    for known in scene.receivers:
+        is_alike = known.array.pattern == array.pattern
+        if not is_alike or not torch.equal(known.array.elements, array.elements):
             raise ValueError(
                 "receiver must be a gaigs.Receiver with its array, as the arrays of the model's "
                 "receivers differ"
@@ -190,16 +200,22 @@ def as_new_receiver(receiver: Any, scene: Scene, transmitters: Any) -> Receiver 
 
 def is_same(one: Receiver, other: Receiver) -> bool:
     """True if two receivers have the same pose and array."""
-    parts = []
-    for receiver in (one, other):
-        pose, array = receiver.pose, receiver.array
-        parts.append((pose.position, pose.rotation, array.elements))
-    alike = [a.shape == b.shape and torch.allclose(a.to(b), b) for a, b in zip(*parts, strict=True)]
-    return all(alike) and one.array.pattern == other.array.pattern
+    pairs = (
+        (one.pose.position, other.pose.position),
+        (one.pose.rotation, other.pose.rotation),
+        (one.array.elements, other.array.elements),
+    )
+    for a, b in pairs:
+        if a.shape != b.shape or not torch.allclose(a.to(b), b):
+            return False
+    return one.array.pattern == other.array.pattern
 
 
 def _kind_of(values: Any) -> tuple[str, tuple[int, ...]]:
-    """Shape and numpy's kind of dtype of an array-like; the kind is ``O`` if not numeric."""
+    """Numpy's letter for the dtype of an array-like, and its shape; ``O`` and () for ragged lists.
+
+    The letters ``i``, ``u`` and ``f`` stand for numbers.
+    """
     try:
         array = np.asarray(values.detach().cpu() if isinstance(values, Tensor) else values)
     except ValueError:  # ragged lists
@@ -208,7 +224,7 @@ def _kind_of(values: Any) -> tuple[str, tuple[int, ...]]:
 
 
 def lacks_numbers(scene: Scene) -> bool:
-    """True for channels if a receiver lacks elements or subcarriers that another one has."""
+    """True for channels if a receiver has fewer elements or subcarriers than the labels."""
     if not scene.task.is_channel:
         return False
     return any(
@@ -230,8 +246,8 @@ def as_known_subcarriers(frequencies: object, scene: Scene, any_frequency: bool)
             f"labels of task {scene.task.name!r} have no subcarriers; leave frequencies out"
         )
     asked = as_subcarriers(frequencies)
-    apart, columns = (scene.task.frequencies - asked[:, None]).abs().min(1)
-    if (apart <= 1e-9 * asked).all():  # float64 computes them no better
+    apart, columns = (scene.task.frequencies - asked[:, None]).abs().min(1)  # nearest ones (s,)
+    if (apart <= 1e-9 * asked).all():  # equal up to rounding
         return Subcarriers(columns=columns)
     if not any_frequency:
         warning = (
@@ -285,7 +301,10 @@ def check_interval(
 
 
 def usual_batch_size(shape: tuple[int, ...], numbers: int = 2**17, most: int = 1024) -> int:
-    """Number of links whose labels have ``numbers`` values together; from 16 to ``most``."""
+    """Number of links whose labels of a ``shape`` have ``numbers`` values together.
+
+    The result is from 16 to ``most``.
+    """
     return min(most, max(16, numbers // math.prod(shape)))
 
 
@@ -294,15 +313,16 @@ def extrapolations(query: Query, scene: Scene) -> list[str]:
     messages = []
     lower, upper = (corner.to(scene.lower) for corner in scene.box)
     positions = scene.positions(lower)
-    beyond = (positions - positions.clamp(lower, upper)).norm(dim=-1).amax()
+    in_box = positions.clamp(lower, upper)  # (receivers, 3), the nearest points of the box
+    beyond = (positions - in_box).norm(dim=-1).amax()
     if beyond > scene.extent:
         messages.append(
             f"a receiver is {beyond:.3g} m outside the box of the training links, which is "
             f"{scene.extent:.3g} m across: nothing was measured near there"
         )
     points = query.transmitters
-    nearest = points.clamp(scene.lower.to(points), scene.upper.to(points))  # (b, 3), in the box
-    distances = (points - nearest).norm(dim=-1)  # (b,)
+    in_box = points.clamp(scene.lower.to(points), scene.upper.to(points))  # (b, 3)
+    distances = (points - in_box).norm(dim=-1)  # (b,)
     if count := int((distances > scene.extent).sum()):
         messages.append(
             f"{count} of {len(points)} positions are up to {distances.amax():.3g} m outside the "

@@ -100,8 +100,8 @@ class Site(Model):
         if roofs.ground is not None:
             self.ground = roofs.ground.to(self.roofs)
         self.grid.copy_(torch.tensor([*roofs.lower, roofs.cell]))
-        kept = without_gross_errors(links)
-        index = kept.split.known
+        links = without_gross_errors(links)
+        index = links.split.known
         query = links.query[index]
         features = self._features(query).double()  # (k, 4)
         if self.buildings and not features[:, 0].any():
@@ -117,7 +117,7 @@ class Site(Model):
         log.info("losses by roofs, length inside, walls and edges: %s", self.losses.tolist())
         corrected = links.labels.clone()
         corrected[index] += (features @ self.losses.double()).to(corrected)
-        self.law.fit(replace(kept, labels=corrected))
+        self.law.fit(replace(links, labels=corrected))
 
     def forward(self, batch: Batch) -> Prediction:
         loss = self._features(batch.query) @ self.losses
@@ -128,7 +128,8 @@ class Site(Model):
         x, y, cell = self.grid.tolist()
         if not cell:  # before the fit
             return query.transmitters.new_full((len(query), 4), torch.nan)
-        # Another wavelength adds a constant to the loss behind an edge, which c1 takes.
+        # With an unknown carrier, 2 GHz: another one adds a constant to the loss behind an edge,
+        # which c1 includes.
         wavelength = speed_of_light / (self.scene.middle_frequency or 2e9)
         starts = self.scene.positions(query.transmitters)[query.receivers].clone()  # (b, 3)
         ends = query.transmitters.clone()
@@ -146,28 +147,29 @@ class Site(Model):
         buildings = read_buildings(self.buildings, frame, self.height) if self.buildings else []
         lower, upper = (corner[:2].double().numpy() for corner in self.scene.box)
         cell = 1.0  # [m]
-        corners = []  # of both maps (2, 2) [m]
+        maps = []  # lower and upper corner of each map (2, 2) [m]
         if self.buildings:
             edges = np.concatenate([building.rings[0] for building in buildings])
-            corners.append(np.stack((edges.min(0), edges.max(0))))
-            self._check_near("buildings", self.buildings, corners[-1])
+            maps.append(np.stack((edges.min(0), edges.max(0))))
+            self._check_near("buildings", self.buildings, maps[-1])
         if self.terrain:
             extent = read_extent(self.terrain, frame)
-            corners.append(np.stack((extent.lower, extent.upper)))
-            self._check_near("terrain", self.terrain, corners[-1])
+            maps.append(np.stack((extent.lower, extent.upper)))
+            self._check_near("terrain", self.terrain, maps[-1])
             cell = cell if self.buildings else extent.cell
-        first = np.maximum(lower - self.scene.extent, np.stack(corners)[:, 0].min(0))
-        last = np.minimum(upper + self.scene.extent, np.stack(corners)[:, 1].max(0))
-        grid = plan_grid(first, last, cell)
+        corners = np.stack(maps)  # (maps, 2, 2)
+        lower = np.maximum(lower - self.scene.extent, corners[:, 0].min(0))
+        upper = np.minimum(upper + self.scene.extent, corners[:, 1].max(0))
+        grid = plan_grid(lower, upper, cell)
         if not self.terrain:
             return rasterize_roofs(buildings, grid)
         ground, is_known = read_ground(self.terrain, frame, grid)
         roofs = rasterize_roofs(buildings, grid, ground)
-        # A margin without heights: beyond the grid the file has none either.
+        # The file has no heights beyond the grid: a margin of one cell has the value 0.
         known = functional.pad(torch.from_numpy(is_known).float(), (1, 1, 1, 1))
-        corner = roofs.lower[0] - roofs.cell, roofs.lower[1] - roofs.cell
-        covered = roofs._replace(ground=known, lower=corner)
-        self._place_ends(links, roofs, covered)
+        padded_lower = roofs.lower[0] - roofs.cell, roofs.lower[1] - roofs.cell
+        covered = roofs._replace(ground=known, lower=padded_lower)
+        self._choose_zero(links, roofs, covered)
         return roofs
 
     def _check_near(self, content: str, file: str, corners: Float[np.ndarray, "2 2"]) -> None:
@@ -183,11 +185,13 @@ class Site(Model):
                 "origin".format(file, content, *ends)
             )
 
-    def _place_ends(self, links: Links, roofs: Roofs, covered: Roofs) -> None:
-        """Decides whether heights of the ends are above the ground.
+    def _choose_zero(self, links: Links, roofs: Roofs, covered: Roofs) -> None:
+        """Sets ``is_lifted``: True if heights of transmitters and receivers are above the ground.
 
         Args:
-            covered: The grid with 1 where the file has a height of the ground, else 0.
+            links: Links, whose known transmitters and receivers are compared with the ground.
+            roofs: Roofs and ground.
+            covered: A grid whose ``ground`` is 1 where the file has a height, else 0.
         """
         known = links.query[links.split.known]
         positions = self.scene.positions(known.transmitters)[known.receivers]
@@ -201,7 +205,7 @@ class Site(Model):
                 100 * outside,
             )
         is_above = self.above_ground
-        heights = ends[:, 2] - roofs.ground_at(ends)  # above the ground, if z has its zero
+        heights = ends[:, 2] - roofs.ground_at(ends)  # above the ground, if z has the file's zero
         if is_above is None:
             is_above = bool(heights.median() < 0)
         self.is_lifted.fill_(is_above)

@@ -105,9 +105,9 @@ class SklearnRegressor(LookUp):
     def forward(self, batch: Batch) -> Prediction:
         task = self.scene.task
         labels = torch.full((len(batch.query), *task.shape), torch.nan, dtype=task.dtype)
-        for is_asked, predicted in self._predictions(batch.query):
-            values = torch.from_numpy(predicted)
-            if task.dtype.is_complex:
+        for is_asked, outputs in self._predictions(batch.query):
+            values = torch.from_numpy(outputs)  # (links, outputs)
+            if task.dtype.is_complex:  # outputs are real and imaginary parts
                 values = torch.view_as_complex(values.reshape(-1, *task.shape, 2).contiguous())
             labels[is_asked] = values.reshape(-1, *task.shape).to(task.dtype)
         return Prediction(at_directions(labels, batch, self.scene), {})
@@ -117,8 +117,8 @@ class SklearnRegressor(LookUp):
         if not has_std or not self.scene.task.is_scalar:
             return None
         deviations = torch.ones(len(batch.query))
-        for is_asked, predicted in self._predictions(batch.query, return_std=True):
-            deviations[is_asked] = torch.from_numpy(predicted[1]).float()
+        for is_asked, (_, stated) in self._predictions(batch.query, return_std=True):
+            deviations[is_asked] = torch.from_numpy(stated).float()
         return deviations
 
 
@@ -147,7 +147,14 @@ def build_estimator(given: Any) -> Any:
 
 
 def find_class(target: str) -> type:
-    """A class of scikit-learn; others are refused, as a stranger's checkpoint may name any."""
+    """The class of scikit-learn with the name ``target``, which includes its module.
+
+    Other classes are refused: a checkpoint from a stranger may name any class.
+
+    Raises:
+        ImportError: scikit-learn is not installed.
+        ValueError: The name is not of a class of scikit-learn.
+    """
     try:
         from sklearn.base import BaseEstimator
         from sklearn.gaussian_process.kernels import Kernel

@@ -38,16 +38,17 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         explains anything.
         """
         axes = room_axes(room.planes)
-        nothing = SlabRoom(room.planes[:0], room.slabs[:0])
-        walls, between = self.propose_along(nothing, axes[axes[:, 2].abs() < 0.01], 0.0)
+        horizontal = axes[axes[:, 2].abs() < 0.01]
+        empty = SlabRoom(room.planes[:0], room.slabs[:0])
+        walls, between = self.propose_along(empty, horizontal, least=0.0)
         trials = []
         for candidate in walls + between:
-            for moved, material in self._propose_by_phases(candidate[None], 0, 0.04):
+            for moved, material in self._propose_by_phases(candidate[None], 0, tilt=0.04):
                 # Without its vertical part; the horizontal part of the normal gets length 1.
                 upright = moved * moved.new_tensor([1.0, 1.0, 0.0, 1.0]) / moved[:2].norm()
                 trials.append(SlabRoom(upright[None], material[None]))
         polished = [self.score.refine(trial) for trial in self.score.choose_best(trials)]
-        return min(polished, key=self.score.error, default=nothing)
+        return min(polished, key=self.score.error, default=empty)
 
     def grow_along(
         self, room: SlabRoom, most: int, others: Float[Tensor, "v 4"] | None = None
@@ -88,7 +89,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
 
         Returns:
             At most four walls, which have all places on one side, and at most four planes between
-            the places, each list best first. In a single list the latter would displace walls.
+            the places, each list best first. In a single list planes between would displace walls.
         """
         walls: list[Candidate] = []
         between: list[Candidate] = []
@@ -96,10 +97,11 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         for line, shares in zip(lines, self.score.rate(room, lines).ratings, strict=True):
             for plane in room.planes:
                 shares[self.frame.is_like(line, plane)] = 0
-            heights = self.frame.points.to(line) @ line[0, :3]
+            heights = self.frame.points.to(line) @ line[0, :3]  # of places along the normal
             is_wall = (line[:, 3] < heights.min()) | (line[:, 3] > heights.max())
-            for kind, rated in ((walls, shares * is_wall), (between, shares * ~is_wall)):
-                kind += [Candidate(line[at], rated[at].item()) for at in find_maxima(rated, 11)]
+            for candidates, rated in ((walls, shares * is_wall), (between, shares * ~is_wall)):
+                for row in find_maxima(rated, 11):
+                    candidates.append(Candidate(line[row], rated[row].item()))
         return _strongest(walls, least), _strongest(between, least)
 
     def add_best(self, room: SlabRoom, candidates: list[Float[Tensor, "4"]]) -> SlabRoom:
@@ -111,7 +113,7 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         number = len(room.planes)
         for plane in candidates:
             planes = torch.cat((room.planes, plane[None]))
-            for moved, material in self._propose_by_phases(planes, number, 1e-4):
+            for moved, material in self._propose_by_phases(planes, number, tilt=1e-4):
                 if not self.frame.is_like(room.planes, moved).any():
                     trials.append(room.with_plane(moved, material))
         best = self.score.choose_best(trials)
@@ -129,7 +131,10 @@ class AxisPlanes(PlaneSearch[SlabRoom]):
         return self.score.choose_best([room, self.score.polish(room, steps=30, rate=3e-4)])[0]
 
     def _propose_by_phases(self, planes: Float[Tensor, "w 4"], number: int, tilt: float) -> list:
-        """Planes near plane ``number``, by ``propose_by_phases`` with every third of ``SLABS``."""
+        """Planes near plane ``number`` and their slabs, by ``propose_by_phases``.
+
+        Planes turn by at most ``tilt`` [rad]. Every third of ``SLABS`` is tried.
+        """
         return propose_by_phases(self.data, planes, number, self.data.reach, tilt, SLABS[::3])
 
 
@@ -148,9 +153,9 @@ def room_axes(planes: Float[Tensor, "w 4"]) -> Float[Tensor, "k 3"]:
     normals = planes[:, :3]
     up = planes.new_tensor([0.0, 0.0, 1.0])
     is_steep = normals[:, 2].abs() < 0.5
-    upright = functional.normalize(normals[is_steep] * (1 - up), dim=1)
-    across = torch.linalg.cross(up.expand_as(upright), upright)
-    return torch.stack(distinct(torch.cat((normals, up[None], upright, across)), 2e-4))
+    horizontal = functional.normalize(normals[is_steep] * (1 - up), dim=1)
+    across = torch.linalg.cross(up.expand_as(horizontal), horizontal)
+    return torch.stack(distinct(torch.cat((normals, up[None], horizontal, across)), 2e-4))
 
 
 def is_square(planes: Float[Tensor, "w 4"]) -> bool:
@@ -162,6 +167,7 @@ def is_square(planes: Float[Tensor, "w 4"]) -> bool:
 
 def find_maxima(ratings: Float[Tensor, " k"], width: int) -> list[int]:
     """Indices of at most two local maxima above 0, each the largest of ``width`` neighbours."""
-    is_peak = functional.max_pool1d(ratings[None], width, 1, width // 2)[0] == ratings
-    at = (ratings * is_peak).topk(2).indices
-    return at[ratings[at] * is_peak[at] > 0].tolist()
+    largest_nearby = functional.max_pool1d(ratings[None], width, 1, width // 2)[0]
+    peaks = ratings * (largest_nearby == ratings)  # 0 beside the maxima
+    highest = peaks.topk(2)
+    return highest.indices[highest.values > 0].tolist()

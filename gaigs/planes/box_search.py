@@ -33,17 +33,20 @@ class ChannelErrors(NamedTuple):
         cls, fields: Complex[Tensor, "b n e s"], channels: Complex[Tensor, "b e s"]
     ) -> "ChannelErrors":
         """The function for measured channels, from the field of each path without obstacles."""
-        fields = fields.flatten(2)
+        fields = fields.flatten(2)  # (b, n, numbers)
         channels = channels.flatten(1)[..., None]  # (b, numbers, 1)
-        power = channels.abs().square().sum((1, 2))[:, None].clamp_min(FAINTEST)
+        power = channels.abs().square().sum((1, 2))[:, None].clamp_min(FAINTEST)  # (b, 1)
         products = (fields.conj() @ fields.mT).real / power[..., None]
-        return cls(products, (fields.conj() @ channels)[..., 0].real / power)
+        matches = (fields.conj() @ channels)[..., 0].real / power
+        return cls(products, matches)
 
     def __call__(self, depths: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
         """Error of each link if its paths are attenuated by ``depths`` [Np]."""
-        passed = (-depths).exp()
-        terms = (self.products @ passed[..., None])[..., 0] - 2 * self.matches
-        errors = (1 + (passed * terms).sum(1)).clamp_min(0)
+        a = (-depths).exp()
+        # |h - F a|² / |h|² = 1 + a' (products a - 2 matches)
+        terms = (self.products @ a[..., None])[..., 0] - 2 * self.matches
+        errors = (1 + (a * terms).sum(1)).clamp_min(0)
+        # A logarithm that hardly changes below ``floor`` and above 1 / ``floor``.
         return (errors / self.floor).log1p() - (errors * self.floor).log1p()
 
 
@@ -61,11 +64,12 @@ class LevelErrors(NamedTuple):
 
     def __call__(self, depths: Float[Tensor, "b n"]) -> Float[Tensor, " b"]:
         """Error of each link if its paths are attenuated by ``depths`` [Np]."""
-        power = (self.powers * (-2 * depths).exp()).sum(1).clamp_min(FAINTEST)
+        power = (self.powers * (-2 * depths).exp()).sum(1).clamp_min(FAINTEST)  # (b,)
         errors = 10 * power.log10() - self.levels
         counts = self.receivers.bincount()
         sums = errors.new_zeros(len(counts)).index_add(0, self.receivers, errors)
-        errors = errors - (sums / counts.clamp_min(1))[self.receivers]
+        means = sums / counts.clamp_min(1)  # of each receiver
+        errors = errors - means[self.receivers]
         return (errors / self.scale).square().log1p()
 
 
@@ -128,7 +132,9 @@ class BoxSearch:
         self.places = places
         count, n = folded.exists.shape
         self.free = places.new_zeros(count, n)  # depths without boxes
-        path = folded.path + n * torch.arange(count, device=folded.path.device)[:, None]  # (b, s)
+        # Segments of existing paths, over all links; a path is numbered link * n + path.
+        first_paths = n * torch.arange(count, device=folded.path.device)[:, None]  # (b, 1)
+        path = folded.path + first_paths  # (b, s)
         exists = folded.exists[:, folded.path].flatten().nonzero()[:, 0]
         self.path = path.flatten()[exists]
         self.start = folded.start.flatten(0, 1)[exists]
@@ -137,7 +143,7 @@ class BoxSearch:
         self.cell = float((upper - lower).norm()) / 45  # 0.2 m in a room of 7 by 5 m
         self.lower = lower - 2 * self.cell
         self.upper = upper + 2 * self.cell
-        nowhere = self.lower + math.inf
+        nowhere = self.lower + math.inf  # the first box is outside, which updates the segments
         self.near = Segments(nowhere, nowhere, self.start, self.end, self.path)
         self.common = 0.0  # depth of all paths, while gains are not yet right [Np]
         self.boxes: list[Cuboid] = []
@@ -160,10 +166,12 @@ class BoxSearch:
         least = before.mean() - self.price
         for seed in self._seeds(depths):
             box = self._adjust(depths, seed, self.steps[:2], 30)
-            fall = before - self.errors(depths + self._depth(box))
-            is_clear = fall.mean() > self.clear * fall.std() / len(fall) ** 0.5
-            if is_clear and before.mean() - fall.mean() < least:
-                best, least = box, before.mean() - fall.mean()
+            fall = before - self.errors(depths + self._depth(box))  # (b,)
+            standard_error = fall.std() / len(fall) ** 0.5
+            is_clear = fall.mean() > self.clear * standard_error
+            error = before.mean() - fall.mean()
+            if is_clear and error < least:
+                best, least = box, error
         if best is None:
             return False
         self.boxes.append(best)
@@ -193,6 +201,7 @@ class BoxSearch:
         """
         if stages.is_up():
             raise TimeoutError
+        # Only segments near the last boxes are tested; a box beyond their region replaces them.
         if (self.near.low > box.corners[0]).any() or (self.near.high < box.corners[1]).any():
             self.near = self._segments_near(box)
         return self.near.path[passes_box(self.near.start, self.near.end, box.corners)]
@@ -211,14 +220,15 @@ class BoxSearch:
 
     def _error(self, depths: Float[Tensor, "b n"], boxes: list[Cuboid]) -> float:
         """Mean error of all links if ``boxes`` add to ``depths`` [Np]."""
+        # Both have the common depth, which must count once.
         return self.errors(depths + self._depths(boxes) - self.common).mean().item()
 
     @cached_property
     def cells(self) -> list[tuple[Cuboid, Int[Tensor, " h"]]]:
-        """Cells without places, on every second position of each axis, with the paths in each."""
-        axes = [
-            torch.arange(*ends, 2 * self.cell) for ends in zip(self.lower, self.upper, strict=True)
-        ]
+        """Cells in which no place lies, a cell apart, and numbers of the paths through each."""
+        axes = []
+        for low, high in zip(self.lower, self.upper, strict=True):
+            axes.append(torch.arange(low, high, 2 * self.cell))
         cells = []
         for corner in torch.cartesian_prod(*axes).to(self.free):
             box = Cuboid(torch.stack((corner, corner + self.cell)), 1.5)
@@ -232,8 +242,8 @@ class BoxSearch:
         rated = []
         for box, hit in self.cells:
             losses = depths.new_full((len(hit),), box.loss)
-            dimmed = depths.flatten().index_add(0, hit, losses).view_as(depths)
-            fall = before - self.errors(dimmed)
+            with_box = depths.flatten().index_add(0, hit, losses).view_as(depths)
+            fall = before - self.errors(with_box)
             rated.append((fall.mean() / (fall.std() + FAINTEST), box))
         rated.sort(key=lambda pair: -pair[0])
         return [box for _, box in rated[: self.seeds]]
@@ -260,31 +270,33 @@ class BoxSearch:
         least = self._error(depths, [box])
         for _ in range(rounds):
             before = least
-            for degree in range(10):
-                for other in self._list_changes(box, degree, steps):
-                    error = self._error(depths, [other])
+            for degree in range(10):  # of freedom
+                for variant in self._list_changes(box, degree, steps):
+                    error = self._error(depths, [variant])
                     if error < least - 1e-5:
-                        box, least = other, error
+                        box, least = variant, error
             if before - least < 1e-4:
                 break
         return box
 
     def _list_changes(self, box: Cuboid, degree: int, steps: tuple[float, ...]) -> list[Cuboid]:
-        """Variants of a box in one degree of freedom, without those that cover a place.
+        """Variants of a box in one degree of freedom; no place lies in them.
 
-        Degrees 0 to 5 move a face, 6 to 8 the box along an axis, and 9 is the loss.
+        Degrees 0 to 2 move a lower face, 3 to 5 an upper face, 6 to 8 the box along an axis.
+        Degree 9 is the loss.
         """
         if degree == 9:
             losses = box.loss * torch.tensor([0.5, 0.7, 0.85, 1.2, 1.4, 2.0])
             return [Cuboid(box.corners, loss) for loss in losses.clamp(*self.losses).tolist()]
-        sides = [degree // 3] if degree < 6 else [0, 1]
-        changed = []
-        inwards = [-step for step in steps]
-        for step in (*steps, *inwards):
+        axis = degree % 3
+        sides = [degree // 3] if degree < 6 else [0, 1]  # rows of ``corners``
+        variants = []
+        negative = [-step for step in steps]
+        for step in (*steps, *negative):
             corners = box.corners.clone()
-            corners[sides, degree % 3] += step * self.cell
-            changed.append(Cuboid(corners, box.loss))
-        return [other for other in changed if self._is_free(other)]
+            corners[sides, axis] += step * self.cell
+            variants.append(Cuboid(corners, box.loss))
+        return [variant for variant in variants if self._is_free(variant)]
 
     def _adjust_all(self, steps: tuple[float, ...], rounds: int) -> None:
         """Adjusts each box while the others stay, then the depth that all paths share."""
@@ -296,30 +308,32 @@ class BoxSearch:
         self.common += min(changes, key=lambda change: self._error(depths + change, []))
 
     def _cut(self, box: Cuboid) -> None:
-        """Replaces a box by nothing, itself or two halves, whichever has the lowest error.
+        """Replaces a box by nothing, itself or two parts of it, in favour of the lowest error.
 
-        A halving, or the box itself, must lower the error by ``price`` to be kept.
+        The box must lower the error by ``price`` to stay, and two parts by ``price`` once more.
         """
         others = [other for other in self.boxes if other is not box]
         depths = self._depths(others)
-        parts: list[Cuboid] = []
+        best: list[Cuboid] = []
         least = self._error(depths, [])
         for trial in [[box], *self._halves(box)]:
             error = self._error(depths, trial)
             if error < least - self.price:
-                parts, least = trial, error
-        self.boxes = others + parts
+                best, least = trial, error
+        self.boxes = others + best
 
     def _halves(self, box: Cuboid) -> list[list[Cuboid]]:
         """Pairs of boxes that remain when a slice across an axis is cut out of a box."""
         pairs = []
         for axis in range(3):
             low, high = box.corners[:, axis].tolist()
-            cuts = torch.linspace(low, high, min(20, int((high - low) / self.cell * 2) + 1))
+            count = min(20, int((high - low) / self.cell * 2) + 1)  # half a cell apart
+            cuts = torch.linspace(low, high, count)
             for begin, end in torch.combinations(cuts[1:-1]).tolist():
-                pair = [Cuboid(box.corners.clone(), box.loss) for _ in range(2)]
-                pair[0].corners[1, axis] = begin
-                pair[1].corners[0, axis] = end
-                if all(map(self._is_free, pair)):
-                    pairs.append(pair)
+                below = Cuboid(box.corners.clone(), box.loss)
+                above = Cuboid(box.corners.clone(), box.loss)
+                below.corners[1, axis] = begin
+                above.corners[0, axis] = end
+                if self._is_free(below) and self._is_free(above):
+                    pairs.append([below, above])
         return pairs

@@ -133,7 +133,7 @@ class ReceiverChannels:
         Args:
             links: Links, of which the training links are used.
             number: Number of the receiver.
-            sign: Sign of the labels' phases.
+            sign: -1 if phases of the labels fall with the delay, as exp(-j 2 pi f delay), else 1.
             elements, subcarriers: Largest numbers, evenly spread over the array and the band.
         """
         receiver = links.receivers[number]
@@ -176,21 +176,23 @@ class ReceiverChannels:
 
     def single(self) -> "ReceiverChannels":
         """The same channels in single precision, for gradient descent."""
-        parts = {
-            name: part.float()
-            for name, part in vars(self).items()
-            if isinstance(part, Tensor) and part.is_floating_point()
-        }
-        return replace(self, **parts, channels=self.channels.to(torch.complex64))
+        return replace(
+            self,
+            places=self.places.float(),
+            channels=self.channels.to(torch.complex64),
+            position=self.position.float(),
+            elements=self.elements.float(),
+            frequencies=self.frequencies.float(),
+        )
 
     def of_unique_places(self) -> "ReceiverChannels":
         """The first link with power of each place, since links of one place predict each other."""
         received = self.at(self.channels.abs().amax((1, 2)) > 0)
-        _, which = received.places.unique(dim=0, return_inverse=True)
-        first: dict[int, int] = {}
-        for row, place in enumerate(which.tolist()):
-            first.setdefault(place, row)
-        return received.at(torch.tensor(sorted(first.values()), dtype=torch.long))
+        _, place_of_link = received.places.unique(dim=0, return_inverse=True)
+        first_rows: dict[int, int] = {}  # by place
+        for row, place in enumerate(place_of_link.tolist()):
+            first_rows.setdefault(place, row)
+        return received.at(torch.tensor(sorted(first_rows.values()), dtype=torch.long))
 
     @cached_property
     def flat(self) -> Complex[Tensor, "b k"]:
@@ -213,6 +215,7 @@ class ReceiverChannels:
         ways = points[..., None, :] - self.elements  # (b, n, e, 3)
         lengths = ways.norm(dim=-1).clamp_min(NEAREST)[..., None]  # (b, n, e, 1)
         turns = lengths * (self.frequencies / speed_of_light)  # (b, n, e, s)
+        # Whole turns have no effect, and large angles have rounded sines.
         turns = turns - turns.detach().round()
         waves = torch.polar((1 / lengths).expand_as(turns), -2 * math.pi * turns)
         return waves.flatten(-2)
@@ -225,11 +228,13 @@ class ReceiverChannels:
     ) -> Complex[Tensor, "b n k"]:
         """Waves of all paths, times their reflection coefficients.
 
-        The wave is 0 for a path that does not exist: it misses one of its planes.
+        The wave is 0 for a path that does not exist, since it misses one of its planes.
 
-        Reflection coefficients are computed at the frequencies ``at`` [Hz], by default at each
-        subcarrier. A single frequency saves time for half-spaces, whose reflection is equal at all
-        frequencies.
+        Args:
+            room: Planes and slabs.
+            sequences: Numbers of the planes of each path.
+            at: Frequencies of the reflection coefficients [Hz], by default of all subcarriers. A
+                single one saves time for half-spaces, whose reflection is equal at all frequencies.
         """
         at = self.frequencies if at is None else at
         planes = room.planes.to(self.places)
@@ -244,8 +249,9 @@ class ReceiverChannels:
             folded.cosines[..., None].clamp(1e-3, 1),
             depths[folded.planes],
         )
-        gains = folded.exists[..., None].to(self.channels.dtype).expand(-1, -1, len(at))
-        gains = folded.reflected(gains, polarised(folded.normals[:, None], te, tm))  # (b, n, s)
+        coefficients = polarised(folded.normals[:, None], te, tm)  # of each reflection
+        exists = folded.exists[..., None].to(self.channels.dtype).expand(-1, -1, len(at))
+        gains = folded.reflected(exists, coefficients)  # (b, n, s)
         waves = self.waves(points[-1]).unflatten(-1, (len(self.elements), -1))  # (b, n, e, s)
         return (waves * gains[:, :, None]).flatten(-2)
 
@@ -268,7 +274,7 @@ class ChannelData:
 
     Args:
         links: Links of task ``csi``, of which the training links are used.
-        sign: Sign of the channels' phases.
+        sign: -1 if phases of the channels fall with the delay, as exp(-j 2 pi f delay), else 1.
         has_common_phase: True if all channels share one unknown phase.
         order: Largest number of reflections of a path. More than 2 count as 2: longer paths hardly
             locate a plane.
@@ -282,7 +288,7 @@ class ChannelData:
         self.order = min(order, 2)
         self.options = options
         received = []
-        self.numbers: list[int] = []  # of these receivers
+        self.numbers: list[int] = []  # indices of the receivers in ``links``
         for number in links.query.receivers[links.split.train].unique().tolist():
             receiver = ReceiverChannels.of(links, number, sign)
             if len(receiver.places):
@@ -294,12 +300,12 @@ class ChannelData:
         self.frame = RoomFrame(torch.cat(ends))
         self.receivers = [receiver.about(self.frame.middle) for receiver in received]
         self.wavelength = min(receiver.wavelength for receiver in self.receivers)
-        bands = [
-            float(receiver.frequencies.max() - receiver.frequencies.min())
-            for receiver in self.receivers
-        ]
-        # [m] Peaks of delay profiles are off by a part of the resolution, where paths are close.
-        self.reach = max(0.07, speed_of_light / 8 / max(*bands, 1.0))
+        widest = 1.0  # band [Hz]; not 0, for channels of one subcarrier
+        for receiver in self.receivers:
+            widest = max(widest, float(receiver.frequencies.max() - receiver.frequencies.min()))
+        # Error of a plane that a delay profile shows [m]: where paths are close, peaks are off by a
+        # part of the resolution c / band.
+        self.reach = max(0.07, speed_of_light / 8 / widest)
 
     def sequences(self, planes: Float[Tensor, "w 4"]) -> Int[Tensor, "n order"]:
         """Sequences of planes of all paths."""
@@ -357,11 +363,14 @@ class ChannelData:
                 # larger ridge gives them the same phase.
                 phases.append(self.fit_free(receiver, planes, 1e-2).strengths[:, 0].sgn())
                 continue
-            # A hundred places in all suffice, with sixteen of each receiver.
+            # About a hundred places of all receivers suffice, but at least sixteen of each.
             count = len(receiver.places)
             step = max(1, min(count // 16, count * len(receivers) // 100))
             thinned = receiver.at(slice(None, None, step))
-            direct = self.fit_free(thinned, planes, 1e-4).strengths[:, 0]
-            strong = direct.abs() >= direct.abs().median()
-            phases.append((direct.sgn() * strong).sum()[None].sgn())
+            direct = self.fit_free(thinned, planes, 1e-4).strengths[
+                :, 0
+            ]  # path 0 is the direct one
+            # Phases of blocked direct paths are wrong: the stronger half decides.
+            is_strong = direct.abs() >= direct.abs().median()
+            phases.append((direct.sgn() * is_strong).sum()[None].sgn())
         return phases

@@ -48,12 +48,12 @@ class ChannelScore(Score[SlabRoom]):
 
     def error(self, room: SlabRoom) -> float:
         sequences = self.data.sequences(room.planes)
-        shares = []
+        log_shares = []
         receivers = [links.receiver for links in self.neighbours]
         phases = self.data.reference_phases(room.planes, receivers)
         for links, phase in zip(self.neighbours, phases, strict=True):
-            shares.append(self._neighbour_errors(links, phase, room, sequences))
-        return torch.cat(shares).mean().item() + self.options.price * len(room.planes)
+            log_shares.append(self._neighbour_errors(links, phase, room, sequences))
+        return torch.cat(log_shares).mean().item() + self.options.price * len(room.planes)
 
     def _neighbour_errors(
         self,
@@ -64,19 +64,20 @@ class ChannelScore(Score[SlabRoom]):
     ) -> Float[Tensor, " t"]:
         """Log of the fraction of each predicted place's power that neighbours do not explain."""
         receiver = links.receiver.at(slice(None), links.receiver.few_subcarriers).single()
-        channels = receiver.flat * phase[:, None].conj().to(receiver.flat)
-        power = receiver.flat.abs().square().sum(1)[:, None, None]
+        channels = receiver.flat * phase[:, None].conj().to(receiver.flat)  # (b, k)
+        power = receiver.flat.abs().square().sum(1)[:, None, None]  # (b, 1, 1)
         waves = receiver.reflected(room, sequences)  # (b, n, k)
-        # Normal equations of each place over its power; summed over a target's neighbours.
-        weights = torch.where(power > 0, 1 / power, 0)  # silent at these subcarriers
+        # Normal equations of each place over its power; summed over a target's neighbours. A place
+        # without power at these subcarriers has weight 0.
+        weights = torch.where(power > 0, 1 / power, 0)
         counts = links.counts[..., None, None]
-        gram = weights * (waves.conj() @ waves.mT).real
+        gram = weights * (waves.conj() @ waves.mT).real  # (b, n, n)
         gram = (counts * gram[links.near]).sum(1)  # (t, n, n)
-        right = weights * (waves.conj() @ channels[..., None]).real
+        right = weights * (waves.conj() @ channels[..., None]).real  # (b, n, 1)
         right = (counts * right[links.near]).sum(1)  # (t, n, 1)
-        strengths = real_strengths(ridged(gram, self.options.ridge), right)
-        predicted = (strengths.mT.to(waves) @ waves[links.targets])[:, 0]
-        predicted = predicted * (power[links.targets, 0] > 0)  # a silent target says nothing
+        strengths = real_strengths(ridged(gram, self.options.ridge), right)  # (t, n, 1)
+        predicted = (strengths.mT.to(waves) @ waves[links.targets])[:, 0]  # (t, k)
+        predicted = predicted * (power[links.targets, 0] > 0)  # without power there is no error
         channels = channels[links.targets]
         if not self.data.has_common_phase:
             channels = align_phases(channels, predicted)
@@ -90,18 +91,18 @@ class ChannelScore(Score[SlabRoom]):
         for links in self.data.receivers:
             receiver = links.of_unique_places()
             targets = evenly(torch.arange(len(receiver.places)), most)
-            gaps = torch.cdist(receiver.places[targets], receiver.places)
+            gaps = torch.cdist(receiver.places[targets], receiver.places)  # [m]
             gaps[gaps < self.data.wavelength] = math.inf  # see ``NeighbourLinks.counts``
             count = min(self.options.neighbours, gaps.shape[1])
             gaps, near = gaps.topk(count, largest=False)  # (t, k)
-            # Only the rows in use are kept; their numbers then count among these.
+            # Only rows in use stay, so their numbers change.
             rows = torch.cat((targets, near.flatten())).unique()
             neighbours.append(
                 NeighbourLinks(
-                    receiver.at(rows),
-                    torch.searchsorted(rows, targets),
-                    torch.searchsorted(rows, near),
-                    gaps.isfinite(),
+                    receiver=receiver.at(rows),
+                    targets=torch.searchsorted(rows, targets),
+                    near=torch.searchsorted(rows, near),
+                    counts=gaps.isfinite(),
                 )
             )
         return neighbours
@@ -121,10 +122,9 @@ class ChannelScore(Score[SlabRoom]):
 
         The descent also fits the slab, since a wrong slab may hide the best offset.
         """
-        best = self._best_moves(room, number)
-        return self.choose_best(
-            best + [self.polish(trial, steps=12, rate=5e-4, only=number) for trial in best]
-        )[0]
+        moved = self._best_moves(room, number)
+        polished = [self.polish(trial, steps=12, rate=5e-4, only=number) for trial in moved]
+        return self.choose_best(moved + polished)[0]
 
     def _best_moves(self, room: SlabRoom, number: int) -> list[SlabRoom]:
         """The best three of a room and its variants, in which a plane moves to where phases agree.
@@ -132,9 +132,9 @@ class ChannelScore(Score[SlabRoom]):
         The best comes first.
         """
         trials = [room]
-        for plane, material in propose_by_phases(
-            self.data, room.planes, number, self.data.reach, 0.006, SLABS
-        ):
+        tilt = 0.006  # [rad]
+        variants = propose_by_phases(self.data, room.planes, number, self.data.reach, tilt, SLABS)
+        for plane, material in variants:
             trials.append(room.replace_plane(number, plane, material))
         return self.choose_best(trials)
 
@@ -194,22 +194,23 @@ class ChannelScore(Score[SlabRoom]):
 
         ``steps`` and ``rate`` [m] are as for ``search.descend``.
         """
-        moves = torch.ones(len(room.planes), dtype=torch.bool)
+        is_moved = torch.ones(len(room.planes), dtype=torch.bool)
         if only is not None:
-            moves = torch.arange(len(room.planes)) == only
-        moves = moves[:, None]  # (w, 1), True for planes that move
+            is_moved = torch.arange(len(room.planes)) == only
+        is_moved = is_moved[:, None]  # (w, 1)
         receivers = self.data.receivers
         references = self.data.reference_phases(room.planes, receivers)
         generator = self.data.frame.generator
 
         def loss(planes: Float[Tensor, "w 4"], slabs: Float[Tensor, "w 3"]) -> Float[Tensor, ""]:
             trial = SlabRoom(
-                torch.where(moves, planes, room.planes), torch.where(moves, slabs, room.slabs)
+                torch.where(is_moved, planes, room.planes),
+                torch.where(is_moved, slabs, room.slabs),
             )
             parts = []
             phases = []
             for receiver, phase in zip(receivers, references, strict=True):
-                # Other links in each step: a stochastic gradient.
+                # Each step has other links and subcarriers: a stochastic gradient.
                 count = max(4, 40 // len(receivers))
                 places = torch.randperm(len(receiver.places), generator=generator)[:count]
                 carriers = torch.randperm(len(receiver.frequencies), generator=generator)[:6]
@@ -219,7 +220,7 @@ class ChannelScore(Score[SlabRoom]):
 
         planes, slabs = descend(loss, receivers, room.planes, [room.slabs], steps, rate)
         return SlabRoom(
-            torch.where(moves, planes, room.planes), torch.where(moves, slabs, room.slabs)
+            torch.where(is_moved, planes, room.planes), torch.where(is_moved, slabs, room.slabs)
         )
 
     # --- ratings ---
@@ -232,19 +233,21 @@ class ChannelScore(Score[SlabRoom]):
         """Rating of candidate planes: mean fraction of the residual's power that each explains.
 
         The residual is the part of a channel that known paths do not explain. A candidate explains
-        it by the wave of its image. The known paths are also removed from this wave. Otherwise the
-        image in a wall behind the array, which resembles the direct path, would be underrated. The
-        fraction, 0 to 1, is 0 for a plane between transmitter and receiver.
+        it by the wave of the transmitter's image. The part that known paths explain is removed from
+        this wave, too. Otherwise the image in a wall behind the array, which resembles the direct
+        path, would be underrated. The fraction, 0 to 1, is 0 for a plane between transmitter and
+        receiver.
         """
         total = planes.new_zeros(len(planes))
         count = 0
         sample = self.data.sample(room.planes)
         for receiver, phase in zip(*sample, strict=True):
             known = receiver.reflected(room, self.data.sequences(room.planes))  # (b, n, k)
+            # A real strength is half a complex unknown.
             unknowns = known.shape[1] if self.has_free_strengths else known.shape[1] / 2
             if unknowns >= known.shape[2]:  # known paths explain any channel
                 continue
-            gram = self._fitted_part(known.conj() @ known.mT)
+            gram = self._fitted_part(known.conj() @ known.mT)  # (b, n, n)
             # Rows of the pseudo-inverse: their product with a wave gives its strengths.
             inverse = torch.linalg.solve(ridged(gram, self.options.ridge), known.conj())
             channels = (receiver.flat * phase[:, None].conj().to(receiver.flat))[..., None]
@@ -284,22 +287,23 @@ class ChannelScore(Score[SlabRoom]):
         power = residual.abs().square().sum((1, 2)).clamp_min(torch.finfo(torch.float32).tiny)
         normals, offsets = planes[:, :3].float(), planes[:, 3].float()
         heights = receiver.places @ normals.mT - offsets  # (b, c)
-        points = receiver.places[:, None] - 2 * heights[..., None] * normals  # (b, c, 3)
-        waves = receiver.waves(points)  # (b, c, k)
-        size = waves.abs().square().sum(2)
-        strengths = (inverse @ waves.mT).mT  # (b, c, n)
+        images = receiver.places[:, None] - 2 * heights[..., None] * normals  # (b, c, 3)
+        waves = receiver.waves(images)  # (b, c, k)
+        wave_power = waves.abs().square().sum(2)  # (b, c)
+        strengths = (inverse @ waves.mT).mT  # of the known waves in ``waves`` (b, c, n)
         # The image's own phase is unknown: its wave and the one a quarter of a turn ahead, each
         # without the part that known waves explain.
         ahead = waves - self._fitted_part(strengths) @ known
         aside = 1j * waves - self._fitted_part(1j * strengths) @ known
-        # Share of the residual by least squares of two waves:
-        # (bb a² - 2 ab a b + aa b²) / (aa bb - ab²).
-        aa = ahead.abs().square().sum(2) + self.options.ridge * size
-        bb = aside.abs().square().sum(2) + self.options.ridge * size
+        # Least squares of the two waves explain the power
+        # (bb a² - 2 ab a b + aa b²) / (aa bb - ab²) of the residual, with their products aa, ab and
+        # bb, and their products a and b with the residual.
+        aa = ahead.abs().square().sum(2) + self.options.ridge * wave_power
+        bb = aside.abs().square().sum(2) + self.options.ridge * wave_power
         ab = (ahead.conj() * aside).real.sum(2)
         a = (ahead.conj() @ residual)[..., 0].real
         b = (aside.conj() @ residual)[..., 0].real
         numerator = bb * a.square() - 2 * ab * a * b + aa * b.square()
         share = numerator / (aa * bb - ab.square()) / power[:, None]
-        is_beside = heights * (normals @ receiver.position - offsets) > 0
-        return (share * is_beside).sum(0)
+        is_same_side = heights * (normals @ receiver.position - offsets) > 0  # as the receiver
+        return (share * is_same_side).sum(0)

@@ -77,17 +77,19 @@ class ChannelSearch:
         return SlabRoom(self.frame.to_world(room.planes), room.slabs)
 
     def find_room(self) -> SlabRoom:
-        """The room of ``run`` in the frame."""
+        """The room of ``run``, in the frame of the search instead of the world.
+
+        The steps are those of the class. If the time is up, the best room so far is returned.
+        """
         with stages.portion(0.6):  # the rest of the time is kept to resolve the planes' offsets
             planes = self.find_free(self.start)
-        best = SlabRoom(planes, planes[:, :3])  # kept if it is empty
+        best = half_spaces(planes)
         if len(planes):
             best = self.prune(self.resolve(self.free.descend(planes, steps=300, rate=5e-3)))
         if stages.is_up():
             return best
-        # Free strengths have three possible faults: tilted planes in place of upright ones, no
-        # plane at all, and known walls that moved away. Then walls along the coordinate axes are
-        # searched.
+        # A search with free strengths may find tilted planes in place of upright ones, no plane at
+        # all, or known walls at wrong places. Then walls along the coordinate axes are searched.
         is_doubtful = len(self.start) or not is_square(best.planes)
         if not len(best.planes) or (self.has_few_numbers and is_doubtful):
             walls = self.find_axis_walls()
@@ -98,13 +100,14 @@ class ChannelSearch:
         if not len(best.planes):
             return best
         if not is_square(best.planes):
-            first = (
-                half_spaces(self.start) if len(self.start) else self.along_axes.find_upright(best)
-            )
+            if len(self.start):
+                first = half_spaces(self.start)
+            else:
+                first = self.along_axes.find_upright(best)
             upright = self.prune(self.along_axes.grow_along(first, self.most, best.planes))
             if self.score.error(upright) < self.score.error(best):
                 return upright
-        if len(best.planes) < len(planes):
+        if len(best.planes) < len(planes):  # ``prune`` has dropped false planes
             best = self.search_anew(best)
         return self.prune(self.along_axes.grow_along(best, self.most))
 
@@ -139,21 +142,22 @@ class ChannelSearch:
             if not trials:
                 return None
             best = self.free.refine(min(trials, key=self.free.error))
-            words = self.frame.describe(best.planes[-1])
-            log.info("%s: %.1f %% of the power", words, 100 * best.share)
+            plane = self.frame.describe(best.planes[-1])
+            log.info("%s: %.1f %% of the power", plane, 100 * best.share)
             return best
 
         def replace(room: FreeRoom, number: int) -> FreeRoom:
+            """The room with plane ``number`` replaced by the best one, which becomes the last."""
             others = self.free.remove(room, number)
             plane = room.planes[number, None]
-            last = self.free.evaluate(torch.cat((others.planes, plane)))
-            return min([*search.list_extensions(others, grid), last], key=self.free.error)
+            unchanged = self.free.evaluate(torch.cat((others.planes, plane)))
+            return min([*search.list_extensions(others, grid), unchanged], key=self.free.error)
 
         room = search.grow(self.free.evaluate(known), self.most, extend)
         # Each new plane is searched again, given all others. It becomes the last plane, so the next
         # plane to search is always the first one after the known planes.
-        turns = [len(known)] * (len(room.planes) - len(known))
-        return search.sweep(room, turns, "search of planes", replace).planes
+        numbers = [len(known)] * (len(room.planes) - len(known))
+        return search.sweep(room, numbers, "search of planes", replace).planes
 
     def resolve(self, planes: Float[Tensor, "w 4"]) -> SlabRoom:
         """A room in which each plane has a slab, and an offset exact to a part of a wavelength.
@@ -165,7 +169,8 @@ class ChannelSearch:
         resolved = torch.zeros(len(planes), dtype=torch.bool)
         sample = self.data.sample(planes)
 
-        def measure(room: SlabRoom) -> tuple[float, SlabRoom]:
+        def measured(room: SlabRoom) -> tuple[float, SlabRoom]:
+            """The residual of a room, and the room."""
             return self.score.measure(sample, room, resolved).item(), room
 
         # Reaches [m] and tilts [rad] of the three rounds. The first also turns planes square, and
@@ -184,17 +189,15 @@ class ChannelSearch:
                     variants += self.square_variants(room.planes, number)
                 trials = []
                 for variant in variants:
-                    for plane, material in propose_by_phases(
-                        self.data, variant, number, reach, tilt, slabs
-                    ):
-                        trials.append(measure(room.replace_plane(number, plane, material)))
+                    proposed = propose_by_phases(self.data, variant, number, reach, tilt, slabs)
+                    for plane, material in proposed:
+                        trials.append(measured(room.replace_plane(number, plane, material)))
                 trials.sort(key=lambda trial: trial[0])
                 if resolved.all():  # a descent on phases needs the phases of all planes
                     for _, trial in trials[:3]:
-                        trials.append(
-                            measure(self.score.polish(trial, steps=12, rate=5e-4, only=number))
-                        )
-                room = min(trials, key=lambda trial: trial[0])[1]
+                        polished = self.score.polish(trial, steps=12, rate=5e-4, only=number)
+                        trials.append(measured(polished))
+                _, room = min(trials, key=lambda trial: trial[0])
         return self.score.refine(room)
 
     def square_variants(
@@ -214,14 +217,14 @@ class ChannelSearch:
             residual = self.data.fit_free(receiver, planes[is_other]).residual
             profiles.append(self.free.compute_profile(receiver, residual))
         variants = []
-        for axis in axes:
+        for normal in axes:
             steps = 0.1 * self.frame.diagonal * torch.linspace(-1, 1, 81).double()
             offsets = planes[number, 3] + steps
-            line = torch.cat((axis.expand(81, 3), offsets[:, None]), 1)
+            line = torch.cat((normal.expand(81, 3), offsets[:, None]), 1)  # (81, 4)
             ratings = self.free.rate_lines(self.free.links, profiles, line[None])[0]
-            for at in find_maxima(ratings, 5):
+            for step in find_maxima(ratings, 5):
                 variant = planes.clone()
-                variant[number] = line[at]
+                variant[number] = line[step]
                 variants.append(variant)
         return variants
 
@@ -229,11 +232,15 @@ class ChannelSearch:
 def _square_axes(
     planes: Float[Tensor, "w 4"], number: int, is_other: Bool[Tensor, " w"]
 ) -> list[Float[Tensor, "3"]]:
-    """At most three normals near plane ``number``'s, parallel or perpendicular to other planes."""
+    """At most three normals near plane ``number``'s, parallel or perpendicular to other planes.
+
+    They differ from the normal of the plane by 2 to 26 degrees.
+    """
     normals = planes[is_other, :3]
     pairs = torch.combinations(torch.arange(len(normals)))
-    crossed = torch.linalg.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])
-    crossed = functional.normalize(crossed[crossed.norm(dim=1) > 0.5], dim=1)
+    crossed = torch.linalg.cross(normals[pairs[:, 0]], normals[pairs[:, 1]])  # square to both
+    is_clear = crossed.norm(dim=1) > 0.5  # nearly parallel planes have no exact cross product
+    crossed = functional.normalize(crossed[is_clear], dim=1)
     axes = torch.cat((crossed, normals))
     cosines = axes @ planes[number, :3]
     is_near = (cosines.abs() > 0.9) & (cosines.abs() < 0.9995)

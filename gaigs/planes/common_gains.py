@@ -60,25 +60,25 @@ class CommonGains:
         elements = max(len(receiver.elements) for receiver in self.data.receivers)
         subcarriers = max(4, 32 // elements)
         max_places = min(200, options.most_waves // (int(steps.sum()) * elements * subcarriers))
-        unique = [part.of_unique_places() for part in self.data.draw(max_places, subcarriers, 1)]
-        receivers = [part for part in unique if len(part.places)]
+        drawn = self.data.draw(max_places, subcarriers, 1)
+        unique = [receiver.of_unique_places() for receiver in drawn]
+        receivers = [receiver for receiver in unique if len(receiver.places)]
         if max_places < 50 or not receivers:
             return half_spaces(self.start[:0])
         axes = torch.eye(3).to(frame.points).split(1)
-        lines = []
+        lines = []  # candidates along each axis (offsets, 4)
         for axis, count in zip(axes, steps, strict=True):
             lines.append(frame.grid(axis, int(count), options.margin)[0])
         # Share of the residual that the best of all these planes explains by chance.
-        by_chance = options.chance / sum(len(part.places) for part in receivers)
+        by_chance = options.chance / sum(len(receiver.places) for receiver in receivers)
         planes = self._place_start(receivers, by_chance)
         planes = self._pursue(receivers, planes, torch.cat(lines), by_chance)
         # Each plane moves once more, as the others are known now. A known wall stays unless the
         # move explains more than by chance.
         for number in range(len(planes)):
             bonus = by_chance if number < len(self.start) else 0.0
-            planes[number] = self.move(
-                receivers, _without(planes, number), planes[number], bonus
-            ).plane
+            others = _without(planes, number)
+            planes[number] = self.move(receivers, others, planes[number], bonus).plane
         planes = self.choose_lobes(receivers, planes, by_chance)
         return half_spaces(self._without_chance_planes(receivers, planes, by_chance))
 
@@ -104,10 +104,9 @@ class CommonGains:
         waiting = list(range(len(self.start)))
         while waiting:
             placed = planes[[number for number in range(len(planes)) if number not in waiting]]
-            trials = {
-                number: self.move(receivers, placed, planes[number], by_chance)
-                for number in waiting
-            }
+            trials = {}
+            for number in waiting:
+                trials[number] = self.move(receivers, placed, planes[number], by_chance)
             best = max(waiting, key=lambda number: trials[number].share)
             planes[best] = trials[best].plane
             waiting.remove(best)
@@ -183,15 +182,15 @@ class CommonGains:
             bonus: Advantage of the present offset [fraction of the power unexplained by the
                 others].
         """
-        known = self.fit(receivers, half_spaces(others))
+        without_plane = self.fit(receivers, half_spaces(others))
         error = self.data.options.drawing_error
         grid = torch.arange(-error, error, self.data.wavelength / 16)
-        moves = torch.cat((torch.zeros(1), grid)).to(plane)
-        line = plane.repeat(len(moves), 1)
-        line[:, 3] += moves
-        shares = self.rate(receivers, known.residuals, line)
-        shares[0] += bonus * known.share
-        return BestOffset(shares.max().item(), line[shares.argmax()])
+        moves = torch.cat((torch.zeros(1), grid)).to(plane)  # [m], first the present offset
+        trials = plane.repeat(len(moves), 1)  # (moves, 4)
+        trials[:, 3] += moves
+        shares = self.rate(receivers, without_plane.residuals, trials)
+        shares[0] += bonus * without_plane.share
+        return BestOffset(shares.max().item(), trials[shares.argmax()])
 
     def fit(self, receivers: list[ReceiverChannels], room: SlabRoom, order: int = 1) -> CommonFit:
         """Fit of one real, non-negative gain for each path, common to all places.
@@ -210,23 +209,25 @@ class CommonGains:
             powers.append(receiver.flat.abs().square().sum(1).float()[:, None, None])
         residuals: list[Tensor] = []
         for _ in range(1 if self.data.has_common_phase else 3):
+            # Normal equations, summed over all places.
             gram = torch.zeros(1, 1)
             right = torch.zeros(1, 1)
             for wave, channel, power in zip(waves, channels, powers, strict=True):
                 gram = gram + ((wave.conj() @ wave.mT).real / power).sum(0, keepdim=True)
-                products = (wave.conj() @ channel[..., None]).real / power
+                products = (wave.conj() @ channel[..., None]).real / power  # (b, n, 1)
                 right = right + products.sum(0, keepdim=True)
             # Gains need no sign, since the reflection coefficients in the waves have one.
             gains = real_strengths(ridged(gram, 1e-6), right).mT.to(waves[0])  # (1, 1, n)
-            known = [(gains @ wave)[:, 0] for wave in waves]
-            if not self.data.has_common_phase:
-                # Each place's channel is turned to the phase of its fit, for the next round.
-                channels = [align_phases(*pair) for pair in zip(channels, known, strict=True)]
-            residuals = [channel - part for channel, part in zip(channels, known, strict=True)]
-        shares = [
-            residual.abs().square().sum(1) / power[:, 0, 0]
-            for residual, power in zip(residuals, powers, strict=True)
-        ]
+            residuals = []
+            for number, wave in enumerate(waves):
+                fitted = (gains @ wave)[:, 0]  # (b, k)
+                if not self.data.has_common_phase:
+                    # Each place's channel is turned to the phase of its fit, for the next round.
+                    channels[number] = align_phases(channels[number], fitted)
+                residuals.append(channels[number] - fitted)
+        shares = []
+        for residual, power in zip(residuals, powers, strict=True):
+            shares.append(residual.abs().square().sum(1) / power[:, 0, 0])
         return CommonFit(torch.cat(shares).mean().item(), residuals)
 
     def rate(
@@ -235,8 +236,12 @@ class CommonGains:
         residuals: list[Complex[Tensor, "b k"]],
         line: Float[Tensor, "c 4"],
     ) -> Float[Tensor, " c"]:
-        """Fraction of power that the image in each plane of ``line`` explains by a common gain."""
-        total, size = line.new_zeros(2, len(line))
+        """Fraction of power that the image in each plane of ``line`` explains by a common gain.
+
+        With the waves w of the image and the residuals r, the gain that is not negative explains
+        max(0, sum w . r)² / sum |w|². The sums are over places, each with weight 1 / power.
+        """
+        products_sum, squares_sum = line.new_zeros(2, len(line))
         for receiver, residual in zip(receivers, residuals, strict=True):
             single = receiver.single()
             middle = receiver.frequencies.mean().float()[None]
@@ -245,11 +250,11 @@ class CommonGains:
                 sequences = torch.arange(len(rows))[:, None]  # each plane alone
                 waves = single.reflected(half_spaces(line[rows]), sequences, middle)
                 products = (waves.conj() @ residual[..., None]).real[..., 0]  # (b, rows)
-                total[rows] += (products / powers).sum(0)
-                squares = torch.view_as_real(waves).square().sum((2, 3))
-                size[rows] += (squares / powers).sum(0)
-        # A gain that is not negative: (sum w . r)² / sum |w|².
-        shares = total.clamp_min(0).square() / size.clamp_min(torch.finfo(line.dtype).tiny)
+                products_sum[rows] += (products / powers).sum(0)
+                squares = torch.view_as_real(waves).square().sum((2, 3))  # (b, rows)
+                squares_sum[rows] += (squares / powers).sum(0)
+        tiny = torch.finfo(line.dtype).tiny
+        shares = products_sum.clamp_min(0).square() / squares_sum.clamp_min(tiny)
         return shares / sum(len(receiver.places) for receiver in receivers)
 
 

@@ -158,19 +158,21 @@ class LagScore(Score[LagRoom]):
         stays if no peak is significantly better. Its paths are open at links whose error they
         lower.
         """
-        # The wave that the other planes' paths lack, and the errors without this plane.
+        # The wave that paths at the other planes lack, and the errors without this plane.
         is_other = torch.arange(len(room.planes)) != number
-        known = room.planes[is_other]
-        open_ = room.open[:, torch.cat((is_other.new_ones(1), is_other))]
-        sequences = self.paths.sequences(known)
-        waves = self._further_waves(known, open_, sequences)
-        blocked = self.errors(known, open_, sequences) + self.options.blocked
+        others = room.planes[is_other]
+        columns = torch.cat((is_other.new_ones(1), is_other))  # the direct path, other planes
+        open_ = room.open[:, columns]
+        sequences = self.paths.sequences(others)
+        waves = self._further_waves(others, open_, sequences)
+        blocked = self.errors(others, open_, sequences) + self.options.blocked  # (b,)
         trials = [room.planes]
+        before, after = room.planes[:number], room.planes[number + 1 :]
         for normal in square_normals(room.planes[:, :3], number):
-            for peak in self.paths.periodogram.find_peaks(
+            peaks = self.paths.periodogram.find_peaks(
                 waves, self.paths.bandwidth, normal, room.planes[number]
-            ):
-                before, after = room.planes[:number], room.planes[number + 1 :]
+            )
+            for peak in peaks:
                 trials.append(torch.cat((before, peak.plane[None], after)))
         everywhere = room.opened(number + 1, True)
         sequences = self.paths.sequences(room.planes)
@@ -179,7 +181,7 @@ class LagScore(Score[LagRoom]):
         least = torch.minimum(errors, blocked)  # (trials, b)
         best = int(least.mean(1).argmin())
         if not self._is_certain(least[0] - least[best]):
-            best = 0
+            best = 0  # the plane stays
         open_ = room.opened(number + 1, errors[best] < blocked)
         return LagRoom(trials[best], open_, least[best])
 
@@ -234,7 +236,8 @@ class LagScore(Score[LagRoom]):
             paths = receiver.paths(room.planes, sequences, passing)
             slopes = receiver.slopes(receiver.covariances(paths, self.paths.bandwidth))
             steering = receiver.steer(plane_waves)  # (k, e)
-            # Fall of the error by the power of a further plane wave: s' M s.
+            # Fall of the error by the power of a further plane wave: s' M s, with the steering
+            # vector s and M = ``slopes``.
             falls = ((steering.conj() @ slopes) * steering).sum(-1).real  # (b, k)
             maps.append(falls.view(-1, 1, 33, 33))
 
@@ -250,25 +253,27 @@ class LagScore(Score[LagRoom]):
     ) -> Float[Tensor, " c"]:
         """Rating of each plane: fall of the errors by the power of its reflection.
 
-        The fall is divided by the norm of this power over links. ``maps`` have the fall of each
-        link's error by a wave from each direction, on a grid of k x k sines.
+        The fall is divided by the norm over links of this power, in which each link's power is
+        relative to its direct path. ``maps`` have the fall of each link's error by a wave from each
+        direction, on a grid of k x k sines.
         """
-        total, square = planes.new_zeros(2, len(planes))
+        fall_sum, square_sum = planes.new_zeros(2, len(planes))
         for receiver, falls in zip(self.paths.receivers, maps, strict=True):
             single = receiver.reflect_once(planes)
-            powers = single.gains.abs().square()
+            powers = single.gains.abs().square()  # (b, c)
             # ``grid_sample`` takes the column first.
-            at = single.directions[..., [1, 0]][:, None]  # (b, 1, c, 2)
-            sampled = functional.grid_sample(falls, at, align_corners=True)[:, 0, 0]  # (b, c)
-            total += (powers * sampled).sum(0)
-            _, direct = receiver.look_at(receiver.places)
-            square += (powers * direct.square()[:, None]).square().sum(0)
-        return total / square.sqrt().clamp_min(1e-6)
+            sines = single.directions[..., [1, 0]][:, None]  # (b, 1, c, 2)
+            sampled = functional.grid_sample(falls, sines, align_corners=True)[:, 0, 0]  # (b, c)
+            fall_sum += (powers * sampled).sum(0)
+            _, distances = receiver.look_at(receiver.places)  # the direct power is 1 / distance²
+            relative = powers * distances.square()[:, None]
+            square_sum += relative.square().sum(0)
+        return fall_sum / square_sum.sqrt().clamp_min(1e-6)
 
     def add(self, room: LagRoom, candidate: Candidate) -> LagRoom | None:
         before = self.errors(room.planes, room.open)
         planes = torch.cat((room.planes, candidate.plane[None]))
-        everywhere = torch.ones_like(room.open[:, :1])
+        everywhere = torch.ones_like(room.open[:, :1])  # the new plane is open at all links
         larger = LagRoom(planes, torch.cat((room.open, everywhere), 1), before)
         larger = self.move(larger, len(room.planes))
         return larger if (before - larger.errors).mean() >= self.options.gain else None

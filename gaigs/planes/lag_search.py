@@ -56,7 +56,7 @@ def group_links(
     train = links.split.train
     numbers = links.query.receivers[train]
     carriers = frequencies[train]
-    existing = torch.stack((numbers.double(), carriers.double()), 1).unique(dim=0)
+    existing = torch.stack((numbers.double(), carriers.double()), 1).unique(dim=0)  # (pairs, 2)
     chosen = existing[evenly(torch.arange(len(existing)), pairs)].tolist()
     size = max(20, most // len(chosen))
     groups = []
@@ -131,7 +131,7 @@ class LagSearch:
         self.use(receivers, order)
 
     def use(self, receivers: list[ReceiverLags], order: int) -> None:
-        """Replaces the receivers of the search."""
+        """Sets the receivers of the search, and the largest number of reflections of a path."""
         self.paths = LinkPaths(self.frame, receivers, self.wavelength, order, self.options.faint)
         self.score = LagScore(self.paths, self.options)
         self.search = PlaneSearch(self.frame, self.score)
@@ -168,11 +168,11 @@ class LagSearch:
         return self.frame.to_world(room.planes.double())
 
     def _choose_bandwidth(self, start: LagRoom, choices: list[float]) -> LagRoom:
-        """Sets the bandwidth to the best of ``choices``; returns the start with all planes moved.
+        """Sets the bandwidth to the best of ``choices`` [Hz]; returns the room with planes moved.
 
-        One bandwidth gives the smallest error after a move of the strongest plane alone. It is
-        compared with the first choice, nearly a single carrier, after moves of all planes, since
-        interference hardly shows while other planes are wrong.
+        First the strongest plane alone is moved with each choice. The choice with the smallest
+        error is then compared with the first choice, nearly a single carrier, after moves of all
+        planes, since interference hardly shows while other planes are wrong.
         """
         best = choices[0]
         if len(choices) > 1:
@@ -180,8 +180,9 @@ class LagSearch:
             trials = []
             for choice in choices:
                 self.paths.bandwidth = choice
-                trials.append((self.score.error(self.score.move(start, strongest)), choice))
-            best = min(trials)[1]
+                moved = self.score.move(start, strongest)
+                trials.append((self.score.error(moved), choice))
+            _, best = min(trials)
         rooms = {}
         for choice in dict.fromkeys((best, choices[0])):
             self.paths.bandwidth = choice

@@ -104,14 +104,15 @@ class ReceiverLags:
 
     @cached_property
     def basis(self) -> Float[Tensor, "m k"]:
-        """Matrix from lags to the power in each of ``directions``.
+        """Matrix that maps covariances at lags to the power in each of ``directions``.
 
-        Its rows are the real parts of the lags from 0 on, then their imaginary parts.
+        Its rows are for the real parts of the covariances from lag 0 on, then for the imaginary
+        parts.
         """
-        half = len(self.counts) // 2
-        # Opposite lags are conjugate, so each lag but 0 counts twice.
+        half = len(self.counts) // 2  # lag 0 is in the middle
+        # Opposite lags have conjugate covariances, so each lag but 0 counts twice.
         weights = self.counts[half:] * torch.where(torch.arange(half + 1) > 0, 2, 1)
-        lags = self.array.lags[0][half:].to(self.places)
+        lags = self.array.lags[0][half:].to(self.places)  # vectors between elements [m]
         phases = self.wavenumber * (lags @ self.directions.to(self.places).T)  # (lags, k)
         return torch.cat((phases.cos() * weights[:, None], phases.sin() * weights[:, None]))
 
@@ -120,9 +121,9 @@ class ReceiverLags:
 
         The normalisation removes the unknown factor and offset of labels.
         """
-        later = lags[:, lags.shape[1] // 2 :]  # the others are their conjugates
-        later = later / later[:, :1].real.clamp_min(1e-12)
-        powers = torch.cat((later.real, later.imag), 1) @ self.basis  # (b, k)
+        from_zero = lags[:, lags.shape[1] // 2 :]  # the others are their conjugates
+        from_zero = from_zero / from_zero[:, :1].real.clamp_min(1e-12)
+        powers = torch.cat((from_zero.real, from_zero.imag), 1) @ self.basis  # (b, k)
         amplitudes = powers.clamp_min(1e-4).sqrt()  # the mean power is e² for e elements
         amplitudes = amplitudes - amplitudes.mean(1, keepdim=True)
         return amplitudes / amplitudes.norm(dim=1, keepdim=True).clamp_min(1e-6)
@@ -136,17 +137,20 @@ class ReceiverLags:
     def slopes(self, lags: Complex[Tensor, "b l"]) -> Complex[Tensor, "b e e"]:
         """Negative gradient M of the errors with respect to the covariance matrices.
 
-        The power of a further wave x lowers the error by x' M x. Its interference with a known wave
-        y lowers it by 2 Re x' M y.
+        The power of a weak further wave x lowers the error by x' M x. Interference of x with a
+        known wave y lowers the error by 2 Re x' M y.
         """
         with torch.enable_grad():
             lags = lags.detach().requires_grad_()
             self.errors(lags).sum().backward()
         half = len(self.counts) // 2
         slopes = -lags.grad[:, half:]
-        slopes[:, 1:] /= 2  # ``shape_of`` reads one of two opposite lags
-        slopes = torch.cat((slopes[:, 1:].conj().flip(1), slopes), 1) / self.counts  # (b, l)
-        return slopes[:, self.array.lags[1]].view(-1, len(self.array), len(self.array))
+        slopes[:, 1:] /= 2  # ``shape_of`` reads one of two opposite lags, which share its slope
+        opposite = slopes[:, 1:].conj().flip(1)
+        # A covariance at a lag is the mean over ``counts`` pairs of elements.
+        slopes = torch.cat((opposite, slopes), 1) / self.counts  # (b, l)
+        lag_of_pair = self.array.lags[1]  # (e e,)
+        return slopes[:, lag_of_pair].view(-1, len(self.array), len(self.array))
 
     # --- paths ---
 
@@ -185,11 +189,11 @@ class ReceiverLags:
         directions, lengths = self.look_at(points[-1])
         gains = folded.exists * self.array.gain(directions) / lengths  # (b, n)
         if passing is not None:
-            # Number -1, no plane, is the last column.
-            columns = torch.cat((passing[:, 1:], torch.ones_like(passing[:, :1])), 1)
-            shares = columns[:, sequences].prod(2)  # (b, n)
-            shares[:, 0] = passing[:, 0]
-            gains = gains * shares
+            # The last column, 1, is for the number -1 (no plane).
+            at_planes = torch.cat((passing[:, 1:], torch.ones_like(passing[:, :1])), 1)
+            transmitted = at_planes[:, sequences].prod(2)  # (b, n)
+            transmitted[:, 0] = passing[:, 0]  # the direct path
+            gains = gains * transmitted
         reflections = reflection(folded.normals, folded.cosines)
         fields = folded.reflected(torch.complex(gains, torch.zeros_like(gains)), reflections)
         phases = -self.wavenumber * lengths
@@ -206,12 +210,13 @@ class ReceiverLags:
             # Over a band the correlation of two paths is sinc(B (L - L') / c).
             gaps = lengths[:, :, None] - lengths[:, None]  # (b, n, n)
             coherence = sinc(bandwidth / speed_of_light * gaps)
-            together = fields[:, :, None] * fields[:, None].conj() * coherence  # (b, n, n)
-            matrices = steering.mT @ together @ steering.conj()  # (b, e, e)
+            of_paths = fields[:, :, None] * fields[:, None].conj() * coherence  # (b, n, n)
+            of_elements = steering.mT @ of_paths @ steering.conj()  # (b, e, e)
         else:
             waves = (fields[:, None] @ steering).mT  # (b, e, 1)
-            matrices = waves @ waves.mH
-        flat = matrices.flatten(1)
+            of_elements = waves @ waves.mH
+        # Means over all pairs of elements with the same lag.
+        flat = of_elements.flatten(1)  # (b, e e)
         sums = flat.new_zeros(len(flat), len(self.counts))
         return sums.index_add(1, self.array.lags[1], flat) / self.counts
 
@@ -226,38 +231,47 @@ class ReceiverLags:
     def reflect_once(self, planes: Float[Tensor, "c 4"]) -> SingleReflections:
         """Paths with one reflection, at each plane alone."""
         normals, offsets = planes[:, :3], planes[:, 3]
-        here = self.pose.position @ normals.T - offsets  # (c,)
-        there = self.places @ normals.T - offsets  # (b, c)
-        directions, lengths = self.look_at(self.places[:, None] - 2 * there[..., None] * normals)
-        cosines = -(here + there) / lengths
-        gains = self.array.gain(directions) / lengths * (here * there > 0)
+        # Heights of receiver and transmitters over each plane [m].
+        receiver_heights = self.pose.position @ normals.T - offsets  # (c,)
+        heights = self.places @ normals.T - offsets  # (b, c)
+        images = self.places[:, None] - 2 * heights[..., None] * normals  # (b, c, 3)
+        directions, lengths = self.look_at(images)
+        cosines = -(receiver_heights + heights) / lengths
+        is_same_side = receiver_heights * heights > 0
+        gains = self.array.gain(directions) / lengths * is_same_side
         gains = gains * reflection(normals, cosines.abs())
         return SingleReflections(directions, lengths, gains, cosines)
 
     def describe_doubts(self, name: str) -> list[str]:
         """A sentence for the log if spectra fit the direct path better with turned azimuths.
 
-        The list is empty if they do not. ``name`` is the receiver's.
+        Otherwise the list is empty.
+
+        Args:
+            name: Name of the receiver.
         """
-        _, pairs, _ = self.array.lags
-        matrices = self.lags[:, pairs].view(-1, len(self.array), len(self.array))
+        _, lag_of_pair, _ = self.array.lags
+        covariances = self.lags[:, lag_of_pair].view(-1, len(self.array), len(self.array))
         directions, _ = self.look_at(self.places)
         shares = {}
-        for turn, flip in itertools.product(range(4), (1, -1)):
-            flat = torch.view_as_complex(directions[:, :2].contiguous()) * 1j**turn
-            turned = torch.view_as_real(flat)
+        for turn, flip in itertools.product(range(4), (1, -1)):  # quarter turns, and a reflection
+            horizontal = torch.view_as_complex(directions[:, :2].contiguous()) * 1j**turn
+            turned = torch.view_as_real(horizontal)
             turned = torch.cat((turned[:, :1], flip * turned[:, 1:], directions[:, 2:]), -1)
             steering = self.steer(turned)
             # Power of a beam towards the path over the power of the spectrum: s' C s / e².
-            powers = torch.einsum("bi,bij,bj->b", steering.conj(), matrices, steering).real
+            powers = torch.einsum("bi,bij,bj->b", steering.conj(), covariances, steering).real
             shares[turn, flip] = (powers / len(self.array) ** 2).median().item()
         (turn, flip), best = max(shares.items(), key=lambda item: item[1])
         if best < 0.4 or shares[0, 1] > best - 0.2:
             return []
-        words = f"turned by {90 * turn} degrees" if turn else ""
-        words += " and " * bool(turn and flip < 0) + "counted clockwise" * (flip < 0)
+        changes = []
+        if turn:
+            changes.append(f"turned by {90 * turn} degrees")
+        if flip < 0:
+            changes.append("counted clockwise")
         return [
             f"the direct path explains {shares[0, 1]:.0%} of the spectra of {name}, "
-            f"{best:.0%} if azimuths were {words}\n"
+            f"{best:.0%} if azimuths were {' and '.join(changes)}\n"
             "check the receiver's orientation and the azimuths of the data"
         ]

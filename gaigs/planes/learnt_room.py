@@ -84,18 +84,22 @@ def build_room(placement: Mirrored, links: Links | None = None) -> LearntRoom:
     planes = outline_planes(placement, trace_paths(placement, query))
     matter = None
     if placement.obstacles is not None:
-        blobs = placement.obstacles
-        columns = [blobs.centres + placement.middle, blobs.widths, NEPER * blobs.densities]
-        losses = NEPER * blobs.box_depths[blobs.used].clamp_min(0)
-        columns += [blobs.box_corners + placement.middle, losses]
+        obstacles = placement.obstacles
+        columns = [
+            obstacles.centres + placement.middle,
+            obstacles.widths,
+            NEPER * obstacles.densities,
+            obstacles.box_corners + placement.middle,
+            NEPER * obstacles.box_depths[obstacles.used].clamp_min(0),
+        ]
         matter = Matter(*(column.cpu().double().numpy() for column in columns))
     paths: list[LearntPath] = []
     if links is not None:
         test = links.query[links.split.test]
-        first = (test.transmitters == test.transmitters[:1]).all(1)
+        is_first_place = (test.transmitters == test.transmitters[:1]).all(1)
         if test.frequencies is not None:
-            first &= test.frequencies == test.frequencies[:1]
-        paths = list_paths(placement, test[first])
+            is_first_place &= test.frequencies == test.frequencies[:1]
+        paths = list_paths(placement, test[is_first_place])
     return LearntRoom(planes, matter, paths)
 
 
@@ -107,8 +111,8 @@ def tabulate_planes(placement: Mirrored, ends: Float[ndarray, "k 3"]) -> PlaneTa
     reflected, _ = fresnel(permittivities, torch.ones_like(real))
     gains = reflected.abs().log() + placement.plane_gains  # [Np]
     middles = placement.middles + placement.middle.double()  # from the world's origin
-    parts = placement.normals, placement.planes[:, 3], gains, middles, placement.log_extents.exp()
-    normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in parts)
+    columns = placement.normals, placement.planes[:, 3], gains, middles, placement.log_extents.exp()
+    normals, offsets, gains, middles, extents = (part.double().cpu().numpy() for part in columns)
     # The middle of the reflecting area need not lie on the plane: take the plane's point x with
     # the least loss |E^-1 (x - middle)|² / 2 [Np], where E = diag(extents). By Lagrange's
     # multiplier it is middle + apart / spread steep, with steep = E² n and spread = n' E² n.
@@ -125,8 +129,8 @@ def tabulate_planes(placement: Mirrored, ends: Float[ndarray, "k 3"]) -> PlaneTa
 def other_offset(scene: Scene, planes: PlaneTable, number: int) -> float | None:
     """The second offset [m] at which a plane would give all paths the same lengths.
 
-    It exists for a plane across an axis of ``FlatAxis``, along which places do not vary; otherwise
-    None.
+    A plane has such an offset if its normal is an axis along which places do not vary, see
+    ``FlatAxis``. The result is None for any other plane.
     """
     normal = planes.normals[number]
     for flat in scene.flat_axes:
@@ -163,22 +167,21 @@ def outline_planes(placement: Mirrored, traced: TracedPaths) -> list[LearntPlane
     margin = 0.1 * diagonal  # so large that planes meet within the box
     box = _sides(lower - margin, upper + margin)
     tolerance = 0.02 * diagonal  # places and walls are uncertain
-    walls = [
-        number
-        for number in plane_shares
-        if (traced.ends @ table.normals[number] - table.offsets[number] <= tolerance).all()
-    ]
+    walls = []
+    for number in plane_shares:
+        heights = traced.ends @ table.normals[number] - table.offsets[number]
+        if (heights <= tolerance).all():
+            walls.append(number)
     drawn = []
     for number, share in plane_shares.items():
         if not ((traced.sequences == number).any(1) & (shares > 0)).any():
             continue
         normal = table.normals[number]
-        # Walls that face the same way, such as one behind another, do not cut each other.
-        sides = box + [
-            HalfSpace(table.normals[wall], table.offsets[wall])
-            for wall in walls
-            if wall != number and table.normals[wall] @ normal < 0.9
-        ]
+        sides = [*box]
+        for wall in walls:
+            # Walls that face the same way, such as one behind another, do not cut each other.
+            if wall != number and table.normals[wall] @ normal < 0.9:
+                sides.append(HalfSpace(table.normals[wall], table.offsets[wall]))
         if number in walls:
             edge = 2 * table.extents[number]  # there it reflects 17 dB less than in its middle
             sides += _sides(table.middles[number] - edge, table.middles[number] + edge)
@@ -199,14 +202,18 @@ def outline_planes(placement: Mirrored, traced: TracedPaths) -> list[LearntPlane
 def _furniture_corners(
     table: PlaneTable, number: int, traced: TracedPaths, tolerance: np.floating
 ) -> Float[ndarray, "4 3"]:
-    """The rectangle around a plane's reflection points; paths below 1 % do not count."""
+    """The rectangle around the reflection points of a plane, with a margin ``tolerance`` [m].
+
+    Paths with less than 1 % of the strongest share do not count.
+    """
     shares = traced.shares
+    # Each reflection at the plane: number of the link, of the path, and position in its sequence.
     link, path, step = np.nonzero((traced.sequences == number) & (shares > 0)[..., None])
     share = shares[link, path]
     points = traced.bounces[link, path, step][share >= 0.01 * share.max()]
     normal = table.normals[number]
     middle = table.offsets[number] * normal
-    flat = (points - middle) @ _basis(normal)
+    flat = (points - middle) @ _basis(normal)  # (points, 2)
     return _rectangle(middle, normal, flat.min(0) - tolerance, flat.max(0) + tolerance)
 
 
@@ -245,13 +252,14 @@ def _cut(corners: Float[ndarray, "c 3"], side: HalfSpace) -> Float[ndarray, "k 3
 
     Source: Sutherland and Hodgman, Reentrant polygon clipping, 1974.
     """
-    heights = corners @ side.normal - side.offset
+    heights = corners @ side.normal - side.offset  # above 0 outside
     remaining = []
     for k in range(len(corners)):
-        here, there = corners[k - 1], corners[k]
-        above, below = heights[k - 1], heights[k]
-        if (above > 0) != (below > 0):  # the edge crosses the side
-            remaining.append(here + above / (above - below) * (there - here))
-        if below <= 0:
-            remaining.append(there)
+        start, end = corners[k - 1], corners[k]
+        start_height, end_height = heights[k - 1], heights[k]
+        if (start_height > 0) != (end_height > 0):  # the edge crosses the side
+            fraction = start_height / (start_height - end_height)
+            remaining.append(start + fraction * (end - start))
+        if end_height <= 0:
+            remaining.append(end)
     return np.array(remaining).reshape(-1, 3)

@@ -93,22 +93,23 @@ class LevelScore(Score[LevelRoom]):
         """
         sequences = self.paths.sequences(room.planes)
         phased = is_phased(sequences, room.located)  # (n,)
+        interfering = phased & ~(sequences == number).any(1)  # with paths at the plane (n,)
         waves = []
         before = []  # powers of each receiver's links while the plane has no phase
         for receiver, passing in self.paths.split(room.passing):
             paths = receiver.paths(room.planes, sequences, passing)
-            before.append(self.add_powers(paths, phased))
-            # The wave of one more path that interferes with paths at located planes, times the
-            # share of the plane's paths that obstacles let through.
-            slopes = receiver.slopes(before[-1])[:, 0]
-            known = phased & ~(sequences == number).any(1)
-            weights = slopes * paths.fields * known * passing[:, number + 1, None]
+            powers = self.add_powers(paths, phased)
+            before.append(powers)
+            # The wave of a path that interferes with paths at located planes, times the share of
+            # the plane's paths that obstacles let through.
+            slopes = receiver.slopes(powers)[:, 0]  # (b, 1)
+            weights = slopes * paths.fields * interfering * passing[:, number + 1, None]
             waves.append(FurtherWave(weights[..., None], paths.lengths))
         located = room.located.index_fill(0, torch.tensor(number), True)
         best = room._replace(gain=0.0, number=number, bandwidth=self.paths.bandwidth)
         for peak in self._find_peaks(room.planes, waves, number)[: self.options.maxima]:
-            parts = (room.planes[:number], peak.plane[None], room.planes[number + 1 :])
-            trial = best._replace(planes=torch.cat(parts), located=located)
+            planes = torch.cat((room.planes[:number], peak.plane[None], room.planes[number + 1 :]))
+            trial = best._replace(planes=planes, located=located)
             trial = trial._replace(gain=self._measure_gain(trial, before, sequences))
             best = min(best, trial, key=self.error)
         return best
@@ -154,8 +155,8 @@ class LevelScore(Score[LevelRoom]):
     def measure_chance(self, room: LevelRoom, numbers: list[int], enough: float) -> float:
         """Largest gain that chance gives one of the planes ``numbers`` [standard errors].
 
-        It is measured with the errors shuffled among links. Trials end at the first gain above
-        ``enough``. The result is infinite if the time is up.
+        Ratios of measured to predicted power are shuffled among links, so no plane explains them.
+        Trials end at the first gain above ``enough``. The result is infinite if the time is up.
         """
         sequences = self.paths.sequences(room.planes)
         phased = is_phased(sequences, room.located)
@@ -166,9 +167,9 @@ class LevelScore(Score[LevelRoom]):
             for receiver, passing in self.paths.split(room.passing):
                 paths = receiver.paths(room.planes, sequences, passing)
                 powers = self.add_powers(paths, phased)
-                errors = receiver.lags / powers.real.clamp_min(1e-12)
-                errors = errors[torch.randperm(len(errors), generator=generator)]
-                shuffled.append(replace(receiver, lags=powers * errors))
+                ratios = receiver.lags / powers.real.clamp_min(1e-12)
+                ratios = ratios[torch.randperm(len(ratios), generator=generator)]
+                shuffled.append(replace(receiver, lags=powers * ratios))
             score = LevelScore(self.paths.with_receivers(shuffled), self.options)
             for number in numbers:
                 if stages.is_up():
@@ -219,23 +220,26 @@ class LevelSearch:
         self.frame = frame_of(links)
         self.wavelength = speed_of_light / frequencies.max().item()
         receivers: list[ReceiverLags] = []
-        values = links.labels - trend
+        relative_levels = links.labels - trend
         for group in group_links(links, frequencies, self.frame, most, self.lag_options.pairs):
             rows = group.rows
             transmitters = links.query.transmitters[rows]
-            places, which = transmitters.unique(dim=0, return_inverse=True)
-            # The mean of the readings at a place.
-            sums = values.new_zeros(len(places)).index_add(0, which, values[rows])
-            levels = sums / which.bincount()
+            places, place_of_row = transmitters.unique(dim=0, return_inverse=True)
+            # The mean of the readings at each place.
+            sums = relative_levels.new_zeros(len(places))
+            sums = sums.index_add(0, place_of_row, relative_levels[rows])
+            levels = sums / place_of_row.bincount()
             powers = 10 ** ((levels - levels.median()) / 10)
-            # A single point: its only lag is the power.
+            # The array is a single point, whose only lag is the power.
             array = group.receiver.array
             point = replace(array, elements=array.elements.new_zeros(1, 3))
             lags = powers[:, None].to(torch.complex64)
             places = places - self.frame.middle
             receivers.append(ReceiverLevels(places, lags, group.carrier, group.pose, point))
-            # The last write counts: flipped, the first link of each place.
-            first = rows.new_zeros(len(places)).index_copy(0, which.flip(0), rows.flip(0))
+            # The first link of each place: of several copies to a place the last one stays, so
+            # links are copied in reversed order.
+            first = rows.new_zeros(len(places))
+            first = first.index_copy(0, place_of_row.flip(0), rows.flip(0))
             self.queries.append(links.query[first])
         self.paths = LinkPaths(
             self.frame, receivers, self.wavelength, order, self.lag_options.faint
@@ -255,7 +259,8 @@ class LevelSearch:
         numbers: list[int] = []
         threshold = 0.0  # ``chance`` times the largest gain by chance; 0 until it is measured
         while True:
-            waiting = [k for k, number in enumerate(self.numbers) if not placement.located[number]]
+            # Rows of the search's planes that are not yet located.
+            waiting = [row for row, k in enumerate(self.numbers) if not placement.located[k]]
             if not waiting:
                 return numbers
             room = self.room_of(placement)
@@ -316,16 +321,17 @@ class LevelSearch:
         They are the model's fields over the fields without obstacles, limited to 1: near Brewster's
         angle planes reflect almost nothing, and the quotient is meaningless.
         """
-        columns = [0, *(number + 1 for number in self.numbers)]
-        parts = []
+        columns = [0, *(number + 1 for number in self.numbers)]  # direct path, searched planes
+        fractions = []
         for receiver, query in zip(self.paths.receivers, self.queries, strict=True):
             cosines = receiver.reflect_once(planes).cosines.abs()
-            expected = reflection(planes[:, :3], cosines).abs()
-            expected = torch.cat((torch.ones_like(expected[:, :1]), expected), 1)
-            fields = placement.passing(query.to(placement.origin.device)).cpu().float()[:, columns]
-            shares = torch.where(fields > 0, fields / expected.clamp_min(1e-6), 1)
-            parts.append(shares.clamp_max(1))
-        return torch.cat(parts)
+            reflected = reflection(planes[:, :3], cosines).abs()  # (b, w)
+            expected = torch.cat((torch.ones_like(reflected[:, :1]), reflected), 1)  # (b, w + 1)
+            fields = placement.passing(query.to(placement.origin.device))
+            fields = fields.cpu().float()[:, columns]
+            fraction = torch.where(fields > 0, fields / expected.clamp_min(1e-6), 1)
+            fractions.append(fraction.clamp_max(1))
+        return torch.cat(fractions)
 
 
 def is_phased(sequences: Int[Tensor, "n order"], located: Bool[Tensor, " w"]) -> Bool[Tensor, " n"]:

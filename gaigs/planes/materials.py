@@ -46,31 +46,32 @@ def materials(placement: Mirrored, query: Query, frequency: float) -> dict[int, 
     sequences = placement.sequences[placement.kept]
     normals = placement.normals
     path_gains = placement.of_bands(placement.path_gains, query).mean(0)
-    gains = path_gains[placement.kept] - path_gains[0]  # logarithms over the direct path
-    bounces = (sequences >= 0).sum(1).clamp_min(1)
-    gains = (gains / bounces).exp()  # of each bounce
+    log_gains = path_gains[placement.kept] - path_gains[0]  # over the direct path
+    reflections = (sequences >= 0).sum(1).clamp_min(1)
+    gains = (log_gains / reflections).exp()  # of each reflection
     compared = torch.abs if placement.path_phases is not None else torch.Tensor.clone
     options = _list_slabs(placement, frequency)
     errors = normals.new_zeros(len(options), len(normals))
     weights = normals.new_zeros(len(normals))
-    for part in query.parts(64):  # links at a time
-        part = part.to(normals.device)
-        powers = placement(None, part).gains.abs().square()
-        _, _, folded = placement.folded(part)
-        planes = folded.planes
+    for links in query.parts(64):  # links at a time
+        links = links.to(normals.device)
+        powers = placement(None, links).gains.abs().square()
+        _, _, folded = placement.folded(links)
+        planes = folded.planes  # plane and path of each reflection
         path = folded.path[: len(planes)]
-        learnt = compared(placement.coefficients(part, folded) * gains[path])
+        learnt = compared(placement.coefficients(links, folded) * gains[path])
         weights.index_add_(0, planes, powers[:, path].sum(0))
         for number, option in enumerate(options):
-            depths = option.thicknesses[planes] * (frequency / speed_of_light)
+            depths = option.thicknesses[planes] * (frequency / speed_of_light)  # [wavelengths]
             te, tm = slab(option.permittivity, folded.cosines, depths)
             error = (compared(polarised(folded.normals, te, tm)) - learnt).abs().square()
             errors[number].index_add_(0, planes, (powers[:, path] * error).sum(0))
-    best = [options[number] for number in errors.argmin(0).tolist()]
-    met = (weights > 0).nonzero()[:, 0].tolist()
-    return {
-        plane: Material(best[plane].name, best[plane].thicknesses[plane].item()) for plane in met
-    }
+    best = errors.argmin(0).tolist()  # number of the option for each plane
+    chosen = {}
+    for plane in (weights > 0).nonzero()[:, 0].tolist():
+        option = options[best[plane]]
+        chosen[plane] = Material(option.name, option.thicknesses[plane].item())
+    return chosen
 
 
 def _list_slabs(placement: Mirrored, frequency: float) -> list[SlabOption]:

@@ -95,8 +95,9 @@ class Crossings(NamedTuple):
         return int(self.surfaces.max()) + 1
 
     def losses(self, conductances: Float[Tensor, " k"], count: int) -> Float[Tensor, " p"]:
-        """Attenuation of each of ``count`` paths [Np]."""
-        conductance = conductances[self.surfaces]
+        """Attenuation [Np] of each of ``count`` paths by surfaces with these ``conductances``."""
+        conductance = conductances[self.surfaces]  # at each crossing (c,)
+        # Fractions of the field that pass, see ``Sheet``.
         te = 1 / (1 + conductance / (2 * self.cosines))
         tm = 1 / (1 + conductance * self.cosines / 2)
         losses = -torch.lerp(te, tm, self.tm_shares).log()
@@ -131,13 +132,15 @@ class MatterGrid:
         Source: Lewiner et al., Efficient implementation of marching cubes' cases with topological
         guarantees, 2003.
         """
-        least = math.log(density)
+        level = math.log(density)
         numbers = self.number_surfaces(density)
-        # Other surfaces lie at least a point apart.
+        # Points in other surfaces become empty; thinner matter between surfaces stays.
         is_near = (numbers == number) | (numbers == 0)
-        logs = np.where(is_near, np.minimum(self.log_densities, least + 9), least - 1)
-        logs = np.pad(np.maximum(logs, least - 9), 1, constant_values=least - 1)
-        vertices, faces, _, _ = marching_cubes(logs, least, spacing=(self.pitch,) * 3)
+        logs = np.where(is_near, np.minimum(self.log_densities, level + 9), level - 1)
+        # Values far from the level do not matter, but must be finite. An empty margin closes the
+        # surface at the edge of the grid.
+        logs = np.pad(np.maximum(logs, level - 9), 1, constant_values=level - 1)
+        vertices, faces, _, _ = marching_cubes(logs, level, spacing=(self.pitch,) * 3)
         return vertices + (self.corner - self.pitch), faces
 
 
@@ -171,30 +174,39 @@ def sample_matter(
 def find_crossings(
     obstacles: Obstacles, matter: MatterGrid, density: float, legs: Legs
 ) -> Crossings:
-    """Points where legs cross the surfaces of a density; surfaces count from 0."""
+    """Points where legs of paths cross the surfaces of one density of matter.
+
+    Numbers of the surfaces are those of ``matter`` minus 1.
+    """
+    # Crossings lie between two samples of a leg, one inside and one outside (c,).
     is_inside = legs.densities > density
     leg, step = (is_inside[:, 1:] != is_inside[:, :-1]).nonzero().T
     before, after = legs.densities[leg, step], legs.densities[leg, step + 1]
-    unit = legs.along[leg] / (legs.densities.shape[1] - 1)  # [m] from one sample to the next
-    share = (density - before) / (after - before)
-    points = legs.start[leg] + (step + share)[:, None] * unit
-    # The gradient of the density: sum_i rho_i w_i (c_i - x), but for its sign.
-    each = measure_densities(obstacles, points)
+    spacing = legs.along[leg] / (legs.densities.shape[1] - 1)  # [m] from one sample to the next
+    share = (density - before) / (after - before)  # of the spacing, by linear interpolation
+    points = legs.start[leg] + (step + share)[:, None] * spacing
+    # The normal is the gradient of the density, sum_i rho_i w_i (c_i - x), but for its sign, with
+    # the densities rho, weights w and centres c of the Gaussians.
+    densities = measure_densities(obstacles, points)  # (c, n)
     weights = (-2 * obstacles.log_widths.double()).exp()
-    gradients = points * (each @ weights) - each @ (weights * obstacles.centres.double())
+    weighted_centres = weights * obstacles.centres.double()
+    gradients = points * (densities @ weights) - densities @ weighted_centres
     normals = functional.normalize(gradients)
-    cosines = (normals * functional.normalize(unit)).sum(1).abs().clamp_min(1e-3)
-    # The sample on the inner side names the surface. Its grid point may be just outside: a dilation
+    cosines = (normals * functional.normalize(spacing)).sum(1).abs().clamp_min(1e-3)
+    # The inner sample shows the surface. Its nearest grid point may be just outside: a dilation
     # gives such a point its neighbour's number.
-    inside = legs.start[leg] + (step + (after > before))[:, None] * unit
+    inner = legs.start[leg] + (step + (after > before))[:, None] * spacing
     numbers = matter.number_surfaces(density)
     numbers = np.where(numbers, numbers, ndimage.grey_dilation(numbers, 3))
-    cells = np.rint((inside.cpu().numpy() - matter.corner) / matter.pitch).astype(int)
+    cells = np.rint((inner.cpu().numpy() - matter.corner) / matter.pitch).astype(int)
     cells = np.clip(cells, 0, np.array(numbers.shape) - 1)
     surfaces = torch.from_numpy(numbers[tuple(cells.T)]).to(leg)
-    met = surfaces > 0  # the grid has no matter thinner than its pitch
+    exists = surfaces > 0  # matter thinner than the pitch is not on the grid
     return Crossings(
-        cosines[met], normals[met, 2].square(), legs.paths[leg[met]], surfaces[met] - 1
+        cosines=cosines[exists],
+        tm_shares=normals[exists, 2].square(),
+        paths=legs.paths[leg[exists]],
+        surfaces=surfaces[exists] - 1,
     )
 
 
@@ -218,8 +230,8 @@ def attenuate_paths(
 ) -> AttenuatedPaths:
     """At most ``options.paths`` paths of a query, and the fractions that obstacles transmit."""
     sequences = placement.sequences[placement.kept]
-    query = query[:: math.ceil(len(query) * len(sequences) / options.paths)]
-    query = query.to(placement.middle.device)
+    every = math.ceil(len(query) * len(sequences) / options.paths)
+    query = query[::every].to(placement.middle.device)
     seen, receivers, folded = placement.folded(query)
     strengths = placement.strengths(query, folded, blocked=False).abs()
     fields = strengths / (seen[-1] - receivers[:, None]).norm(dim=-1)
@@ -236,11 +248,10 @@ def attenuate_paths(
     depths = obstacles(start.float(), (start + along).float(), no_boxes).real.double()
     depths = fields.new_zeros(fields.numel()).index_add(0, paths, depths)  # (b n,), of each path
     steps = torch.linspace(0, 1, options.samples).to(along)[:, None]  # (k, 1)
-    samples = [
-        measure_densities(obstacles, first + steps * way).sum(1)
-        for first, way in zip(start, along, strict=True)
-    ]
-    legs = Legs(start, along, paths, torch.stack(samples))
+    densities = []
+    for first, way in zip(start, along, strict=True):
+        densities.append(measure_densities(obstacles, first + steps * way).sum(1))
+    legs = Legs(start, along, paths, torch.stack(densities))
     return AttenuatedPaths(fields, (-depths).exp().view_as(fields), legs)
 
 
@@ -251,16 +262,18 @@ def choose_densities(paths: AttenuatedPaths, count: int) -> list[float]:
     first density, and a tenth in matter denser than the last. The list is empty if paths lose
     nothing.
     """
-    densities = paths.legs.densities
-    # Each leg's loss, spread over its matter.
-    losses = (paths.fields * (1 - paths.passed)).flatten()[paths.legs.paths, None] * densities
+    densities = paths.legs.densities  # (s, k)
+    # The loss of each leg's path, spread over the leg's samples in proportion to their density.
+    path_losses = (paths.fields * (1 - paths.passed)).flatten()  # (b n,)
+    losses = path_losses[paths.legs.paths, None] * densities
     losses = losses / densities.sum(1, keepdim=True).clamp_min(1e-300)
     order = densities.flatten().argsort()
-    sums = losses.flatten()[order].cumsum(0)
-    if not sums[-1] > 0:
+    cumulative = losses.flatten()[order].cumsum(0)
+    if not cumulative[-1] > 0:
         return []
-    at = torch.searchsorted(sums, sums[-1] * sums.new_tensor([0.1, 0.9]))
-    low, high = densities.flatten()[order[at]].log().tolist()
+    tenths = cumulative[-1] * cumulative.new_tensor([0.1, 0.9])
+    ranks = torch.searchsorted(cumulative, tenths)
+    low, high = densities.flatten()[order[ranks]].log().tolist()
     return torch.linspace(low, high, count).exp().tolist()
 
 
@@ -320,12 +333,12 @@ class SheetFit:
         descent = torch.optim.LBFGS([values], max_iter=50, line_search_fn="strong_wolfe")
 
         def measure() -> Tensor:
+            """The error of ``values``."""
             *logs, gain = values.split((*sizes, 1))
-            spread = [
-                log.expand(self.crossings[number].surface_count)
-                for number, log in zip(chosen, logs, strict=True)
-            ]
-            return self.error(chosen, spread, gain)
+            of_surfaces = []
+            for number, log in zip(chosen, logs, strict=True):
+                of_surfaces.append(log.expand(self.crossings[number].surface_count))
+            return self.error(chosen, of_surfaces, gain)
 
         def step() -> Tensor:
             descent.zero_grad()
@@ -376,18 +389,19 @@ def fit_sheets(
     fit = SheetFit(paths, crossings)
     crossed = [number for number, part in enumerate(crossings) if len(part.paths)]
     size = min(options.densities, len(crossed))
-    trials = {
-        numbers: fit.fit(numbers, (1,) * size, paths.fields.new_zeros(size + 1))
-        for numbers in itertools.combinations(crossed, size)
-    }
+    trials = {}
+    for numbers in itertools.combinations(crossed, size):
+        start = paths.fields.new_zeros(size + 1)
+        trials[numbers] = fit.fit(numbers, (1,) * size, start)
     chosen = min(trials, key=lambda numbers: trials[numbers][0])
-    values = trials[chosen][1]
+    _, values = trials[chosen]
+    # The conductance of each density is the start for all its surfaces.
     sizes = [crossings[number].surface_count for number in chosen]
-    spread = [log.expand(size) for log, size in zip(values[:-1], sizes, strict=True)]
-    _, values = fit.fit(chosen, sizes, torch.cat([*spread, values[-1:]]))
+    logs = [log.expand(size) for log, size in zip(values[:-1], sizes, strict=True)]
+    _, values = fit.fit(chosen, sizes, torch.cat([*logs, values[-1:]]))
     sheets = boxes
-    for number, logs in zip(chosen, values[:-1].split(sizes), strict=True):
-        for surface, conductance in enumerate(logs.exp().tolist(), 1):
+    for number, log in zip(chosen, values[:-1].split(sizes), strict=True):
+        for surface, conductance in enumerate(log.exp().tolist(), 1):
             if conductance < options.least_conductance:
                 continue
             vertices, faces = matter.mesh(candidates[number], surface)

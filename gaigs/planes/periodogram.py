@@ -86,11 +86,11 @@ class PlanePeriodogram:
         half = min(self.wavelength, self.reach)
         moves = torch.linspace(-half, half, 19)
         turns = self._turns(bounce)
-        both_ways = torch.cat((-turns.flip(0)[:-1], turns))
+        signed_turns = torch.cat((-turns.flip(0)[:-1], turns))
         axes = torch.stack(tangents(normal))
         count = 2 * math.ceil(self.reach / half / 2) + 1
-        starts = normal @ bounce + torch.linspace(-self.reach, self.reach, count)
-        centres = torch.cat((normal.expand(count, 3), starts[:, None]), 1)  # (tiles, 4)
+        offsets = normal @ bounce + torch.linspace(-self.reach, self.reach, count)
+        centres = torch.cat((normal.expand(count, 3), offsets[:, None]), 1)  # (tiles, 4)
         pivots = mean_bounces(self.receivers, centres)
         values = []
         rates = []
@@ -99,16 +99,15 @@ class PlanePeriodogram:
             values.append(products.values)
             rates.append(products.rates)
         peaks = []
-        for pivot, value, rate in zip(
-            pivots, torch.cat(values, 1), torch.cat(rates, 1), strict=True
-        ):
-            sums = periodogram(value, rate, moves, turns)
+        tiles = zip(pivots, torch.cat(values, 1), torch.cat(rates, 1), strict=True)
+        for pivot, tile_values, tile_rates in tiles:
+            sums = periodogram(tile_values, tile_rates, moves, turns)
             best = sums.flatten().topk(2)
-            at = torch.unravel_index(best.indices, sums.shape)
-            for height, step, first, second in zip(best.values.tolist(), *at, strict=True):
-                turned = normal + both_ways[first] * axes[0] + both_ways[second] * axes[1]
+            indices = torch.unravel_index(best.indices, sums.shape)
+            for height, move, first, second in zip(best.values.tolist(), *indices, strict=True):
+                turned = normal + signed_turns[first] * axes[0] + signed_turns[second] * axes[1]
                 turned = functional.normalize(turned, dim=0)
-                offset = turned @ pivot + moves[step]
+                offset = turned @ pivot + moves[move]
                 peaks.append(TilePeak(height, torch.cat((turned, offset[None])), pivot))
         peaks.sort(key=lambda peak: -peak.height)
         return self._distinct(peaks)
@@ -131,10 +130,15 @@ class PlanePeriodogram:
         return distinct
 
     def _is_apart(self, peak: TilePeak, other: TilePeak) -> bool:
-        """True if normals differ by a quarter of ``tile``, or pivots by a quarter wavelength."""
-        gap = peak.plane - other.plane
-        move = (gap[3] - gap[:3] @ peak.pivot).abs()
-        return bool(gap[:3].norm() > self.tile / 4 or move > self.wavelength / 4)
+        """True if two peaks have different lobes.
+
+        Their normals differ by a quarter of ``tile``, or at the pivot the planes are a quarter
+        wavelength apart.
+        """
+        difference = peak.plane - other.plane
+        normal, offset = difference[:3], difference[3]
+        distance = (offset - normal @ peak.pivot).abs()
+        return bool(normal.norm() > self.tile / 4 or distance > self.wavelength / 4)
 
 
 def compare_with_wave(
@@ -159,17 +163,20 @@ def compare_with_wave(
     values = values * torch.polar(torch.ones_like(lengths), receiver.wavenumber * lengths)
     # Magnitudes saturate at the median, so that no link dominates.
     sizes = values.abs()
-    medians = torch.where(sizes > 0, sizes, math.nan).nanmedian(1, keepdim=True).values
+    medians = torch.where(sizes > 0, sizes, math.nan).nanmedian(1, keepdim=True).values  # (c, 1)
     values = values / (sizes + medians.nan_to_num(1.0))
     # A path's length changes by 2 cos(theta) per metre that the plane moves along its normal. Per
     # radian that it turns, it changes by this times the bounce's distance from the pivot.
     normals, offsets = planes[:, None, :3], planes[:, None, 3]
     heights = (receiver.places * normals).sum(-1) - offsets  # (c, b)
-    ways = reflect(receiver.places, normals, offsets) - receiver.pose.position
-    units = functional.normalize(ways, dim=2)  # (c, b, 3)
+    from_images = reflect(receiver.places, normals, offsets) - receiver.pose.position
+    units = functional.normalize(from_images, dim=2)  # (c, b, 3)
+    # From place to bounce the path is height / cos(theta) long. So the bounce's distance from the
+    # pivot times cos(theta) is the place's (``aside``) times cos(theta), plus the height times the
+    # path's direction.
     aside = (receiver.places - pivots[:, None]) @ axes.T  # (c, b, 2)
-    turned = aside * cosines[..., None] + heights[..., None] * (units @ axes.T)
-    rates = 2 * receiver.wavenumber * torch.cat((cosines[..., None], -turned), 2)
+    bounces = aside * cosines[..., None] + heights[..., None] * (units @ axes.T)
+    rates = 2 * receiver.wavenumber * torch.cat((cosines[..., None], -bounces), 2)
     return WaveProducts(values, rates)
 
 
@@ -190,26 +197,30 @@ def periodogram(
     """
     phases = rates[:, :1] * moves
     moved = values[:, None] * torch.polar(torch.ones_like(phases), phases)  # (b, m)
-    # With v exp(j r0 move) = x + j y, Re(v exp(j (a + b))) is (x cos a cos b - x sin a sin b)
-    # - (y sin a cos b + y cos a sin b). Turns to both sides have the same products but for signs.
-    sides = rates[:, 1:, None] * turns  # (b, 2, t)
-    cos, other_cos = sides.cos().unbind(1)
-    sin, other_sin = sides.sin().unbind(1)
-    size = (len(turns), len(moves), len(turns))
+    # With v exp(j r0 move) = x + j y and the angles a = r1 turn and b = r2 turn',
+    # Re((x + j y) exp(j (a + b))) is
+    # x cos a cos b - x sin a sin b - y sin a cos b - y cos a sin b.
+    # Negative turns have the same four products but for signs.
+    angles = rates[:, 1:, None] * turns  # (b, 2, t)
+    cos_a, cos_b = angles.cos().unbind(1)
+    sin_a, sin_b = angles.sin().unbind(1)
+    shape = (len(turns), len(moves), len(turns))
 
-    def total(
+    def sum_links(
         part: Float[Tensor, "b m"], first: Float[Tensor, "b t"], second: Float[Tensor, "b t"]
     ) -> Float[Tensor, "m t t"]:
+        """The sum over links of the products of three factors, for all moves and turns."""
         products = (part[:, :, None] * first[:, None]).flatten(1)  # (b, m t)
-        return (second.T @ products).view(size).movedim(0, 2)
+        return (second.T @ products).view(shape).movedim(0, 2)
 
-    even = total(moved.real, cos, other_cos)
-    odd = total(moved.real, sin, other_sin)
-    first_odd = total(moved.imag, sin, other_cos)
-    second_odd = total(moved.imag, cos, other_sin)
-    rows = []
-    for sign in (-1, 1):
-        near = even - sign * first_odd  # even in the second turn
-        far = sign * odd + second_odd  # odd in the second turn
-        rows.append(torch.cat(((near + far).flip(2)[..., :-1], near - far), 2))
-    return torch.cat((rows[0].flip(1)[:, :-1], rows[1]), 1)
+    x_cos_cos = sum_links(moved.real, cos_a, cos_b)
+    x_sin_sin = sum_links(moved.real, sin_a, sin_b)
+    y_sin_cos = sum_links(moved.imag, sin_a, cos_b)
+    y_cos_sin = sum_links(moved.imag, cos_a, sin_b)
+    halves = []
+    for sign in (-1, 1):  # of the first turn
+        even = x_cos_cos - sign * y_sin_cos  # in the second turn
+        odd = sign * x_sin_sin + y_cos_sin
+        negative = (even + odd).flip(2)[..., :-1]  # second turns in ascending order, without 0
+        halves.append(torch.cat((negative, even - odd), 2))
+    return torch.cat((halves[0].flip(1)[:, :-1], halves[1]), 1)

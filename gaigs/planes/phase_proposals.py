@@ -47,34 +47,36 @@ def propose_by_phases(
     """
     plane = planes[number]
     axes = tangents(plane[:3])
-    grids = _grids(data, reach, tilt)
+    offsets, tilts, other_tilts = grids = _grids(data, reach, tilt)
     parts = []
     references = data.reference_phases(planes, data.receivers)
     for receiver, phase in zip(data.receivers, references, strict=True):
         parts.append(_phasors(data, receiver, phase, planes, number))
     values, slopes, cosines = (torch.cat(column) for column in zip(*parts, strict=True))
-    waves = []
+    # Phase factors of the change in path length by each offset o, tilt t and other tilt u.
+    factors = []
     for axis, grid in enumerate(grids):
-        turns = 2 * math.pi / data.wavelength * slopes[:, axis, None] * grid  # (b, steps)
-        waves.append(torch.polar(torch.ones_like(turns), turns))
+        phases = 2 * math.pi / data.wavelength * slopes[:, axis, None] * grid  # (b, steps)
+        factors.append(torch.polar(torch.ones_like(phases), phases))
     peaks: list[SlabPeak] = []
     for material in slabs:
         permittivity, thickness = materials_of(material)
         te, tm = slab(permittivity, cosines, thickness / data.wavelength)
-        expected = polarised(plane[:3], te, tm)  # (b,)
-        # sum_b Re(a_b Gamma_b* exp(j k L_b(offset, tilts))) on the grid, as a product of matrices.
-        products = (values * expected.conj())[:, None] * waves[0]  # (b, o)
-        products = products[:, :, None] * waves[1][:, None]  # (b, o, t)
-        sums = (products.flatten(1).mT @ waves[2]).real  # (o t, u)
-        sums = sums.unflatten(0, (len(grids[0]), -1)).flatten(1)  # (o, t u)
-        highest, at = sums.max(1)
+        expected = polarised(plane[:3], te, tm)  # reflection coefficients Gamma (b,)
+        # sum_b Re(a_b Gamma_b* exp(j k L_b(offset, tilts))) on the grid, as a product of matrices,
+        # where a are ``values``, and L changes of the lengths.
+        products = (values * expected.conj())[:, None] * factors[0]  # (b, o)
+        products = products[:, :, None] * factors[1][:, None]  # (b, o, t)
+        sums = (products.flatten(1).mT @ factors[2]).real  # (o t, u)
+        sums = sums.unflatten(0, (len(offsets), -1)).flatten(1)  # (o, t u)
+        highest, best_tilts = sums.max(1)
         highest = highest / (values.abs() * expected.abs()).sum()
         for step in range(len(highest)):
             # A maximum over five offsets: the neighbours are parts of the same lobe.
             if highest[step] == highest[max(0, step - 2) : step + 3].max():
-                first = grids[1][at[step] // len(grids[2])]
-                second = grids[2][at[step] % len(grids[2])]
-                shift = torch.stack((grids[0][step], first, second))
+                first = tilts[best_tilts[step] // len(other_tilts)]
+                second = other_tilts[best_tilts[step] % len(other_tilts)]
+                shift = torch.stack((offsets[step], first, second))
                 peaks.append(SlabPeak(highest[step].item(), shift, material))
     peaks.sort(key=lambda peak: -peak.height)
     return [
@@ -86,15 +88,16 @@ def propose_by_phases(
 def _grids(data: ChannelData, reach: float, tilt: float) -> list[Float[Tensor, " k"]]:
     """Grids of the periodogram: offsets [m], and tilts [rad] towards two axes."""
     wavelength = data.wavelength
-    # A step changes a path's length by an eighth or a fifth of a wavelength at most, so no lobe is
-    # missed: bounces are within half a diagonal of the middle. Four steps on a side at least.
+    # A step changes a path's length by an eighth (offset) or a fifth (tilt) of a wavelength at
+    # most, so no lobe is missed: reflection points are within half a diagonal of the middle. Each
+    # side has four steps or more.
     offset_step = min(wavelength / 16, reach / 4)
     tilt_step = min(wavelength / 5 / data.frame.diagonal, tilt / 4)
-    offsets = min(round(reach / offset_step), data.options.offset_cells)
-    tilts = min(round(tilt / tilt_step), data.options.tilt_cells)
-    offset_grid = offset_step * torch.arange(-offsets, offsets + 1).double()
-    tilt_grid = tilt_step * torch.arange(-tilts, tilts + 1).double()
-    return [offset_grid, tilt_grid, tilt_grid]
+    offset_count = min(round(reach / offset_step), data.options.offset_cells)
+    tilt_count = min(round(tilt / tilt_step), data.options.tilt_cells)
+    offsets = offset_step * torch.arange(-offset_count, offset_count + 1).double()
+    tilts = tilt_step * torch.arange(-tilt_count, tilt_count + 1).double()
+    return [offsets, tilts, tilts]
 
 
 def _shifted(
@@ -130,15 +133,16 @@ def _phasors(
 
     def path_lengths(shift: Float[Tensor, "3"]) -> Float[Tensor, " b"]:
         plane = _shifted(planes[number], axes, shift)
-        ways = reflect(receiver.places, plane[:3], plane[3]) - receiver.position
-        return ways.norm(dim=1)
+        from_images = reflect(receiver.places, plane[:3], plane[3]) - receiver.position
+        return from_images.norm(dim=1)
 
     slopes = torch.autograd.functional.jacobian(path_lengths, torch.zeros(3).double())  # (b, 3)
-    ways = reflect(receiver.places, normal, offset) - receiver.position
-    cosines = (functional.normalize(ways, dim=1) @ normal).abs().clamp(1e-3, 1)
-    weights = strengths.abs() * waves[:, path].norm(dim=1) / receiver.flat.norm(dim=1)
+    from_images = reflect(receiver.places, normal, offset) - receiver.position  # (b, 3)
+    cosines = (functional.normalize(from_images, dim=1) @ normal).abs().clamp(1e-3, 1)
+    weights = strengths.abs() * waves[:, path].norm(dim=1) / receiver.flat.norm(dim=1)  # (b,)
     values = weights * strengths.sgn() * phase.conj()
-    strongest = weights.argsort(descending=True)[: max(16, 120 // len(data.receivers))]
+    places_per_receiver = max(16, 120 // len(data.receivers))
+    strongest = weights.argsort(descending=True)[:places_per_receiver]
     return Phasors(values[strongest], slopes[strongest], cosines[strongest])
 
 
@@ -147,10 +151,14 @@ def _distinct_peaks(peaks: list[SlabPeak], least: float) -> list[SlabPeak]:
 
     Two peaks of one kind are in the same lobe if their offsets differ by less than ``least`` [m].
     """
+    half_spaces: list[SlabPeak] = []
+    slabs: list[SlabPeak] = []
     distinct: list[SlabPeak] = []
     for peak in peaks:
-        alike = [other for other in distinct if (other.slab[2] < 0) == (peak.slab[2] < 0)]
-        is_apart = all((peak.shift - other.shift)[0].abs() > least for other in alike)
-        if len(alike) < 8 and is_apart:
+        has_thickness = peak.slab[2] < 0  # a logarithm; half-spaces have 0, 1 m
+        same_kind = slabs if has_thickness else half_spaces
+        is_apart = all((peak.shift - other.shift)[0].abs() > least for other in same_kind)
+        if len(same_kind) < 8 and is_apart:
+            same_kind.append(peak)
             distinct.append(peak)
     return distinct

@@ -28,9 +28,10 @@ def thin_batch(batch: Batch, rows: int) -> Batch:
     labels = batch.labels
     directions = batch.directions
     if isinstance(directions, Grid):
-        thinning = slice(None, None, max(1, round(directions.shape[0] / rows)))
-        labels = labels[:, thinning, thinning]
-        directions = directions.thin(thinning, thinning)
+        step = max(1, round(directions.shape[0] / rows))
+        every = slice(None, None, step)
+        labels = labels[:, every, every]
+        directions = directions.thin(every, every)
     return Batch(batch.query, directions, labels)
 
 
@@ -78,7 +79,7 @@ def move_plane(
     ``turns`` the normals of ``square_normals`` are also tried.
     """
     placement: Mirrored = model.placement
-    origin = placement.origin[plane]
+    origin = placement.origin[plane]  # normal and offset, a view that is changed in place
     step = wavelength / 10  # a reflected path changes by twice as much
     count = round(reach / step)
     moves = step * torch.arange(-count, count + 1).to(origin)
@@ -113,11 +114,12 @@ def _measure_moves(
         model.excite(batch.query)
         strengths = placement.held
         numbers = max(1000, batch.labels[0].numel())
-        for part in moves.split(max(1, 2_000_000 // (count * numbers))):
-            # Each link once for each move.
+        moves_at_a_time = max(1, 2_000_000 // (count * numbers))  # limits memory
+        for part in moves.split(moves_at_a_time):
+            # All links for the first move, then all links for the second, ...
             rows = torch.arange(count, device=moves.device).repeat(len(part))
             placement.held = strengths[rows]
-            placement.tried = placement.offsets.repeat(len(rows), 1)
+            placement.tried = placement.offsets.repeat(len(rows), 1)  # (moves x links, w)
             placement.tried[:, plane] += part.repeat_interleave(count)
             moved = Batch(batch.query[rows], batch.directions)
             numbered = torch.arange(len(rows), device=rows.device)
@@ -152,26 +154,28 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: flo
     Returns:
         A sentence for the log.
     """
-    planes = len(placement.used)
-    paths = int(placement.kept.sum())
+    plane_count = len(placement.used)
+    path_count = int(placement.kept.sum())
     before = [loss(batch) for batch in batches]
 
     def suffices(kept: Bool[Tensor, " n"]) -> bool:
         """Keeps only these paths; True if no batch's loss rises by 0.1 %."""
         placement.kept.copy_(kept)
-        return all(
-            loss(batch) <= old * (1 + 1e-3) for batch, old in zip(batches, before, strict=True)
-        )
+        for batch, old_loss in zip(batches, before, strict=True):
+            if not loss(batch) <= old_loss * (1 + 1e-3):  # also if it is NaN
+                return False
+        return True
 
-    best = placement.kept.clone()
+    best = placement.kept.clone()  # True for the paths that stay
     shares = torch.stack([_path_shares(placement, batch) for batch in batches]).amax(0)
     paths_in_use = best.nonzero()[:, 0]
     best[paths_in_use[shares < negligible * shares.max()]] = False
     for plane in reversed(sort_by_strength(placement, batches[0])):
-        without = best & ~(placement.sequences == plane).any(1)
-        best = without if suffices(without) else best
+        without_plane = best & ~(placement.sequences == plane).any(1)
+        best = without_plane if suffices(without_plane) else best
     placement.kept.copy_(best)
-    weakest = best.nonzero()[:, 0][_path_shares(placement, batches[0]).argsort()]
+    order = _path_shares(placement, batches[0]).argsort()
+    weakest = best.nonzero()[:, 0][order]  # numbers of the paths, the weakest first
     # The largest number of weak paths that may go, by bisection.
     low, high = 0, len(weakest) - 1
     while low < high:
@@ -182,8 +186,8 @@ def prune(placement: Mirrored, batches: list[Batch], loss: Loss, negligible: flo
             high = middle - 1
     placement.kept.copy_(best.index_fill(0, weakest[:low], False))
     return (
-        f"{planes - len(placement.used)} of {planes} planes and "
-        f"{paths - int(placement.kept.sum())} of {paths} "
+        f"{plane_count - len(placement.used)} of {plane_count} planes and "
+        f"{path_count - int(placement.kept.sum())} of {path_count} "
         f"paths dropped; loss {before[0]:.4f} -> {loss(batches[0]):.4f}"
     )
 
@@ -192,9 +196,10 @@ def sort_by_strength(placement: Mirrored, batch: Batch) -> list[int]:
     """Numbers of used planes, sorted by the received power of their paths, strongest first."""
     shares = _path_shares(placement, batch)
     sequences = placement.sequences[placement.kept]
-    powers = {
-        plane: shares[(sequences == plane).any(1)].sum().item() for plane in placement.used.tolist()
-    }
+    powers = {}
+    for plane in placement.used.tolist():
+        has_plane = (sequences == plane).any(1)  # (n,)
+        powers[plane] = shares[has_plane].sum().item()
     return sorted(powers, key=lambda plane: -powers[plane])
 
 

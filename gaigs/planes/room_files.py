@@ -72,19 +72,20 @@ def _summarize_paths(traced: TracedPaths) -> list[dict]:
 def write_room(placement: Mirrored, query: Query, folder: Path) -> None:
     """Writes ``planes.obj``, with planes cut to their paths, and ``obstacles.ply`` if any."""
     write_text(folder / "planes.obj", wavefront_obj(placement, trace_paths(placement, query)))
-    blobs = placement.obstacles
-    if blobs is None:
+    obstacles = placement.obstacles
+    if obstacles is None:
         return
-    # Grey, and as opaque as the share of power lost through the middle of an obstacle of its mean
-    # width.
-    depths = blobs.densities * math.sqrt(2 * math.pi) * blobs.widths.log().mean(1).exp()
+    # Obstacles are grey. The opacity is the share of power lost through the middle: the integral of
+    # a Gaussian density along a line is density sqrt(2 pi) width, here with the mean width.
+    mean_widths = obstacles.widths.log().mean(1).exp()
+    depths = obstacles.densities * math.sqrt(2 * math.pi) * mean_widths  # [Np]
     parts = {
-        "means": blobs.centres + placement.middle,
-        "quats": torch.tensor([1.0, 0, 0, 0]).expand(len(blobs), 4),
-        "log_scales": blobs.log_widths,
+        "means": obstacles.centres + placement.middle,
+        "quats": torch.tensor([1.0, 0, 0, 0]).expand(len(obstacles), 4),
+        "log_scales": obstacles.log_widths,
         # log((1 - t) / t) with t = exp(-2 depth), without a difference of nearly equal numbers.
         "opacity_logits": 2 * depths + torch.log(-torch.expm1(-2 * depths)),
-        "signal": torch.zeros(len(blobs), 3, 1),
+        "signal": torch.zeros(len(obstacles), 3, 1),
     }
     comment = "gaigs: obstacles; places in metres; opacity: share of power lost through the middle"
     write_ply(folder / "obstacles.ply", parts, comment)

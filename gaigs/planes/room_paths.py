@@ -42,11 +42,11 @@ class TracedPaths(NamedTuple):
         Keys are numbers of planes. Shares are averages over links. A path with two planes counts
         for both.
         """
-        means = self.shares.mean(0)
-        numbers = np.unique(self.sequences[self.sequences >= 0]).tolist()
-        shares = {
-            number: means[(self.sequences == number).any(1)].sum().item() for number in numbers
-        }
+        means = self.shares.mean(0)  # (n,)
+        shares = {}
+        for number in np.unique(self.sequences[self.sequences >= 0]).tolist():
+            has_plane = (self.sequences == number).any(1)
+            shares[number] = means[has_plane].sum().item()
         return dict(sorted(shares.items(), key=lambda item: -item[1]))
 
 
@@ -82,15 +82,16 @@ def trace_paths(placement: Mirrored, query: Query) -> TracedPaths:
     powers = []
     bounces = []
     receivers = []
-    for part in query.parts(64):  # links at a time
-        part = part.to(device)
-        powers.append(placement(None, part).gains.abs().square())
-        _, stands, folded = placement.folded(part)
-        receivers.append(placement.scene.positions(stands)[part.receivers])
-        points = stands.new_full((len(part), *sequences.shape, 3), torch.nan)
-        # Folding begins at the last plane of a sequence.
-        for back, (first, met) in enumerate(folded.parts(folded.bounces), 1):
-            points[:, first:, -back] = met + placement.middle
+    for links in query.parts(64):  # links at a time
+        links = links.to(device)
+        powers.append(placement(None, links).gains.abs().square())
+        _, positions, folded = placement.folded(links)
+        receivers.append(placement.scene.positions(positions)[links.receivers])
+        points = positions.new_full((len(links), *sequences.shape, 3), torch.nan)
+        # Folding begins at the receiver, that is at the last plane of a sequence. Only paths from
+        # number ``first`` on have a plane at this place.
+        for from_end, (first, reflected) in enumerate(folded.parts(folded.bounces), 1):
+            points[:, first:, -from_end] = reflected + placement.middle
         bounces.append(points)
     return TracedPaths(
         sequences.cpu().numpy(),

@@ -42,9 +42,9 @@ class Score(Generic[R]):
     """Quality of planes for labels of one kind.
 
     ``PlaneSearch`` itself knows nothing of the labels. Labels of a new kind need two classes. The
-    first is a NamedTuple for rooms, with ``planes`` and
-    further fitted quantities, such as materials. The second is a subclass of this class. It
-    implements the methods for the steps that its search uses; no method changes a room:
+    first is a NamedTuple for rooms, with ``planes`` and further fitted quantities, such as
+    materials. The second is a subclass of this class. It implements the methods for the steps that
+    its search uses; no method changes a room:
 
     * ``PlaneSearch.sweep`` needs ``move``;
     * ``PlaneSearch.extend`` needs ``error``, ``rate`` and ``add``;
@@ -143,15 +143,17 @@ class PlaneSearch(Generic[R]):
             turned = functional.normalize(normals, dim=-1)
             offsets = planes[:, None, 3:] + shift * noise[..., 3:]
             near = torch.cat((turned, offsets), 2)  # (starts, 24, 4)
-            highest, at = rough.rate(near.flatten(0, 1)).view(near.shape[:2]).max(1)
-            planes = near[torch.arange(len(planes)), at]
+            near_ratings = rough.rate(near.flatten(0, 1)).view(near.shape[:2])  # (starts, 24)
+            highest, best = near_ratings.max(1)
+            planes = near[torch.arange(len(planes)), best]  # (starts, 4)
             turn, shift = turn / 2, shift / 2
         candidates: list[Candidate] = []
+        known = [*room.planes]
         for number in highest.argsort(descending=True).tolist():
-            known = [*room.planes, *(candidate.plane for candidate in candidates)]
             is_known = any(self.frame.is_like(planes[number, None], plane) for plane in known)
             if len(candidates) < 3 and not is_known:
                 candidates.append(Candidate(planes[number], highest[number].item()))
+                known.append(planes[number])
         return candidates
 
     def list_extensions(self, room: R, grid: Float[Tensor, "n k 4"]) -> list[R]:
@@ -160,7 +162,10 @@ class PlaneSearch(Generic[R]):
         return [trial for trial in larger if trial is not None]
 
     def extend(self, room: R, grid: Float[Tensor, "n k 4"]) -> R | None:
-        """The room with the candidate of the lowest error; None if ``Score.add`` accepts none."""
+        """The room with one more plane, the candidate with the lowest error.
+
+        None if ``Score.add`` accepts no candidate.
+        """
         return min(self.list_extensions(room, grid), key=self.score.error, default=None)
 
     def grow(self, room: R, most: int, extend: Callable[[R], R | None]) -> R:
@@ -198,10 +203,9 @@ class PlaneSearch(Generic[R]):
     def prune(self, room: R, fewest: int) -> R:
         """The room without planes whose removal lowers the error; the first ``fewest`` stay."""
         while len(room.planes) > fewest and not stages.is_up():
-            smaller = [
-                self.score.remove(room, number) for number in range(fewest, len(room.planes))
-            ]
-            best = min(smaller, key=self.score.error)
+            numbers = range(fewest, len(room.planes))
+            smaller_rooms = [self.score.remove(room, number) for number in numbers]
+            best = min(smaller_rooms, key=self.score.error)
             if self.score.error(best) > self.score.error(room):
                 break
             room = self.score.refine(best)
@@ -218,27 +222,29 @@ def descend(
     rate: float,
     turns: float = 0.4,
 ) -> list[Tensor]:
-    """Planes and ``others``, the further arguments of a loss, after gradient descent by Adam.
+    """Planes and further arguments of a loss after gradient descent by Adam, in one list.
 
     Args:
-        loss: Function of planes and ``others`` to minimise.
+        loss: Function of planes and further arguments to minimise.
         receivers: Receivers whose ``mean_bounces`` are the pivots of rotations.
         planes: Initial planes.
-        others: Initial values of the other arguments.
+        others: Initial values of the further arguments.
         steps: Number of steps, whose size falls to 3 % of the first.
         rate: First step of a plane along its normal [m].
         turns: First rotation of a plane over ``rate`` [rad/m]; 0 for none.
     """
     if not len(planes):
         return [planes, *others]
-    pivots = mean_bounces(receivers, planes)
-    heights = planes[:, 3] - (planes[:, :3] * pivots).sum(1)
+    pivots = mean_bounces(receivers, planes)  # (w, 3)
+    heights = planes[:, 3] - (planes[:, :3] * pivots).sum(1)  # of the planes over their pivots
     axes = torch.stack([torch.stack(tangents(normal)) for normal in planes[:, :3]])  # (w, 2, 3)
-    shifts = (0 * planes[:, :3]).clone().requires_grad_()  # one along the normal, two turns
+    # A shift along the normal [m], and two turns [1 / ``turns`` rad] (w, 3).
+    shifts = (0 * planes[:, :3]).clone().requires_grad_()
     others = [part.clone().requires_grad_() for part in others]
 
     def moved() -> Float[Tensor, "w 4"]:
-        # Lengths change by about twice a shift [m], and by some metres times a turn [rad].
+        """The planes after their shifts and turns."""
+        # Path lengths change by about twice a shift [m], but by some metres times a turn [rad].
         turned = planes[:, :3] + turns * (shifts[:, 1:, None] * axes).sum(1)  # (w, 3)
         normals = functional.normalize(turned, dim=1)
         offsets = (normals * pivots).sum(1) + heights + shifts[:, 0]
@@ -248,8 +254,8 @@ def descend(
     for step in stages.track(range(steps)):
         if stages.is_up():
             break
-        for group, highest in zip(optimizer.param_groups, (rate, 2e-2), strict=True):
-            group["lr"] = highest * 0.03 ** (step / steps)
+        for group, first_rate in zip(optimizer.param_groups, (rate, 2e-2), strict=True):
+            group["lr"] = first_rate * 0.03 ** (step / steps)
         optimizer.zero_grad()
         loss(moved(), *others).backward()
         optimizer.step()

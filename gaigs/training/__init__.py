@@ -20,14 +20,17 @@ class MeanScores:
         self.count = 0
 
     def add(self, batch: Batch, values: torch.Tensor) -> None:
-        """Adds the scores of a batch, weighted by the batch's fraction of links."""
-        share = batch.shares[0]
-        self.count += share * len(batch)
+        """Adds the scores of the predictions ``values`` of a batch, weighted by its ``shares``."""
+        weight, _ = batch.shares
+        self.count += weight * len(batch)
         for name, scores in self.task.scores(batch.labels, values).items():
-            self.sums[name] = self.sums.get(name, 0.0) + share * scores.sum().item()
+            self.sums[name] = self.sums.get(name, 0.0) + weight * scores.sum().item()
 
     def over_processes(self, strategy) -> dict[str, float]:
-        """Means over all processes' links, as ``Task.logged``; every process must call it."""
+        """Mean scores over the links of all processes, in the form of ``Task.logged``.
+
+        Every process must call this method, since processes wait for each other in it.
+        """
         numbers = [self.count, *self.sums.values()]
         totals = torch.tensor(numbers, dtype=torch.float64, device=strategy.root_device)
         count, *sums = strategy.reduce(totals, reduce_op="sum").tolist()

@@ -42,39 +42,39 @@ class Batches:
         self.size = size
         self.seed = seed
         self.steps = steps
-        _, place = links.query[index].unique(with_receivers=False)  # (k,)
+        _, place = links.query[index].unique(with_receivers=False)  # number of each place (k,)
         by_place = index[place.argsort(stable=True)]
-        self.places = by_place.split(place.bincount().tolist())
-        self.position = 0
+        self.places = by_place.split(place.bincount().tolist())  # links of each place
+        self.position = 0  # batches so far
 
     def __len__(self) -> int:
         return self.steps
 
     def __iter__(self) -> Iterator[Batch]:
-        length = -(-len(self.places) // self.size)
+        batches_per_pass = -(-len(self.places) // self.size)  # rounded up
         while self.position < self.steps:
-            # The order follows from seed and pass, so that a resumed training needs the step alone.
-            passed, within = divmod(self.position, length)
-            order = torch.randperm(len(self.places), generator=seeded(self.seed, passed))
-            parts = order.split(self.size)
-            for chosen in parts[within : within + self.steps - self.position]:
+            # The order follows from seed and pass: a resumed training needs only its position.
+            passes, first = divmod(self.position, batches_per_pass)
+            order = torch.randperm(len(self.places), generator=seeded(self.seed, passes))
+            remaining = self.steps - self.position
+            for numbers in order.split(self.size)[first : first + remaining]:
                 self.position += 1
-                yield self._share([self.places[i] for i in chosen.tolist()])
+                yield self._batch_of_process([self.places[i] for i in numbers.tolist()])
 
-    def _share(self, places: list[Tensor]) -> Batch:
-        """This process's part of a batch."""
+    def _batch_of_process(self, places: list[Tensor]) -> Batch:
+        """The batch of this process, from the links of each place in the step."""
         rank, processes = process()
-        # A process without a place takes one with weight 0: every process has to take part in the
-        # step.
-        shared = places[rank::processes]
-        taken = shared or places[:1]
+        own_places = places[rank::processes]
+        # Every process has to take part in the step: without a place it takes one with weight 0.
+        taken = own_places or places[:1]
         batch = self.links.batch(torch.cat(taken))
         if processes == 1:
             return batch
-        # The mean over processes of weighted means is the mean over the batch.
-        weight = processes if shared else 0
-        links = weight * len(batch) / sum(map(len, places))
-        return replace(batch, shares=(links, weight * len(taken) / len(places)))
+        # Each process weights its mean so that the mean over processes is the mean over the step.
+        weight = processes if own_places else 0
+        weight_of_links = weight * len(batch) / sum(map(len, places))
+        weight_of_places = weight * len(taken) / len(places)
+        return replace(batch, shares=(weight_of_links, weight_of_places))
 
     def state_dict(self) -> dict:
         return {"position": self.position}
@@ -96,9 +96,9 @@ class InOrder:
     def __iter__(self) -> Iterator[Batch]:
         rank, processes = process()
         for part in self.parts:
-            shared = part[rank::processes]
-            # A process without a link takes one with weight 0: all go through the same number of
-            # batches.
-            share = float(len(shared) > 0)
-            batch = self.links.batch(shared if share else part[:1])
-            yield replace(batch, shares=(share, share))
+            own_links = part[rank::processes]
+            # All processes need the same number of batches: without a link a process takes one with
+            # weight 0.
+            weight = float(len(own_links) > 0)
+            batch = self.links.batch(own_links if weight else part[:1])
+            yield replace(batch, shares=(weight, weight))

@@ -48,8 +48,8 @@ class Budget(Callback):
         self.share = 0.0
         self.end = math.inf
         self.began = searched  # time at which the last validation began [s]
-        self.validated = searched  # time at which it ended [s]
-        self.is_due = False
+        self.validated = searched  # time at which the last validation ended [s]
+        self.is_due = False  # True if a validation follows the present step
         self.spent = searched  # time before the training [s]
         self.start: float | None = None  # clock at the start of the training [s]
 
@@ -183,8 +183,11 @@ def seconds(option: str, duration: object) -> float:
 
 def watched(config: Mapping) -> contextlib.AbstractContextManager[stages.Timekeeper]:
     """The timekeeper of a run with the limit ``max_time``; with bars if the trainer has bars."""
-    limit = math.inf if config.get("max_time") is None else seconds("max_time", config["max_time"])
-    return stages.watched(limit, is_first() and config["trainer"].get("enable_progress_bar", True))
+    limit = math.inf
+    if config.get("max_time") is not None:
+        limit = seconds("max_time", config["max_time"])
+    has_bars = is_first() and config["trainer"].get("enable_progress_bar", True)
+    return stages.watched(limit, has_bars)
 
 
 def time_share(trainer) -> float | None:

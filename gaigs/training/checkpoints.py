@@ -24,8 +24,8 @@ class KeepBest(Checkpoint):
     """Writes the checkpoint of the best validation score (``Task.monitor``).
 
     Without validation it is the checkpoint of the last step. The training stops after ``patience``
-    validations without a better score. The training also stops if a linear extrapolation of the
-    last two scores ends below a ``rival`` score.
+    validations without a better score. It also stops if the best score, which rises to the end as
+    fast as since the last validation, stays below the score ``rival``.
     """
 
     def __init__(self, path: Path, patience: int | None, rival: float | None = None):
@@ -59,18 +59,19 @@ class KeepBest(Checkpoint):
         if trainer.sanity_checking:
             return
         score = trainer.callback_metrics[f"validation/{module.task.monitor}"].item()
-        before, share = self.best, self.share
+        last_best, last_share = self.best, self.share
         self.waited = 0 if self._keep(trainer, module, score) else self.waited + 1
         if self.rival is not None:
             self.share = share_done(trainer)(trainer.global_step)
-            rate = (self.best - before) / max(self.share - share, 1e-9)
-            self.is_behind = self.best + rate * (1 - self.share) < self.rival
+            rate = (self.best - last_best) / max(self.share - last_share, 1e-9)
+            extrapolated = self.best + rate * (1 - self.share)  # at the end of the training
+            self.is_behind = extrapolated < self.rival
         if self.is_behind:
             log.info("step %d: a law of distance stays ahead of the room", trainer.global_step)
         self._stop_without_progress(trainer)
 
     def on_train_end(self, trainer, module) -> None:
-        """Scores the model after the last step, if no validation was due there."""
+        """Scores the model after the last step, if no validation followed this step."""
         if trainer.enable_validation and trainer.global_step % trainer.val_check_batch:
             self._validate(trainer, module)
 

@@ -84,28 +84,28 @@ class DensityControl(Callback):
     @torch.no_grad()
     def on_train_batch_end(self, trainer, module, *_) -> None:
         gaussians = module.model.primitives
-        follower = getattr(module.model, "deformation", None)
+        follower = getattr(module.model, "deformation", None)  # may have a row for each Gaussian
         optimizer = trainer.optimizers[0]
         step = trainer.global_step
         is_due = step % self.every == 0 and self.start <= step <= self.stop
         if not is_due or not gaussians.means.requires_grad:
             return
-        pulled = self.pull / self.steps > self.gradient  # (n,)
-        room = max(0, self.max_count - len(gaussians))
-        if int(pulled.sum()) > room:  # the hardest pulled alone
-            chosen = torch.topk(torch.where(pulled, self.pull, -1), room).indices
-            pulled = torch.zeros_like(pulled).index_fill(0, chosen, True)
+        is_pulled = self.pull / self.steps > self.gradient  # (n,)
+        most_new = max(0, self.max_count - len(gaussians))
+        if int(is_pulled.sum()) > most_new:  # only the strongest pulls fit
+            strongest = torch.topk(torch.where(is_pulled, self.pull, -1), most_new).indices
+            is_pulled = torch.zeros_like(is_pulled).index_fill(0, strongest, True)
         # A narrow Gaussian covers too little and is cloned, a wide one too much and is split (Kerbl
         # et al., 2023).
-        wide = gaussians.scales.amax(-1) / self._distances(module) > self.split_angle  # (n,)
-        split = pulled & wide
-        density.clone(gaussians, optimizer, pulled & ~wide, follower)
-        # Clones are last, and are not split.
-        split = torch.cat((split, split.new_zeros(len(gaussians) - len(split))))
-        density.split(gaussians, optimizer, split, seeded(self.seed, step), follower)
-        faint = gaussians.opacities < self.opacity
-        if faint.any():
-            density.prune(gaussians, optimizer, faint, follower)
+        is_wide = gaussians.scales.amax(-1) / self._distances(module) > self.split_angle  # (n,)
+        is_split = is_pulled & is_wide
+        density.clone(gaussians, optimizer, is_pulled & ~is_wide, follower)
+        # Clones are appended, and are not split.
+        is_split = torch.cat((is_split, is_split.new_zeros(len(gaussians) - len(is_split))))
+        density.split(gaussians, optimizer, is_split, seeded(self.seed, step), follower)
+        is_faint = gaussians.opacities < self.opacity
+        if is_faint.any():
+            density.prune(gaussians, optimizer, is_faint, follower)
         self.steps = 0
         if trainer.world_size > 1:
             # All processes have the same Gaussians, but Lightning's wrapper still holds the

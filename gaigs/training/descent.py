@@ -118,18 +118,25 @@ class Descent(lightning.LightningModule):
             batch = replace(batch, query=batch.query[chosen], labels=batch.labels[chosen])
         batch = self.thin(batch, generator)
         if self.jitter:
-            # One move a place, the same for all receivers.
+            # Links of one place to all receivers shift together.
             places, which = batch.query.unique(with_receivers=False)
-            moves = torch.randn(places.transmitters.shape, generator=generator)
-            moves = self.jitter * moves.to(places.transmitters)
-            moved = (places.transmitters + moves)[which]  # (b, 3)
-            batch = replace(batch, query=replace(batch.query, transmitters=moved))
+            shifts = torch.randn(places.transmitters.shape, generator=generator)
+            shifts = self.jitter * shifts.to(places.transmitters)
+            shifted = (places.transmitters + shifts)[which]  # (b, 3)
+            batch = replace(batch, query=replace(batch.query, transmitters=shifted))
         return batch
 
     def add_up(
         self, loss: Tensor, terms: dict[str, Tensor], penalties: dict[str, Tensor], batch: Batch
     ) -> Tensor:
-        """The loss with its penalties, checked and logged."""
+        """The loss plus the weighted penalties; checks that it is finite, and logs all.
+
+        Args:
+            loss: Mean loss of the batch.
+            terms: Terms of the loss, for the log.
+            penalties: Penalties of the model, means over places.
+            batch: The batch, whose ``shares`` weight means over links and places.
+        """
         links, places = batch.shares
         total = links * loss
         for name, penalty in penalties.items():
@@ -148,10 +155,9 @@ class Descent(lightning.LightningModule):
         return total
 
     def _log_now(self, terms: dict[str, Tensor]) -> None:
-        """Logs means over processes, now.
+        """Logs means over processes at once.
 
-        Lightning would log after the step's callbacks, and a checkpoint written by them would lack
-        the row.
+        Lightning would log after the callbacks of the step: their checkpoint would lack the row.
         """
         values = torch.stack([*terms.values()]).detach()
         values = self.trainer.strategy.reduce(values, reduce_op="mean").tolist()

@@ -24,16 +24,17 @@ def find_broken(model: Model, batch: Batch, terms: Mapping[str, Tensor]) -> str:
             return f"the parameter {name}"
     broken: list[str] = []
 
-    def look(name: str, part: nn.Module, arguments: tuple, output: object) -> None:
-        values = output if isinstance(output, tuple) else (output,)
-        if not all(is_finite(value) for value in values if isinstance(value, Tensor)):
+    def check_output(name: str, part: nn.Module, arguments: tuple, output: object) -> None:
+        """A forward hook, which records parts in the order of their calls."""
+        outputs = output if isinstance(output, tuple) else (output,)
+        tensors = [value for value in outputs if isinstance(value, Tensor)]
+        if not all(is_finite(tensor) for tensor in tensors):
             broken.append(f"the output of {name}")
 
-    hooks = [
-        part.register_forward_hook(partial(look, name))
-        for name, part in model.named_modules()
-        if name
-    ]
+    hooks = []
+    for name, part in model.named_modules():
+        if name:  # not the whole model
+            hooks.append(part.register_forward_hook(partial(check_output, name)))
     try:
         value, penalties = model(batch)
     finally:

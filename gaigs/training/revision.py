@@ -30,11 +30,11 @@ def _stopping_when_time_is_up(trainer, model: nn.Module) -> Iterator[None]:
     Searches that call no submodule ask ``stages.is_up``.
     """
 
-    def look(*_) -> None:
+    def check_time(*_) -> None:
         if is_time_up(trainer):
             raise _TimeUp
 
-    hooks = [part.register_forward_pre_hook(look) for part in model.modules()]
+    hooks = [part.register_forward_pre_hook(check_time) for part in model.modules()]
     keeper = stages.current()
     keeper.ends = functools.partial(is_time_up, trainer)
     try:

@@ -37,8 +37,9 @@ def make_optimizer(
     known = inspect.signature(kind).parameters.keys()
     implementations = {"fused", "foreach", "differentiable"} & known
     on_cpu = all(p.is_floating_point() and p.device.type == "cpu" for p in parameters)
-    # False would keep torch from the grouped steps that it takes by itself on a GPU.
-    if "fused" in implementations and on_cpu and not implementations & options.keys():
+    is_chosen = bool(implementations & options.keys())  # by the user
+    # On a GPU ``fused`` stays None: True and False would switch off torch's own fast steps.
+    if "fused" in implementations and on_cpu and not is_chosen:
         options["fused"] = True
     optimizer = call("training.optimizer", kind, options, params=parts)
     for group in optimizer.param_groups:
@@ -79,14 +80,19 @@ def warmup_and_decay(
         raise ValueError(f"training.schedule.warmup must be at least 0 steps, got {warmup}")
 
     def factor(step: int) -> float:
-        risen = min(1.0, (step + 1) / max(warmup, 1))
-        return risen * final ** share_done(step)
+        rise = min(1.0, (step + 1) / max(warmup, 1))
+        decay = final ** share_done(step)
+        return rise * decay
 
     return LambdaLR(optimizer, factor)
 
 
 def _target(option: str, config: Mapping, module: ModuleType, base: type) -> tuple[type, dict]:
-    """The class in ``_target_``, and the other options; a ``ValueError`` for another base."""
+    """The class that ``_target_`` names, and the other options.
+
+    Raises:
+        ValueError: The class is not in ``module``, or has not the base class ``base``.
+    """
     options = dict(config)
     target = str(options.pop("_target_", None))
     start = f"{module.__name__}."
