@@ -27,8 +27,8 @@ def check_places(links: Any) -> Iterator[Finding]:
     sites = sites_of(links.query)
     measured = _measured(links)
     tree = cKDTree(_positions(links)[measured].double().numpy())
-    near = tree.query(sites.double().numpy())[0] < 0.01
-    # One may be measured beside a receiver; radios that move meet at the same places.
+    near = tree.query(sites.double().numpy())[0] < 0.01  # transmitters within 1 cm
+    # A single place may be beside a receiver, and moving radios meet at the same places.
     if len(sites) > 1 and near.sum() > 1 and not links.one_radio:
         text = f"{int(near.sum())} places are where a receiver stands"
         yield Finding("places at a receiver", text)
@@ -80,16 +80,16 @@ def scale_of(places: Float[Tensor, "n 3"]) -> str:
         if 0 <= low - lower <= margin and 0 <= upper - high <= margin:
             return f"scaled to {lower:g}..{upper:g} along each axis"
     # Standardised coordinates have deviation 1 and mean 0.
-    off_deviation = (places.std(0, correction=0) - 1).abs().max()
-    off_mean = places.mean(0).abs().max()
-    return "standardised along each axis" if max(off_deviation, off_mean) < 0.1 else ""
+    deviation_error = (places.std(0, correction=0) - 1).abs().max()
+    mean_error = places.mean(0).abs().max()
+    return "standardised along each axis" if max(deviation_error, mean_error) < 0.1 else ""
 
 
 def sites_of(query: Query) -> Float[Tensor, "k 3"]:
-    """The distinct places of transmitters."""
-    _, which = query.place_keys.unique(return_inverse=True)
-    sites = query.transmitters.new_zeros((int(which.max()) + 1, 3))
-    sites[which] = query.transmitters
+    """The distinct places of transmitters [m]."""
+    _, numbers = query.place_keys.unique(return_inverse=True)  # (n,)
+    sites = query.transmitters.new_zeros((int(numbers.max()) + 1, 3))
+    sites[numbers] = query.transmitters
     return sites
 
 
@@ -103,7 +103,7 @@ def check_arrays(links: Any) -> Iterator[Finding]:
     for receiver in links.receivers:
         elements = receiver.array.elements
         extent = _diagonal(elements)
-        aside = elements.mean(0).norm().item()
+        aside = elements.mean(0).norm().item()  # from the receiver's position [m]
         if extent > room > 0:
             yield Finding(
                 "unit of elements",
@@ -137,7 +137,12 @@ def check_arrays(links: Any) -> Iterator[Finding]:
 
 
 def check_walls(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> Iterator[Finding]:
-    """A finding if walls, from above, are in another unit or area than the places."""
+    """A finding if walls are in another unit or area than the places, in the floor plan.
+
+    Args:
+        walls: Points of the walls [m].
+        places: Transmitters and receivers [m].
+    """
     across = _diagonal(walls[:, :2])
     room = _diagonal(places[:, :2])
     if across and room and not 1 / 50 < across / room < 50:  # millimetres differ by 1000
@@ -145,6 +150,7 @@ def check_walls(walls: Float[Tensor, "k 3"], places: Float[Tensor, "n 3"]) -> It
         yield Finding("unit of walls", text, "are both in m?")
         return
     lower, upper = walls[:, :2].amin(0), walls[:, :2].amax(0)
+    # Gap between the two boxes along x and y; negative where they overlap.
     gaps = torch.maximum(lower - places[:, :2].amax(0), places[:, :2].amin(0) - upper)  # (2,)
     apart = gaps.clamp_min(0).norm().item()
     if apart > 0.1 * (across + room):  # a single wall may also be some distance away
