@@ -350,7 +350,7 @@ def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
     The first array with a letter in its shape fixes the letter's size.
     """
     known: dict[object, int] = {}  # size of each letter
-    kinds = {"real": "iuf", "whole": "iu", "complex": "c"}  # of numpy's data types
+    kinds = {"real": "iuf", "whole": "iu", "complex": "c"}  # numpy's letters of data types
     for name, array in arrays.items():
         kind, letters = ARRAYS[name]
         if name == "elements" and array.ndim == 3:
@@ -365,7 +365,7 @@ def _check_shapes(file: Path, arrays: Mapping[str, np.ndarray]) -> None:
             raise ValueError(f"{file}: {name}: expected {kind} numbers, got {got}")
         sizes = tuple(known.get(letter, letter) for letter in letters)
         if not array.size or not _fits(array.shape, sizes):
-            # MATLAB's arrays get a last axis of 1.
+            # Channels of one antenna without the axis of elements: (n, s), or (n, s, 1) by MATLAB.
             is_flat = name == "h" and (array.ndim == 2 or array.shape[-1] == 1)
             hint = "; for one antenna add an axis, h[:, None, :]" if is_flat else ""
             expected = str(sizes).replace("'", "")

@@ -145,7 +145,7 @@ def _fit_laws(
     # Without constant, slope and variance, the density is |K|^-1/2 (1'1 S_xx)^-1/2 R^-n/2, with the
     # correlation K of the shadowing, n readings and the unexplained sum of squares R.
     log_determinants = factors.diagonal(dim1=1, dim2=2).log().sum(1, keepdim=True)  # (c, 1)
-    size = log_determinants + (one_one.log() + s_xx.log()) / 2
+    log_norm = log_determinants + (one_one.log() + s_xx.log()) / 2
     least = prior.noise**2 * len(levels)
-    evidence = -size - len(levels) / 2 * unexplained.clamp_min(least).log()
+    evidence = -log_norm - len(levels) / 2 * unexplained.clamp_min(least).log()
     return Laws(evidence, slopes, (one_y - slopes * one_x) / one_one)

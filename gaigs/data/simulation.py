@@ -107,7 +107,7 @@ def simulate_channels(
 
     A channel's squared magnitude is the power that an element receives of unit power sent, between
     antennas of unit gain. Its time dependence is exp(+j omega t). There is no noise. Unless
-    ``phase`` is known, links are distorted at random as a receiver would.
+    ``phase`` is known, each link gets random distortions as a receiver without synchronisation has.
     """
     if not 0 < bandwidth < math.inf:
         raise ValueError(f"bandwidth must be positive [Hz], got {bandwidth}")

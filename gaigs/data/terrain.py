@@ -25,7 +25,10 @@ class Extent(NamedTuple):
 
 
 def read_extent(file: str | Path, frame: Frame | None) -> Extent:
-    """The area that a file covers; see ``read_ground``."""
+    """The area that a terrain file covers, in the world frame [m].
+
+    File and frame are as for ``read_ground``.
+    """
     rasterio = find_rasterio()
     with _open(rasterio, file) as raster:
         source, target, origin = _systems(raster, frame)

@@ -156,6 +156,7 @@ def hold_out(
     count = int(surplus.abs().argmin()) + 1
     if at_most:
         count = max(1, int((surplus <= 0).sum()))
+    # Nine links are sought, up to 0.3 of the weight.
     if fraction is None and filled[count - 1] < 9:
         enough = int((filled < 9).sum())
         if enough < len(filled) and filled[enough] <= 0.3 * total:

@@ -35,6 +35,7 @@ def official(
     length = min(length, max(1, int(validating_rows / 4)))
     has_runs = length > 1
     groups = runs_of(links, length) if has_runs else places_of(links)
+    # Runs are large, so the nearest number of runs could be far above the fraction.
     drawn_by = {"at_most": True} if has_runs else {"rows": rows}
     train, validating, share = hold_out(
         "validation", train, groups, links.query.votes, validation, generator, **drawn_by

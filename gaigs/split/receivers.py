@@ -42,7 +42,8 @@ def receivers(
     check("test", test, 0 < test < 1, "in (0, 1)")
     generator = generator_of(seed)
     order = torch.randperm(len(links.receivers), generator=generator)
-    if links.uncertainties is not None:  # a receiver without a place is located by its links
+    # A place that is estimated would come from the links that are predicted.
+    if links.uncertainties is not None:
         order = order[links.uncertainties[order].isfinite()]
     held, name = _held(links, order, hold, test, fold)
     if not torch.isin(held, order).all() or not len(held):

@@ -33,7 +33,7 @@ from gaigs.data.checks.waves import (
 class Measure(NamedTuple):
     """A measure of how well geometry explains channels."""
 
-    measure: Callable[[Sample], float]  # share of a sample that geometry explains, 0 to 1
+    measure: Callable[[Sample], float]  # gives the share of a sample that geometry explains
     least: float  # smallest fraction that identifies a convention
     enough: float  # share above which the data need no other convention
     sentence: str  # sentence for users, with {} for the share

@@ -76,7 +76,8 @@ def fit_law(logarithms: Float[Tensor, "*h n"], sample: Sample, patterns: bool = 
         # Levels fall with the distance, by its sixth power at most.
         slopes = (products / squares.clamp_min(1e-9)).clamp(-60, 0)
         errors = levels_left - slopes[..., sample.receivers] * logarithms_left
-        # 1.4826 medians of normal absolute errors are a standard deviation.
+        # 1.4826 medians of normal absolute errors are a standard deviation. Huber's weight is
+        # min(1, 1.345 scale / |error|).
         scale = 1.4826 * errors.abs().median(-1, keepdim=True).values
         weights = (1.345 * scale.clamp_min(0.1) / errors.abs().clamp_min(1e-9)).clamp_max(1)
     return Law(slopes, errors)

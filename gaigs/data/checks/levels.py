@@ -231,6 +231,7 @@ def _scale(errors: Float[Tensor, " n"], sample: Sample) -> Float[Tensor, " r"]:
 
     A receiver with under 10 links gets the deviation over all receivers.
     """
+    # 1.4826 medians of normal absolute errors are a standard deviation.
     scales = (1.4826 * errors.abs().median()).expand(len(sample.positions)).clone()
     for number in range(len(scales)):
         at_receiver = errors[sample.receivers == number]

@@ -51,6 +51,7 @@ def check_extent(links: Any) -> Iterator[Finding]:
     span = extent.max().item()
     across = extent[:2].max().item()
     x, y = sites[:, :2].mean(0).tolist()
+    # Longitude and latitude are far from 0 in comparison with the extent of a site.
     is_global = abs(x) <= 180 and abs(y) <= 90 and math.hypot(x, y) > 30 * across > 0
     if links.frame is None and is_global and across < 0.3:
         text = f"x and y of places span {across:.2g} m around ({x:.7g}, {y:.7g})"
@@ -126,6 +127,7 @@ def check_arrays(links: Any) -> Iterator[Finding]:
                     f"{apart / wavelength:.3g} wavelengths",
                     "are they in m?",
                 )
+    # Half of the last digit of float32 at the largest coordinate [m].
     rounding = places.abs().max().item() * torch.finfo(torch.float32).eps / 2
     if links.task.dtype.is_complex and rounding > wavelength / 300 > 0:
         yield Finding(

@@ -366,7 +366,7 @@ def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sa
     """
     receiver = int(sample.receivers.bincount().argmax())
     links = (sample.receivers == receiver).nonzero()[:, 0]
-    brightest = sample.labels[links].flatten(1).argmax(1)
+    brightest = sample.labels[links].flatten(1).argmax(1)  # (k,)
     pixels = grid.flatten()[brightest]
     local = from_spherical(pixels.azimuths, pixels.elevations).double()
     directions = local @ sample.rotations[receiver].T  # u, world frame (k, 3)
@@ -378,7 +378,8 @@ def _unscaled(sample: Sample, grid: Grid, draws: int = 200) -> list[Callable[[Sa
     generator = torch.Generator().manual_seed(0)
     threes = [torch.randperm(len(links), generator=generator)[:3] for _ in range(draws)]
     systems = equations[torch.stack(threes)].flatten(1, 2)  # (draws, 9, 6)
-    # The solution of A x = 0 is the last right singular vector; its sign is free.
+    # The best solution of A x = 0 is the right singular vector of the smallest singular value, the
+    # last one. Its sign is free, and the first scale is made positive.
     solutions = torch.linalg.svd(systems).Vh[:, -1]  # (draws, 6)
     solutions = solutions * solutions[:, :1].sgn()
     changes: list[Callable[[Sample], Sample]] = []
