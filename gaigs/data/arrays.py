@@ -108,10 +108,7 @@ def from_arrays(
     parts: Any = None
     if test_rows is not None:
         parts = parts_of_rows(row, len(places), test_rows, train_rows)
-        train_sites, test_sites = (sites[row[part]] for part in parts)
-        shared = int(torch.isin(test_sites, train_sites).sum())
-        if shared:
-            remarks.append(f"{shared} test links stand at places of training links")
+        remarks += _remarks_on_shared_places(*(sites[row[part]] for part in parts))
     undivided = Links(
         query=Query(places[row], index[received].long(), _carriers(frequency, task, row, places)),
         receivers=receivers,
@@ -128,6 +125,12 @@ def from_arrays(
     links = divide(undivided, config)
     _warn_of_untrained(receivers, links.receivers)
     return links
+
+
+def _remarks_on_shared_places(train: Int[Tensor, " k"], test: Int[Tensor, " l"]) -> list[str]:
+    """A remark if test links stand at places of training links; both as numbers of places."""
+    shared = int(torch.isin(test, train).sum())
+    return [f"{shared} test links stand at places of training links"] if shared else []
 
 
 def _warn_of_untrained(receivers: Sequence[Receiver], trained: Sequence[Receiver]) -> None:

@@ -124,20 +124,22 @@ def find_axes(table: tables.Table, coordinates: Sequence[str] | None = None) -> 
 
     here = table.heading
     for first, second in PAIRS:
-        x, y = columns_of(first), columns_of(second)
-        if not (x and y):
+        xs = columns_of(first)
+        ys = columns_of(second)
+        if not (xs and ys):
             continue
         heights = columns_of(HEIGHTS)
-        z = heights or columns_of(FLOORS)
-        for columns in (x, y, z):
+        zs = heights or columns_of(FLOORS)
+        for columns in (xs, ys, zs):
             if len(columns) > 1:
                 doubled = ", ".join(table.names[k] for k in columns)
                 raise ValueError(
                     f"{here}: several columns of one coordinate, {doubled}; choose by "
                     "data.coordinates"
                 )
-        is_global = first is longitudes and not has_unit[x[0]]
-        return Axes(x[0], y[0], z[0] if z else -1, bool(z) and not heights, is_global)
+        is_global = first is longitudes and not has_unit[xs[0]]
+        z = zs[0] if zs else -1
+        return Axes(xs[0], ys[0], z, bool(zs) and not heights, is_global)
     # A column such as "(1.0, 2.0)" has all coordinates in one cell.
     joined = [name for k, name in enumerate(table.names) if tables.numbers_in(table.text(0, k))]
     hint = ""
